@@ -1,0 +1,1 @@
+"""The onboard half: tracks under a CPU budget and never waits for anybody."""

@@ -1,0 +1,187 @@
+"""The values that the two sides share: one writer each. Arrays are structure-of-arrays, one row a keypoint.
+
+A keyframe's keypoints share one index space [0, n). Each keypoint is either a *birth* (it has a descriptor, and names a
+new point by its own index) or a *sighting* of a point born elsewhere. Pixels are those of the rectified left camera.
+Depth is inverse depth along the optical axis of the keyframe (z), in 1/m; 0 means unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+I64 = NDArray[np.int64]
+
+
+class WireError(Exception):
+    """Bytes that are no valid packet or code. The only exception that a decoder raises, on any bytes."""
+
+
+class Kind(IntEnum):
+    """What a value is. Below 16 the agent writes, from 16 on the base."""
+
+    CAMERA = 1
+    LIVE = 2
+    HEAD = 3
+    BIRTHS = 4
+    SIGHTINGS = 5
+    POSE = 16
+    DEPTHS = 17
+    FOUND = 18
+    REMOVED = 19
+    CULLED = 20
+    PLACEMENT = 21
+    TILE = 22
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """The ideal camera to which an agent's keypoints refer."""
+
+    agent: AgentId
+    camera: RectifiedCamera
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """An agent's newest pose, relative to a keyframe. T_k_c: (4,4) camera in the keyframe. quality: -1, 0, 1..100."""
+
+    agent: AgentId
+    t_ns: int
+    keyframe: KeyframeId
+    T_k_c: F64
+    quality: int
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """A keyframe's header. T_p_k: (4,4) this keyframe's camera in its parent's; for the first of a submap
+    (parent NO_KEYFRAME) in the submap frame m, whose z points up.
+    """
+
+    keyframe: KeyframeId
+    t_ns: int
+    parent: KeyframeId
+    T_p_k: F64
+    keypoints: int  # how many keypoints the keyframe has, over all sections
+
+
+@dataclass(frozen=True, slots=True)
+class Births:
+    """New keypoints of a keyframe, best first over the parts. index: (n,) increasing within a part. uv: (n,2) px.
+    inv_depth: (n,) 1/m as seen. octave: (n,) pyramid level (scale 2 per level). angle: (n,) in 1/256 turns.
+    descriptor: (n,32).
+    """
+
+    keyframe: KeyframeId
+    part: int
+    index: U16
+    uv: F32
+    inv_depth: F32
+    octave: U8
+    angle: U8
+    descriptor: U8
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Observations of points born in other keyframes. point: (n,) PointId. inv_depth: (n,) 1/m from stereo, 0 none."""
+
+    keyframe: KeyframeId
+    part: int
+    index: U16
+    uv: F32
+    inv_depth: F32
+    octave: U8
+    point: I64
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The base's pose of a keyframe. T_m_k: (4,4) camera in the submap frame."""
+
+    keyframe: KeyframeId
+    T_m_k: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Depths:
+    """The base's positions of points born in a keyframe. index: (n,) keypoints. inv_depth: (n,) 1/m.
+    offset: (n,2) px added to the keypoint's pixel to give the bearing.
+    """
+
+    keyframe: KeyframeId
+    index: U16
+    inv_depth: F32
+    offset: F32
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Births that the base recognised as older points: keypoint index[i] of the keyframe shows point[i] (a root).
+    The point born at that keypoint is thereby an alias of the root.
+    """
+
+    keyframe: KeyframeId
+    index: U16
+    point: I64
+
+
+@dataclass(frozen=True, slots=True)
+class Removed:
+    """Observations that the base rejected: keypoints of the keyframe that no longer count (as sighting or as birth)."""
+
+    keyframe: KeyframeId
+    index: U16
+
+
+@dataclass(frozen=True, slots=True)
+class Culled:
+    """Points born in the keyframe that the base dropped; `keyframe_too` drops the keyframe's observations as well."""
+
+    keyframe: KeyframeId
+    index: U16
+    keyframe_too: int  # 0 or 1
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where a submap lies. T_w_m: (4,4)."""
+
+    submap: SubmapId
+    T_w_m: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A square of the occupancy grid. cells: (32,32) int8, 0..100 occupied percent, -1 unknown; row 0 is the lowest y.
+    column, row: tile numbers; the tile's corner lies at (column, row) * 32 * cell_m in w.
+    """
+
+    column: int
+    row: int
+    cell_m: float
+    cells: NDArray[np.int8]
+
+
+Record = (
+    Camera | Live | Head | Births | Sightings | Pose | Depths | Found | Removed | Culled | Placement | Tile
+)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Key:
+    """The name of a value: what it is, of what, and which part of it."""
+
+    kind: int
+    id: int  # keyframe, submap or agent id; a tile's packed column and row
+    part: int = 0

@@ -1,0 +1,80 @@
+"""Ids that carry their origin: (agent, boot, submap, sequence[, keypoint]) packed into one non-negative int64.
+
+Bit layout of a point id, most significant first: agent 6 | boot 14 | submap 12 | sequence 20 | keypoint 11.
+A keyframe id is a point id without the keypoint bits; a submap id is a keyframe id without the sequence bits.
+A point is named by the keyframe and keypoint of its birth, so a new point costs no bytes beyond its keypoint.
+"""
+
+from __future__ import annotations
+
+from typing import NewType
+
+AgentId = NewType("AgentId", int)
+SubmapId = NewType("SubmapId", int)
+KeyframeId = NewType("KeyframeId", int)
+PointId = NewType("PointId", int)
+
+BOOT_BITS = 14
+SUBMAP_BITS = 12
+SEQUENCE_BITS = 20
+KEYPOINT_BITS = 11
+
+MAX_AGENTS = 1 << 6
+MAX_BOOTS = 1 << BOOT_BITS
+MAX_SUBMAPS = 1 << SUBMAP_BITS
+MAX_KEYFRAMES = 1 << SEQUENCE_BITS
+MAX_KEYPOINTS = 1 << KEYPOINT_BITS
+
+NO_KEYFRAME = KeyframeId(-1)
+NO_POINT = PointId(-1)
+
+
+def submap_id(agent: int, boot: int, submap: int) -> SubmapId:
+    """Pack a submap id. Raises ValueError when a part does not fit its bits."""
+    if not (0 <= agent < MAX_AGENTS and 0 <= boot < MAX_BOOTS and 0 <= submap < MAX_SUBMAPS):
+        raise ValueError(f"submap id out of range: agent {agent}, boot {boot}, submap {submap}")
+    return SubmapId((agent << BOOT_BITS | boot) << SUBMAP_BITS | submap)
+
+
+def keyframe_id(submap: SubmapId, sequence: int) -> KeyframeId:
+    """Pack a keyframe id. Raises ValueError when the sequence does not fit its bits."""
+    if not 0 <= sequence < MAX_KEYFRAMES:
+        raise ValueError(f"keyframe sequence out of range: {sequence}")
+    return KeyframeId(submap << SEQUENCE_BITS | sequence)
+
+
+def point_id(keyframe: KeyframeId, keypoint: int) -> PointId:
+    """The id of the point born at `keypoint` of `keyframe`. Raises ValueError when the index does not fit its bits."""
+    if not 0 <= keypoint < MAX_KEYPOINTS:
+        raise ValueError(f"keypoint index out of range: {keypoint}")
+    return PointId(keyframe << KEYPOINT_BITS | keypoint)
+
+
+def keyframe_of_point(point: PointId) -> KeyframeId:
+    """The keyframe on which a point hangs."""
+    return KeyframeId(point >> KEYPOINT_BITS)
+
+
+def keypoint_of_point(point: PointId) -> int:
+    """The index of the keypoint at which a point was born."""
+    return point & (MAX_KEYPOINTS - 1)
+
+
+def submap_of_keyframe(keyframe: KeyframeId) -> SubmapId:
+    """The submap to which a keyframe belongs."""
+    return SubmapId(keyframe >> SEQUENCE_BITS)
+
+
+def sequence_of_keyframe(keyframe: KeyframeId) -> int:
+    """The number of a keyframe within its submap."""
+    return keyframe & (MAX_KEYFRAMES - 1)
+
+
+def agent_of_submap(submap: SubmapId) -> AgentId:
+    """The agent that opened a submap."""
+    return AgentId(submap >> (SUBMAP_BITS + BOOT_BITS))
+
+
+def agent_of_keyframe(keyframe: KeyframeId) -> AgentId:
+    """The agent that saw a keyframe."""
+    return agent_of_submap(submap_of_keyframe(keyframe))

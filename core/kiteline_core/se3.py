@@ -1,0 +1,129 @@
+"""Rigid motions as 4x4 float64 arrays. `T_a_b` maps points of frame b into frame a: p_a = T_a_b @ p_b.
+
+Tangent vectors are [translation (3), rotation (3)] in metres and radians. Quaternions are [w, x, y, z] with w >= 0.
+Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", appendix D.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+_SMALL_RAD = 1e-7  # below this angle the series is exact to double precision
+
+
+def skew(v: F64) -> F64:
+    """The 3x3 matrix with skew(v) @ x == cross(v, x)."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def so3_exp(w: F64) -> F64:
+    """Rotation matrix (3,3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
+    angle = float(np.sqrt(w @ w))
+    k = skew(w)
+    if angle < _SMALL_RAD:
+        return np.eye(3) + k + 0.5 * (k @ k)
+    return np.eye(3) + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k)
+
+
+def so3_log(r: F64) -> F64:
+    """Rotation vector (3,) in radians, of length at most pi, of a rotation matrix (3,3)."""
+    q = quaternion_from_rotation(r)
+    n = float(np.sqrt(q[1:] @ q[1:]))
+    if n < _SMALL_RAD:
+        return np.asarray(2.0 * q[1:] / q[0])
+    return np.asarray(2.0 * np.arctan2(n, q[0]) / n * q[1:])
+
+
+def _left_jacobian(w: F64) -> F64:
+    angle = float(np.sqrt(w @ w))
+    k = skew(w)
+    if angle < 1e-4:
+        return np.eye(3) + 0.5 * k + (k @ k) / 6.0
+    return (
+        np.eye(3) + ((1.0 - np.cos(angle)) / angle**2) * k + ((angle - np.sin(angle)) / angle**3) * (k @ k)
+    )
+
+
+def exp(xi: F64) -> F64:
+    """T (4,4) of a tangent vector (6,) [translation, rotation]."""
+    t = np.eye(4)
+    t[:3, :3] = so3_exp(xi[3:])
+    t[:3, 3] = _left_jacobian(xi[3:]) @ xi[:3]
+    return t
+
+
+def log(t: F64) -> F64:
+    """Tangent vector (6,) [translation, rotation] of T (4,4)."""
+    w = so3_log(t[:3, :3])
+    return np.concatenate([np.linalg.solve(_left_jacobian(w), t[:3, 3]), w])
+
+
+def inverse(t: F64) -> F64:
+    """T_b_a of T_a_b."""
+    out = np.eye(4)
+    out[:3, :3] = t[:3, :3].T
+    out[:3, 3] = -t[:3, :3].T @ t[:3, 3]
+    return out
+
+
+def from_rt(r: F64, t: F64) -> F64:
+    """T (4,4) of a rotation (3,3) and a translation (3,) in metres."""
+    out = np.eye(4)
+    out[:3, :3] = r
+    out[:3, 3] = t
+    return out
+
+
+def transform(t: F64, points: F64) -> F64:
+    """Apply T (4,4) to points (n,3)."""
+    return points @ t[:3, :3].T + t[:3, 3]
+
+
+def orthonormalise(t: F64) -> F64:
+    """The rigid motion nearest to T: products of many rotations drift off the manifold."""
+    u, _, vt = np.linalg.svd(t[:3, :3])
+    r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return from_rt(r, t[:3, 3])
+
+
+def quaternion_from_rotation(r: F64) -> F64:
+    """Unit quaternion [w, x, y, z], w >= 0, of a rotation matrix (3,3) (Shepperd's method)."""
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    d = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
+    i = int(np.argmax(d))
+    if i == 0:
+        q = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    elif i == 1:
+        q = np.array(
+            [r[2, 1] - r[1, 2], 1.0 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]
+        )
+    elif i == 2:
+        q = np.array(
+            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]]
+        )
+    else:
+        q = np.array(
+            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2]]
+        )
+    q = q / np.sqrt(q @ q)
+    return np.asarray(-q if q[0] < 0 else q)
+
+
+def rotation_from_quaternion(q: F64) -> F64:
+    """Rotation matrix (3,3) of a quaternion [w, x, y, z]; it is normalised first."""
+    w, x, y, z = q / np.sqrt(q @ q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def from_quaternion(q: F64, t: F64) -> F64:
+    """T (4,4) of a quaternion [w, x, y, z] and a translation (3,) in metres."""
+    return from_rt(rotation_from_quaternion(q), t)

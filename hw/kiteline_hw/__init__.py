@@ -1,0 +1,1 @@
+"""The edge of kiteline: cameras, data sets, logs, links, clocks. Knows nothing of SLAM."""

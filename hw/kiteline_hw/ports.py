@@ -1,0 +1,76 @@
+"""What the edge promises to the rest: small protocols, one per kind of device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from kiteline_core.cameras import CameraRig
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
+
+
+class SourceError(Exception):
+    """A source that cannot be read. The text says what was found, what was expected and how to mend it."""
+
+
+class LinkError(Exception):
+    """A link that cannot be opened. Loss and silence are no errors: they are what links do."""
+
+
+@dataclass(slots=True)
+class SourceReport:
+    """What a source passed over, by reason; it grows while the source is read. `notes` holds a few examples."""
+
+    skipped: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def skip(self, reason: str, note: str) -> None:
+        """Count one skipped item; keep the first ten notes."""
+        self.skipped[reason] = self.skipped.get(reason, 0) + 1
+        if len(self.notes) < 10:
+            self.notes.append(f"{reason}: {note}")
+
+
+class FrameSource(Protocol):
+    """A camera or a recording. Iterating yields samples in order of time; an ImuBatch holds all inertial samples
+    since the last one up to and including the time of the Frame that follows it.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def rig(self) -> CameraRig: ...
+    @property
+    def imu(self) -> ImuCalibration | None: ...
+    @property
+    def ground_truth(self) -> Trajectory | None: ...
+    @property
+    def report(self) -> SourceReport: ...
+    @property
+    def frame_count(self) -> int | None:
+        """How many frames will come, for a progress bar; None when unknown."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame | ImuBatch]: ...
+    def close(self) -> None: ...
+
+
+class ByteLink(Protocol):
+    """A way to carry packets, unreliable and unordered. Neither call ever blocks."""
+
+    def send(self, packet: bytes) -> bool:
+        """Hand over one packet; False when it was dropped at once (full buffer, no peer)."""
+        ...
+
+    def receive(self) -> list[bytes]:
+        """All packets that have arrived since the last call."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Clock(Protocol):
+    """A monotonic clock."""
+
+    def now_ns(self) -> int: ...

@@ -1,0 +1,1 @@
+"""A simulated world, a modelled link, a modelled flight controller."""

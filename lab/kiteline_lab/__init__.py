@@ -1,0 +1,1 @@
+"""Experiments: fly, evaluate, benchmark, plot."""
