@@ -1,0 +1,60 @@
+# `make demo` flies a simulated drone and judges it. `make check` is what every change must pass. All set-up happens by itself.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.kiteline-installed
+ROOMS := core codec hw agent basestation lab cli
+
+# Compiled kernels are kept with the environment, so that tests and demo compile once.
+export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba-cache
+export OMP_NUM_THREADS ?= 1
+export PYTHONUNBUFFERED := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test check format lint types contracts bench clean
+
+help: ## say what can be made
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: $(STAMP) ## set up .venv (every other target does this by itself)
+
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || { echo "kiteline: no $(PYTHON) found. On Debian or Ubuntu: sudo apt install python3 python3-venv" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "kiteline: $$($(PYTHON) --version) found, 3.11 or newer is needed. Name another with: make PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "kiteline: python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(STAMP): pyproject.toml | $(BIN)/python
+	@echo "installing kiteline and what it needs into $(VENV) (once; some 300 MB)"
+	$(BIN)/python -m pip install --quiet -e '.[base,lab,dev]'
+	@touch $@
+
+demo: $(STAMP) ## simulate a flight, fly it over a real link, judge the result
+	@$(BIN)/python -m kiteline_lab.demo
+
+test: $(STAMP) ## run the tests
+	$(BIN)/python -m pytest -q
+
+check: lint types contracts test ## everything that a change must pass
+
+format: $(STAMP) ## format and mend what can be mended
+	$(BIN)/ruff check -q --fix .
+	$(BIN)/ruff format -q .
+
+lint: $(STAMP) ## style and likely bugs
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(STAMP) ## mypy, strict
+	$(BIN)/mypy
+
+contracts: $(STAMP) ## who may import whom
+	$(BIN)/lint-imports --quiet
+
+bench: $(STAMP) ## measure, and write docs/results.md
+	$(BIN)/kiteline bench
+
+clean: ## remove what tools left behind, keep .venv
+	rm -rf build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info
+	find $(ROOMS) tests -name __pycache__ -type d -prune -exec rm -rf {} +

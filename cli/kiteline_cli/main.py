@@ -1,0 +1,5 @@
+"""placeholder while the package is installed"""
+
+
+def run() -> None:
+    print("kiteline")
