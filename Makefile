@@ -50,7 +50,7 @@ types: $(STAMP) ## mypy, strict
 	$(BIN)/mypy
 
 contracts: $(STAMP) ## who may import whom
-	$(BIN)/lint-imports --quiet
+	$(BIN)/lint-imports
 
 bench: $(STAMP) ## measure, and write docs/results.md
 	$(BIN)/kiteline bench

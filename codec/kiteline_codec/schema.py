@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
-from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -173,9 +174,7 @@ class Tile:
     cells: NDArray[np.int8]
 
 
-Record = (
-    Camera | Live | Head | Births | Sightings | Pose | Depths | Found | Removed | Culled | Placement | Tile
-)
+Record = Camera | Live | Head | Births | Sightings | Pose | Depths | Found | Removed | Culled | Placement | Tile
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -167,9 +167,7 @@ def _is_rectified(rig: CameraRig) -> bool:
     )
 
 
-def _undistortion_maps(
-    camera: CameraModel, rotation: F64, new: F64
-) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+def _undistortion_maps(camera: CameraModel, rotation: F64, new: F64) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     size = (camera.width, camera.height)
     d = np.array(camera.distortion, np.float64)
     if camera.lens is Lens.EQUIDISTANT:

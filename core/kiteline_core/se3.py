@@ -25,7 +25,7 @@ def so3_exp(w: F64) -> F64:
     k = skew(w)
     if angle < _SMALL_RAD:
         return np.eye(3) + k + 0.5 * (k @ k)
-    return np.eye(3) + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k)
+    return np.asarray(np.eye(3) + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k))
 
 
 def so3_log(r: F64) -> F64:
@@ -42,7 +42,7 @@ def _left_jacobian(w: F64) -> F64:
     k = skew(w)
     if angle < 1e-4:
         return np.eye(3) + 0.5 * k + (k @ k) / 6.0
-    return (
+    return np.asarray(
         np.eye(3) + ((1.0 - np.cos(angle)) / angle**2) * k + ((angle - np.sin(angle)) / angle**3) * (k @ k)
     )
 
@@ -97,17 +97,11 @@ def quaternion_from_rotation(r: F64) -> F64:
     if i == 0:
         q = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
     elif i == 1:
-        q = np.array(
-            [r[2, 1] - r[1, 2], 1.0 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]]
-        )
+        q = np.array([r[2, 1] - r[1, 2], 1.0 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]])
     elif i == 2:
-        q = np.array(
-            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]]
-        )
+        q = np.array([r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]])
     else:
-        q = np.array(
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2]]
-        )
+        q = np.array([r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2]])
     q = q / np.sqrt(q @ q)
     return np.asarray(-q if q[0] < 0 else q)
 
