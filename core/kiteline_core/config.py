@@ -1,0 +1,146 @@
+"""Frozen configuration: nested dataclasses, overridden by a parsed TOML table, described as TOML.
+
+A value's unit and reason stand beside its default in the code; a table can only replace values that exist.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from enum import Enum
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """An unknown key or a value of the wrong type; the text names the key, its section and what is known there."""
+
+
+def apply(config: T, table: Mapping[str, object], path: str = "") -> T:
+    """A copy of `config` (a frozen dataclass, sections nested) with the values of `table` in place of its own.
+
+    path: name of the section, for error texts. Raises ConfigError for an unknown key, a value of the wrong type, or
+    one that the section itself rejects (ValueError of its __post_init__).
+    """
+    if not is_dataclass(config) or isinstance(config, type):
+        raise TypeError(f"a config section is a dataclass instance, not {type(config).__name__}")
+    known = {f.name: f for f in fields(config) if f.init}
+    hints = get_type_hints(type(config))
+    changes: dict[str, object] = {}
+    for key, value in table.items():
+        if key not in known:
+            raise ConfigError(f"unknown key {key!r} in {_section(path)}; known are: {', '.join(sorted(known))}")
+        old = getattr(config, key)
+        inner = f"{path}.{key}" if path else key
+        if is_dataclass(old):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"[{inner}] is a section: found {_shown(value)}, expected keys and values under it")
+            changes[key] = apply(old, value, inner)
+        else:
+            changes[key] = _convert(value, hints[key], inner)
+    try:
+        return replace(config, **changes)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{_section(path)}: {error}") from error
+
+
+def describe(config: object) -> str:
+    """The TOML text of a config with the values it has now; `apply` of its parse gives the same config."""
+    lines: list[str] = []
+    _describe(config, "", lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _describe(config: object, path: str, lines: list[str]) -> None:
+    if not is_dataclass(config) or isinstance(config, type):
+        raise TypeError(f"a config section is a dataclass instance, not {type(config).__name__}")
+    values = {f.name: getattr(config, f.name) for f in fields(config) if f.init}
+    plain = {k: v for k, v in values.items() if not is_dataclass(v)}
+    if path and plain:
+        lines += ["", f"[{path}]"]
+    for key, value in plain.items():
+        lines.append(f"# {key} is not set" if value is None else f"{key} = {_toml(value)}")
+    for key, value in values.items():
+        if is_dataclass(value):
+            _describe(value, f"{path}.{key}" if path else key, lines)
+
+
+def _toml(value: object) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case Enum():
+            return _toml(value.value)
+        case int() | float():
+            return repr(value)
+        case str():
+            return _quoted(value)
+        case tuple() | list():
+            return "[" + ", ".join(_toml(v) for v in value) + "]"
+    raise TypeError(f"a config value is a bool, number, string, enum or tuple of them, not {type(value).__name__}")
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}" for c in escaped) + '"'
+
+
+def _convert(value: object, hint: Any, path: str) -> object:
+    """`value` as the type `hint`, widening int to float and list to tuple; ConfigError when it does not fit."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        for option in get_args(hint):
+            if option is not type(None):
+                try:
+                    return _convert(value, option, path)
+                except ConfigError:
+                    continue
+    elif origin is Literal:
+        if value in get_args(hint):
+            return value
+    elif origin is tuple:
+        if isinstance(value, list | tuple):
+            args = get_args(hint)
+            items = (args[0],) * len(value) if len(args) == 2 and args[1] is Ellipsis else args
+            if len(items) == len(value):
+                return tuple(_convert(v, h, f"{path}[{i}]") for i, (v, h) in enumerate(zip(value, items)))
+    elif isinstance(hint, type) and issubclass(hint, Enum):
+        if value in [member.value for member in hint]:
+            return hint(value)
+    elif hint is float:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+    elif hint is int:
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+    elif isinstance(hint, type) and isinstance(value, hint):
+        return value
+    raise ConfigError(f"{path}: found {_shown(value)}, expected {_name(hint)}")
+
+
+def _name(hint: Any) -> str:
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_name(o) for o in get_args(hint) if o is not type(None))
+    if origin is Literal:
+        return "one of " + ", ".join(repr(a) for a in get_args(hint))
+    if origin is tuple:
+        args = get_args(hint)
+        if len(args) == 2 and args[1] is Ellipsis:
+            return f"a list of {_name(args[0])}"
+        return f"a list of {len(args)}: " + ", ".join(_name(a) for a in args)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return "one of " + ", ".join(repr(member.value) for member in hint)
+    return {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}.get(hint, str(hint))
+
+
+def _shown(value: object) -> str:
+    return f"{value!r} ({type(value).__name__})"
+
+
+def _section(path: str) -> str:
+    return f"section [{path}]" if path else "the top of the file"
