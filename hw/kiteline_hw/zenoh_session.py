@@ -1,0 +1,119 @@
+"""Opening and closing Zenoh sessions so that nothing hangs: client (drone) or listening peer (base), TCP, no discovery.
+
+A process that ends while a Zenoh session with callbacks is open hangs for ever. So every session opened here is closed
+at the latest when the main thread ends, and `exit_on_sigterm` turns SIGTERM into a normal end of the program.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import Any, Literal
+
+import zenoh
+
+from kiteline_hw.ports import LinkError
+
+CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
+_RETRY_S = 0.1  # s between two tries to connect
+
+Role = Literal["client", "base"]
+
+
+def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
+    """The configuration of a session. endpoint: a Zenoh locator such as tcp/127.0.0.1:7447. Raises LinkError."""
+    config = zenoh.Config()
+    options: dict[str, Any] = {
+        "mode": "client" if role == "client" else "peer",
+        "connect/endpoints": [endpoint] if role == "client" else [],
+        "listen/endpoints": [endpoint] if role == "base" else [],
+        "connect/timeout_ms": 500,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": lease_ms,
+    }
+    try:
+        for name, value in options.items():
+            config.insert_json5(name, json.dumps(value))
+    except zenoh.ZError as error:
+        raise LinkError(f"{endpoint!r} is no Zenoh endpoint ({error}); write tcp/HOST:PORT") from error
+    return config
+
+
+def open_session(
+    endpoint: str,
+    role: Role,
+    *,
+    lease_ms: int = 2000,
+    connect_timeout_s: float = 10.0,
+    give_up: threading.Event | None = None,
+) -> zenoh.Session:
+    """Listen (base) or connect (client, trying again until the timeout). Raises LinkError. Blocks: never in a tracking
+    loop. `give_up`, when set by another thread, ends the tries.
+    """
+    config = session_config(endpoint, role, lease_ms)
+    deadline_s = time.monotonic() + connect_timeout_s
+    while True:
+        try:
+            session = zenoh.open(config)
+            break
+        except zenoh.ZError as error:
+            if role == "base":
+                raise LinkError(
+                    f"cannot listen on {endpoint} ({error}): is another base station running, and is the address "
+                    "one of this machine (tcp/0.0.0.0:PORT listens on all)?"
+                ) from error
+            if time.monotonic() >= deadline_s or (give_up is not None and give_up.is_set()):
+                raise LinkError(
+                    f"no base station answers at {endpoint} within {connect_timeout_s:g} s: start it first, and check "
+                    "the address and the network"
+                ) from error
+        if give_up is None:
+            time.sleep(_RETRY_S)
+        else:
+            give_up.wait(_RETRY_S)
+    threading.Thread(target=_close_after_main, args=(session,), name="zenoh-exit", daemon=True).start()
+    return session
+
+
+def _close_after_main(session: zenoh.Session) -> None:
+    """Close a forgotten session when the main thread has ended: atexit handlers run too late for that."""
+    threading.main_thread().join()
+    with contextlib.suppress(zenoh.ZError):
+        session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+
+
+def close_session(session: zenoh.Session) -> bool:
+    """Close a session within CLOSE_TIMEOUT_S; False when it had to be abandoned. May be called twice."""
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+
+    thread = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    thread.start()
+    thread.join(CLOSE_TIMEOUT_S)
+    return not thread.is_alive()
+
+
+def direct(callback: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:
+    """A handler that calls back from Zenoh's own thread, without a Python thread in between."""
+    return zenoh.handlers.Callback(callback, drop or (lambda: None), indirect=False)
+
+
+def exit_on_sigterm() -> None:
+    """Turn SIGTERM into SystemExit(143) in the main thread, so that `with` blocks close their links."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        del frame
+        sys.exit(128 + number)
+
+    signal.signal(signal.SIGTERM, leave)
