@@ -1,0 +1,10 @@
+"""`kiteline sim`: record a simulated flight."""
+
+from __future__ import annotations
+
+
+def run(argv: list[str]) -> int | None:
+    """Parse the arguments after `kiteline sim` and do it; the exit status."""
+    from kiteline_lab.simulate import main
+
+    return main(argv)
