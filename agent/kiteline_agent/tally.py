@@ -1,0 +1,98 @@
+"""What a flight amounts to, counted frame by frame; no clock and no file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from kiteline_core import tum
+from kiteline_core.ids import KeyframeId, SubmapId
+from numpy import float64
+from numpy.typing import NDArray
+
+F64 = NDArray[float64]
+
+
+class FlownFrame(Protocol):
+    """The part of an Estimate that is counted."""
+
+    @property
+    def t_ns(self) -> int: ...
+    @property
+    def tracked(self) -> bool: ...
+    @property
+    def T_m_b(self) -> F64 | None: ...
+    @property
+    def T_o_b(self) -> F64: ...
+    @property
+    def T_w_b(self) -> F64 | None: ...
+    @property
+    def keyframe(self) -> KeyframeId: ...
+    @property
+    def submap(self) -> SubmapId: ...
+    @property
+    def bridged(self) -> bool: ...
+
+
+@dataclass(slots=True)
+class Tally:
+    """frames = tracked + lost + dropped. bridged: those of the tracked that the IMU carried."""
+
+    tracked: int = 0
+    bridged: int = 0
+    lost: int = 0
+    dropped: int = 0
+    bytes_up: int = 0
+    bytes_down: int = 0
+    keyframes: set[KeyframeId] = field(default_factory=set)
+    submaps: set[SubmapId] = field(default_factory=set)
+
+    @property
+    def frames(self) -> int:
+        """How many frames the source gave."""
+        return self.tracked + self.lost + self.dropped
+
+    def count(self, estimate: FlownFrame | None) -> None:
+        """Count one frame that was given to the tracker; None when no estimate came of it."""
+        if estimate is None or live_pose(estimate) is None:
+            self.lost += 1
+        else:
+            self.tracked += 1
+            self.bridged += estimate.bridged
+        if estimate is not None and estimate.keyframe >= 0:
+            self.keyframes.add(estimate.keyframe)
+            self.submaps.add(estimate.submap)
+
+    def as_report(self) -> dict[str, int | float]:
+        """The counts as report.json holds them."""
+        keyframes = len(self.keyframes)
+        return {
+            "frames": self.frames,
+            "tracked": self.tracked,
+            "bridged": self.bridged,
+            "lost": self.lost,
+            "dropped": self.dropped,
+            "submaps": len(self.submaps),
+            "keyframes": keyframes,
+            "bytes_up": self.bytes_up,
+            "bytes_down": self.bytes_down,
+            "bytes_per_keyframe": round(self.bytes_up / keyframes, 1) if keyframes else 0.0,
+        }
+
+
+def live_pose(estimate: FlownFrame) -> F64 | None:
+    """The body in w where the base has placed the submap, else in m; None for a frame that was not tracked."""
+    if not estimate.tracked:
+        return None
+    return estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
+
+
+def live_line(estimate: FlownFrame) -> str:
+    """The frame's line in live.tum; empty where it has no pose."""
+    pose = live_pose(estimate)
+    return "" if pose is None else tum.line(estimate.t_ns, pose)
+
+
+def odometry_line(estimate: FlownFrame) -> str:
+    """The frame's line in odometry.tum."""
+    return tum.line(estimate.t_ns, estimate.T_o_b)

@@ -1,0 +1,90 @@
+"""What the two sides of a lock-step flight say at the barrier, one message each a tick."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from kiteline_hw.ports import LinkError
+
+NO_MORE_FRAMES_NS = -1
+
+_UP = struct.Struct("<qBI")  # next frame's flight time, flags, packets
+_DOWN = struct.Struct("<qBI")  # flight time of this tick, phase, packets
+_LENGTH = struct.Struct("<I")
+
+
+class Phase(IntEnum):
+    """Where the flight stands."""
+
+    FLY = 0
+    DRAIN = 1  # no frames left: the link is emptied
+    END = 2  # nothing follows: close
+
+
+@dataclass(frozen=True, slots=True)
+class Up:
+    """An agent's turn. next_ns: flight time of its next frame, NO_MORE_FRAMES_NS after its last.
+    quiet, digest_equal: as its endpoint sees the link.
+    """
+
+    next_ns: int
+    quiet: bool
+    digest_equal: bool
+    packets: tuple[bytes, ...]
+
+    def encode(self) -> bytes:
+        """The message as bytes."""
+        flags = self.quiet | self.digest_equal << 1
+        return _UP.pack(self.next_ns, flags, len(self.packets)) + _join(self.packets)
+
+    @classmethod
+    def decode(cls, message: bytes) -> Up:
+        """Raises LinkError when the message is none."""
+        next_ns, flags, packets = _split(_UP, message)
+        return cls(next_ns, bool(flags & 1), bool(flags & 2), packets)
+
+
+@dataclass(frozen=True, slots=True)
+class Down:
+    """The base's turn. now_ns: flight time of the tick that begins."""
+
+    now_ns: int
+    phase: Phase
+    packets: tuple[bytes, ...]
+
+    def encode(self) -> bytes:
+        """The message as bytes."""
+        return _DOWN.pack(self.now_ns, self.phase, len(self.packets)) + _join(self.packets)
+
+    @classmethod
+    def decode(cls, message: bytes) -> Down:
+        """Raises LinkError when the message is none."""
+        now_ns, phase, packets = _split(_DOWN, message)
+        try:
+            return cls(now_ns, Phase(phase), packets)
+        except ValueError as error:
+            raise LinkError(f"lock-step message of an unknown phase {phase}") from error
+
+
+def _join(packets: Sequence[bytes]) -> bytes:
+    return b"".join(_LENGTH.pack(len(packet)) + packet for packet in packets)
+
+
+def _split(header: struct.Struct, message: bytes) -> tuple[int, int, tuple[bytes, ...]]:
+    try:
+        time_ns, flags, count = header.unpack_from(message)
+        packets = []
+        at = header.size
+        for _ in range(count):
+            (length,) = _LENGTH.unpack_from(message, at)
+            at += _LENGTH.size
+            packets.append(message[at : at + length])
+            at += length
+    except struct.error as error:
+        raise LinkError(f"lock-step message of {len(message)} bytes is cut short") from error
+    if at != len(message):
+        raise LinkError(f"lock-step message of {len(message)} bytes, expected {at}: are both sides of one version?")
+    return int(time_ns), int(flags), tuple(packets)
