@@ -1,0 +1,399 @@
+"""Records to codes and back. A code says everything of a value but its key."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
+from numpy.typing import NDArray
+
+from kiteline_codec import quantise
+from kiteline_codec.packing import Reader, Writer
+from kiteline_codec.schema import (
+    Births,
+    Camera,
+    Culled,
+    Depths,
+    Found,
+    Head,
+    Key,
+    Kind,
+    Live,
+    Placement,
+    Pose,
+    Record,
+    Removed,
+    Sightings,
+    Tile,
+    WireError,
+)
+
+I64 = NDArray[np.int64]
+
+MAX_KEYFRAME_ID = (1 << 52) - 1  # as laid out in kiteline_core.ids
+MAX_PARTS = 1 << 8
+DESCRIPTOR_BYTES = 32
+TILE_CELLS = 32  # along each side
+_TILE_BITS = 24  # of a column or row number
+_TILE_OFFSET = 1 << _TILE_BITS - 1
+_MAX_SIZE_PX = 1 << 14
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """How one array of a record becomes columns of integers. Codes lie in [low, high]."""
+
+    columns: int
+    low: int
+    high: int
+    codes: Callable[[Any], I64]
+    values: Callable[[I64], Any]
+
+
+def _plain(dtype: Any, high: int) -> _Field:
+    return _Field(1, 0, high, lambda a: np.asarray(a).astype(np.int64), lambda c: c[0].astype(dtype))
+
+
+_FIELDS = {
+    "index": _plain(np.uint16, MAX_KEYPOINTS - 1),
+    "uv": _Field(2, 0, quantise.PIXEL_CODES - 1, quantise.pixel_codes, quantise.pixels),
+    "inv_depth": _Field(
+        1, 0, quantise.DEPTH_CODES - 1, quantise.inverse_depth_codes, lambda c: quantise.inverse_depths(c[0])
+    ),
+    "octave": _plain(np.uint8, 15),
+    "angle": _plain(np.uint8, 255),
+    "offset": _Field(
+        2, 1 - quantise.OFFSET_CODES, quantise.OFFSET_CODES - 1, quantise.offset_codes, quantise.offsets
+    ),
+}  # fmt: skip
+
+_COLUMNS: dict[Kind, tuple[str, ...]] = {
+    Kind.BIRTHS: ("index", "uv", "inv_depth", "octave", "angle"),
+    Kind.SIGHTINGS: ("index", "uv", "inv_depth", "octave"),
+    Kind.DEPTHS: ("index", "inv_depth", "offset"),
+    Kind.FOUND: ("index",),
+    Kind.REMOVED: ("index",),
+    Kind.CULLED: ("index",),
+}
+
+
+def key(record: Record) -> Key:
+    """The name under which a record is shared."""
+    coder = _CODERS[_KIND_OF[type(record)]]
+    return Key(int(coder.kind), *coder.key(record))
+
+
+def encode(record: Record) -> bytes:
+    """The code of a record: quantised, without its key. Raises ValueError for a record that cannot be coded."""
+    coder = _CODERS[_KIND_OF[type(record)]]
+    out = Writer()
+    coder.write(out, record)
+    return out.bytes()
+
+
+def decode(key: Key, code: bytes) -> Record:
+    """The record of a key and a code. `encode` gives the same code of it again. Raises WireError, on any bytes."""
+    coder = _CODERS.get(key.kind)
+    if coder is None:
+        raise WireError(f"kind {key.kind} is unknown; known are {sorted(_CODERS)}")
+    if not 0 <= key.id <= coder.max_id or not 0 <= key.part < coder.parts:
+        raise WireError(f"{key} is out of range")
+    source = Reader(code)
+    record = coder.read(source, key)
+    source.end()
+    return record
+
+
+def _write_pose(out: Writer, pose: NDArray[np.float64]) -> None:
+    for c in quantise.pose_codes(pose):
+        out.signed(c)
+
+
+def _read_pose(source: Reader) -> NDArray[np.float64]:
+    moved = [source.signed(quantise.TRANSLATION_CODES - 1) for _ in range(3)]
+    turned = [source.signed(quantise.ROTATION_STEPS) for _ in range(3)]
+    try:
+        return quantise.pose((*moved, *turned))
+    except ValueError as e:
+        raise WireError(str(e)) from None
+
+
+def _write_columns(out: Writer, kind: Kind, record: Any) -> None:
+    n = len(record.index)
+    if n > MAX_KEYPOINTS:
+        raise ValueError(f"found {n} keypoints, expected at most {MAX_KEYPOINTS}")
+    out.varint(n)
+    names = _COLUMNS[kind]
+    values = np.empty((sum(_FIELDS[name].columns for name in names), n), np.int64)
+    row = 0
+    for name in names:
+        field = _FIELDS[name]
+        codes = field.codes(getattr(record, name))
+        if n and (codes.min() < field.low or codes.max() > field.high):
+            raise ValueError(f"{name} is {codes.min()}..{codes.max()}, expected {field.low}..{field.high}")
+        values[row : row + field.columns] = codes
+        row += field.columns
+    if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
+        raise ValueError("indices must increase")
+    out.columns(values)
+
+
+def _read_columns(source: Reader, kind: Kind) -> tuple[int, dict[str, Any]]:
+    n = source.varint(MAX_KEYPOINTS)
+    names = _COLUMNS[kind]
+    values = source.columns(sum(_FIELDS[name].columns for name in names), n)
+    out = {}
+    row = 0
+    for name in names:
+        field = _FIELDS[name]
+        codes = values[row : row + field.columns]
+        if n and (codes.min() < field.low or codes.max() > field.high):
+            raise WireError(f"{name} is {codes.min()}..{codes.max()}, expected {field.low}..{field.high}")
+        out[name] = field.values(codes)
+        row += field.columns
+    if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
+        raise WireError("indices must increase")
+    return n, out
+
+
+def _write_points(out: Writer, point: I64) -> None:
+    """Point ids: a table of the keyframes of birth, increasing, then two columns: place in the table and keypoint."""
+    point = np.asarray(point, np.int64)
+    if not point.size:
+        return
+    if point.min() < 0:
+        raise ValueError("a point id is not negative")
+    table, place = np.unique(point >> KEYPOINT_BITS, return_inverse=True)
+    out.varint(len(table))
+    last = 0
+    for keyframe in table.tolist():
+        out.varint(keyframe - last)
+        last = keyframe
+    out.columns(np.stack([place.reshape(-1).astype(np.int64), point & (MAX_KEYPOINTS - 1)]))
+
+
+def _read_points(source: Reader, n: int) -> I64:
+    if not n:
+        return np.zeros(0, np.int64)
+    size = source.varint(n)
+    table = np.zeros(size, np.int64)
+    last = 0
+    for i in range(size):
+        step = source.varint(MAX_KEYFRAME_ID)
+        last += step
+        if last > MAX_KEYFRAME_ID or (i and not step):
+            raise WireError("keyframes of birth must increase and fit an id")
+        table[i] = last
+    place, keypoint = source.columns(2, n)
+    if not size or place.min() < 0 or place.max() >= size or keypoint.min() < 0 or keypoint.max() >= MAX_KEYPOINTS:
+        raise WireError("a point id is out of range")
+    return np.asarray(table[place] << KEYPOINT_BITS | keypoint, np.int64)
+
+
+def _write_camera(out: Writer, record: Camera) -> None:
+    c = record.camera
+    out.varint(c.width)
+    out.varint(c.height)
+    for value in (c.fx, c.fy, c.cx, c.cy, c.baseline_m):
+        out.f64(value)
+    out.u8(int(c.stereo))
+    for value in np.asarray(c.T_b_c, np.float64)[:3].reshape(-1):
+        out.f64(float(value))
+
+
+def _read_camera(source: Reader, key: Key) -> Camera:
+    width, height = source.varint(_MAX_SIZE_PX), source.varint(_MAX_SIZE_PX)
+    fx, fy, cx, cy, baseline_m = (source.f64() for _ in range(5))
+    stereo = source.u8()
+    t_b_c = np.eye(4)
+    t_b_c[:3] = np.array([source.f64() for _ in range(12)]).reshape(3, 4)
+    if not (width and height and fx > 0 and fy > 0 and baseline_m > 0 and stereo < 2):
+        raise WireError("a camera has size, focal lengths and a baseline above zero")
+    if np.abs(t_b_c).max() > 1e6 or np.abs(t_b_c[:3, :3] @ t_b_c[:3, :3].T - np.eye(3)).max() > 1e-3:
+        raise WireError("the camera's place in the body is no rigid motion")
+    return Camera(AgentId(key.id), RectifiedCamera(width, height, fx, fy, cx, cy, baseline_m, stereo == 1, t_b_c))
+
+
+def _write_live(out: Writer, record: Live) -> None:
+    out.varint(record.t_ns)
+    out.varint(record.keyframe + 1)
+    _write_pose(out, record.T_k_c)
+    out.signed(record.quality)
+
+
+def _read_live(source: Reader, key: Key) -> Live:
+    t_ns = source.varint()
+    keyframe = KeyframeId(source.varint(MAX_KEYFRAME_ID + 1) - 1)
+    t_k_c = _read_pose(source)
+    quality = source.signed(100)
+    if quality < -1:
+        raise WireError(f"quality is -1, 0 or 1..100, found {quality}")
+    return Live(AgentId(key.id), t_ns, keyframe, t_k_c, quality)
+
+
+def _write_head(out: Writer, record: Head) -> None:
+    out.varint(record.t_ns)
+    # Most parents are the keyframe before: their difference is 1.
+    out.varint(0 if record.parent == NO_KEYFRAME else 1 + _zigzag(record.keyframe - record.parent))
+    _write_pose(out, record.T_p_k)
+    out.varint(record.keypoints)
+
+
+def _zigzag(value: int) -> int:
+    return 2 * value if value >= 0 else -2 * value - 1
+
+
+def _read_head(source: Reader, key: Key) -> Head:
+    t_ns = source.varint()
+    step = source.varint()
+    parent = NO_KEYFRAME
+    if step:
+        z = step - 1
+        parent = KeyframeId(key.id - ((z >> 1) ^ -(z & 1)))
+        if not 0 <= parent <= MAX_KEYFRAME_ID:
+            raise WireError(f"parent {parent} is no keyframe id")
+    t_p_k = _read_pose(source)
+    return Head(KeyframeId(key.id), t_ns, parent, t_p_k, source.varint(MAX_KEYPOINTS))
+
+
+def _write_births(out: Writer, record: Births) -> None:
+    descriptor = np.ascontiguousarray(record.descriptor, np.uint8)
+    if descriptor.shape != (len(record.index), DESCRIPTOR_BYTES):
+        raise ValueError(f"descriptors are {descriptor.shape}, expected {(len(record.index), DESCRIPTOR_BYTES)}")
+    _write_columns(out, Kind.BIRTHS, record)
+    out.raw(descriptor.tobytes())
+
+
+def _read_births(source: Reader, key: Key) -> Births:
+    n, columns = _read_columns(source, Kind.BIRTHS)
+    raw = np.frombuffer(source.raw(DESCRIPTOR_BYTES * n), np.uint8).reshape(n, DESCRIPTOR_BYTES)
+    return Births(keyframe=KeyframeId(key.id), part=key.part, descriptor=raw, **columns)
+
+
+def _write_sightings(out: Writer, record: Sightings) -> None:
+    _write_columns(out, Kind.SIGHTINGS, record)
+    _write_points(out, record.point)
+
+
+def _read_sightings(source: Reader, key: Key) -> Sightings:
+    n, columns = _read_columns(source, Kind.SIGHTINGS)
+    return Sightings(keyframe=KeyframeId(key.id), part=key.part, point=_read_points(source, n), **columns)
+
+
+def _write_found(out: Writer, record: Found) -> None:
+    _write_columns(out, Kind.FOUND, record)
+    _write_points(out, record.point)
+
+
+def _read_found(source: Reader, key: Key) -> Found:
+    n, columns = _read_columns(source, Kind.FOUND)
+    return Found(keyframe=KeyframeId(key.id), point=_read_points(source, n), **columns)
+
+
+def _write_culled(out: Writer, record: Culled) -> None:
+    _write_columns(out, Kind.CULLED, record)
+    out.u8(record.keyframe_too)
+
+
+def _read_culled(source: Reader, key: Key) -> Culled:
+    _, columns = _read_columns(source, Kind.CULLED)
+    too = source.u8()
+    if too > 1:
+        raise WireError(f"keyframe_too is 0 or 1, found {too}")
+    return Culled(keyframe=KeyframeId(key.id), keyframe_too=too, **columns)
+
+
+def _tile_id(record: Tile) -> int:
+    column, row = record.column + _TILE_OFFSET, record.row + _TILE_OFFSET
+    if not (0 <= column < 1 << _TILE_BITS and 0 <= row < 1 << _TILE_BITS):
+        raise ValueError(f"tile ({record.column}, {record.row}) lies beyond +-{_TILE_OFFSET}")
+    return column << _TILE_BITS | row
+
+
+def _write_tile(out: Writer, record: Tile) -> None:
+    if record.cells.shape != (TILE_CELLS, TILE_CELLS):
+        raise ValueError(f"a tile is {TILE_CELLS}x{TILE_CELLS} cells, found {record.cells.shape}")
+    out.f32(record.cell_m)
+    levels = quantise.occupancy_codes(record.cells).reshape(-1)
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -10)
+    out.raw(deflate.compress((levels[0::2] | levels[1::2] << 4).tobytes()) + deflate.flush())
+
+
+def _read_tile(source: Reader, key: Key) -> Tile:
+    cell_m = source.f32()
+    if cell_m <= 0:
+        raise WireError(f"a cell has a size, found {cell_m} m")
+    inflate = zlib.decompressobj(-15)
+    expected = TILE_CELLS * TILE_CELLS // 2
+    try:
+        data = inflate.decompress(source.raw(source.left), expected + 1)
+    except zlib.error as e:
+        raise WireError(f"tile: {e}") from None
+    if len(data) != expected or not inflate.eof or inflate.unused_data or inflate.unconsumed_tail:
+        raise WireError(f"a tile holds {expected} bytes, found {len(data)}")
+    pairs = np.frombuffer(data, np.uint8)
+    levels = np.stack([pairs & 15, pairs >> 4], axis=1).reshape(TILE_CELLS, TILE_CELLS)
+    column, row = key.id >> _TILE_BITS, key.id & (1 << _TILE_BITS) - 1
+    return Tile(column - _TILE_OFFSET, row - _TILE_OFFSET, cell_m, quantise.occupancy(levels))
+
+
+@dataclass(frozen=True, slots=True)
+class _Coder:
+    kind: Kind
+    record: type
+    max_id: int
+    parts: int
+    key: Callable[[Any], tuple[int, ...]]
+    write: Callable[[Writer, Any], None]
+    read: Callable[[Reader, Key], Record]
+
+
+def _of_keyframe(record: Any) -> tuple[int, ...]:
+    return (int(record.keyframe),)
+
+
+def _of_part(record: Any) -> tuple[int, ...]:
+    return int(record.keyframe), int(record.part)
+
+
+def _of_agent(record: Any) -> tuple[int, ...]:
+    return (int(record.agent),)
+
+
+_TABLE = (
+    _Coder(Kind.CAMERA, Camera, 63, 1, _of_agent, _write_camera, _read_camera),
+    _Coder(Kind.LIVE, Live, 63, 1, _of_agent, _write_live, _read_live),
+    _Coder(Kind.HEAD, Head, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_head, _read_head),
+    _Coder(Kind.BIRTHS, Births, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_births, _read_births),
+    _Coder(Kind.SIGHTINGS, Sightings, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_sightings, _read_sightings),
+    _Coder(
+        Kind.POSE, Pose, MAX_KEYFRAME_ID, 1, _of_keyframe,
+        lambda out, r: _write_pose(out, r.T_m_k),
+        lambda source, key: Pose(KeyframeId(key.id), _read_pose(source)),
+    ),
+    _Coder(
+        Kind.DEPTHS, Depths, MAX_KEYFRAME_ID, 1, _of_keyframe,
+        lambda out, r: _write_columns(out, Kind.DEPTHS, r),
+        lambda source, key: Depths(keyframe=KeyframeId(key.id), **_read_columns(source, Kind.DEPTHS)[1]),
+    ),
+    _Coder(Kind.FOUND, Found, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_found, _read_found),
+    _Coder(
+        Kind.REMOVED, Removed, MAX_KEYFRAME_ID, 1, _of_keyframe,
+        lambda out, r: _write_columns(out, Kind.REMOVED, r),
+        lambda source, key: Removed(keyframe=KeyframeId(key.id), **_read_columns(source, Kind.REMOVED)[1]),
+    ),
+    _Coder(Kind.CULLED, Culled, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_culled, _read_culled),
+    _Coder(
+        Kind.PLACEMENT, Placement, (1 << 32) - 1, 1, lambda r: (int(r.submap),),
+        lambda out, r: _write_pose(out, r.T_w_m),
+        lambda source, key: Placement(SubmapId(key.id), _read_pose(source)),
+    ),
+    _Coder(Kind.TILE, Tile, (1 << 2 * _TILE_BITS) - 1, 1, lambda r: (_tile_id(r),), _write_tile, _read_tile),
+)  # fmt: skip
+_CODERS: dict[int, _Coder] = {int(c.kind): c for c in _TABLE}
+_KIND_OF: dict[type, int] = {c.record: int(c.kind) for c in _TABLE}

@@ -1,0 +1,182 @@
+"""Integer columns as one stream of bits. The layout is described in SPEC.md, "Columns"."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+MAX_WIDTH = 40  # bits of one packed number: wider than any column needs
+_MAX_VARINT = 1 << 42  # keeps sums of 2048 deltas far from the limits of int64
+
+
+@njit(cache=True, nogil=True)
+def _put_varint(out: U8, at: int, value: int) -> int:
+    while value >= 128:
+        out[at] = np.uint8((value & 127) | 128)
+        value >>= 7
+        at += 1
+    out[at] = np.uint8(value)
+    return at + 1
+
+
+@njit(cache=True, nogil=True)
+def _varint_bytes(value: int) -> int:
+    n = 1
+    while value >= 128:
+        value >>= 7
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _zigzag(value: int) -> int:
+    return 2 * value if value >= 0 else -2 * value - 1
+
+
+@njit(cache=True, nogil=True)
+def _width(value: int) -> int:
+    n = 0
+    while value > 0:
+        value >>= 1
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def pack_columns(values: I64, out: U8) -> int:
+    """Pack values (c, n) int64, n >= 1, |value| < 2^40, into `out` (zeroed, at least c * (5 * n + 16) + 8 bytes).
+
+    Returns the number of bytes written. Each column is coded by offsets from its least value, or by differences of
+    neighbours when that is shorter.
+    """
+    c, n = values.shape
+    shape = np.zeros((c, 2), np.int64)  # subtracted number and width of each column
+    delta = np.zeros(c, np.bool_)
+    at = 0
+    for i in range(c):
+        low = values[i, 0]
+        high = low
+        low_d = np.int64(0)
+        high_d = np.int64(0)
+        for j in range(1, n):
+            v = values[i, j]
+            low = min(low, v)
+            high = max(high, v)
+            d = v - values[i, j - 1]
+            if j == 1:
+                low_d = d
+                high_d = d
+            low_d = min(low_d, d)
+            high_d = max(high_d, d)
+        width = _width(high - low)
+        width_d = _width(high_d - low_d)
+        first = values[i, 0]
+        bits = 8 * _varint_bytes(_zigzag(low)) + width * n
+        bits_d = 8 * (_varint_bytes(_zigzag(first)) + _varint_bytes(_zigzag(low_d))) + width_d * (n - 1)
+        if bits_d < bits:
+            delta[i] = True
+            out[at] = np.uint8(64 | width_d)
+            at = _put_varint(out, at + 1, _zigzag(first))
+            at = _put_varint(out, at, _zigzag(low_d))
+            shape[i, 0] = low_d
+            shape[i, 1] = width_d
+        else:
+            out[at] = np.uint8(width)
+            at = _put_varint(out, at + 1, _zigzag(low))
+            shape[i, 0] = low
+            shape[i, 1] = width
+    bit = 8 * at
+    for i in range(c):
+        base = shape[i, 0]
+        width = shape[i, 1]
+        start = 1 if delta[i] else 0
+        for j in range(start, n):
+            v = values[i, j] - base
+            if delta[i]:
+                v -= values[i, j - 1]
+            left = width
+            while left > 0:
+                shift = bit & 7
+                take = min(8 - shift, left)
+                out[bit >> 3] |= np.uint8((v & ((1 << take) - 1)) << shift)
+                v >>= take
+                bit += take
+                left -= take
+    return (bit + 7) >> 3
+
+
+@njit(cache=True, nogil=True)
+def _get_varint(data: U8, at: int) -> tuple[int, int]:
+    """(value, position after it); position -1 when the bytes end or the number is too large or not the shortest."""
+    value = 0
+    shift = 0
+    while at < data.size and shift <= 42:
+        b = np.int64(data[at])
+        at += 1
+        value |= (b & 127) << shift
+        if b < 128:
+            if value > _MAX_VARINT or (b == 0 and shift > 0):
+                return 0, -1
+            return value, at
+        shift += 7
+    return 0, -1
+
+
+@njit(cache=True, nogil=True)
+def unpack_columns(data: U8, at: int, values: I64) -> int:
+    """Fill values (c, n), n >= 1, from data[at:]. Returns the position after the columns, or -1 for invalid bytes."""
+    c, n = values.shape
+    shape = np.zeros((c, 4), np.int64)  # mode, first, subtracted number, width
+    total = 0
+    for i in range(c):
+        if at >= data.size:
+            return -1
+        head = np.int64(data[at])
+        at += 1
+        mode = head >> 6
+        width = head & 63
+        if mode > 1 or width > MAX_WIDTH:
+            return -1
+        z, at = _get_varint(data, at)
+        if at < 0:
+            return -1
+        first = (z >> 1) ^ -(z & 1)
+        shape[i, 0] = mode
+        shape[i, 1] = first
+        shape[i, 2] = first
+        shape[i, 3] = width
+        if mode == 1:
+            z, at = _get_varint(data, at)
+            if at < 0:
+                return -1
+            shape[i, 2] = (z >> 1) ^ -(z & 1)
+        total += width * (n - mode)
+    end = at + ((total + 7) >> 3)
+    if end > data.size:
+        return -1
+    bit = 8 * at
+    for i in range(c):
+        mode = shape[i, 0]
+        base = shape[i, 2]
+        width = shape[i, 3]
+        if mode == 1:
+            values[i, 0] = shape[i, 1]
+        for j in range(mode, n):
+            v = np.int64(0)
+            got = 0
+            while got < width:
+                shift = bit & 7
+                take = min(8 - shift, width - got)
+                v |= ((np.int64(data[bit >> 3]) >> shift) & ((1 << take) - 1)) << got
+                bit += take
+                got += take
+            values[i, j] = v + base
+            if mode == 1:
+                values[i, j] += values[i, j - 1]
+    if bit & 7 and (np.int64(data[bit >> 3]) >> (bit & 7)) != 0:
+        return -1
+    return end
