@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -68,6 +68,32 @@ class ByteLink(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+class LinkHub(Protocol):
+    """The base's end of the links of any number of agents."""
+
+    def links(self) -> Mapping[int, ByteLink]:
+        """The links of all agents that have appeared so far, by agent number."""
+        ...
+
+    def alive(self) -> frozenset[int]:
+        """The agents whose process is known to be reachable now."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Framer(Protocol):
+    """Puts packets on a byte stream and finds them again. Holds the state of one stream."""
+
+    def encode(self, packet: bytes) -> bytes:
+        """The bytes of one framed packet."""
+        ...
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take what the stream delivered, any bytes in any pieces; the whole and sound packets completed by it."""
+        ...
 
 
 class Clock(Protocol):

@@ -1,19 +1,16 @@
 """Opening and closing Zenoh sessions so that nothing hangs: client (drone) or listening peer (base), TCP, no discovery.
 
 A process that ends while a Zenoh session with callbacks is open hangs for ever. So every session opened here is closed
-at the latest when the main thread ends, and `exit_on_sigterm` turns SIGTERM into a normal end of the program.
+at the latest when the main thread ends.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
-from types import FrameType
 from typing import Any, Literal
 
 import zenoh
@@ -107,13 +104,3 @@ def close_session(session: zenoh.Session) -> bool:
 def direct(callback: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:
     """A handler that calls back from Zenoh's own thread, without a Python thread in between."""
     return zenoh.handlers.Callback(callback, drop or (lambda: None), indirect=False)
-
-
-def exit_on_sigterm() -> None:
-    """Turn SIGTERM into SystemExit(143) in the main thread, so that `with` blocks close their links."""
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        del frame
-        sys.exit(128 + number)
-
-    signal.signal(signal.SIGTERM, leave)

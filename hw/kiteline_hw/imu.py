@@ -1,0 +1,87 @@
+"""Inertial samples on their way to a batch: what is not finite, repeated or backwards in time is dropped and counted."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from kiteline_core.frame import ImuBatch
+from numpy.typing import NDArray
+
+from kiteline_hw.ports import SourceReport
+
+I64 = NDArray[np.int64]
+F64 = NDArray[np.float64]
+
+
+class ImuSamples(Protocol):
+    """Where a source keeps the samples that no frame has claimed yet."""
+
+    def take_until(self, t_ns: int) -> ImuBatch | None:
+        """All samples not yet taken with a time <= t_ns, or None when there are none."""
+        ...
+
+
+class NoImu:
+    """The samples of a source without an IMU."""
+
+    def take_until(self, t_ns: int) -> ImuBatch | None:
+        return None
+
+
+class ImuTable:
+    """Samples of a whole recording. t_ns: (n,). gyro: (n,3) rad/s. accel: (n,3) m/s^2."""
+
+    def __init__(self, t_ns: I64, gyro: F64, accel: F64, report: SourceReport) -> None:
+        keep = _usable(t_ns, gyro, accel, -(2**63), report)
+        self._t_ns, self._gyro, self._accel = t_ns[keep], gyro[keep], accel[keep]
+        self._next = 0
+
+    def take_until(self, t_ns: int) -> ImuBatch | None:
+        begin, end = self._next, int(np.searchsorted(self._t_ns, t_ns, side="right"))
+        if end <= begin:
+            return None
+        self._next = end
+        return ImuBatch(self._t_ns[begin:end], self._gyro[begin:end], self._accel[begin:end])
+
+
+class ImuStream:
+    """Samples as they come in; bounded by what arrives between two frames."""
+
+    def __init__(self, report: SourceReport) -> None:
+        self._report = report
+        self._t_ns: list[int] = []
+        self._rows: list[tuple[float, ...]] = []
+        self._last_ns = -(2**63)
+
+    def add(self, t_ns: int, row: tuple[float, ...]) -> None:
+        """One sample: gyro x y z rad/s, accel x y z m/s^2."""
+        self._t_ns.append(t_ns)
+        self._rows.append(row)
+
+    def take_until(self, t_ns: int) -> ImuBatch | None:
+        n = len(self._t_ns)
+        while n > 0 and self._t_ns[n - 1] > t_ns:
+            n -= 1
+        if n == 0:
+            return None
+        times = np.array(self._t_ns[:n], np.int64)
+        rows = np.array(self._rows[:n], np.float64)
+        del self._t_ns[:n], self._rows[:n]
+        keep = _usable(times, rows[:, :3], rows[:, 3:], self._last_ns, self._report)
+        times, rows = times[keep], rows[keep]
+        if len(times) == 0:
+            return None
+        self._last_ns = int(times[-1])
+        return ImuBatch(times, rows[:, :3].copy(), rows[:, 3:].copy())
+
+
+def _usable(t_ns: I64, gyro: F64, accel: F64, last_ns: int, report: SourceReport) -> NDArray[np.bool_]:
+    finite = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    for t in t_ns[~finite]:
+        report.skip("imu sample not finite", f"at {t} ns")
+    newest = np.maximum.accumulate(np.concatenate([[last_ns], np.where(finite, t_ns, last_ns)]))[:-1]
+    late = finite & (t_ns <= newest)
+    for t in t_ns[late]:
+        report.skip("imu stamp not increasing", f"at {t} ns")
+    return np.asarray(finite & ~late)
