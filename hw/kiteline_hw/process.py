@@ -1,13 +1,15 @@
-"""A process and those who watch over it: signals, systemd, the parent that started it, its memory."""
+"""A process and those who watch over it: signals, systemd, the parent that started it, its memory and its number."""
 
 from __future__ import annotations
 
 import json
 import os
+import queue
 import signal
 import socket
 import sys
 import threading
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -32,10 +34,6 @@ class StopSignal:
         """Sleep, but no longer than until a signal comes; True when one has come."""
         return self._event.wait(max(0.0, seconds))
 
-    def set(self) -> None:
-        """Ask for the end, as a signal would."""
-        self._event.set()
-
 
 def notify(state: str) -> None:
     """Tell systemd, if it started us: READY=1, WATCHDOG=1, STATUS=... (sd_notify(3)). Never raises."""
@@ -49,24 +47,35 @@ def notify(state: str) -> None:
         pass  # a watcher that does not listen is no reason to stop flying
 
 
-def end_with_parent() -> None:
-    """End this process as soon as the parent that holds the other end of stdin is gone, however it went."""
+class Parent:
+    """The process that started this one and holds the other end of stdin and stdout. When it goes, so do we."""
 
-    def watch() -> None:
-        while os.read(0, 4096):
-            pass
-        os._exit(3)
+    def __init__(self) -> None:
+        self._words: queue.SimpleQueue[str] = queue.SimpleQueue()
+        threading.Thread(target=self._watch, name="parent-watch", daemon=True).start()
 
-    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
+    def _watch(self) -> None:
+        rest = b""
+        while chunk := os.read(0, 4096):
+            *lines, rest = (rest + chunk).split(b"\n")
+            for line in lines:
+                self._words.put(line.decode(errors="replace"))
+        os._exit(3)  # no one is left to close down for
 
+    def said(self) -> str | None:
+        """The next line that the parent wrote, or None. Never blocks."""
+        try:
+            return self._words.get_nowait()
+        except queue.Empty:
+            return None
 
-def tell_parent(event: str, **values: Any) -> None:
-    """Write one line of JSON to stdout for the process that started this one."""
-    try:
-        sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
-        sys.stdout.flush()
-    except (BrokenPipeError, ValueError):
-        pass
+    def tell(self, event: str, **values: Any) -> None:
+        """Write one line of JSON to the parent."""
+        try:
+            sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
+            sys.stdout.flush()
+        except (BrokenPipeError, ValueError):
+            pass  # it is gone: the watch ends us
 
 
 def rss_mib() -> float:
@@ -76,3 +85,26 @@ def rss_mib() -> float:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / _MIB
     except (OSError, ValueError, IndexError):
         return 0.0
+
+
+def next_number(path: Path) -> int:
+    """A number one higher than at the last call with this file, which is made when missing; first 1. It survives a
+    crash at any moment. Raises OSError when the folder cannot be written.
+    """
+    try:
+        last = int(path.read_text())
+    except (FileNotFoundError, ValueError):
+        last = 0
+    write_atomically(path, f"{last + 1}\n".encode())
+    return last + 1
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file by new content so that a reader or a crash sees either the old or the new one, whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    young = path.with_name(path.name + ".new")
+    with young.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(young, path)

@@ -1,0 +1,30 @@
+"""The channel of an agent that flies without a base: nothing is sent, nothing comes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from kiteline_codec.schema import Key, Record
+
+
+class AloneChannel:
+    """A RecordChannel with nobody at the other end."""
+
+    def put(self, record: Record) -> Record:
+        """The record as it is: no code has rounded it."""
+        return record
+
+    def remove(self, key: Key) -> None:
+        """Nothing was shared, so nothing is taken back."""
+
+    def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
+        """Nothing."""
+        return []
+
+    def take_removed(self) -> list[Key]:
+        """Nothing."""
+        return []
+
+    def poll(self, now_ns: int) -> list[bytes]:
+        """Nothing."""
+        return []
