@@ -37,7 +37,7 @@ def test_a_mistyped_command_is_answered_with_the_nearest(capsys: pytest.CaptureF
 
 def test_arguments_after_the_command_are_handed_on_untouched(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[list[str]] = []
-    _stand_in(monkeypatch, lambda argv: seen.append(argv))
+    _stand_in(monkeypatch, seen.append)
     assert cli.main(["fly", "--help", "--out", "x", "--version"]) == 0
     assert seen == [["--help", "--out", "x", "--version"]]
 

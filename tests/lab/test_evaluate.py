@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiteline_core import se3
+from kiteline_core.frame import Trajectory
+from kiteline_lab import evaluate
+from kiteline_lab.trajectories import TrajectoryError, read
+
+TUM = "1403715273.262142976 0.1 0.2 0.3 0 0 0 1\n1403715273.312143104 0.2 0.2 0.3 0 0 0.6 0.8\n"
+
+
+def arc(n: int) -> list[np.ndarray]:
+    poses = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.02 * i, 0.0])) for i in range(n)]
+    for i, pose in enumerate(poses):
+        pose[:3, 3] = [np.sin(0.1 * i), 0.0, 0.3 * i]
+    return poses
+
+
+def tum_text(poses: list[np.ndarray], period_s: float = 0.1, start_s: float = 100.0) -> str:
+    rows = []
+    for i, pose in enumerate(poses):
+        w, x, y, z = se3.quaternion_from_rotation(pose[:3, :3])
+        p = " ".join(f"{v:.9f}" for v in pose[:3, 3])
+        rows.append(f"{start_s + i * period_s:.9f} {p} {x:.9f} {y:.9f} {z:.9f} {w:.9f}\n")
+    return "# t x y z qx qy qz qw\n" + "".join(rows)
+
+
+def kitti_text(poses: list[np.ndarray]) -> str:
+    return "".join(" ".join(f"{v:.9e}" for v in pose[:3].ravel()) + "\n" for pose in poses)
+
+
+def test_tum_times_are_exact_and_quaternions_end_with_w(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_text("# comment\n\n" + TUM)
+    file = read(str(tmp_path / "a.tum"))
+    assert file.trajectory.t_ns.tolist() == [1403715273262142976, 1403715273312143104]
+    np.testing.assert_allclose(file.trajectory.T_w_b[1, :3, 3], [0.2, 0.2, 0.3])
+    np.testing.assert_allclose(file.trajectory.T_w_b[1, :3, 0], [0.28, 0.96, 0.0], atol=1e-12)
+
+
+def test_euroc_table(tmp_path: Path) -> None:
+    (tmp_path / "data.csv").write_text(
+        "#timestamp, p_RS_R_x [m], ...\n1403636580838555648,4.6,-1.7,0.7,0.8,0.0,0.0,0.6,0.1,0.2\n"
+    )
+    t = read(str(tmp_path / "data.csv")).trajectory
+    assert t.t_ns.tolist() == [1403636580838555648]
+    np.testing.assert_allclose(t.T_w_b[0, :3, 0], [0.28, 0.96, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "holds no pose"),
+        ("a b c\n", "line 1 has 3 columns"),
+        (TUM + "1403715273.4 0.1 0.2\n", "line 3 has 3 columns"),
+        (TUM + "1403715273.3 0 0 0 0 0 0 1\n", "line 3: its time is not after"),
+        (TUM + "1403715274.3 0 0 nan 0 0 0 1\n", "line 3: a value is not finite"),
+        (TUM + "1403715274.3 0 0 x 0 0 0 1\n", "line 3: expected numbers"),
+        ("1.0 0 0 0 1 1 0 1\n", "quaternion has length 1.732"),
+        ("1 2 3 4 5 6 7 8 9 10 11 12\n", "no rotation matrix"),
+        ("t,x,y\n1,2,3\n", "expected EuRoC's"),
+    ],
+)
+def test_what_is_no_trajectory_is_named_by_line(text: str, words: str, tmp_path: Path) -> None:
+    file = tmp_path / "bad.txt"
+    file.write_text(text)
+    with pytest.raises(TrajectoryError) as caught:
+        read(str(file))
+    assert words in str(caught.value)
+    assert str(file) in str(caught.value)
+
+
+def test_a_picture_and_a_missing_file_are_errors_too(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(TrajectoryError, match="not a text file"):
+        read(str(tmp_path / "a.txt"))
+    with pytest.raises(TrajectoryError, match="no such file"):
+        read(str(tmp_path / "b.txt"))
+
+
+def test_kitti_poses_take_the_other_one_s_times_in_order(tmp_path: Path) -> None:
+    poses = arc(20)
+    (tmp_path / "poses.txt").write_text(kitti_text(poses))
+    (tmp_path / "est.tum").write_text(tum_text(poses))
+    e = evaluate.evaluate_files(str(tmp_path / "est.tum"), str(tmp_path / "poses.txt"))
+    assert e.matched == 20
+    assert e.ate_m.max < 1e-7
+
+
+def test_a_shorter_estimate_meets_kitti_poses_at_10_hz_or_at_times_txt(tmp_path: Path) -> None:
+    poses = arc(20)
+    (tmp_path / "poses.txt").write_text(kitti_text(poses))
+    (tmp_path / "est.tum").write_text(tum_text(poses[5:], 0.1, 0.5))
+    e = evaluate.evaluate_files(str(tmp_path / "est.tum"), str(tmp_path / "poses.txt"))
+    assert e.matched == 15
+    assert e.ate_m.max < 1e-7
+    (tmp_path / "times.txt").write_text("".join(f"{7.0 + 0.2 * i:e}\n" for i in range(20)))
+    (tmp_path / "est.tum").write_text(tum_text(poses[5:], 0.2, 8.0))
+    assert evaluate.evaluate_files(str(tmp_path / "est.tum"), str(tmp_path / "poses.txt")).ate_m.max < 1e-7
+
+
+def test_times_txt_of_another_length_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(kitti_text(arc(5)))
+    (tmp_path / "times.txt").write_text("0 0.1 0.2\n")
+    with pytest.raises(TrajectoryError, match=r"3 times, but .* has 5 poses"):
+        read(str(tmp_path / "poses.txt"))
+
+
+def test_command_prints_a_table_or_json_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "gt.tum").write_text(tum_text(arc(30)))
+    (tmp_path / "est.tum").write_text(tum_text([p + 0.0 for p in arc(25)]))
+    files = [str(tmp_path / "est.tum"), str(tmp_path / "gt.tum")]
+    assert evaluate.main([*files, "--plot", str(tmp_path / "p" / "plot.png")]) == 0
+    text = capsys.readouterr().out
+    assert "25 of 25 matched" in text
+    assert "82.8% of the time" in text
+    assert (tmp_path / "p" / "plot.png").read_bytes().startswith(b"\x89PNG")
+    assert evaluate.main([*files, "--json", "--scale"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["alignment"] == "sim3"
+    assert result["ate_m"]["rmse"] < 1e-7
+    assert result["rpe_frame"]["translation_m"]["n"] == 24
+
+
+def test_plot_without_truth_and_of_an_empty_line(tmp_path: Path) -> None:
+    from kiteline_lab.plot import Line, plot_trajectories
+
+    poses = np.stack(arc(30))
+    whole = Trajectory(np.arange(30, dtype=np.int64) * 10**8, poses)
+    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    plot_trajectories(tmp_path / "a.png", [Line("live", whole), Line("lost", nothing)])
+    plot_trajectories(tmp_path / "b.png", [Line("live", whole), Line("lost", nothing)])
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    plot_trajectories(tmp_path / "c.png", [Line("live", whole), Line("lost", nothing)], whole, "both", align=True)
+    assert (tmp_path / "c.png").stat().st_size > 10_000
