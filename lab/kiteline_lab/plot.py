@@ -62,13 +62,16 @@ def plot_trajectories(
         p = line.trajectory.T_w_b[:, :3, 3]
         if len(p) == 0:
             continue
-        top.plot(p[:, across], p[:, along], color=colour, lw=1.3, label=line.name, zorder=2)
+        _, way = _with_gaps(t_s, p[:, [across, along]])
+        top.plot(way[:, 0], way[:, 1], color=colour, lw=1.3, label=line.name, zorder=2)
         top.plot(p[:1, across], p[:1, along], "o", color=colour, ms=5, zorder=3)
         height.plot(*_with_gaps(t_s, sign * p[:, up]), color=colour, lw=1.2, zorder=2)
         if error is not None and truth is not None:
             i_est, i_true = associate(line.trajectory.t_ns, truth.t_ns)
             off = np.linalg.norm(p[i_est] - truth.T_w_b[i_true, :3, 3], axis=1)
             error.plot(*_with_gaps(t_s[i_est], off), color=colour, lw=1.2)
+    if error is not None:
+        error.set_ylim(bottom=0.0)
     if title:
         figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
     if top.get_legend_handles_labels()[0]:
@@ -87,7 +90,6 @@ def _panels(figure: Figure, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
     _style(height, "height, m", "" if with_error else "time, s", "")
     if error is not None:
         _style(error, "distance from the truth, m", "time, s", "")
-        error.set_ylim(bottom=0.0)
     return top, height, error
 
 
@@ -141,4 +143,4 @@ def _with_gaps(t_s: F64, values: F64) -> tuple[F64, F64]:
     if len(steps) == 0:
         return t_s, values
     gaps = np.flatnonzero(steps > 5.0 * np.median(steps)) + 1
-    return np.insert(t_s, gaps, t_s[gaps - 1]), np.insert(values, gaps, np.nan)
+    return np.insert(t_s, gaps, t_s[gaps - 1]), np.insert(values, gaps, np.nan, axis=0)
