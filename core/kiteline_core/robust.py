@@ -1,0 +1,34 @@
+"""Robust costs over squared, normalised residuals, and the chi-square bounds that tell an outlier."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+CHI2_2 = 5.991  # 95 % of a chi-square with 2 degrees of freedom: a pixel
+CHI2_3 = 7.815  # 95 % with 3 degrees of freedom: a pixel and a disparity
+
+
+def huber_cost(s: F64, bound: F64) -> F64:
+    """Huber's cost of squared residual norms s (n,): s up to `bound`, then growing with sqrt(s) only.
+
+    Source: P. Huber, "Robust estimation of a location parameter", 1964, written for squared norms.
+    """
+    outside = s > bound
+    root = np.sqrt(np.where(outside, s, 1.0))
+    return np.where(outside, 2.0 * np.sqrt(bound) * root - bound, s)
+
+
+def huber_weight(s: F64, bound: F64) -> F64:
+    """Derivative of `huber_cost` by s: the weight that a residual keeps in iterated least squares."""
+    outside = s > bound
+    return np.where(outside, np.sqrt(bound) / np.sqrt(np.where(outside, s, 1.0)), 1.0)
+
+
+def spread(values: F64) -> float:
+    """Standard deviation of values (n,) by the median absolute deviation; 0 for none."""
+    if len(values) == 0:
+        return 0.0
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))

@@ -1,0 +1,464 @@
+"""The sparse map: keyframes, their keypoints and the points that hang on them, as structures of arrays keyed by id.
+
+Points hang on keyframes: a point is a pixel of the keyframe of its birth (its *anchor*) and an inverse depth, so that it
+moves with its keyframe. Each keypoint owns one *slot* (its row in `keypoints`); a point is named inside the map by the
+slot of its birth. `root` maps every slot to the point it observes, fused points to the one they were fused into.
+Sections may come in any order and any number of times; what a section does not know yet is linked when it comes.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from dataclasses import dataclass, fields
+
+import numpy as np
+from kiteline_core import sparse_map_kernels as kernels
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import (
+    KEYPOINT_BITS,
+    MAX_KEYPOINTS,
+    NO_KEYFRAME,
+    NO_POINT,
+    AgentId,
+    KeyframeId,
+    SubmapId,
+    agent_of_keyframe,
+    submap_of_keyframe,
+)
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+EMPTY, BIRTH, SIGHTING = 0, 1, 2  # what a keypoint is
+REMOVED, CULLED, REFINED = 1, 2, 4  # bits of its flags: observation rejected; point dropped; point has a base value
+NO_POSE, COMPOSED, REFINED_POSE = 0, 1, 2  # where a keyframe's pose comes from
+
+
+@dataclass(slots=True)
+class KeyframeTable:
+    """One row a keyframe, in order of arrival. Arrays have spare capacity: only the first `len(map)` rows count."""
+
+    id: I64
+    t_ns: I64
+    parent: I64  # keyframe id, NO_KEYFRAME for the first of a submap
+    T_p_k: F64  # (n,4,4) in the parent, as the agent wrote it
+    T_m_k: F64  # (n,4,4) in the submap: the base's value, else composed from the parent's
+    pose_source: U8
+    start: I32  # first slot of its keypoints
+    count: I32  # number of keypoints
+    filled: I32  # number of keypoints that have arrived
+    culled: U8  # 1: its observations no longer count
+    camera: F64  # (n,5) fx fy cx cy bf in px and px*m
+
+
+@dataclass(slots=True)
+class KeypointTable:
+    """One row (slot) a keypoint. Arrays have spare capacity: only the first `slots` rows count."""
+
+    uv: F32  # (n,2) px
+    inv_depth: F32  # 1/m as the agent saw it, 0 unknown
+    octave: U8
+    angle: U8  # 1/256 turns
+    kind: U8  # EMPTY, BIRTH, SIGHTING
+    part: U8  # section from which it came
+    flags: U8
+    usable: U8  # 1: a valid observation: present, not removed, of a keyframe that has a pose and is not culled
+    point: I64  # id of the point that a sighting names; NO_POINT for a birth
+    row: I32  # row of its keyframe
+    root: I32  # slot of the point it observes, -1 while unknown
+    first: I32  # newest observation that hangs on the point born here, -1 none
+    next: I32  # next observation of the same point, -1 none
+    refined: F32  # 1/m: inverse depth of the point born here by the base, valid with flag REFINED
+    offset: F32  # (n,2) px from the keypoint to the point's bearing by the base
+    descriptor: U8  # (n,32) of a birth
+
+
+def _grown(table: KeyframeTable | KeypointTable, capacity: int) -> None:
+    for field in fields(table):
+        old = getattr(table, field.name)
+        new = np.zeros((capacity, *old.shape[1:]), old.dtype)
+        new[: len(old)] = old
+        setattr(table, field.name, new)
+
+
+def _empty_keyframes() -> KeyframeTable:
+    i64, u8, i32 = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int32)
+    t = np.zeros((0, 4, 4))
+    return KeyframeTable(i64, i64, i64, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)))
+
+
+def _empty_keypoints() -> KeypointTable:
+    f32, u8, i32 = np.zeros(0, np.float32), np.zeros(0, np.uint8), np.zeros(0, np.int32)
+    f32x2 = np.zeros((0, 2), np.float32)
+    return KeypointTable(
+        f32x2, f32, u8, u8, u8, u8, u8, u8, np.zeros(0, np.int64), i32, i32, i32, i32, f32, f32x2,
+        np.zeros((0, 32), np.uint8),
+    )  # fmt: skip
+
+
+class SparseMap:
+    """Keyframes, keypoints and points of any number of agents and submaps. Row and slot numbers never change."""
+
+    def __init__(self) -> None:
+        self.keyframes = _empty_keyframes()
+        self.keypoints = _empty_keypoints()
+        self.slots = 0
+        self.rows: dict[KeyframeId, int] = {}
+        self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes of each submap in order of id
+        self.cameras: dict[AgentId, RectifiedCamera] = {}
+        self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
+        self._children: dict[KeyframeId, list[int]] = {}
+        self._waiting: dict[KeyframeId, list[int]] = {}  # slots that name a point of a keyframe that is not here yet
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return len(self.rows)
+
+    def __contains__(self, keyframe: KeyframeId) -> bool:
+        return keyframe in self.rows
+
+    # -- what the agents wrote ---------------------------------------------------------------------------------------
+
+    def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
+        """The ideal camera of an agent; keyframes that are already here take it on."""
+        self.cameras[agent] = camera
+        for keyframe, row in self.rows.items():
+            if agent_of_keyframe(keyframe) == agent:
+                self.keyframes.camera[row] = _parameters(camera)
+
+    def add_keyframe(self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64, keypoints: int) -> int:
+        """Add a keyframe, or renew its header. T_p_k: (4,4). Returns its row.
+
+        Raises ValueError on too many keypoints, or a parent that is not an older keyframe of the same submap.
+        """
+        if not 0 <= keypoints <= MAX_KEYPOINTS:
+            raise ValueError(f"keyframe {keyframe} claims {keypoints} keypoints: expected at most {MAX_KEYPOINTS}")
+        if parent != NO_KEYFRAME and not (
+            parent < keyframe and submap_of_keyframe(parent) == submap_of_keyframe(keyframe)
+        ):
+            raise ValueError(f"keyframe {keyframe} names parent {parent}: expected an older one of its submap")
+        table = self.keyframes
+        row = self.rows.get(keyframe)
+        if row is None:
+            row = len(self.rows)
+            if row == len(table.id):
+                _grown(table, row + max(32, row // 4))
+            self.rows[keyframe] = row
+            insort(self.submaps.setdefault(submap_of_keyframe(keyframe), []), keyframe)
+            table.id[row] = keyframe
+            table.start[row] = self._allocate(row, keypoints)
+            table.count[row] = keypoints
+            camera = self.cameras.get(agent_of_keyframe(keyframe))
+            if camera is not None:
+                table.camera[row] = _parameters(camera)
+            self._children.setdefault(parent, []).append(row)
+        elif table.parent[row] != parent:
+            self._children[KeyframeId(int(table.parent[row]))].remove(row)
+            self._children.setdefault(parent, []).append(row)
+        table.t_ns[row] = t_ns
+        table.parent[row] = parent
+        table.T_p_k[row] = T_p_k
+        if table.pose_source[row] != REFINED_POSE:
+            self._compose(row)
+        waiting = self._waiting.pop(keyframe, None)
+        if waiting is not None:
+            self._link_sightings(np.array(waiting, np.int32))
+        return row
+
+    def put_births(
+        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8, angle: U8,
+        descriptor: U8,
+    ) -> None:  # fmt: skip
+        """Births of a keyframe whose header is here (see codec schema Births); a newer part replaces an older one."""
+        slots, keep = self._section(keyframe, part, index, BIRTH)
+        table = self.keypoints
+        table.uv[slots] = uv[keep]
+        table.inv_depth[slots] = inv_depth[keep]
+        table.octave[slots] = octave[keep]
+        table.angle[slots] = angle[keep]
+        table.descriptor[slots] = descriptor[keep]
+        fresh = slots[table.kind[slots] != BIRTH]
+        table.kind[slots] = BIRTH
+        table.part[slots] = part
+        table.point[slots] = NO_POINT
+        kernels.link(fresh, fresh, table.root, table.first, table.next)
+        self._refresh_usable(self.rows[keyframe])
+
+    def put_sightings(
+        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8, point: I64
+    ) -> None:
+        """Sightings of a keyframe whose header is here (see codec schema Sightings); a newer part replaces an older."""
+        slots, keep = self._section(keyframe, part, index, SIGHTING)
+        table = self.keypoints
+        table.uv[slots] = uv[keep]
+        table.inv_depth[slots] = inv_depth[keep]
+        table.octave[slots] = octave[keep]
+        table.kind[slots] = SIGHTING
+        table.part[slots] = part
+        table.point[slots] = point[keep]
+        if bool(np.any(inv_depth > 0)):
+            self.measures_depth.add(agent_of_keyframe(keyframe))
+        self._link_sightings(slots)
+        self._refresh_usable(self.rows[keyframe])
+
+    # -- what the base wrote -----------------------------------------------------------------------------------------
+
+    def set_pose(self, keyframe: KeyframeId, T_m_k: F64) -> None:
+        """The base's pose (4,4) of a keyframe; descendants without a base value move along."""
+        row = self.rows[keyframe]
+        had = self.keyframes.pose_source[row]
+        self.keyframes.T_m_k[row] = T_m_k
+        self.keyframes.pose_source[row] = REFINED_POSE
+        if had == NO_POSE:
+            self._refresh_usable(row)
+        self._compose_children(keyframe)
+
+    def set_depths(self, slots: I32, inv_depth: F32, offset: F32) -> None:
+        """The base's positions of the points born at `slots` (n,): inv_depth (n,) 1/m, offset (n,2) px."""
+        self.keypoints.refined[slots] = inv_depth
+        self.keypoints.offset[slots] = offset
+        self.keypoints.flags[slots] |= REFINED
+
+    def set_flags(self, slots: I32, bit: int) -> None:
+        """Set REMOVED (observations) or CULLED (points) at `slots` (n,)."""
+        self.keypoints.flags[slots] |= bit
+        for row in np.unique(self.keypoints.row[slots]).tolist():
+            self._refresh_usable(row)
+
+    def cull_keyframe(self, keyframe: KeyframeId) -> None:
+        """Drop a keyframe's observations; its pose stays while points hang on it."""
+        row = self.rows[keyframe]
+        self.keyframes.culled[row] = 1
+        self._refresh_usable(row)
+
+    def fuse(self, child: int, parent: int) -> list[KeyframeId]:
+        """Make the point born at slot `child` an alias of the point born at slot `parent` (both roots).
+
+        Returns the keyframes, sorted, that have births which now show another root than before.
+        """
+        table = self.keypoints
+        one = np.array([child], np.int32)
+        moved = np.empty(kernels.count(one, table.first, table.next), np.int32)
+        kernels.fuse(child, parent, table.root, table.first, table.next, moved)
+        births = moved[table.kind[moved] == BIRTH]
+        rows = np.union1d(table.row[births], table.row[one])
+        return [KeyframeId(k) for k in np.sort(self.keyframes.id[rows]).tolist()]
+
+    # -- questions ---------------------------------------------------------------------------------------------------
+
+    def slots_of(self, keyframe: KeyframeId) -> I32:
+        """All slots of a keyframe, in order of keypoint index."""
+        row = self.rows[keyframe]
+        start = int(self.keyframes.start[row])
+        return np.arange(start, start + int(self.keyframes.count[row]), dtype=np.int32)
+
+    def keypoint_of(self, slots: I32) -> I32:
+        """Keypoint indices within their keyframes."""
+        return np.asarray(slots - self.keyframes.start[self.keypoints.row[slots]], np.int32)
+
+    def point_ids(self, slots: I32) -> I64:
+        """Ids (n,) of the points born at slots (n,)."""
+        anchors = self.keyframes.id[self.keypoints.row[slots]]
+        return np.asarray((anchors << KEYPOINT_BITS) | self.keypoint_of(slots), np.int64)
+
+    def find_points(self, points: I64) -> I32:
+        """Slots (n,) of the births of points (n,), -1 where the keyframe is unknown or has no such keypoint."""
+        anchors, which = np.unique(points >> KEYPOINT_BITS, return_inverse=True)
+        rows = np.array([self.rows.get(KeyframeId(a), -1) for a in anchors.tolist()], np.int64)[which]
+        index = points & (MAX_KEYPOINTS - 1)
+        known = (rows >= 0) & (points >= 0)
+        known[known] = index[known] < self.keyframes.count[rows[known]]
+        out = np.full(len(points), -1, np.int32)
+        out[known] = self.keyframes.start[rows[known]] + index[known]
+        return out
+
+    def observed(self, keyframe: KeyframeId) -> I32:
+        """Slots of a keyframe's valid observations whose point is known and not culled."""
+        slots = self.slots_of(keyframe)
+        return slots[self._counts(slots)]
+
+    def points_of(self, keyframe: KeyframeId) -> I32:
+        """Sorted slots of the points that a keyframe observes."""
+        return np.unique(self.keypoints.root[self.observed(keyframe)])
+
+    def roots(self) -> I32:
+        """Sorted slots of all points that live: born, not fused into another, not culled."""
+        table = self.keypoints
+        n = self.slots
+        here = np.arange(n, dtype=np.int32)
+        live = (table.kind[:n] == BIRTH) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
+        return here[live]
+
+    def observations(self, points: I32) -> tuple[I32, I32]:
+        """Valid observations of points (n,), in order of keyframe id, one a keyframe.
+
+        Returns starts (n + 1,) and slots: those of points[i] are slots[starts[i]:starts[i + 1]].
+        """
+        table = self.keypoints
+        starts = np.empty(len(points) + 1, np.int32)
+        slots = np.empty(kernels.count(points, table.first, table.next), np.int32)
+        n = kernels.gather(
+            points, table.first, table.next, table.row, table.usable, self.keyframes.id, starts, slots
+        )  # fmt: skip
+        return starts, slots[:n]
+
+    def covisible(self, points: I32) -> I32:
+        """How many of the points (n,) each keyframe (by row) observes."""
+        shared = np.zeros(len(self), np.int32)
+        table = self.keypoints
+        kernels.covisibility(points, table.first, table.next, table.row, table.usable, shared)
+        return shared
+
+    def one_keyframe_sees_both(self, a: int, b: int) -> bool:
+        """Whether some keyframe observes both points: then they cannot be one."""
+        table = self.keypoints
+        return bool(kernels.share_keyframe(a, b, table.first, table.next, table.row, table.usable))
+
+    def inverse_depths(self, points: I32) -> F64:
+        """Inverse depth (n,) in 1/m of points in their anchors: refined, else as seen; 0 unknown."""
+        table = self.keypoints
+        refined = table.flags[points] & REFINED != 0
+        return np.where(refined, table.refined[points], table.inv_depth[points]).astype(np.float64)
+
+    def positions(self, points: I32) -> tuple[F64, Bool]:
+        """Positions (n,3) in m of the anchors' submaps, and whether each is known."""
+        table = self.keypoints
+        rows = table.row[points]
+        inv = self.inverse_depths(points)
+        valid = (inv > 0) & (self.keyframes.pose_source[rows] != NO_POSE) & (table.kind[points] == BIRTH)
+        z = 1.0 / np.where(valid, inv, 1.0)
+        fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
+        uv = table.uv[points].astype(np.float64) + table.offset[points]
+        local = np.stack([(uv[:, 0] - cx) / np.where(fx > 0, fx, 1.0) * z, (uv[:, 1] - cy) / np.where(fy > 0, fy, 1.0) * z, z], 1)
+        pose = self.keyframes.T_m_k[rows]
+        return np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3], valid & (fx > 0)
+
+    def bearing_of(self, points: I32, positions: F64) -> tuple[F32, F32, Bool]:
+        """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, and whether each lies before its anchor."""
+        rows = self.keypoints.row[points]
+        pose = self.keyframes.T_m_k[rows]
+        local = np.einsum("nji,nj->ni", pose[:, :3, :3], positions - pose[:, :3, 3])
+        ahead = local[:, 2] > 1e-3
+        inv = 1.0 / np.where(ahead, local[:, 2], 1.0)
+        fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
+        u, v = fx * local[:, 0] * inv + cx, fy * local[:, 1] * inv + cy
+        offset = np.stack([u, v], 1) - self.keypoints.uv[points]
+        return inv.astype(np.float32), offset.astype(np.float32), ahead
+
+    def pose(self, keyframe: KeyframeId) -> F64 | None:
+        """T_m_k (4,4) of a keyframe, or None when it is unknown or its parents are missing."""
+        row = self.rows.get(keyframe)
+        if row is None or self.keyframes.pose_source[row] == NO_POSE:
+            return None
+        return self.keyframes.T_m_k[row].copy()
+
+    def complete(self, keyframe: KeyframeId) -> bool:
+        """Whether all keypoints that the header announced have arrived."""
+        row = self.rows[keyframe]
+        return bool(self.keyframes.filled[row] >= self.keyframes.count[row])
+
+    def nbytes(self) -> int:
+        """Bytes of all arrays, spare capacity included."""
+        tables: tuple[KeyframeTable | KeypointTable, ...] = (self.keyframes, self.keypoints)
+        return sum(getattr(t, f.name).nbytes for t in tables for f in fields(t))
+
+    # -- inside ------------------------------------------------------------------------------------------------------
+
+    def _allocate(self, row: int, keypoints: int) -> int:
+        start, table = self.slots, self.keypoints
+        self.slots += keypoints
+        if self.slots > len(table.row):
+            _grown(table, self.slots + max(8192, self.slots // 4))
+        new = slice(start, self.slots)
+        table.row[new] = row
+        table.root[new] = -1
+        table.first[new] = -1
+        table.next[new] = -1
+        table.point[new] = NO_POINT
+        return start
+
+    def _section(self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], kind: int) -> tuple[I32, Bool]:
+        """Slots of a section's rows, and which rows fit the header; what an older version of it had is withdrawn."""
+        row = self.rows[keyframe]
+        keep = index < self.keyframes.count[row]
+        slots = (int(self.keyframes.start[row]) + index[keep].astype(np.int32)).astype(np.int32)
+        table = self.keypoints
+        mine = self.slots_of(keyframe)
+        old = mine[(table.kind[mine] == kind) & (table.part[mine] == part)]
+        gone = np.setdiff1d(old, slots).astype(np.int32)
+        turned = slots[(table.kind[slots] != EMPTY) & (table.kind[slots] != kind)]
+        gone = np.union1d(gone, turned).astype(np.int32)
+        kernels.link(gone, np.full(len(gone), -1, np.int32), table.root, table.first, table.next)
+        table.kind[gone] = EMPTY
+        return slots, keep
+
+    def _link_sightings(self, slots: I32) -> None:
+        """Hang sightings on the points they name; those whose keyframe is not here wait for it."""
+        table = self.keypoints
+        slots = slots[table.kind[slots] == SIGHTING]
+        named = self.find_points(table.point[slots])
+        roots = np.full(len(slots), -1, np.int32)
+        known = named >= 0
+        target = named[known]
+        # A point that was fused is followed to its root; one whose own section is still to come is its own root.
+        fused = (table.kind[target] == BIRTH) & (table.root[target] >= 0)
+        roots[known] = np.where(fused, table.root[target], target)
+        kernels.link(slots, roots, table.root, table.first, table.next)
+        for slot in slots[~known].tolist():
+            anchor = KeyframeId(int(table.point[slot]) >> KEYPOINT_BITS)
+            if anchor not in self.rows:
+                self._waiting.setdefault(anchor, []).append(slot)
+
+    def _counts(self, slots: I32) -> Bool:
+        table = self.keypoints
+        root = table.root[slots]
+        alive = (table.usable[slots] != 0) & (root >= 0)
+        alive[alive] = (table.flags[root[alive]] & CULLED == 0) & (table.kind[root[alive]] == BIRTH)
+        return alive
+
+    def _refresh_usable(self, row: int) -> None:
+        table = self.keypoints
+        start = int(self.keyframes.start[row])
+        mine = slice(start, start + int(self.keyframes.count[row]))
+        open_ = self.keyframes.culled[row] == 0 and self.keyframes.pose_source[row] != NO_POSE
+        here = table.kind[mine] != EMPTY
+        table.usable[mine] = here & (table.flags[mine] & REMOVED == 0) & open_
+        self.keyframes.filled[row] = np.count_nonzero(here)
+
+    def _compose(self, row: int) -> None:
+        """Set a pose from the parent's (or from the submap frame), and those of the descendants that hang on it."""
+        table = self.keyframes
+        parent = KeyframeId(int(table.parent[row]))
+        if parent == NO_KEYFRAME:
+            table.T_m_k[row] = table.T_p_k[row]
+        else:
+            above = self.rows.get(parent)
+            if above is None or table.pose_source[above] == NO_POSE:
+                return
+            table.T_m_k[row] = table.T_m_k[above] @ table.T_p_k[row]
+        table.pose_source[row] = COMPOSED
+        self._refresh_usable(row)
+        self._compose_children(KeyframeId(int(table.id[row])))
+
+    def _compose_children(self, keyframe: KeyframeId) -> None:
+        table = self.keyframes
+        open_ = [keyframe]
+        while open_:
+            above = open_.pop()
+            for row in self._children.get(above, []):
+                if table.pose_source[row] == REFINED_POSE:
+                    continue
+                table.T_m_k[row] = table.T_m_k[self.rows[above]] @ table.T_p_k[row]
+                if table.pose_source[row] == NO_POSE:
+                    table.pose_source[row] = COMPOSED
+                    self._refresh_usable(row)
+                open_.append(KeyframeId(int(table.id[row])))
+
+
+def _parameters(camera: RectifiedCamera) -> tuple[float, float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy, camera.bf
