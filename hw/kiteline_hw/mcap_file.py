@@ -1,0 +1,266 @@
+"""The records of an MCAP file, whole or cut: with its index when it has one, else by walking it from the front.
+
+A file cut anywhere gives all messages before the cut, also those of the chunk that was cut; `cut` then says where. A
+damaged chunk is passed over and noted. Memory holds one chunk, or those chunks that overlap in time when the messages are asked for
+in order. Format: mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import heapq
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Metadata, Schema
+
+from kiteline_hw.ports import SourceError
+
+MAGIC = b"\x89MCAP0\r\n"
+_RUN_BYTES = 1 << 20  # bytes; bare messages are read in runs of this size, like chunks
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQII")
+
+
+class RawMessage(NamedTuple):
+    """A message as it stands in the file."""
+
+    channel: int
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """A chunk, or a run of bare messages: where it stands, when its messages were logged, which channels it has."""
+
+    offset: int
+    length: int
+    first_ns: int
+    last_ns: int
+    chunk: bool
+    channels: frozenset[int] | None
+
+
+class McapFile:
+    """An open MCAP file. Raises SourceError when it is none; a cut or damaged one opens, see `cut` and `notes`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.counts: dict[int, int] = {}  # messages by channel
+        self.metadata: list[Metadata] = []
+        self.cut: str | None = None
+        self.notes: list[str] = []
+        self.indexed = False
+        self.first_ns = self.last_ns = 0
+        self._spans: list[_Span] = []
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise SourceError(f"{path}: {error.strerror}") from error
+        head = self._file.read(len(MAGIC))
+        if head != MAGIC:
+            self._file.close()
+            raise SourceError(f"{path}: no MCAP file: it starts with {head!r}" if head else f"{path}: empty file")
+        self._size = path.stat().st_size
+        if not self._read_index():
+            self._walk()
+        used = [span for span in self._spans if span.last_ns]
+        if used:
+            self.first_ns = min(span.first_ns for span in used)
+            self.last_ns = max(span.last_ns for span in used)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def schema_of(self, channel: int) -> Schema | None:
+        """The schema of a channel's messages, or None."""
+        return self.schemas.get(self.channels[channel].schema_id)
+
+    def messages(self, channels: Collection[int] | None = None, ordered: bool = True) -> Iterator[RawMessage]:
+        """Messages of the channels (None: all), in order of log time, or (ordered False) as they stand in the file."""
+        wanted = None if channels is None else frozenset(channels)
+        spans = [s for s in self._spans if wanted is None or s.channels is None or s.channels & wanted]
+        if not ordered:
+            for span in spans:
+                yield from self._span(span, wanted)
+            return
+        heap: list[tuple[int, int, RawMessage]] = []
+        order = 0
+        for span in sorted(spans, key=lambda s: (s.first_ns, s.offset)):
+            while heap and heap[0][0] < span.first_ns:
+                yield heapq.heappop(heap)[2]
+            for message in self._span(span, wanted):
+                heapq.heappush(heap, (message.log_ns, order, message))
+                order += 1
+        while heap:
+            yield heapq.heappop(heap)[2]
+
+    def first(self, channel: int) -> RawMessage | None:
+        """The first message of a channel in the file."""
+        return next(self.messages((channel,), ordered=False), None)
+
+    def _read_index(self) -> bool:
+        try:
+            reader = SeekingReader(self._file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None or not summary.chunk_indexes or not summary.channels:
+                return False
+            self.metadata = list(reader.iter_metadata())
+        except (McapError, struct.error, ValueError, OSError, UnicodeDecodeError):
+            return False
+        if sum(summary.statistics.channel_message_counts.values()) and not summary.schemas:
+            return False
+        self.schemas, self.channels = dict(summary.schemas), dict(summary.channels)
+        self.counts = dict(summary.statistics.channel_message_counts)
+        for index in sorted(summary.chunk_indexes, key=lambda i: i.chunk_start_offset):
+            if index.chunk_start_offset + index.chunk_length > self._size:
+                return False
+            channels = frozenset(index.message_index_offsets) or None
+            where = (index.chunk_start_offset, index.chunk_length, index.message_start_time, index.message_end_time)
+            self._spans.append(_Span(*where, True, channels))
+        self.indexed = True
+        return True
+
+    def _walk(self) -> None:
+        """Find spans, schemas and channels from the front, up to the end or the cut."""
+        self._spans, self.metadata = [], []
+        offset = len(MAGIC)
+        run_start, run_times, run_channels = 0, [0, 0], set[int]()
+
+        def end_run() -> None:
+            nonlocal run_start, run_times, run_channels
+            if run_start:
+                length = offset - run_start
+                self._spans.append(_Span(run_start, length, *run_times, False, frozenset(run_channels)))
+            run_start, run_times, run_channels = 0, [0, 0], set()
+
+        while True:
+            self._file.seek(offset)
+            head = self._file.read(_RECORD.size)
+            if len(head) < _RECORD.size:
+                self.cut = f"cut after {self._size} bytes, without the end that a finished file has"
+                break
+            opcode, length = _RECORD.unpack(head)
+            end = offset + _RECORD.size + length
+            if opcode == Opcode.MESSAGE and end <= self._size:
+                channel, _, log_ns, _ = _MESSAGE.unpack(self._file.read(_MESSAGE.size))
+                if not run_start:
+                    run_start, run_times = offset, [log_ns, log_ns]
+                run_times = [min(run_times[0], log_ns), max(run_times[1], log_ns)]
+                run_channels.add(channel)
+                self.counts[channel] = self.counts.get(channel, 0) + 1
+                offset = end
+                if offset - run_start > _RUN_BYTES:
+                    end_run()
+                continue
+            end_run()
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                break
+            if opcode == 0 or (opcode > Opcode.DATA_END and opcode < 0x80):
+                self.cut = f"damaged at byte {offset} of {self._size}"
+                break
+            if opcode == Opcode.CHUNK:
+                self._add_chunk(offset, min(end, self._size) - offset)
+            if end > self._size:
+                self.cut = f"cut after {self._size} bytes, inside a record that needs {end - self._size} more"
+                break
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(opcode, self._file.read(length))
+            elif opcode == Opcode.METADATA:
+                self.metadata.append(Metadata.read(ReadDataStream(BytesIO(self._file.read(length)))))
+            offset = end
+        end_run()
+
+    def _add_chunk(self, offset: int, length: int) -> None:
+        span = _Span(offset, length, 0, 0, True, None)
+        channels: set[int] = set()
+        first_ns, last_ns = 2**64, 0
+        for message in self._span(span, None):
+            channels.add(message.channel)
+            self.counts[message.channel] = self.counts.get(message.channel, 0) + 1
+            first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
+        if channels:
+            self._spans.append(_Span(offset, length, first_ns, last_ns, True, frozenset(channels)))
+
+    def _learn(self, opcode: int, body: bytes) -> None:
+        try:
+            stream = ReadDataStream(BytesIO(body))
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self.schemas[schema.id] = schema
+            else:
+                channel = Channel.read(stream)
+                self.channels[channel.id] = channel
+        except (McapError, struct.error, ValueError, UnicodeDecodeError) as error:
+            self._note(f"unreadable schema or channel ({error})")
+
+    def _span(self, span: _Span, wanted: frozenset[int] | None) -> Iterator[RawMessage]:
+        self._file.seek(span.offset)
+        body = self._file.read(span.length)
+        if span.chunk:
+            body = self._unpack(body, span.offset)
+        at, size = 0, len(body)
+        while at + _RECORD.size <= size:
+            opcode, length = _RECORD.unpack_from(body, at)
+            at += _RECORD.size
+            if at + length > size:
+                return
+            if opcode == Opcode.MESSAGE:
+                if length < _MESSAGE.size:
+                    self._note(f"damaged message near byte {span.offset}")
+                    return
+                channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(body, at)
+                if (wanted is None or channel in wanted) and channel in self.channels:
+                    data = body[at + _MESSAGE.size : at + length]
+                    yield RawMessage(channel, sequence, log_ns, publish_ns, data)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and not self.indexed:
+                self._learn(opcode, body[at : at + length])
+            at += length
+
+    def _unpack(self, record: bytes, offset: int) -> bytes:
+        """The records inside a chunk; of a cut chunk those before the cut, of a damaged one none."""
+        try:
+            _, _, size, crc, name_length = _CHUNK.unpack_from(record, _RECORD.size)
+            at = _RECORD.size + _CHUNK.size
+            compression = record[at : at + name_length].decode()
+            (stored,) = struct.unpack_from("<Q", record, at + name_length)
+            packed = record[at + name_length + 8 :][:stored]
+            whole = len(packed) == stored
+            if compression == "":
+                body = packed
+            elif compression == "zstd" and whole:
+                body = zstandard.decompress(packed, size)
+            elif compression == "zstd":
+                body = zstandard.ZstdDecompressor().decompressobj().decompress(packed)
+            elif compression == "lz4":
+                body = lz4.frame.LZ4FrameDecompressor().decompress(packed)
+            else:
+                raise ValueError(f"unknown compression {compression!r}")
+        except (struct.error, ValueError, RuntimeError, zstandard.ZstdError, UnicodeDecodeError) as error:
+            self._note(f"damaged chunk at byte {offset} ({error})")
+            return b""
+        if whole and crc and zlib.crc32(body) != crc:
+            self._note(f"damaged chunk at byte {offset} (checksum differs)")
+            return b""
+        return body
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)

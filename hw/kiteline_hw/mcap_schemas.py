@@ -1,0 +1,59 @@
+"""The message types of our logs: Foxglove's protobuf schemas where one fits, and three small ones of our own.
+
+`kiteline.Blob` {bytes data}: opaque bytes. `kiteline.Imu` {sfixed64 t_ns[], double gyro[], double accel[]}: a batch of
+samples. Both are protobuf too, so that a viewer that does not know them still opens the log.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from foxglove_schemas_protobuf import (
+    CameraCalibration_pb2,
+    CompressedImage_pb2,
+    FrameTransform_pb2,
+    Grid_pb2,
+    LaserScan_pb2,
+    Log_pb2,
+    PoseInFrame_pb2,
+    PosesInFrame_pb2,
+)
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap_protobuf.schema import build_file_descriptor_set
+
+CompressedImage = CompressedImage_pb2.CompressedImage
+CameraCalibration = CameraCalibration_pb2.CameraCalibration
+FrameTransform = FrameTransform_pb2.FrameTransform
+PoseInFrame = PoseInFrame_pb2.PoseInFrame
+PosesInFrame = PosesInFrame_pb2.PosesInFrame
+LaserScan = LaserScan_pb2.LaserScan
+Grid = Grid_pb2.Grid
+Log = Log_pb2.Log
+
+_F = FieldDescriptorProto
+
+
+def _own_messages() -> tuple[Any, Any]:
+    file = FileDescriptorProto(name="kiteline.proto", package="kiteline", syntax="proto3")
+    blob = file.message_type.add(name="Blob")
+    blob.field.add(name="data", number=1, type=_F.TYPE_BYTES, label=_F.LABEL_OPTIONAL)
+    imu = file.message_type.add(name="Imu")
+    imu.field.add(name="t_ns", number=1, type=_F.TYPE_SFIXED64, label=_F.LABEL_REPEATED)
+    imu.field.add(name="gyro", number=2, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
+    imu.field.add(name="accel", number=3, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
+    pool = DescriptorPool()
+    pool.Add(file)
+    return tuple(GetMessageClass(pool.FindMessageTypeByName(f"kiteline.{name}")) for name in ("Blob", "Imu"))
+
+
+Blob, Imu = _own_messages()
+
+
+@cache
+def schema_data(message_class: Any) -> bytes:
+    """The FileDescriptorSet of a message class, as an MCAP schema holds it."""
+    data: bytes = build_file_descriptor_set(message_class).SerializeToString()
+    return data
