@@ -1,7 +1,7 @@
 """Opening and closing Zenoh sessions so that nothing hangs: client (drone) or listening peer (base), TCP, no discovery.
 
-A process that ends while a Zenoh session with callbacks is open hangs for ever. So every session opened here is closed
-at the latest when the main thread ends.
+A process that ends while a session is open hangs for ever when a callback has a Python thread of its own. So callbacks
+are `direct`, and every session opened here is closed at the latest when the main thread ends.
 """
 
 from __future__ import annotations

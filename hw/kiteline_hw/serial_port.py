@@ -1,0 +1,157 @@
+"""A serial port that comes back: opened exclusively, read and written without blocking, reopened with back-off."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import termios
+import threading
+from collections.abc import Callable
+
+import serial
+
+from kiteline_hw.ports import LinkError
+
+_READ_BYTES = 4096  # bytes a read takes at most: a whole tty buffer
+_FIRST_RETRY_S = 0.05  # s until the first try to open the port again
+_LAST_RETRY_S = 2.0  # s between tries in the end: a replugged adapter is found soon, a missing one costs nothing
+_IDLE_S = 0.5  # s that the thread sleeps at most
+
+# pyserial raises TypeError and ValueError when its port vanishes in the middle of a call.
+_ERRORS = (serial.SerialException, OSError, termios.error, ValueError, TypeError)
+
+
+def parse_serial(spec: str) -> tuple[str, int]:
+    """Device and baud rate of DEV:BAUD. Raises LinkError."""
+    device, colon, baud = spec.rpartition(":")
+    if not colon or not device or not baud.isdecimal() or int(baud) == 0:
+        raise LinkError(f"serial port {spec!r}: expected DEVICE:BAUD, for instance /dev/ttyUSB0:57600")
+    return device, int(baud)
+
+
+class SerialPort:
+    """A thread that owns the port. `on_data` gets what arrives, `next_out` is asked for what to write (b"" for nothing);
+    both are called in the thread. Call `wake` when there is something new to write.
+
+    required: raise LinkError when the port cannot be opened now; else keep trying in the background.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        baud: int,
+        on_data: Callable[[bytes], None],
+        next_out: Callable[[], bytes],
+        *,
+        required: bool = True,
+    ) -> None:
+        self._device = device
+        self._baud = baud
+        self._on_data = on_data
+        self._next_out = next_out
+        self._closed = threading.Event()
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._left = b""  # of the frame that is being written
+        self.opened = 0
+        self.cut_frames = 0  # frames begun and not finished when the port went away
+        self.callback_errors = 0
+        self.connected = False
+        port: serial.Serial | None = None
+        try:
+            port = self._open()
+        except _ERRORS as error:
+            if required:
+                self._close_pipe()
+                raise LinkError(
+                    f"cannot open serial port {device} at {baud} baud: {error}. Is it plugged in, used by another "
+                    "program, or closed to this user (group dialout)?"
+                ) from error
+        self._thread = threading.Thread(target=self._run, args=(port,), name="serial", daemon=True)
+        self._thread.start()
+
+    def _open(self) -> serial.Serial:
+        port = serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
+        self.opened += 1
+        self.connected = True
+        return port
+
+    def wake(self) -> None:
+        """There is something to write. Never blocks; from any thread."""
+        with contextlib.suppress(OSError):  # a full pipe wakes the thread anyway; a closed one needs no wake
+            os.write(self._wake_write, b"\0")
+
+    def _run(self, port: serial.Serial | None) -> None:
+        retry_s = _FIRST_RETRY_S
+        while not self._closed.is_set():
+            if port is None:
+                try:
+                    port = self._open()
+                    retry_s = _FIRST_RETRY_S
+                except _ERRORS:
+                    self._closed.wait(retry_s)
+                    retry_s = min(2.0 * retry_s, _LAST_RETRY_S)
+                    continue
+            try:
+                self._turn(port)
+            except _ERRORS:
+                self._hang_up(port)
+                port = None
+                self._closed.wait(retry_s)
+        if port is not None:
+            self._hang_up(port)
+
+    def _turn(self, port: serial.Serial) -> None:
+        """Wait for something to do and do it. A hang-up raises SerialException or plain OSError."""
+        if not self._left:
+            self._left = self._ask()
+        fd = port.fileno()
+        readable, writable, _ = select.select([fd, self._wake_read], [fd] if self._left else [], [], _IDLE_S)
+        if self._wake_read in readable:
+            os.read(self._wake_read, _READ_BYTES)
+        if fd in readable:
+            data = port.read(_READ_BYTES)
+            if data:
+                self._hand_in(data)
+        if fd in writable:
+            try:
+                written = port.write(self._left)
+            except serial.SerialTimeoutException:
+                written = 0
+            self._left = self._left[written or 0 :]
+
+    def _ask(self) -> bytes:
+        try:
+            return self._next_out()
+        except Exception:
+            self.callback_errors += 1
+            return b""
+
+    def _hand_in(self, data: bytes) -> None:
+        try:
+            self._on_data(data)
+        except Exception:
+            self.callback_errors += 1
+
+    def _hang_up(self, port: serial.Serial) -> None:
+        self.connected = False
+        self.cut_frames += bool(self._left)
+        self._left = b""
+        with contextlib.suppress(*_ERRORS):
+            port.close()
+
+    def close(self) -> None:
+        """Close the port, within a second. May be called twice."""
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        self.wake()
+        self._thread.join(1.0)
+        if not self._thread.is_alive():
+            self._close_pipe()
+
+    def _close_pipe(self) -> None:
+        os.close(self._wake_read)
+        os.close(self._wake_write)
