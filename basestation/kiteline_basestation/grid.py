@@ -48,7 +48,7 @@ class GridConfig:
     obstacle_low_m: float = 0.1  # m; lower than this is ground: a vehicle rolls, and noise reaches this far
     vehicle_height_m: float = 2.0  # m; what hangs higher is passed below
     noise_per_m: float = 0.01  # m of height per m of distance from the nearest view: stereo noise grows with distance
-    free_below_m: float = 1.2  # m; a ray higher above the ground says nothing about the floor below it
+    free_below_m: float = 1.0  # m; a ray higher above the ground says nothing about the floor below it
     camera_above_m: float = 0.1  # m; ground points lie at least this far below every camera that sees them
     patch_m: float = 2.0  # m; side of the neighbourhoods (three by three of them) that share a ground height
     height_bin_m: float = 0.05  # m; half of obstacle_low_m, so that a peak falls into the ground's band
@@ -201,7 +201,7 @@ def ground_heights(config: GridConfig, points: F64, camera_z: F64) -> F64:
         count, seed, seed_bin if seed_bin >= 0 else floor_bin, reach, config.peak_share, config.peak_points,
         ground, queue,
     )  # fmt: skip
-    height = base + (ground + 0.5) * config.height_bin_m
+    height = base + (ground.astype(np.float64) + 0.5) * config.height_bin_m
     return _between(height, (points[:, :2] - corner) / config.patch_m - 0.5)
 
 
@@ -252,12 +252,9 @@ def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: 
         grid = empty(config, len(points))
         return GridMap(grid.cell_m, grid.tiles, grid.cells, labels, ground)
     obstacle = np.flatnonzero(labels == OBSTACLE)
-    start = np.floor(positions[seen[:, 0], :2] / config.cell_m).astype(np.int64)
-    end = np.floor(points[seen[:, 1], :2] / config.cell_m).astype(np.int64)
-    solid = np.floor(points[obstacle, :2] / config.cell_m).astype(np.int64)
-    corners = np.concatenate([start, end, solid])
-    first_tile = corners.min(axis=0) // TILE
-    columns, rows = corners.max(axis=0) // TILE - first_tile + 1
+    cameras, ends = np.unique(seen[:, 0]), np.flatnonzero(np.bincount(seen[:, 1]))
+    first_tile, last_tile = _tile_box(config.cell_m, positions[cameras, :2], points[ends, :2], points[obstacle, :2])
+    columns, rows = last_tile - first_tile + 1
     origin = first_tile * TILE
     slots = np.full((rows, columns), -1, np.int32)
 
@@ -265,15 +262,15 @@ def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: 
     hits, free, through = (np.zeros((capacity, TILE, TILE), np.uint16) for _ in range(3))
     low = np.full((capacity, TILE, TILE), np.inf, np.float32)
     high = np.full((capacity, TILE, TILE), -np.inf, np.float32)
-    solid -= origin
+    solid = _cells(config.cell_m, points[obstacle]) - origin
     used = kernels.mark_points(
         solid[:, 0], solid[:, 1], points[obstacle, 2], views[obstacle], slots, 0, hits, low, high
     )
     z = np.stack([positions[seen[:, 0], 2], points[seen[:, 1], 2]], axis=1)
     ceiling = ground[seen[:, 1]] + config.free_below_m
     short = np.where(labels[seen[:, 1]] == OBSTACLE, 1, 0).astype(np.int64)
-    start -= origin
-    end -= origin
+    start = _cells(config.cell_m, positions[seen[:, 0]]) - origin
+    end = _cells(config.cell_m, points[seen[:, 1]]) - origin
     done = 0
     while True:
         done, used = kernels.cast_rays(
@@ -289,6 +286,17 @@ def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: 
     r, c = np.nonzero(slots >= 0)
     order = slots[r, c]
     return GridMap(config.cell_m, np.stack([c, r], axis=1) + first_tile, cells[order], labels, ground)
+
+
+def _cells(cell_m: float, points: F64) -> I64:
+    """Column and row (n,2) of the cells in which points (n, 2 or 3) lie."""
+    return np.asarray(np.floor(points[:, :2] / cell_m).astype(np.int64))
+
+
+def _tile_box(cell_m: float, *points: F64) -> tuple[I64, I64]:
+    """Column and row of the lowest and of the highest tile that points (n,2) lie in."""
+    cells = np.concatenate([_cells(cell_m, p) for p in points])
+    return cells.min(axis=0) // TILE, cells.max(axis=0) // TILE
 
 
 def _grow(a: NDArray[_T], more: int, fill: float) -> NDArray[_T]:

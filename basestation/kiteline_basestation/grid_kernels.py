@@ -18,6 +18,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 TILE = 32  # cells along a side of a tile: the shape of a Tile record
+SHIFT, MASK = 5, TILE - 1  # a division by TILE and its rest: the inner loop's main cost otherwise
 COUNT_MAX = 65535  # counts are 16 bits wide and stay there
 
 
@@ -51,7 +52,7 @@ def cast_rays(
 ) -> tuple[int, int]:  # fmt: skip
     """Walk rays cell by cell (Bresenham, integers only). start, end: (n,2) column, row. z: (n,2) heights at both ends.
 
-    A step below ceiling[i] counts in `free`; a step between a cell's `low` and `high` (widened by margin_m) counts in
+    A step below ceiling[i] counts in `free`; a step at any height between a cell's `low` and `high` (widened by margin_m) counts in
     `through`: that obstacle was looked through. The last short[i] cells are left out. Begins with ray `first` and
     stops before a ray that the pool might not hold. Returns (next ray, tiles in use).
     """
@@ -70,18 +71,19 @@ def cast_rays(
         old_r, old_c, tile = -1, -1, -1
         for k in range(steps + 1 - short[i]):
             height = z[i, 0] + slope * k
+            tr, tc = r >> SHIFT, c >> SHIFT
+            if tr != old_r or tc != old_c:
+                tile = slots[tr, tc]
+                old_r, old_c = tr, tc
+            y, x = r & MASK, c & MASK
             if height < ceiling[i]:
-                tr, tc = r // TILE, c // TILE
-                if tr != old_r or tc != old_c:
-                    tile = slots[tr, tc]
-                    if tile < 0:
-                        tile = used
-                        slots[tr, tc] = tile
-                        used += 1
-                    old_r, old_c = tr, tc
-                y, x = r % TILE, c % TILE
+                if tile < 0:
+                    tile = used
+                    slots[tr, tc] = tile
+                    used += 1
                 if free[tile, y, x] < COUNT_MAX:
                     free[tile, y, x] += 1
+            if tile >= 0:
                 inside = low[tile, y, x] - margin_m < height < high[tile, y, x] + margin_m
                 if inside and through[tile, y, x] < COUNT_MAX:
                     through[tile, y, x] += 1
