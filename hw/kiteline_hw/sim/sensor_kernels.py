@@ -1,0 +1,78 @@
+"""What happens between light and numbers: motion blur, vignette, exposure, shot and read noise, quantisation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+
+_STILL_PX = 0.25  # a shorter streak is not worth resampling
+_MOST_TAPS = 17
+
+
+@njit(cache=True, nogil=True)
+def motion_blur(radiance: F32, distance: F32, rays: F32, linear: F64, angular: F64, exposure_s: float, out: F32) -> None:
+    """Average each pixel along its streak of one exposure. linear, angular: the camera's twist in its own frame.
+
+    A point at distance t along the unit ray d moves by -(v/t + w x d) per second, seen from the camera. The streak
+    lies symmetrically around the middle of the exposure, which is the frame's stamp.
+    """
+    height, width = radiance.shape
+    for y in range(height):
+        for x in range(width):
+            d, right, down = rays[y + 1, x + 1], rays[y + 1, x + 2], rays[y + 2, x + 1]
+            inverse = 1.0 / distance[y, x]
+            fx = -(linear[0] * inverse + angular[1] * d[2] - angular[2] * d[1])
+            fy = -(linear[1] * inverse + angular[2] * d[0] - angular[0] * d[2])
+            fz = -(linear[2] * inverse + angular[0] * d[1] - angular[1] * d[0])
+            along = fx * d[0] + fy * d[1] + fz * d[2]
+            fx, fy, fz = fx - along * d[0], fy - along * d[1], fz - along * d[2]
+            ax, ay, az = right[0] - d[0], right[1] - d[1], right[2] - d[2]
+            bx, by, bz = down[0] - d[0], down[1] - d[1], down[2] - d[2]
+            aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
+            fa, fb = fx * ax + fy * ay + fz * az, fx * bx + fy * by + fz * bz
+            determinant = aa * bb - ab * ab
+            u = exposure_s * (fa * bb - fb * ab) / determinant
+            v = exposure_s * (fb * aa - fa * ab) / determinant
+            length = np.sqrt(u * u + v * v)
+            if not length > _STILL_PX:
+                out[y, x] = radiance[y, x]
+                continue
+            taps = min(_MOST_TAPS, int(length * 1.2) + 2)
+            total = 0.0
+            for k in range(taps):
+                s = (k + 0.5) / taps - 0.5
+                px = min(max(x + s * u, 0.0), width - 1.001)
+                py = min(max(y + s * v, 0.0), height - 1.001)
+                i, j = int(px), int(py)
+                gx, gy = px - i, py - j
+                top = radiance[j, i] * (1.0 - gx) + radiance[j, i + 1] * gx
+                low = radiance[j + 1, i] * (1.0 - gx) + radiance[j + 1, i + 1] * gx
+                total += top * (1.0 - gy) + low * gy
+            out[y, x] = total / taps
+
+
+@njit(cache=True, nogil=True)
+def expose(radiance: F32, fall_off: F32, gain: float, read: float, shot: float, key: np.uint64, out: U8) -> None:
+    """Grey values of a radiance image: vignette, gain, then noise of variance read^2 + shot * value, rounded.
+
+    The noise of a pixel depends on `key` and its place alone (splitmix64; the sum of four uniforms is nearly normal),
+    so frames can be made in any order.
+    """
+    height, width = radiance.shape
+    for y in range(height):
+        for x in range(width):
+            value = radiance[y, x] * fall_off[y, x] * gain
+            z = key + np.uint64(y * width + x + 1) * np.uint64(0x9E3779B97F4A7C15)
+            z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            z = z ^ (z >> np.uint64(31))
+            four = (z & np.uint64(0xFFFF)) + ((z >> np.uint64(16)) & np.uint64(0xFFFF))
+            four += ((z >> np.uint64(32)) & np.uint64(0xFFFF)) + (z >> np.uint64(48))
+            normal = (float(four) - 131070.0) * (1.7320508 / 65536.0)
+            value += normal * np.sqrt(read * read + shot * max(value, 0.0))
+            out[y, x] = np.uint8(min(255.0, max(0.0, np.floor(value + 0.5))))
