@@ -70,7 +70,6 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     free[problem.free] = np.arange(np.count_nonzero(problem.free), dtype=np.int32)
     weight = 1.0 / np.square(problem.sigma)
     n, m, f = len(points), len(problem.camera), int(np.count_nonzero(problem.free))
-    active = np.ones(m, np.uint8)
     bound = np.array([config.chi2_mono, config.chi2_stereo])
     squared = np.empty(m)
     scratch = (
@@ -79,6 +78,8 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     )  # fmt: skip
     counts = np.zeros(3, np.int64)
     model = (problem.starts, problem.camera, problem.measured, weight)
+    kernels.squared_residuals(cameras, problem.lens, points, *model, squared)
+    active = (squared < kernels.BEHIND).astype(np.uint8)
     initial = float(kernels.robust_cost(cameras, problem.lens, points, *model, active, bound))
     cost = initial
     limit = np.where(problem.measured[:, 2] >= 0, config.chi2_stereo, config.chi2_mono)

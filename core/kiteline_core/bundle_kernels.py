@@ -13,7 +13,7 @@ import numpy as np
 from kiteline_core.jit import njit
 
 NEAR_M = 0.02  # a point nearer than this to the camera plane has no image
-BEHIND = 1.0e4  # squared residual charged for such an observation
+BEHIND = 1.0e12  # squared residual charged for such an observation: no step may lead there
 
 
 @njit
