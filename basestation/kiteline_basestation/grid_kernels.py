@@ -52,7 +52,7 @@ def cast_rays(
 ) -> tuple[int, int]:  # fmt: skip
     """Walk rays cell by cell (Bresenham, integers only). start, end: (n,2) column, row. z: (n,2) heights at both ends.
 
-    A step below ceiling[i] counts in `free`; a step at any height between a cell's `low` and `high` (widened by margin_m) counts in
+    A step below ceiling[i] counts in `free`. A step between a cell's `low` and `high` (widened by margin_m) counts in
     `through`: that obstacle was looked through. The last short[i] cells are left out. Begins with ray `first` and
     stops before a ray that the pool might not hold. Returns (next ray, tiles in use).
     """
