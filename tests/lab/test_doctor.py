@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from kiteline_lab import doctor
+from kiteline_lab.doctor import Finding, Level
+
+
+def test_every_plain_dependency_is_looked_at() -> None:
+    """The list in the code and the one that pip reads must not drift apart."""
+    import re
+    import tomllib
+
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+
+    def names(specs: list[str]) -> set[str]:
+        return {re.split(r"[<>=!~\[ ]", s)[0] for s in specs}
+
+    assert set(doctor.PLAIN) == names(project["dependencies"])
+    for extra, packages in doctor.EXTRAS.items():
+        assert set(packages) == names(project["optional-dependencies"][extra])
+
+
+def test_this_machine_can_run_the_tests_so_python_and_packages_are_fine() -> None:
+    assert [f.level for f in doctor.check_python()] == [Level.OK]
+    assert next(iter(doctor.check_packages())).level is Level.OK
+
+
+def test_a_package_that_does_not_load_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(doctor.PLAIN, "numpy", "no_such_module_here")
+    found = next(iter(doctor.check_packages()))
+    assert found.level is Level.FAIL
+    assert "numpy (No module named 'no_such_module_here')" in found.text
+
+
+def test_the_cache_folder_must_be_writable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert [f.level for f in doctor.check_kernel_cache()] == [Level.OK]
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))  # nobody may write there, root included
+    found = next(iter(doctor.check_kernel_cache()))
+    assert found.level is Level.FAIL
+    assert "NUMBA_CACHE_DIR" in found.mend
+
+
+def test_serial_ports_are_found_by_pattern(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(doctor, "SERIAL_PORTS", (str(tmp_path / "ttyUSB*"),))
+    assert [f.level for f in doctor.check_serial()] == [Level.NOTE]
+    (tmp_path / "ttyUSB0").touch()
+    found = list(doctor.check_serial())
+    assert found[0] == Finding(Level.OK, "serial", str(tmp_path / "ttyUSB0"))
+    assert "SERIALx_OPTIONS" in found[1].mend
+
+
+def test_exit_status_tells_of_a_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def good() -> list[Finding]:
+        return [Finding(Level.OK, "one", "fine")]
+
+    def bad() -> list[Finding]:
+        return [Finding(Level.FAIL, "two", "broken", "mend it so")]
+
+    def breaks() -> list[Finding]:
+        raise RuntimeError("odd machine")
+
+    monkeypatch.setattr(doctor, "CHECKS", (good, breaks))
+    assert doctor.main([]) == 0
+    assert "could not be checked: odd machine" in capsys.readouterr().out
+    monkeypatch.setattr(doctor, "CHECKS", (good, bad))
+    assert doctor.main([]) == 1
+    assert "-> mend it so" in capsys.readouterr().out
+
+
+def test_zenoh_opens_on_this_machine() -> None:
+    assert [f.level for f in doctor.check_zenoh()] == [Level.OK]
