@@ -31,8 +31,8 @@ def parse_serial(spec: str) -> tuple[str, int]:
 
 
 class SerialPort:
-    """A thread that owns the port. `on_data` gets what arrives, `next_out` is asked for what to write (b"" for nothing);
-    both are called in the thread. Call `wake` when there is something new to write.
+    """A thread that owns the port. `on_data` gets what arrives, `next_out` is asked for what to write (b"" for
+    nothing); both are called in the thread. Call `wake` when there is something new to write.
 
     required: raise LinkError when the port cannot be opened now; else keep trying in the background.
     """

@@ -1,0 +1,120 @@
+"""A thin link as pure, seeded computation: rate, queue, delay, jitter, loss, bursts, duplicates, reordering.
+
+Losses in bursts follow the two-state chain of Gilbert (Bell System Technical Journal 39, 1960): a good state with
+independent loss, and a bad one, entered at random, in which everything is lost.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True, slots=True)
+class LinkModelConfig:
+    """What a link does to packets. The default is a perfect one."""
+
+    rate_bytes_s: int = 0  # B/s on the wire; 0: unlimited
+    overhead_bytes: int = 0  # B that the carrier adds to each packet
+    queue_bytes: int = 65536  # B that may wait for a slow wire; a packet that does not fit is dropped
+    delay_ns: int = 0  # ns from the last byte sent to arrival
+    jitter_ns: int = 0  # ns; up to so much more, uniform; order is kept
+    loss: float = 0.0  # chance that a packet vanishes
+    burst: float = 0.0  # chance per packet that a burst of losses begins
+    burst_packets: float = 8.0  # mean length of a burst
+    duplicate: float = 0.0  # chance that a packet arrives twice
+    reorder: float = 0.0  # chance that a packet is held back, so that later ones overtake it
+    reorder_ns: int = 50_000_000  # ns; the longest that it is held back, uniform
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("loss", "burst", "duplicate", "reorder"):
+                if not 0.0 <= value <= 1.0:
+                    raise ValueError(f"link model: {field.name} is a chance, found {value}, expected 0 to 1")
+            elif not value >= (1.0 if field.name == "burst_packets" else 0):
+                raise ValueError(f"link model: {field.name} = {value} is too small")
+
+
+@dataclass(slots=True)
+class LinkModelStats:
+    """What happened to packets. sent = delivered + lost + overflowed + still under way - duplicated."""
+
+    sent: int = 0
+    lost: int = 0
+    overflowed: int = 0
+    duplicated: int = 0
+    delivered: int = 0
+    wire_bytes: int = 0
+
+
+class LinkModel:
+    """One direction of a link. Same configuration, seed and calls give the same deliveries. Times must not go back.
+
+    Each packet takes the same number of random draws whatever befalls it, so that a change of one setting leaves the
+    fate of packets under the others as it was.
+    """
+
+    def __init__(self, config: LinkModelConfig, seed: int) -> None:
+        self.config = config
+        self.stats = LinkModelStats()
+        self._random = random.Random(seed)
+        self._in_burst = False
+        self._wire_free_ns = 0
+        self._waiting: deque[tuple[int, int]] = deque()  # (ns at which it has left, bytes) of what is queued
+        self._waiting_bytes = 0
+        self._last_arrival_ns = 0
+        self._order = 0
+        self._air: list[tuple[int, int, bytes]] = []  # heap of (arrival ns, order, packet)
+
+    def send(self, packet: bytes, now_ns: int) -> bool:
+        """Hand over a packet; False when the queue before the wire is full."""
+        c = self.config
+        self.stats.sent += 1
+        draw = [self._random.random() for _ in range(7)]
+        size = len(packet) + c.overhead_bytes
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            self._waiting_bytes -= self._waiting.popleft()[1]
+        if c.rate_bytes_s and self._waiting_bytes and self._waiting_bytes + size > c.queue_bytes:
+            self.stats.overflowed += 1
+            return False
+        begins_ns = max(now_ns, self._wire_free_ns)
+        self._wire_free_ns = begins_ns + (-(-size * 1_000_000_000 // c.rate_bytes_s) if c.rate_bytes_s else 0)
+        self._waiting.append((self._wire_free_ns, size))
+        self._waiting_bytes += size
+        self.stats.wire_bytes += size
+        if self._in_burst:
+            self._in_burst = draw[0] >= 1.0 / c.burst_packets
+        else:
+            self._in_burst = draw[0] < c.burst
+        if self._in_burst or draw[1] < c.loss:
+            self.stats.lost += 1
+            return True
+        arrival_ns = self._wire_free_ns + c.delay_ns + int(draw[2] * c.jitter_ns)
+        if draw[3] < c.reorder:
+            self._fly(arrival_ns + int(draw[4] * c.reorder_ns), packet)
+        else:
+            self._last_arrival_ns = arrival_ns = max(arrival_ns, self._last_arrival_ns)
+            self._fly(arrival_ns, packet)
+        if draw[5] < c.duplicate:
+            self.stats.duplicated += 1
+            self._fly(arrival_ns + int(draw[6] * c.reorder_ns), packet)
+        return True
+
+    def _fly(self, arrival_ns: int, packet: bytes) -> None:
+        self._order += 1
+        heapq.heappush(self._air, (arrival_ns, self._order, packet))
+
+    def deliver(self, now_ns: int) -> list[bytes]:
+        """The packets that have arrived by now and were not delivered yet, in order of arrival."""
+        packets = []
+        while self._air and self._air[0][0] <= now_ns:
+            packets.append(heapq.heappop(self._air)[2])
+        self.stats.delivered += len(packets)
+        return packets
+
+    def next_ns(self) -> int | None:
+        """When the next packet arrives, or None when nothing is under way."""
+        return self._air[0][0] if self._air else None
