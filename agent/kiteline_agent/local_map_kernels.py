@@ -1,0 +1,143 @@
+"""Which points of the local map should be in view, where, and how their templates look from here."""
+
+from __future__ import annotations
+
+import numpy as np
+from kiteline_core.jit import njit
+
+
+@njit
+def project(T_c_m, camera, size, margin_px, max_scale, slots, T_m_k, counts, usable, bearing, rho, sigma_rho, out_row, out_uv, out_warp, out_xyz, out_ray, out_depth):  # type: ignore[no-untyped-def]
+    """Project the usable points of keyframe slots into a camera.
+
+    T_c_m: (4,4). camera: fx, fy, cx, cy, bf. size: width, height px. slots: (s,) int64. T_m_k: (K,4,4). counts: (K,).
+    usable: (K,B) bool. bearing: (K,B,2) x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth and its deviation, 1/m.
+    Out, capacity K*B: out_row slot*B+index, out_uv px, out_warp (2,2) d(px here)/d(px in the keyframe), out_xyz m in the
+    submap frame, out_ray m (one deviation of depth as a vector in m), out_depth m. Returns how many were written.
+    """
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    births = usable.shape[1]
+    n = 0
+    step = 4.0
+    for s in range(slots.shape[0]):
+        k = slots[s]
+        # rotation and translation keyframe -> camera
+        r = np.empty((3, 3))
+        t = np.empty(3)
+        for a in range(3):
+            t[a] = T_c_m[a, 3]
+            for m in range(3):
+                t[a] += T_c_m[a, m] * T_m_k[k, m, 3]
+            for b in range(3):
+                v = 0.0
+                for m in range(3):
+                    v += T_c_m[a, m] * T_m_k[k, m, b]
+                r[a, b] = v
+        for i in range(counts[k]):
+            if not usable[k, i]:
+                continue
+            bx, by, p = bearing[k, i, 0], bearing[k, i, 1], rho[k, i]
+            x = r[0, 0] * bx + r[0, 1] * by + r[0, 2] + t[0] * p
+            y = r[1, 0] * bx + r[1, 1] * by + r[1, 2] + t[1] * p
+            z = r[2, 0] * bx + r[2, 1] * by + r[2, 2] + t[2] * p
+            if z < 0.05 or z < 0.1 * p:
+                continue
+            u = fx * x / z + cx
+            v = fy * y / z + cy
+            if u < margin_px or v < margin_px or u >= size[0] - margin_px or v >= size[1] - margin_px:
+                continue
+            x1, y1, z1 = x + r[0, 0] * step / fx, y + r[1, 0] * step / fx, z + r[2, 0] * step / fx
+            x2, y2, z2 = x + r[0, 1] * step / fy, y + r[1, 1] * step / fy, z + r[2, 1] * step / fy
+            if z1 < 0.05 or z2 < 0.05:
+                continue
+            a00 = (fx * x1 / z1 + cx - u) / step
+            a10 = (fy * y1 / z1 + cy - v) / step
+            a01 = (fx * x2 / z2 + cx - u) / step
+            a11 = (fy * y2 / z2 + cy - v) / step
+            det = a00 * a11 - a01 * a10
+            if det < 1.0 / (max_scale * max_scale) or det > max_scale * max_scale:
+                continue
+            out_row[n] = k * births + i
+            out_uv[n, 0] = u
+            out_uv[n, 1] = v
+            out_warp[n, 0, 0] = a00
+            out_warp[n, 0, 1] = a01
+            out_warp[n, 1, 0] = a10
+            out_warp[n, 1, 1] = a11
+            depth = 1.0 / p
+            far = sigma_rho[k, i] * depth * depth  # d(1/rho) = d(rho) / rho^2
+            for a in range(3):
+                ray = T_m_k[k, a, 0] * bx + T_m_k[k, a, 1] * by + T_m_k[k, a, 2]
+                out_xyz[n, a] = T_m_k[k, a, 3] + ray * depth
+                out_ray[n, a] = ray * far
+            out_depth[n] = z * depth
+            n += 1
+    return n
+
+
+@njit
+def select(order, uv, cell_px, limit, per_cell, cells, chosen):  # type: ignore[no-untyped-def]
+    """Take candidates in `order`, at most per_cell a cell and `limit` in all. cells: (rows, columns) int32, in and out.
+
+    chosen: (limit,) int64 out. Returns how many were chosen.
+    """
+    n = 0
+    for j in range(order.shape[0]):
+        if n >= limit:
+            break
+        i = order[j]
+        r = int(uv[i, 1] / cell_px)
+        c = int(uv[i, 0] / cell_px)
+        if r < 0 or c < 0 or r >= cells.shape[0] or c >= cells.shape[1] or cells[r, c] >= per_cell:
+            continue
+        cells[r, c] += 1
+        chosen[n] = i
+        n += 1
+    return n
+
+
+@njit
+def sharpen(T_c_m, camera, rows, inlier, observed, sigma_px, inflate, floor_rho, T_m_k, bearing, rho, sigma_rho):  # type: ignore[no-untyped-def]
+    """Scalar Kalman update of inverse depths from where points were seen, the pose held fixed.
+
+    rows: (n,) slot*B+index. observed: (n,3) u, v, disparity px (< 0: none). sigma_px: (n,). inflate: factor on the
+    variance of a sighting, for the pose's own error and for errors shared by successive sightings. rho, sigma_rho: in, out.
+    """
+    fx, fy, cx, cy, bf = camera[0], camera[1], camera[2], camera[3], camera[4]
+    births = rho.shape[1]
+    for j in range(rows.shape[0]):
+        if not inlier[j]:
+            continue
+        k = rows[j] // births
+        i = rows[j] % births
+        if sigma_rho[k, i] <= floor_rho:
+            continue
+        p = rho[k, i]
+        bx, by = bearing[k, i, 0], bearing[k, i, 1]
+        d = np.empty(3)
+        t = np.empty(3)
+        for a in range(3):
+            t[a] = T_c_m[a, 3]
+            d[a] = 0.0
+            for m in range(3):
+                t[a] += T_c_m[a, m] * T_m_k[k, m, 3]
+                d[a] += T_c_m[a, m] * (T_m_k[k, m, 0] * bx + T_m_k[k, m, 1] * by + T_m_k[k, m, 2])
+        x, y, z = d[0] + t[0] * p, d[1] + t[1] * p, d[2] + t[2] * p
+        if z < 1e-3:
+            continue
+        iz = 1.0 / z
+        ju = fx * (t[0] - x * iz * t[2]) * iz
+        jv = fy * (t[1] - y * iz * t[2]) * iz
+        variance = sigma_px[j] * sigma_px[j] * inflate
+        info = (ju * ju + jv * jv) / variance
+        grad = (ju * (observed[j, 0] - fx * x * iz - cx) + jv * (observed[j, 1] - fy * y * iz - cy)) / variance
+        if observed[j, 2] >= 0.0:  # disparity = bf * p / z
+            jd = bf * iz * (1.0 - p * t[2] * iz)
+            info += jd * jd / variance
+            grad += jd * (observed[j, 2] - bf * p * iz) / variance
+        prior = 1.0 / (sigma_rho[k, i] * sigma_rho[k, i])
+        total = prior + info
+        new = p + grad / total
+        if new > 0.2 * p and new < 5.0 * p:
+            rho[k, i] = new
+            sigma_rho[k, i] = max(np.sqrt(1.0 / total), floor_rho)
