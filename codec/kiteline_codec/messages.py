@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
 from numpy.typing import NDArray
 
 from kiteline_codec import quantise
@@ -32,6 +30,8 @@ from kiteline_codec.schema import (
     Tile,
     WireError,
 )
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
 
 I64 = NDArray[np.int64]
 

@@ -58,15 +58,15 @@ def pack_columns(values: I64, out: U8) -> int:
     delta = np.zeros(c, np.bool_)
     at = 0
     for i in range(c):
-        low = values[i, 0]
+        low = int(values[i, 0])
         high = low
-        low_d = np.int64(0)
-        high_d = np.int64(0)
+        low_d = 0
+        high_d = 0
         for j in range(1, n):
-            v = values[i, j]
+            v = int(values[i, j])
             low = min(low, v)
             high = max(high, v)
-            d = v - values[i, j - 1]
+            d = v - int(values[i, j - 1])
             if j == 1:
                 low_d = d
                 high_d = d
@@ -74,7 +74,7 @@ def pack_columns(values: I64, out: U8) -> int:
             high_d = max(high_d, d)
         width = _width(high - low)
         width_d = _width(high_d - low_d)
-        first = values[i, 0]
+        first = int(values[i, 0])
         bits = 8 * _varint_bytes(_zigzag(low)) + width * n
         bits_d = 8 * (_varint_bytes(_zigzag(first)) + _varint_bytes(_zigzag(low_d))) + width_d * (n - 1)
         if bits_d < bits:
@@ -91,13 +91,13 @@ def pack_columns(values: I64, out: U8) -> int:
             shape[i, 1] = width
     bit = 8 * at
     for i in range(c):
-        base = shape[i, 0]
-        width = shape[i, 1]
+        base = int(shape[i, 0])
+        width = int(shape[i, 1])
         start = 1 if delta[i] else 0
         for j in range(start, n):
-            v = values[i, j] - base
+            v = int(values[i, j]) - base
             if delta[i]:
-                v -= values[i, j - 1]
+                v -= int(values[i, j - 1])
             left = width
             while left > 0:
                 shift = bit & 7

@@ -8,8 +8,9 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from kiteline_core import se3
 from numpy.typing import NDArray
+
+from kiteline_core import se3
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -1,0 +1,391 @@
+"""The endpoint: keeps what two sides share in agreement over any link that loses, repeats or reorders packets.
+
+The model is state synchronisation (K. Winstein, H. Balakrishnan, "Mosh: an interactive remote shell for mobile
+clients", 2012): a packet is filled, when it may be sent, with the most valuable values that the peer lacks, at their
+newest version. Nothing is queued, so nothing grows old in a queue. Packets are described in SPEC.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from kiteline_codec.budget import SlidingBudget
+from kiteline_codec.inbox import Inbox, Update
+from kiteline_codec.outbox import Order, Outbox
+from kiteline_codec.packet import (
+    CRC_BYTES,
+    MAX_HEADER_BYTES,
+    MAX_ITEM_BYTES,
+    MAX_KIND,
+    Header,
+    VersionError,
+    parse,
+    seal,
+    write_header,
+)
+from kiteline_codec.packing import Writer
+from kiteline_codec.schema import Key, Kind, WireError
+
+__all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
+
+_RANKS = {
+    Kind.LIVE: 0,
+    Kind.CAMERA: 0,  # nothing can be made of keypoints without it
+    Kind.POSE: 1,
+    Kind.DEPTHS: 1,
+    Kind.FOUND: 1,
+    Kind.REMOVED: 1,
+    Kind.CULLED: 1,
+    Kind.PLACEMENT: 1,
+    Kind.HEAD: 2,
+    Kind.BIRTHS: 3,
+    Kind.SIGHTINGS: 4,
+    Kind.TILE: 6,
+}
+_RANK_OTHER_PARTS = 5
+_RANK_UNKNOWN = 6
+_MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
+
+
+def default_order(key: Key) -> Order:
+    """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
+    rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
+    if key.part:
+        rank = max(rank, _RANK_OTHER_PARTS)
+    return (rank, -key.id, key.part)
+
+
+@dataclass(frozen=True, slots=True)
+class SyncConfig:
+    """How an endpoint uses its link."""
+
+    packet_bytes: int = 1200  # largest packet: fits an Ethernet frame inside any tunnel; a MAVLink tunnel wants 128
+    overhead_bytes: int = 28  # a packet costs on the wire beyond its own bytes: IPv4 and UDP
+    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
+    window_packets: int = 64  # on their way at once: what one acknowledgement can tell of
+    ack_delay_ns: int = 20_000_000  # waiting a little lets an acknowledgement ride on a packet with values
+    ack_packets: int = 16  # acknowledge at once after so many: well inside the window
+    reorder_packets: int = (
+        3  # overtaken by so many, a packet that took longer than a round trip and 2 deviations is lost (as RFC 9002)
+    )
+    first_rto_ns: int = 500_000_000  # patience before any round trip has been measured
+    min_rto_ns: int = 100_000_000  # an idle process may take so long to answer
+    max_rto_ns: int = 2_000_000_000  # a link that comes back is found again within this time
+    hello_ns: int = 250_000_000  # between greetings while the peer is unknown
+    heartbeat_ns: int = 1_000_000_000  # longest silence while the peer is known
+    oldest_every: int = 8  # every eighth packet begins with the value that has waited longest, so that none starves
+    max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
+    max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
+    max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
+    order: Callable[[Key], Order] = default_order
+
+    def __post_init__(self) -> None:
+        if not _MIN_PACKET_BYTES <= self.packet_bytes <= 1 << 16:
+            raise ValueError(f"packet_bytes is {self.packet_bytes}, expected {_MIN_PACKET_BYTES}..65536")
+        least = 2 * (_MIN_PACKET_BYTES + self.overhead_bytes)
+        if self.budget_bytes and self.budget_bytes < least:
+            raise ValueError(f"budget_bytes is {self.budget_bytes}, expected 0 (unlimited) or at least {least}")
+
+    @property
+    def filled_bytes(self) -> int:
+        """How long packets are made: within a tight budget no longer than a quarter of it, or the pose would wait."""
+        if not self.budget_bytes:
+            return self.packet_bytes
+        return max(_MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 4 - self.overhead_bytes))
+
+
+@dataclass(frozen=True, slots=True)
+class SyncStats:
+    """Numbers of an endpoint since its start. Bytes are those on the wire, overhead included."""
+
+    bytes_sent: int
+    packets_sent: int
+    bytes_received: int
+    packets_received: int
+    lost: int  # packets taken for lost
+    duplicates: int  # packets received again, or too late
+    rejected: int
+    reasons: tuple[tuple[str, int], ...]  # why packets were rejected, how many
+    rtt_ns: int  # smoothed round trip; 0 before the first
+    dirty: int  # values that the peer is not known to hold
+    in_flight: int  # packets
+    values: int  # that the peer's session wrote
+    legacy: int  # that earlier sessions of the peer wrote and its present one has not replaced
+    peer_session: int  # 0: no peer has been heard
+    restarts: int  # of the peer, noticed
+    mismatches: int  # digests that differed: a defect, mended by sending everything again
+
+
+class Endpoint:
+    """One end of a relation between two sessions. Pure: time and packets are handed in, packets are handed out."""
+
+    def __init__(self, config: SyncConfig, session: int, name: str = "") -> None:
+        """A session number must be above 0 and larger than that of any earlier endpoint in this place."""
+        if not 0 < session < 1 << 56:
+            raise ValueError(f"session is {session}, expected 1..2^56-1")
+        self.config = config
+        self.session = session
+        self.name = name
+        self._out = Outbox(config.filled_bytes, config.oldest_every)
+        self._in = Inbox()
+        self._budget = SlidingBudget(config.budget_bytes)
+        self._peer = 0
+        self._legacy: dict[Key, bytes] = {}
+        self._peer_verified = -1  # our version that the peer found equal
+        self._verified = -1  # the peer's version that we found equal
+        self._resync = -1  # the peer's version that we found different
+        self._last_void = -1  # our version up to which all was voided
+        self._reset: tuple[int, int] | None = (
+            None  # the same while the peer must be told, and the first packet that does
+        )
+        self._overtaken = 0  # packets before this one have been overtaken by too many acknowledged ones
+        self._owed = 0  # packets to acknowledge, or news to tell
+        self._owed_since_ns = 0
+        self._told_ns = -(1 << 62)  # when a packet last left
+        self._digest_sent: tuple[int, int] = (-1, 0)  # version, when
+        self._rtt_ns = self._rtt_var_ns = 0
+        self._backoff = 0
+        self._bytes_sent = self._packets_sent = self._bytes_received = self._packets_received = 0
+        self._duplicates = self._restarts = self._mismatches = 0
+        self._reasons: dict[str, int] = {}
+
+    # ---- values
+
+    def put(self, key: Key, code: bytes, priority: Order | None = None) -> None:
+        """Share a value, or a new version of it. Raises ValueError for a key or code that cannot be sent."""
+        if not (0 <= key.kind <= MAX_KIND and 0 <= key.id < 1 << 62 and 0 <= key.part <= 0xFFFF):
+            raise ValueError(f"{key} does not fit a packet")
+        if len(code) > self.config.max_value_bytes:
+            raise ValueError(f"{key}: {len(code)} bytes, expected at most {self.config.max_value_bytes}")
+        self._out.put(key, code, self.config.order(key) if priority is None else priority)
+
+    def remove(self, key: Key) -> None:
+        """Take a value back; unknown keys are ignored."""
+        self._out.remove(key)
+
+    def peer_values(self) -> dict[Key, bytes]:
+        """What the peer's session wrote, by key; a copy."""
+        return {key: code for key, (_, code) in self._in.values.items()}
+
+    def legacy_values(self) -> dict[Key, bytes]:
+        """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
+        return dict(self._legacy)
+
+    def forget_legacy(self) -> None:
+        """Drop the values of earlier sessions of the peer."""
+        self._legacy.clear()
+
+    # ---- agreement
+
+    @property
+    def peer_session(self) -> int:
+        """The peer's session, 0 while none has been heard."""
+        return self._peer
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the peer is known to hold all that was put, and no value has arrived in part."""
+        return bool(self._peer) and self._out.clean and not self._in.assembling and self._reset is None
+
+    @property
+    def digest_equal(self) -> bool:
+        """Whether, in both directions, the newest state has been compared and found equal."""
+        return self.quiet and self._peer_verified == self._out.newest and self._verified == self._in.newest
+
+    @property
+    def digests(self) -> tuple[bytes, bytes]:
+        """Digests of what this side wrote and of what the peer wrote."""
+        return self._out.digest.bytes(), self._in.digest.bytes()
+
+    @property
+    def stats(self) -> SyncStats:
+        """A snapshot of the numbers."""
+        reasons = tuple(sorted(self._reasons.items()))
+        return SyncStats(
+            self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, self._out.lost,
+            self._duplicates, sum(n for _, n in reasons), reasons, self._rtt_ns, self._out.pending,
+            self._out.in_flight, len(self._in.values), len(self._legacy), self._peer, self._restarts, self._mismatches,
+        )  # fmt: skip
+
+    # ---- receiving
+
+    def receive(self, packet: bytes, now_ns: int) -> list[Update]:
+        """Take in a packet. Returns the values that changed by it. Never raises: bad packets are counted."""
+        self._bytes_received += len(packet) + self.config.overhead_bytes
+        self._packets_received += 1
+        try:
+            header, items = parse(packet, self.config.max_value_bytes)
+        except VersionError as e:
+            return self._refuse(str(e))
+        except WireError:
+            return self._refuse("damaged or no packet of this protocol")
+        if header.session < self._peer:
+            return self._refuse("from an earlier session of the peer")
+        if header.peer > self.session:
+            return self._refuse("the peer has heard a later session of this side: the stored session number went back")
+        if header.session > self._peer:
+            self._greet(header.session)
+            self._owe(now_ns)
+        if header.peer != self.session:
+            # A greeting, or the peer has not yet noticed that this side restarted: let it know.
+            self._owe(now_ns)
+            return self._refuse("for an earlier session of this side") if header.peer else []
+        self._take_control(header, now_ns)
+        updates = self._void(header.reset)
+        if header.values is not None:
+            number, watermark = header.values
+            if not self._in.is_new(number):
+                self._duplicates += 1
+                self._owe(now_ns)
+                return updates
+            if not self._in.room_for(items, self.config.max_inbox_bytes, self.config.max_assembly_bytes):
+                self._refuse("no memory left for it")
+                return updates
+            self._in.mark(number)
+            self._owe(now_ns)
+            self._in.raise_watermark(watermark)
+            for item in items:
+                update = self._in.apply(item)
+                if update is not None:
+                    self._legacy.pop(update.key, None)
+                    updates.append(update)
+        self._compare(header, now_ns)
+        return updates
+
+    def _refuse(self, reason: str) -> list[Update]:
+        self._reasons[reason] = self._reasons.get(reason, 0) + 1
+        return []
+
+    def _greet(self, session: int) -> None:
+        """A new session of the peer: it holds nothing of ours, and what its forerunner wrote becomes legacy."""
+        if self._peer:
+            self._restarts += 1
+        self._peer = session
+        self._legacy.update(self.peer_values())
+        self._in = Inbox()
+        self._out.restart()
+        self._peer_verified = self._verified = self._resync = -1
+        self._reset = None
+        self._digest_sent = (-1, 0)
+        self._backoff = self._overtaken = 0
+
+    def _owe(self, now_ns: int) -> None:
+        if not self._owed:
+            self._owed_since_ns = now_ns
+        self._owed += 1
+
+    def _take_control(self, header: Header, now_ns: int) -> None:
+        if header.ack is not None:
+            sent_ns, number = self._out.acknowledge(*header.ack)
+            if number:
+                self._measure(now_ns - sent_ns)
+                self._backoff = 0
+                self._overtaken = max(self._overtaken, number - self.config.reorder_packets)
+                if self._reset is not None and number >= self._reset[1]:
+                    self._reset = None
+        if header.verified is not None:
+            self._peer_verified = max(self._peer_verified, min(header.verified, self._out.newest))
+            if self._reset is not None and self._peer_verified >= self._reset[0]:
+                self._reset = None
+        if header.resync is not None and header.resync <= self._out.newest:
+            if header.resync > self._last_void:
+                self._last_void = self._out.renumber()
+                self._reset = (self._last_void, self._out.next_number)
+                self._peer_verified = -1
+
+    def _void(self, reset: int | None) -> list[Update]:
+        """The peer voided its values up to a version, since the digests differed."""
+        if reset is None:
+            return []
+        if reset >= self._resync:
+            self._resync = -1
+        return [Update(key, None) for key in self._in.reset(reset)]
+
+    def _compare(self, header: Header, now_ns: int) -> None:
+        """Compare the peer's digest with that of what has arrived, unless newer values have arrived since."""
+        if header.digest is None:
+            return
+        version, digest = header.digest
+        if self._in.newest > version:
+            return
+        if digest != self._in.digest.bytes():
+            if self._resync != version:
+                self._mismatches += 1
+            self._resync = version
+        else:
+            self._in.raise_watermark(version)
+            self._in.newest = version
+            self._verified = version
+        self._owe(now_ns)
+
+    def _measure(self, rtt_ns: int) -> None:
+        """Smoothed round trip and its deviation (RFC 6298)."""
+        if not self._rtt_ns:
+            self._rtt_ns, self._rtt_var_ns = max(1, rtt_ns), rtt_ns // 2
+            return
+        self._rtt_var_ns += (abs(rtt_ns - self._rtt_ns) - self._rtt_var_ns) // 4
+        self._rtt_ns = max(1, self._rtt_ns + (rtt_ns - self._rtt_ns) // 8)
+
+    @property
+    def _rto_ns(self) -> int:
+        c = self.config
+        base = self._rtt_ns + 4 * self._rtt_var_ns + c.ack_delay_ns if self._rtt_ns else c.first_rto_ns
+        return min(max(base, c.min_rto_ns) << self._backoff, c.max_rto_ns)
+
+    # ---- sending
+
+    def poll(self, now_ns: int) -> bytes | None:
+        """The next packet to send now, or None. Call until None."""
+        c = self.config
+        self._out.give_up(now_ns - self._rtt_ns - max(self._rtt_ns // 4, 2 * self._rtt_var_ns), self._overtaken)
+        if self._out.give_up(now_ns - self._rto_ns):
+            self._backoff = min(self._backoff + 1, 6)
+        left = self._budget.left(now_ns) - c.overhead_bytes
+        if self._peer and self._out.window_open(max(1, c.window_packets >> self._backoff)) and self._out.has_work():
+            if left < c.filled_bytes:
+                return None
+            return self._packet(now_ns, values=True, digest=False)
+        silent_ns = now_ns - self._told_ns
+        owed = self._owed and (self._owed >= c.ack_packets or now_ns - self._owed_since_ns >= c.ack_delay_ns)
+        digest = self._digest_due(now_ns)
+        if not (owed or digest or silent_ns >= (c.heartbeat_ns if self._peer else c.hello_ns)):
+            return None
+        if left < _MIN_PACKET_BYTES:
+            return None
+        return self._packet(now_ns, values=False, digest=digest)
+
+    def _digest_due(self, now_ns: int) -> bool:
+        """Whether all has arrived, the peer has not confirmed it, and it was not told so just now."""
+        out = self._out
+        if not self._peer or not out.clean or self._peer_verified == out.newest:
+            return False
+        version, sent_ns = self._digest_sent
+        return version != out.newest or now_ns - sent_ns >= self._rto_ns
+
+    def _packet(self, now_ns: int, values: bool, digest: bool) -> bytes:
+        out = self._out
+        watermark = out.watermark()
+        header = Header(
+            self.session,
+            self._peer,
+            self._in.acknowledgement() if self._peer else None,
+            (out.newest, out.digest.bytes()) if digest else None,
+            self._verified if self._verified >= 0 else None,
+            self._resync if self._resync >= 0 else None,
+            self._reset[0] if self._reset is not None else None,
+            (out.next_number, watermark) if values else None,
+        )
+        data = Writer()
+        write_header(data, header)
+        if values:
+            out.fill(data, self.config.filled_bytes - CRC_BYTES, watermark, now_ns)
+        packet = seal(data)
+        if digest:
+            self._digest_sent = (out.newest, now_ns)
+        self._owed = 0
+        self._told_ns = now_ns
+        self._budget.spend(now_ns, len(packet) + self.config.overhead_bytes)
+        self._bytes_sent += len(packet) + self.config.overhead_bytes
+        self._packets_sent += 1
+        return packet
