@@ -28,6 +28,7 @@ class Command:
 COMMANDS = (
     Command("fly", "fly recordings or a simulation: agents and a base as processes of this machine"),
     Command("eval", "judge a trajectory against ground truth: ATE, RPE, KITTI drift, coverage"),
+    Command("grid", "judge an occupancy grid: precision and recall of the roads drawn on it"),
     Command("sim", "record a simulated flight"),
     Command("agent", "the onboard half: camera in, pose out, thin diffs to the base"),
     Command("base", "the base station: maps for any number of agents"),

@@ -1,0 +1,17 @@
+from __future__ import annotations
+
+import pytest
+from kiteline_cli import main as cli
+
+
+def test_grid_without_eval_says_how(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["grid"]) == 2
+    assert "kiteline grid eval EST.yaml TRUE.yaml" in capsys.readouterr().err
+    assert cli.main(["grid", "--help"]) == 0
+
+
+def test_grid_eval_reaches_the_evaluation(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(["grid", "eval", "--help"])
+    assert left.value.code == 0
+    assert "EST.yaml" in capsys.readouterr().out
