@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from kiteline_core.cameras import CameraRig
-from kiteline_core.frame import EncodedImage, Frame, ImuBatch
 from numpy.typing import NDArray
 
+from kiteline_core.cameras import CameraRig
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch
 from kiteline_hw.images import BadImage, ImageRef, decode_depth, decode_grey
 from kiteline_hw.imu import ImuSamples
 from kiteline_hw.ports import SourceError, SourceReport

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import se3
 from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.frame import ImuCalibration, Trajectory
-from numpy.typing import NDArray
-
 from kiteline_hw.assemble import Capture, pair_by_time, pair_tolerance_ns
 from kiteline_hw.dataset_files import (
     CaptureList,

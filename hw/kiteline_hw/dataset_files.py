@@ -9,11 +9,11 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import se3
 from kiteline_core.cameras import CameraModel, CameraRig, Lens
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
-from numpy.typing import NDArray
-
 from kiteline_hw.assemble import Capture, deliver
 from kiteline_hw.imu import ImuSamples, NoImu
 from kiteline_hw.ports import SourceError, SourceReport
@@ -31,7 +31,7 @@ class Recording:
 
     name: str
     rig: CameraRig
-    captures: "CaptureList"
+    captures: CaptureList
     imu: ImuCalibration | None = None
     ground_truth: Trajectory | None = None
     report: SourceReport = field(default_factory=SourceReport)

@@ -1,8 +1,8 @@
 """Plain images by a file pattern: `images:GLOB` (one camera) or `images:LEFT_GLOB,RIGHT_GLOB` (a rectified pair).
 
-The calibration stands in camera.yaml beside the images or one folder above: fx, fy, cx, cy, width, height, optional k1 k2 p1
-p2 k3, for a pair baseline_m, and rate_hz (10 when absent) for names that are no stamps. A name of 16 or more digits is a
-stamp in ns, one with a decimal point a stamp in seconds.
+The calibration stands in camera.yaml beside the images or one folder above: fx, fy, cx, cy, width, height, optional
+k1 k2 p1 p2 k3, for a pair baseline_m, and rate_hz (10 when absent) for names that are no stamps. A name of 16 or more
+digits is a stamp in ns, one with a decimal point a stamp in seconds.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from kiteline_core.cameras import CameraModel, CameraRig, Lens
 
+from kiteline_core.cameras import CameraModel, CameraRig, Lens
 from kiteline_hw.assemble import Capture
 from kiteline_hw.dataset_files import (
     CaptureList,

@@ -1,8 +1,8 @@
 """KITTI odometry folders: calib.txt, image_0/1, image_2/3 or image_l/r, times.txt, poses.txt; rectified, no body.
 
 calib.txt has projection matrices as rows of 12 numbers, named (`P0:`…`P3:`) or bare (left, right). A projection is
-K [I | t]; the baseline is the *difference* of the two t along x. What t says along y and z (millimetres between the colour
-cameras) is left alone: the images were rectified so that rows agree.
+K [I | t]; the baseline is the *difference* of the two t along x. What t says along y and z (millimetres between the
+colour cameras) is left alone: the images were rectified so that rows agree.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from kiteline_core.cameras import CameraModel, CameraRig
-from kiteline_core.frame import Trajectory
 from numpy.typing import NDArray
 
+from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_core.frame import Trajectory
 from kiteline_hw.assemble import Capture
 from kiteline_hw.dataset_files import (
     CaptureList,
@@ -134,7 +134,7 @@ def _size(images: list[Path]) -> tuple[int, int]:
 
 
 def _row_of(images: list[Path], rows_there: int) -> list[int]:
-    """Which row of times.txt or poses.txt belongs to each image: its number, if all numbers are rows, else its place."""
+    """Which row of times.txt or poses.txt belongs to each image: its number, if all are rows, else its place."""
     if all(path.stem.isdigit() and int(path.stem) < rows_there for path in images):
         return [int(path.stem) for path in images]
     return list(range(len(images)))

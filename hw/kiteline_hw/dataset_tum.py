@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from kiteline_core.cameras import CameraModel, CameraRig, Lens
 
+from kiteline_core.cameras import CameraModel, CameraRig, Lens
 from kiteline_hw.assemble import DEPTH_TOLERANCE_NS, Capture, pair_by_time
 from kiteline_hw.dataset_files import (
     CaptureList,

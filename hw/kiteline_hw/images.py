@@ -11,8 +11,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from kiteline_core.frame import EncodedImage
 from numpy.typing import NDArray
+
+from kiteline_core.frame import EncodedImage
+from kiteline_hw.raw_pixels import BadImage, RawPixels
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -20,10 +22,6 @@ F32 = NDArray[np.float32]
 DEPTH_FORMAT = "png/1000"  # millimetres: what our own logs write when a source holds no encoded depth
 
 _FORMATS = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\x00": "tiff", b"MM\x00*": "tiff"}
-
-
-class BadImage(Exception):
-    """One image that cannot be used; the text says why. It stays inside this package: sources count it as a skip."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class ImageFile:
     format: str = ""
 
 
-ImageRef = ImageFile | EncodedImage | U8 | F32
+ImageRef = ImageFile | EncodedImage | RawPixels
 
 
 def sniff(data: bytes) -> str:
@@ -65,8 +63,8 @@ def _encoded(ref: ImageFile | EncodedImage) -> EncodedImage:
 
 def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
     """Grey pixels (h, w) uint8 and the bytes that they came from (None for raw pixels). Raises BadImage."""
-    if isinstance(ref, np.ndarray):
-        return np.asarray(ref, np.uint8), None
+    if isinstance(ref, RawPixels):
+        return ref.grey(), None
     image = _encoded(ref)
     pixels = _imdecode(image, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(pixels, np.uint8), image
@@ -74,8 +72,8 @@ def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
 
 def decode_depth(ref: ImageRef) -> tuple[F32, EncodedImage | None]:
     """Depth (h, w) float32 in metres, 0 unknown, and the bytes that it came from. Raises BadImage."""
-    if isinstance(ref, np.ndarray):
-        return np.asarray(ref, np.float32), None
+    if isinstance(ref, RawPixels):
+        return ref.metres(), None
     image = _encoded(ref)
     raw = _imdecode(image, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype != np.uint16:

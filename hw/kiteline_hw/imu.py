@@ -1,13 +1,13 @@
-"""Inertial samples on their way to a batch: what is not finite, repeated or backwards in time is dropped and counted."""
+"""Inertial samples until a frame claims them: what is not finite, repeated or backwards in time is dropped, counted."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 import numpy as np
-from kiteline_core.frame import ImuBatch
 from numpy.typing import NDArray
 
+from kiteline_core.frame import ImuBatch
 from kiteline_hw.ports import SourceReport
 
 I64 = NDArray[np.int64]

@@ -1,8 +1,8 @@
 """The records of an MCAP file, whole or cut: with its index when it has one, else by walking it from the front.
 
 A file cut anywhere gives all messages before the cut, also those of the chunk that was cut; `cut` then says where. A
-damaged chunk is passed over and noted. Memory holds one chunk, or those chunks that overlap in time when the messages are asked for
-in order. Format: mcap.dev/spec.
+damaged chunk is passed over and noted. Memory holds one chunk, or those chunks that overlap in time when the messages
+are asked for in order. Format: mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class McapFile:
             nonlocal run_start, run_times, run_channels
             if run_start:
                 length = offset - run_start
-                self._spans.append(_Span(run_start, length, *run_times, False, frozenset(run_channels)))
+                self._spans.append(_Span(run_start, length, run_times[0], run_times[1], False, frozenset(run_channels)))
             run_start, run_times, run_channels = 0, [0, 0], set()
 
         while True:

@@ -36,12 +36,12 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
-from kiteline_core import se3
-from kiteline_core.cameras import CameraModel, CameraRig
-from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, Trajectory
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from kiteline_core import se3
+from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_hw import mcap_schemas as schemas
 from kiteline_hw.images import BadImage, decode_depth, decode_grey, encode_depth, encode_image
 from kiteline_hw.mcap_file import McapFile

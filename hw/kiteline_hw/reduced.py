@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
-
 from kiteline_hw.ports import FrameSource, SourceReport
 
 

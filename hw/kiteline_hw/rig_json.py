@@ -7,9 +7,9 @@ from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
+
 from kiteline_core.cameras import CameraModel, CameraRig, Lens
 from kiteline_core.frame import ImuCalibration
-
 from kiteline_hw.ports import SourceError
 
 LENS_NAMES = {Lens.NONE: "plumb_bob", Lens.RADTAN: "plumb_bob", Lens.EQUIDISTANT: "kannala_brandt"}  # Foxglove's names
@@ -52,5 +52,5 @@ def _camera_to_json(camera: CameraModel) -> dict[str, Any]:
 
 def _camera_from_json(value: Mapping[str, Any]) -> CameraModel:
     distortion = tuple(float(d) for d in value["distortion"])
-    focal = (float(value[key]) for key in ("fx", "fy", "cx", "cy"))
-    return CameraModel(int(value["width"]), int(value["height"]), *focal, Lens(value["lens"]), distortion)
+    fx, fy, cx, cy = (float(value[key]) for key in ("fx", "fy", "cx", "cy"))
+    return CameraModel(int(value["width"]), int(value["height"]), fx, fy, cx, cy, Lens(value["lens"]), distortion)
