@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec import quantise
-from kiteline_codec.packing import Reader, Writer
+from kiteline_codec.packing import Reader, Writer, unzigzag, zigzag
+from kiteline_codec.rows import MAX_KEYFRAME_ID, read_columns, read_points, write_columns, write_points
 from kiteline_codec.schema import (
     Births,
     Camera,
@@ -31,55 +32,14 @@ from kiteline_codec.schema import (
     WireError,
 )
 from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
+from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
 
-I64 = NDArray[np.int64]
-
-MAX_KEYFRAME_ID = (1 << 52) - 1  # as laid out in kiteline_core.ids
 MAX_PARTS = 1 << 8
 DESCRIPTOR_BYTES = 32
 TILE_CELLS = 32  # along each side
 _TILE_BITS = 24  # of a column or row number
 _TILE_OFFSET = 1 << _TILE_BITS - 1
 _MAX_SIZE_PX = 1 << 14
-
-
-@dataclass(frozen=True, slots=True)
-class _Field:
-    """How one array of a record becomes columns of integers. Codes lie in [low, high]."""
-
-    columns: int
-    low: int
-    high: int
-    codes: Callable[[Any], I64]
-    values: Callable[[I64], Any]
-
-
-def _plain(dtype: Any, high: int) -> _Field:
-    return _Field(1, 0, high, lambda a: np.asarray(a).astype(np.int64), lambda c: c[0].astype(dtype))
-
-
-_FIELDS = {
-    "index": _plain(np.uint16, MAX_KEYPOINTS - 1),
-    "uv": _Field(2, 0, quantise.PIXEL_CODES - 1, quantise.pixel_codes, quantise.pixels),
-    "inv_depth": _Field(
-        1, 0, quantise.DEPTH_CODES - 1, quantise.inverse_depth_codes, lambda c: quantise.inverse_depths(c[0])
-    ),
-    "octave": _plain(np.uint8, 15),
-    "angle": _plain(np.uint8, 255),
-    "offset": _Field(
-        2, 1 - quantise.OFFSET_CODES, quantise.OFFSET_CODES - 1, quantise.offset_codes, quantise.offsets
-    ),
-}  # fmt: skip
-
-_COLUMNS: dict[Kind, tuple[str, ...]] = {
-    Kind.BIRTHS: ("index", "uv", "inv_depth", "octave", "angle"),
-    Kind.SIGHTINGS: ("index", "uv", "inv_depth", "octave"),
-    Kind.DEPTHS: ("index", "inv_depth", "offset"),
-    Kind.FOUND: ("index",),
-    Kind.REMOVED: ("index",),
-    Kind.CULLED: ("index",),
-}
 
 
 def key(record: Record) -> Key:
@@ -121,78 +81,6 @@ def _read_pose(source: Reader) -> NDArray[np.float64]:
         return quantise.pose((*moved, *turned))
     except ValueError as e:
         raise WireError(str(e)) from None
-
-
-def _write_columns(out: Writer, kind: Kind, record: Any) -> None:
-    n = len(record.index)
-    if n > MAX_KEYPOINTS:
-        raise ValueError(f"found {n} keypoints, expected at most {MAX_KEYPOINTS}")
-    out.varint(n)
-    names = _COLUMNS[kind]
-    values = np.empty((sum(_FIELDS[name].columns for name in names), n), np.int64)
-    row = 0
-    for name in names:
-        field = _FIELDS[name]
-        codes = field.codes(getattr(record, name))
-        if n and (codes.min() < field.low or codes.max() > field.high):
-            raise ValueError(f"{name} is {codes.min()}..{codes.max()}, expected {field.low}..{field.high}")
-        values[row : row + field.columns] = codes
-        row += field.columns
-    if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
-        raise ValueError("indices must increase")
-    out.columns(values)
-
-
-def _read_columns(source: Reader, kind: Kind) -> tuple[int, dict[str, Any]]:
-    n = source.varint(MAX_KEYPOINTS)
-    names = _COLUMNS[kind]
-    values = source.columns(sum(_FIELDS[name].columns for name in names), n)
-    out = {}
-    row = 0
-    for name in names:
-        field = _FIELDS[name]
-        codes = values[row : row + field.columns]
-        if n and (codes.min() < field.low or codes.max() > field.high):
-            raise WireError(f"{name} is {codes.min()}..{codes.max()}, expected {field.low}..{field.high}")
-        out[name] = field.values(codes)
-        row += field.columns
-    if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
-        raise WireError("indices must increase")
-    return n, out
-
-
-def _write_points(out: Writer, point: I64) -> None:
-    """Point ids: a table of the keyframes of birth, increasing, then two columns: place in the table and keypoint."""
-    point = np.asarray(point, np.int64)
-    if not point.size:
-        return
-    if point.min() < 0:
-        raise ValueError("a point id is not negative")
-    table, place = np.unique(point >> KEYPOINT_BITS, return_inverse=True)
-    out.varint(len(table))
-    last = 0
-    for keyframe in table.tolist():
-        out.varint(keyframe - last)
-        last = keyframe
-    out.columns(np.stack([place.reshape(-1).astype(np.int64), point & (MAX_KEYPOINTS - 1)]))
-
-
-def _read_points(source: Reader, n: int) -> I64:
-    if not n:
-        return np.zeros(0, np.int64)
-    size = source.varint(n)
-    table = np.zeros(size, np.int64)
-    last = 0
-    for i in range(size):
-        step = source.varint(MAX_KEYFRAME_ID)
-        last += step
-        if last > MAX_KEYFRAME_ID or (i and not step):
-            raise WireError("keyframes of birth must increase and fit an id")
-        table[i] = last
-    place, keypoint = source.columns(2, n)
-    if not size or place.min() < 0 or place.max() >= size or keypoint.min() < 0 or keypoint.max() >= MAX_KEYPOINTS:
-        raise WireError("a point id is out of range")
-    return np.asarray(table[place] << KEYPOINT_BITS | keypoint, np.int64)
 
 
 def _write_camera(out: Writer, record: Camera) -> None:
@@ -239,13 +127,9 @@ def _read_live(source: Reader, key: Key) -> Live:
 def _write_head(out: Writer, record: Head) -> None:
     out.varint(record.t_ns)
     # Most parents are the keyframe before: their difference is 1.
-    out.varint(0 if record.parent == NO_KEYFRAME else 1 + _zigzag(record.keyframe - record.parent))
+    out.varint(0 if record.parent == NO_KEYFRAME else 1 + zigzag(record.keyframe - record.parent))
     _write_pose(out, record.T_p_k)
     out.varint(record.keypoints)
-
-
-def _zigzag(value: int) -> int:
-    return 2 * value if value >= 0 else -2 * value - 1
 
 
 def _read_head(source: Reader, key: Key) -> Head:
@@ -253,8 +137,7 @@ def _read_head(source: Reader, key: Key) -> Head:
     step = source.varint()
     parent = NO_KEYFRAME
     if step:
-        z = step - 1
-        parent = KeyframeId(key.id - ((z >> 1) ^ -(z & 1)))
+        parent = KeyframeId(key.id - unzigzag(step - 1))
         if not 0 <= parent <= MAX_KEYFRAME_ID:
             raise WireError(f"parent {parent} is no keyframe id")
     t_p_k = _read_pose(source)
@@ -265,43 +148,43 @@ def _write_births(out: Writer, record: Births) -> None:
     descriptor = np.ascontiguousarray(record.descriptor, np.uint8)
     if descriptor.shape != (len(record.index), DESCRIPTOR_BYTES):
         raise ValueError(f"descriptors are {descriptor.shape}, expected {(len(record.index), DESCRIPTOR_BYTES)}")
-    _write_columns(out, Kind.BIRTHS, record)
+    write_columns(out, Kind.BIRTHS, record)
     out.raw(descriptor.tobytes())
 
 
 def _read_births(source: Reader, key: Key) -> Births:
-    n, columns = _read_columns(source, Kind.BIRTHS)
+    n, columns = read_columns(source, Kind.BIRTHS)
     raw = np.frombuffer(source.raw(DESCRIPTOR_BYTES * n), np.uint8).reshape(n, DESCRIPTOR_BYTES)
     return Births(keyframe=KeyframeId(key.id), part=key.part, descriptor=raw, **columns)
 
 
 def _write_sightings(out: Writer, record: Sightings) -> None:
-    _write_columns(out, Kind.SIGHTINGS, record)
-    _write_points(out, record.point)
+    write_columns(out, Kind.SIGHTINGS, record)
+    write_points(out, record.point)
 
 
 def _read_sightings(source: Reader, key: Key) -> Sightings:
-    n, columns = _read_columns(source, Kind.SIGHTINGS)
-    return Sightings(keyframe=KeyframeId(key.id), part=key.part, point=_read_points(source, n), **columns)
+    n, columns = read_columns(source, Kind.SIGHTINGS)
+    return Sightings(keyframe=KeyframeId(key.id), part=key.part, point=read_points(source, n), **columns)
 
 
 def _write_found(out: Writer, record: Found) -> None:
-    _write_columns(out, Kind.FOUND, record)
-    _write_points(out, record.point)
+    write_columns(out, Kind.FOUND, record)
+    write_points(out, record.point)
 
 
 def _read_found(source: Reader, key: Key) -> Found:
-    n, columns = _read_columns(source, Kind.FOUND)
-    return Found(keyframe=KeyframeId(key.id), point=_read_points(source, n), **columns)
+    n, columns = read_columns(source, Kind.FOUND)
+    return Found(keyframe=KeyframeId(key.id), point=read_points(source, n), **columns)
 
 
 def _write_culled(out: Writer, record: Culled) -> None:
-    _write_columns(out, Kind.CULLED, record)
+    write_columns(out, Kind.CULLED, record)
     out.u8(record.keyframe_too)
 
 
 def _read_culled(source: Reader, key: Key) -> Culled:
-    _, columns = _read_columns(source, Kind.CULLED)
+    _, columns = read_columns(source, Kind.CULLED)
     too = source.u8()
     if too > 1:
         raise WireError(f"keyframe_too is 0 or 1, found {too}")
@@ -378,14 +261,14 @@ _TABLE = (
     ),
     _Coder(
         Kind.DEPTHS, Depths, MAX_KEYFRAME_ID, 1, _of_keyframe,
-        lambda out, r: _write_columns(out, Kind.DEPTHS, r),
-        lambda source, key: Depths(keyframe=KeyframeId(key.id), **_read_columns(source, Kind.DEPTHS)[1]),
+        lambda out, r: write_columns(out, Kind.DEPTHS, r),
+        lambda source, key: Depths(keyframe=KeyframeId(key.id), **read_columns(source, Kind.DEPTHS)[1]),
     ),
     _Coder(Kind.FOUND, Found, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_found, _read_found),
     _Coder(
         Kind.REMOVED, Removed, MAX_KEYFRAME_ID, 1, _of_keyframe,
-        lambda out, r: _write_columns(out, Kind.REMOVED, r),
-        lambda source, key: Removed(keyframe=KeyframeId(key.id), **_read_columns(source, Kind.REMOVED)[1]),
+        lambda out, r: write_columns(out, Kind.REMOVED, r),
+        lambda source, key: Removed(keyframe=KeyframeId(key.id), **read_columns(source, Kind.REMOVED)[1]),
     ),
     _Coder(Kind.CULLED, Culled, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_culled, _read_culled),
     _Coder(

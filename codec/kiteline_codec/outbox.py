@@ -196,7 +196,7 @@ class Outbox:
             self._enqueue(key, entry)
 
     def window_open(self, packets: int) -> bool:
-        """Whether another packet may leave: few are on their way, and an acknowledgement can still tell of the first."""
+        """Whether another packet may leave: few are on their way, and the first can still be acknowledged."""
         if self.in_flight >= packets:
             return False
         oldest = next((n for n, f in self._flights.items() if not f.lost), None)

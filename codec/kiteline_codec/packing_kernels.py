@@ -117,7 +117,7 @@ def _get_varint(data: U8, at: int) -> tuple[int, int]:
     while at < data.size and shift <= 42:
         b = np.int64(data[at])
         at += 1
-        value |= (b & 127) << shift
+        value |= int(b & 127) << shift
         if b < 128:
             if value > _MAX_VARINT or (b == 0 and shift > 0):
                 return 0, -1

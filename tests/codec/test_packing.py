@@ -1,0 +1,142 @@
+"""Numbers to bytes and back; columns against a second reader written from SPEC.md alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kiteline_codec import ranges
+from kiteline_codec.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
+from kiteline_codec.schema import WireError
+
+
+@given(st.integers(0, (1 << 63) - 1), st.integers(-(1 << 62), 1 << 62))
+def test_numbers(unsigned: int, signed: int) -> None:
+    out = Writer()
+    out.varint(unsigned)
+    assert len(out) == varint_bytes(unsigned)
+    out.signed(signed)
+    source = Reader(out.bytes())
+    assert source.varint() == unsigned
+    assert source.signed(1 << 62) == signed
+    source.end()
+    assert unzigzag(zigzag(signed)) == signed
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"", "end within"),
+        (b"\x80", "end within"),
+        (b"\x80\x00", "shortest"),
+        (b"\xff" * 10, "longer than 64"),
+        (b"\x65", "at most 100"),
+    ],
+)
+def test_bad_numbers(data: bytes, text: str) -> None:
+    with pytest.raises(WireError, match=text):
+        Reader(data).varint(100)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_floats_are_finite(bad: float) -> None:
+    out = Writer()
+    out.f64(bad)
+    with pytest.raises(WireError, match="infinite"):
+        Reader(out.bytes()).f64()
+
+
+def read_columns_slowly(data: bytes, c: int, n: int) -> tuple[list[list[int]], int]:
+    """SPEC.md, "Columns", word by word."""
+    at = 0
+
+    def varint() -> int:
+        nonlocal at
+        value = shift = 0
+        while True:
+            b = data[at]
+            at += 1
+            value |= (b & 127) << shift
+            shift += 7
+            if b < 128:
+                return value
+
+    heads = []
+    for _ in range(c):
+        mode, width = data[at] >> 6, data[at] & 63
+        at += 1
+        first = unzigzag(varint())
+        step = unzigzag(varint()) if mode else 0
+        heads.append((mode, width, first, step))
+    stream = int.from_bytes(data[at:], "little")
+    total = 0
+    columns = []
+    for mode, width, first, step in heads:
+        column = [first] if mode else []
+        while len(column) < n:
+            bits = stream & (1 << width) - 1
+            stream >>= width
+            total += width
+            column.append(column[-1] + step + bits if mode else first + bits)
+        columns.append(column)
+    return columns, at + (total + 7) // 8
+
+
+COLUMNS = st.integers(1, 40).flatmap(
+    lambda n: st.lists(
+        st.one_of(
+            st.lists(st.integers(-(1 << 39), 1 << 39), min_size=n, max_size=n),
+            st.lists(st.integers(0, 9), min_size=n, max_size=n),
+            st.lists(st.integers(0, 1 << 20), min_size=n, max_size=n).map(sorted),
+        ),
+        min_size=1,
+        max_size=6,
+    )
+)
+
+
+@given(COLUMNS, st.binary(max_size=3))
+def test_columns(columns: list[list[int]], after: bytes) -> None:
+    values = np.array(columns, np.int64)
+    out = Writer()
+    out.u8(7)
+    out.columns(values)
+    end = len(out)
+    out.raw(after)
+    source = Reader(out.bytes(), 1)
+    assert np.array_equal(source.columns(*values.shape), values)
+    assert source.left == len(after)
+    assert read_columns_slowly(out.bytes()[1:end], *values.shape) == (columns, end - 1)
+    for cut in {1, end // 2, end - 1}:
+        with pytest.raises(WireError, match="columns"):
+            Reader(out.bytes()[:cut], 1).columns(*values.shape)
+
+
+def test_sorted_columns_are_shorter_than_shuffled_ones() -> None:
+    values = np.arange(0, 4000, 40, dtype=np.int64)
+    straight, shuffled = Writer(), Writer()
+    straight.columns(values[None])
+    shuffled.columns(np.random.default_rng(0).permutation(values)[None])
+    assert len(straight) == 4
+    assert len(shuffled) >= 100 * 12 // 8
+
+
+@given(st.binary(max_size=80), st.integers(1, 5), st.integers(1, 2048))
+def test_any_bytes_are_columns_or_an_error(data: bytes, c: int, n: int) -> None:
+    try:
+        values = Reader(data).columns(c, n)
+    except WireError:
+        return
+    assert values.shape == (c, n)
+    assert np.abs(values).max() < 1 << 55
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 30), st.integers(0, 30)), max_size=20))
+def test_ranges_are_sets(steps: list[tuple[bool, int, int]]) -> None:
+    got, expected = ranges.NONE, set()
+    for add, a, b in steps:
+        got = ranges.add(got, a, b) if add else ranges.cut(got, a, b)
+        expected = expected | set(range(a, b)) if add else expected - set(range(a, b))
+        assert [i for a, b in got for i in range(a, b)] == sorted(expected)
+        assert all(x[1] < y[0] for x, y in zip(got, got[1:], strict=False)) or not add

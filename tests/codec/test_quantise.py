@@ -1,0 +1,123 @@
+"""Each quantiser keeps its stated error bound, and a decoded value has the same code again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from kiteline_codec import quantise
+from kiteline_core import se3
+
+SLACK = 1.0 + 1e-6  # float32 storage
+
+
+def test_every_pixel_code_comes_back() -> None:
+    codes = np.arange(quantise.PIXEL_CODES)
+    codes = np.stack([codes, codes[::-1]])
+    assert np.array_equal(quantise.pixel_codes(quantise.pixels(codes)), codes)
+
+
+@given(st.lists(st.tuples(*[st.floats(-64.0, 4031.9, width=32)] * 2), min_size=1, max_size=20))
+def test_pixels_within_a_thirtysecond(values: list[tuple[float, float]]) -> None:
+    uv = np.array(values, np.float32)
+    assert np.abs(quantise.pixels(quantise.pixel_codes(uv)) - uv).max() <= SLACK / 32
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -64.1, 4032.0])
+def test_pixels_without_a_code_are_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="pixel does not fit"):
+        quantise.pixel_codes(np.array([[bad, 0.0]], np.float32))
+
+
+def test_every_inverse_depth_code_comes_back_and_codes_are_ordered() -> None:
+    codes = np.arange(quantise.DEPTH_CODES)
+    x = quantise.inverse_depths(codes)
+    assert np.array_equal(quantise.inverse_depth_codes(x), codes)
+    assert x[0] == 0.0
+    assert np.diff(x).min() > 0
+
+
+@given(st.floats(2.0**-17, 63.9, width=32))
+@example(0.01)
+@example(5.0)
+def test_inverse_depth_bounds(x: float) -> None:
+    got = float(quantise.inverse_depths(quantise.inverse_depth_codes(np.array([x], np.float32)))[0])
+    error = abs(got - float(np.float32(x)))
+    assert error <= 2.0**-11 * (x + 2.0**-7) * SLACK
+    if x <= 0.01:
+        assert error <= 1e-5  # 0.004 px of disparity at 380 px m
+    if x >= 0.2:
+        assert error <= 1e-3 * x
+
+
+def test_inverse_depth_at_its_ends() -> None:
+    codes = quantise.inverse_depth_codes(np.array([0.0, -1.0, np.nan, 1e-9, 1e9, np.inf], np.float32))
+    assert codes.tolist() == [0, 0, 0, 1, quantise.DEPTH_CODES - 1, quantise.DEPTH_CODES - 1]
+
+
+def test_every_offset_code_comes_back() -> None:
+    codes = np.arange(1 - quantise.OFFSET_CODES, quantise.OFFSET_CODES)
+    codes = np.stack([codes, codes])
+    assert np.array_equal(quantise.offset_codes(quantise.offsets(codes)), codes)
+
+
+@given(st.floats(-127.9, 127.9, width=32))
+def test_offsets_within_a_sixtyfourth(x: float) -> None:
+    offset = np.array([[x, -x]], np.float32)
+    assert np.abs(quantise.offsets(quantise.offset_codes(offset)) - offset).max() <= SLACK / 64
+
+
+ROTATION = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: sum(c * c for c in v) > 1e-4)
+ANGLE = st.one_of(st.floats(0.0, np.pi), st.floats(np.pi - 1e-5, np.pi), st.floats(0.0, 1e-4))
+
+
+@given(ROTATION, ANGLE, st.tuples(*[st.floats(-1e6, 1e6)] * 3))
+@example((1.0, 0.0, 0.0), np.pi, (0.0, 0.0, 0.0))
+@example((1.0, -1.0, 0.0), np.pi, (0.0, 0.0, 0.0))
+def test_pose_bounds(axis: tuple[float, ...], angle: float, moved: tuple[float, ...]) -> None:
+    w = np.array(axis) / np.linalg.norm(axis) * angle
+    pose = se3.from_rt(se3.so3_exp(w), np.array(moved))
+    codes = quantise.pose_codes(pose)
+    got = quantise.pose(codes)
+    assert quantise.pose_codes(got) == codes
+    assert np.abs(got[:3, 3] - pose[:3, 3]).max() <= 0.5e-4 + 1e-9
+    assert np.linalg.norm(se3.so3_log(got[:3, :3].T @ pose[:3, :3])) <= 2e-5
+    if angle < 3.0:
+        assert np.linalg.norm(se3.so3_log(got[:3, :3].T @ pose[:3, :3])) <= 6.7e-6
+    assert np.abs(got[:3, :3] @ got[:3, :3].T - np.eye(3)).max() < 1e-14
+    assert np.linalg.det(got[:3, :3]) > 0
+
+
+TURN = st.integers(-quantise.ROTATION_STEPS, quantise.ROTATION_STEPS)
+
+
+@given(st.tuples(TURN, TURN, TURN), st.tuples(*[st.integers(-(1 << 39), 1 << 39)] * 3))
+@example((524287, 0, 0), (0, 0, 0))
+@example((370727, 370727, 0), (0, 0, 0))
+def test_every_pose_code_comes_back(turned: tuple[int, ...], moved: tuple[int, ...]) -> None:
+    if sum(c * c for c in turned) > (1 << 38) - (1 << 12):
+        with pytest.raises(ValueError, match="half a turn"):
+            quantise.pose((*moved, *turned))
+    else:
+        assert quantise.pose_codes(quantise.pose((*moved, *turned))) == (*moved, *turned)
+
+
+@pytest.mark.parametrize("bad", [np.full((4, 4), np.nan), 2.0 * np.eye(4), se3.from_rt(np.eye(3), np.full(3, 1e9))])
+def test_poses_without_a_code_are_refused(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        quantise.pose_codes(bad)
+
+
+def test_occupancy_bounds() -> None:
+    cells = np.arange(-1, 101, dtype=np.int8)
+    got = quantise.occupancy(quantise.occupancy_codes(cells))
+    assert (got[1:] >= 0).all()
+    assert got[0] == -1
+    assert np.abs(got[1:].astype(int) - cells[1:]).max() <= 4
+    assert got[1] == 0
+    assert got[-1] == 100
+    codes = np.arange(16, dtype=np.uint8)
+    assert np.array_equal(quantise.occupancy_codes(quantise.occupancy(codes)), codes)
+    with pytest.raises(ValueError, match="occupancy"):
+        quantise.occupancy_codes(np.array([101], np.int8))
