@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch
-from kiteline_hw.images import BadImage, ImageRef, decode_depth, decode_grey
+from kiteline_hw.images import ImageRef, decode_depth, decode_grey
 from kiteline_hw.imu import ImuSamples
 from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.raw_pixels import BadImage
 
 PAIR_TOLERANCE_NS = 5_000_000  # ns; unsynchronised halves further apart than this are no pair for a moving vehicle
 DEPTH_TOLERANCE_NS = 20_000_000  # ns; what the TUM tools use: free-running depth cameras lag by up to half a period

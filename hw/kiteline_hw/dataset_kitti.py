@@ -26,8 +26,9 @@ from kiteline_hw.dataset_files import (
     seconds_to_ns,
     trajectory,
 )
-from kiteline_hw.images import BadImage, ImageFile, decode_grey
+from kiteline_hw.images import ImageFile, decode_grey
 from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.raw_pixels import BadImage
 
 F64 = NDArray[np.float64]
 

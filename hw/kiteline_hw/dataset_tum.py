@@ -22,8 +22,9 @@ from kiteline_hw.dataset_files import (
     seconds_to_ns,
     yaml_number,
 )
-from kiteline_hw.images import BadImage, ImageFile, decode_grey
+from kiteline_hw.images import ImageFile, decode_grey
 from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.raw_pixels import BadImage
 
 DEPTH_SCALE = 5000.0  # stored units a metre, as the data set's page says
 

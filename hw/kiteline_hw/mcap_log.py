@@ -1,15 +1,15 @@
-"""Logs: one MCAP file a process, readable by Foxglove and Lichtblick, recoverable when cut, the same bytes for the same calls.
+"""Logs: one MCAP file a process, readable by Foxglove and Lichtblick, recoverable when cut, reproducible in every byte.
 
 Write::
 
     log = LogWriter(path, {"role": "agent", "agent": "0"})      # metadata record "kiteline"
     log.rig(t_ns, source.rig, source.imu)                       # once, so that the log opens as a source again
-    log.frame(frame)                                            # /left/image, /right/image, /depth/image (encoded bytes kept)
+    log.frame(frame)                                            # /left/image, /right/image, /depth/image
     log.imu(IMU, t_ns, batch)
     log.blob("/packets/in", t_ns, packet)                       # opaque bytes
     log.json("/events", t_ns, {"reset": 1})
     log.transform("/tf", t_ns, "map", "body", T_map_body);  log.pose("/pose", t_ns, "world", T_w_b)
-    log.path("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.scan(...);  log.text("/log", t_ns, "info", "…")
+    log.poses("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.scan(...);  log.text("/log", t_ns, "info", "…")
     log.close()                                                 # also a context manager
 
 Every call takes the flight time that the caller hands in as log time; nothing here reads a clock, so equal calls give
@@ -22,15 +22,14 @@ Read::
         for m in log.messages(["/packets/in", "/left/image"]):  # in the order in which they were written
             m.topic, m.t_ns;  m.blob() | m.json() | m.image() | m.imu() | m.pose() | m.transform()
 
-`read_frame(images, t_ns, has_depth)` decodes logged images to the Frame that the source gave. The whole log is a source as well:
-`open_source("mcap:agent0/log.mcap")` yields the same Frames and ImuBatches.
+`read_frame(images, t_ns, has_depth)` decodes logged images to the Frame that the source gave. The whole log is a source
+as well: `open_source("mcap:agent0/log.mcap")` yields the same Frames and ImuBatches.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -43,12 +42,14 @@ from kiteline_core import se3
 from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_hw import mcap_schemas as schemas
-from kiteline_hw.images import BadImage, decode_depth, decode_grey, encode_depth, encode_image
-from kiteline_hw.mcap_file import McapFile
+from kiteline_hw.images import encode_depth, encode_image
+from kiteline_hw.mcap_log_read import LogMessage, LogReader, read_frame
 from kiteline_hw.ports import SourceError
 from kiteline_hw.rig_json import LENS_NAMES, rig_to_json
 
 F64 = NDArray[np.float64]
+
+__all__ = ["DEPTH", "GROUND_TRUTH", "IMU", "LEFT", "RIG", "RIGHT", "LogMessage", "LogReader", "LogWriter", "read_frame"]
 
 LEFT, RIGHT, DEPTH = "/left/image", "/right/image", "/depth/image"
 IMU, RIG, GROUND_TRUTH = "/imu", "/rig", "/ground_truth"
@@ -162,7 +163,7 @@ class LogWriter:
         _fill_pose(message.pose.position, message.pose.orientation, pose)
         self._add(topic, t_ns, message)
 
-    def path(self, topic: str, t_ns: int, frame_id: str, poses: F64) -> None:
+    def poses(self, topic: str, t_ns: int, frame_id: str, poses: F64) -> None:
         """Poses (n,4,4) in a frame."""
         message = schemas.PosesInFrame(frame_id=frame_id)
         self._stamp(message, t_ns)
@@ -189,7 +190,7 @@ class LogWriter:
         cell_m: float,
         corner_m: tuple[float, float],
     ) -> None:
-        """Occupancy (rows, columns) int8, 0..100 percent, -1 unknown; row 0 is the lowest y, corner_m its lower left."""
+        """Occupancy (rows, columns) int8, 0..100 percent, -1 unknown; row 0 is the lowest y, corner_m lower left."""
         message = schemas.Grid(frame_id=frame_id, column_count=cells.shape[1], row_stride=cells.shape[1], cell_stride=1)
         self._stamp(message, t_ns)
         message.pose.position.x, message.pose.position.y = corner_m
@@ -201,7 +202,7 @@ class LogWriter:
 
     def text(self, topic: str, t_ns: int, level: str, text: str, name: str = "kiteline") -> None:
         """A line of text; level: debug, info, warning, error, fatal."""
-        message = schemas.Log(level=LEVELS[level], message=text, name=name)
+        message = schemas.Log(level=LEVELS[level], message=text, name=name)  # type: ignore[arg-type]
         self._stamp(message, t_ns)
         self._add(topic, t_ns, message)
 
@@ -309,111 +310,7 @@ class LogWriter:
             self.rig(t_ns, rig, imu)
 
 
-@dataclass(frozen=True, slots=True)
-class LogMessage:
-    """One logged message; the accessor that fits its topic decodes it. Raises SourceError when it does not fit."""
-
-    topic: str
-    t_ns: int
-    schema: str
-    data: bytes
-    notes: Mapping[str, str]
-
-    def blob(self) -> bytes:
-        """The bytes that were logged."""
-        data: bytes = self._parse(schemas.Blob).data
-        return data
-
-    def json(self) -> Any:
-        """The value that was logged."""
-        return json.loads(self.data)
-
-    def image(self) -> EncodedImage:
-        """The encoded image; a depth image's format carries its scale."""
-        message = self._parse(schemas.CompressedImage)
-        scale = self.notes.get("depth_scale")
-        return EncodedImage(message.data, f"{message.format}/{scale}" if scale else message.format)
-
-    def imu(self) -> ImuBatch:
-        """The batch of samples."""
-        message = self._parse(schemas.Imu)
-        gyro, accel = (np.array(rows, np.float64).reshape(-1, 3) for rows in (message.gyro, message.accel))
-        return ImuBatch(np.array(message.t_ns, np.int64), gyro, accel)
-
-    def pose(self) -> F64:
-        """The pose (4,4)."""
-        message = self._parse(schemas.PoseInFrame)
-        return _read_pose(message.pose.position, message.pose.orientation)
-
-    def transform(self) -> tuple[str, str, F64]:
-        """Parent frame, child frame, T_parent_child (4,4)."""
-        m = self._parse(schemas.FrameTransform)
-        return m.parent_frame_id, m.child_frame_id, _read_pose(m.translation, m.rotation)
-
-    def _parse(self, message_class: Any) -> Any:
-        expected = message_class.DESCRIPTOR.full_name
-        if self.schema != expected:
-            raise SourceError(f"{self.topic} holds {self.schema}, not {expected}")
-        message = message_class()
-        try:
-            message.ParseFromString(self.data)
-        except Exception as error:
-            raise SourceError(f"{self.topic} at {self.t_ns} ns: damaged {expected}") from error
-        return message
-
-
-class LogReader:
-    """Reads a log, also one that was cut. Raises SourceError when it is no MCAP file."""
-
-    def __init__(self, path: Path | str) -> None:
-        self._file = McapFile(Path(path))
-        self.cut = self._file.cut
-        self.metadata: dict[str, str] = {}
-        for record in self._file.metadata:
-            if record.name == "kiteline":
-                self.metadata = dict(record.metadata)
-        self.topics = {c.topic: self._file.counts.get(i, 0) for i, c in self._file.channels.items()}
-
-    def __enter__(self) -> LogReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-        """Messages of the topics (None: all), in the order in which they were written."""
-        channels = self._file.channels
-        wanted = None if topics is None else [i for i, c in channels.items() if c.topic in topics]
-        for raw in self._file.messages(wanted, ordered=False):
-            channel = channels[raw.channel]
-            schema = self._file.schema_of(raw.channel)
-            name = schema.name if schema is not None else ""
-            yield LogMessage(channel.topic, raw.log_ns, name, raw.data, channel.metadata)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def read_frame(images: Sequence[EncodedImage], t_ns: int, has_depth: bool = False) -> Frame:
-    """The Frame of logged images: left, then right, or (has_depth) depth. Raises SourceError."""
-    try:
-        left, _ = decode_grey(images[0])
-        depth = decode_depth(images[-1])[0] if has_depth and len(images) > 1 else None
-        right = decode_grey(images[1])[0] if len(images) - (depth is not None) > 1 else None
-    except BadImage as error:
-        raise SourceError(f"logged image at {t_ns} ns cannot be decoded: {error}") from error
-    return Frame(t_ns, left, right, depth, tuple(images))
-
-
 def _fill_pose(position: Any, orientation: Any, pose: F64) -> None:
     position.x, position.y, position.z = (float(v) for v in pose[:3, 3])
     q = se3.quaternion_from_rotation(pose[:3, :3])
     orientation.w, orientation.x, orientation.y, orientation.z = (float(v) for v in q)
-
-
-def _read_pose(position: Any, orientation: Any) -> F64:
-    q = np.array([orientation.w, orientation.x, orientation.y, orientation.z])
-    return se3.from_quaternion(q, np.array([position.x, position.y, position.z]))

@@ -127,8 +127,8 @@ def _cameras(name: str, images: list[ImageTopic], calibrations: list[tuple[str, 
     eyes = [i for i in images if not i.depth and i.count]
     if not eyes:
         raise SourceError(
-            f"{name}: no images: expected sensor_msgs/msg/Image, sensor_msgs/msg/CompressedImage, foxglove.CompressedImage "
-            "or foxglove.RawImage"
+            f"{name}: no images: expected sensor_msgs/msg/Image, sensor_msgs/msg/CompressedImage, "
+            "foxglove.CompressedImage or foxglove.RawImage"
         )
     # One topic a camera: rectified before raw, encoded before raw pixels, then the one with most images.
     eyes.sort(key=lambda i: ("rect" not in i.topic, not i.encoded, -i.count, i.topic))
@@ -144,8 +144,8 @@ def _cameras(name: str, images: list[ImageTopic], calibrations: list[tuple[str, 
     if not cameras:
         topics = ", ".join(eye.topic for eye in chosen)
         raise SourceError(
-            f"{name}: no calibration for {topics}: expected sensor_msgs/msg/CameraInfo or foxglove.CameraCalibration with "
-            "the same frame_id"
+            f"{name}: no calibration for {topics}: expected sensor_msgs/msg/CameraInfo or foxglove.CameraCalibration "
+            "with the same frame_id"
         )
     return cameras
 
@@ -228,8 +228,8 @@ def _explain_no_pair(name: str, left: _Camera, right: _Camera, tree: TransformTr
     if t is None:
         raise SourceError(
             f"{name}: {topics}: nothing says how far apart the cameras are (no baseline): expected static transforms "
-            f"between the frames {left.images.frame_id!r} and {right.images.frame_id!r}, or CameraInfo whose P has it; with "
-            "mono (--mono) the left camera alone can be used"
+            f"between the frames {left.images.frame_id!r} and {right.images.frame_id!r}, or CameraInfo whose P has it; "
+            "with mono (--mono) the left camera alone can be used"
         )
     if np.linalg.norm(t[:3, 3]) < 1e-4:
         checked_baseline(t, f"{name}: {topics}")

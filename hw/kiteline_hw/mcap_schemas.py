@@ -6,7 +6,6 @@ samples. Both are protobuf too, so that a viewer that does not know them still o
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 from foxglove_schemas_protobuf import (
@@ -52,8 +51,12 @@ def _own_messages() -> tuple[Any, Any]:
 Blob, Imu = _own_messages()
 
 
-@cache
+_schema_data: dict[str, bytes] = {}
+
+
 def schema_data(message_class: Any) -> bytes:
     """The FileDescriptorSet of a message class, as an MCAP schema holds it."""
-    data: bytes = build_file_descriptor_set(message_class).SerializeToString()
-    return data
+    name: str = message_class.DESCRIPTOR.full_name
+    if name not in _schema_data:
+        _schema_data[name] = build_file_descriptor_set(message_class).SerializeToString()
+    return _schema_data[name]

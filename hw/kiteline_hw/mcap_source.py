@@ -1,8 +1,9 @@
-"""An MCAP recording as a source: ROS 2 bags, Foxglove recordings, and our own logs, which give the very same frames again."""
+"""An MCAP recording as a source: ROS 2 bags, Foxglove recordings, our own logs (which give the very same frames)."""
 
 from __future__ import annotations
 
 import heapq
+import json
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
@@ -83,7 +84,7 @@ class McapSource:
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """Poses of the body that the recording itself calls truth, or the only poses that it has; read when first asked."""
+        """Poses of the body that the recording calls truth, or the only poses that it has; read when first asked."""
         if not self._truth_read:
             self._truth_read = True
             channel = self._truth_channel()
@@ -118,8 +119,6 @@ class McapSource:
         raw = self._file.first(rig_channel)
         if raw is None:
             raise SourceError(f"{self.name}: the log was cut before its calibration")
-        import json
-
         try:
             rig, self.imu = rig_from_json(json.loads(raw.data))
         except ValueError as error:
@@ -268,7 +267,7 @@ class McapSource:
             self.report.skip("damaged chunk", note)
 
     def _in_order(self, with_imu: bool) -> Iterator[tuple[int, int, Any]]:
-        """Images and samples (t_ns, channel, item) in order of their own stamps, which need not be that of recording."""
+        """Images and samples (t_ns, channel, item) in order of their own stamps, not of their recording."""
         wanted = [c for c in (self._left, self._right, self._depth) if c is not None]
         if with_imu and self._imu_channel is not None:
             wanted.append(self._imu_channel)

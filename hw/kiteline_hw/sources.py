@@ -1,5 +1,5 @@
-"""Opens whatever a SOURCE names: `euroc:DIR kitti:DIR tum:DIR mcap:FILE images:GLOB sim:SCENE v4l2:DEV`, or a plain path,
-recognised by its layout.
+"""Opens whatever a SOURCE names: `euroc:DIR kitti:DIR tum:DIR mcap:FILE images:GLOB sim:SCENE v4l2:DEV`, or a plain
+path, recognised by its layout.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ _MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 def open_source(spec: str, mono: bool = False, imu: bool = True) -> FrameSource:
-    """Open a camera or a recording. mono: left images alone, without right eye or depth. imu: False leaves inertial samples
-    out (the body frame stays). Reads calibration only; images are read and decoded while iterating.
+    """Open a camera or a recording. mono: left images alone, without right eye or depth. imu: False leaves inertial
+    samples out (the body frame stays). Reads calibration only; images are read and decoded while iterating.
 
     Raises SourceError that says what was found and what was expected.
     """
