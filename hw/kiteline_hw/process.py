@@ -1,4 +1,4 @@
-"""A process and those who watch over it: signals, systemd, the parent that started it, its memory and its number."""
+"""A process and those who watch over it: signals, systemd, the parent that started it, and what survives its end."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import threading
 from pathlib import Path
 from types import FrameType
 from typing import Any
-
-_MIB = 1024.0 * 1024.0
 
 
 class StopSignal:
@@ -76,15 +74,6 @@ class Parent:
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
             pass  # it is gone: the watch ends us
-
-
-def rss_mib() -> float:
-    """Resident memory of this process in MiB; 0 where the system does not tell."""
-    try:
-        with open("/proc/self/statm", "rb") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / _MIB
-    except (OSError, ValueError, IndexError):
-        return 0.0
 
 
 def next_number(path: Path) -> int:

@@ -1,0 +1,70 @@
+"""A source read one frame ahead: when the next frame comes, what it brings, and what decoding it cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from kiteline_core.frame import Frame, ImuBatch
+
+
+class Camera:
+    """Frames of a source, each with the inertial samples since the one taken before it.
+
+    until_ns: frames with a later stamp are left out; None: all. cpu_clock: process CPU time in ns, handed in.
+    """
+
+    def __init__(self, items: Iterable[Frame | ImuBatch], until_ns: int | None, cpu_clock: Callable[[], int]) -> None:
+        self.decode_ms: list[float] = []
+        self.decode_ns = 0  # process CPU spent on reading and decoding so far
+        self.period_ns = 0  # between the last two frames that were read
+        self._items = iter(items)
+        self._until_ns = until_ns
+        self._clock = cpu_clock
+        self._frame: Frame | None = None
+        self._imu: list[ImuBatch] = []
+        self._advance()
+
+    @property
+    def next_ns(self) -> int | None:
+        """Stamp of the next frame; None after the last."""
+        return None if self._frame is None else self._frame.t_ns
+
+    def take(self) -> tuple[Frame, ImuBatch | None]:
+        """The next frame, and the inertial samples since the one that was taken before it."""
+        assert self._frame is not None, "no frame is left"
+        frame, imu = self._frame, joined(self._imu)
+        self._imu = []
+        self._advance()
+        return frame, imu
+
+    def drop(self) -> None:
+        """Pass over the next frame; its inertial samples go with the one after."""
+        self._advance()
+
+    def _advance(self) -> None:
+        before_ns = self._clock()
+        last, self._frame = self._frame, None
+        for item in self._items:
+            if isinstance(item, ImuBatch):
+                self._imu.append(item)
+                continue
+            if self._until_ns is None or item.t_ns <= self._until_ns:
+                self._frame = item
+            break
+        spent_ns = self._clock() - before_ns
+        self.decode_ns += spent_ns
+        if self._frame is not None:
+            self.decode_ms.append(spent_ns / 1e6)
+            self.period_ns = 0 if last is None else self._frame.t_ns - last.t_ns
+
+
+def joined(batches: Sequence[ImuBatch]) -> ImuBatch | None:
+    """Batches one after the other as one; None where there is none."""
+    if len(batches) < 2:
+        return batches[0] if batches else None
+    return ImuBatch(
+        np.concatenate([batch.t_ns for batch in batches]),
+        np.concatenate([batch.gyro for batch in batches]),
+        np.concatenate([batch.accel for batch in batches]),
+    )

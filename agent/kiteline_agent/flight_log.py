@@ -1,0 +1,87 @@
+"""How the steps of an agent stand in its log: first what went in, then what came out. Pure: the log is handed in.
+
+Each step begins with a /step record (what follows is counted there), so that a reader can group what belongs together.
+Numbers pass through JSON unchanged to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any, Protocol
+
+import numpy as np
+from kiteline_core.frame import Frame, ImuBatch
+from numpy.typing import NDArray
+
+from kiteline_agent.agent import Estimate, StepInput, StepOutput
+
+STEP, IMU, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
+    "/step", "/imu", "/packets/in", "/packets/out", "/estimate", "/events",
+)  # fmt: skip
+
+
+class StepLog(Protocol):
+    """The part of a log that steps are written with; kiteline_hw.mcap_log.LogWriter is one."""
+
+    def frame(self, frame: Frame) -> None: ...
+    def imu(self, topic: str, t_ns: int, batch: ImuBatch) -> None: ...
+    def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
+    def json(self, topic: str, t_ns: int, value: object) -> None: ...
+    def pose(self, topic: str, t_ns: int, frame_id: str, pose: NDArray[np.float64]) -> None: ...
+
+
+def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int) -> None:
+    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+    frame, imu = step_input.frame, step_input.imu
+    log.json(
+        STEP,
+        log_ns,
+        {
+            "now_ns": now_ns,
+            "cpu_ns": step_input.cpu_ns,
+            "frame_ns": None if frame is None else frame.t_ns,
+            "imu": imu is not None,
+            "packets_in": len(step_input.packets),
+            "packets_out": len(output.packets),
+        },
+    )
+    if imu is not None:
+        log.imu(IMU, log_ns, imu)
+    if frame is not None:
+        log.frame(frame)
+    for packet in step_input.packets:
+        log.blob(PACKETS_IN, log_ns, packet)
+    estimate = output.estimate
+    if estimate is not None:
+        log.json(ESTIMATE, log_ns, estimate_to_json(estimate))
+        log.pose("/odometry", log_ns, "odometry", estimate.T_o_b)
+        pose = estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
+        if estimate.tracked and pose is not None:
+            log.pose("/pose", log_ns, "submap" if estimate.T_w_b is None else "world", pose)
+    if output.events:
+        log.json(EVENTS, log_ns, {"events": [repr(event) for event in output.events]})
+    for packet in output.packets:
+        log.blob(PACKETS_OUT, log_ns, packet)
+
+
+def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
+    """Every field of an estimate; matrices (4,4) as 16 numbers in rows."""
+    out: dict[str, Any] = {}
+    for field in fields(estimate):
+        value = getattr(estimate, field.name)
+        out[field.name] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+    return out
+
+
+def estimate_from_json(value: Mapping[str, Any]) -> Estimate:
+    """The estimate of such a record. Raises ValueError when a field is missing or of another shape."""
+    known = {field.name for field in fields(Estimate)}
+    if known != set(value):
+        raise ValueError(f"logged estimate has fields {sorted(value)}, expected {sorted(known)}")
+    return Estimate(**{name: _matrix(v) if isinstance(v, list) else v for name, v in value.items()})
+
+
+def _matrix(numbers: Sequence[float]) -> NDArray[np.float64]:
+    a = np.array(numbers, np.float64)
+    return a.reshape(4, 4) if a.size == 16 else a

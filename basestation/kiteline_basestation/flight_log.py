@@ -1,0 +1,71 @@
+"""How the steps of a base stand in its log: first what went in, then what came out. Pure: the log is handed in.
+
+Each step begins with a /step record. A job's result is not kept, only its fingerprint: a replay works the job out again
+from the same inputs and hands it in at the same step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from kiteline_core.ids import AgentId
+
+from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.station import StationOutput
+
+STEP, JOB = "/step", "/job"
+
+
+class StepLog(Protocol):
+    """The part of a log that steps are written with; kiteline_hw.mcap_log.LogWriter is one."""
+
+    def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
+    def json(self, topic: str, t_ns: int, value: object) -> None: ...
+
+
+def packets_in(agent: int) -> str:
+    """The topic of the packets that came from an agent."""
+    return f"/agent{agent}/packets/in"
+
+
+def packets_out(agent: int) -> str:
+    """The topic of the packets to an agent."""
+    return f"/agent{agent}/packets/out"
+
+
+def write_step(
+    log: StepLog,
+    packets: Mapping[AgentId, Sequence[bytes]],
+    done: Sequence[JobDone],
+    output: StationOutput,
+    now_ns: int,
+    log_ns: int,
+) -> None:
+    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+    log.json(
+        STEP,
+        log_ns,
+        {
+            "now_ns": now_ns,
+            "agents": {str(agent): len(packets[agent]) for agent in sorted(packets)},
+            "done": [job.id for job in done],
+            "jobs": [[job.id, job.kind] for job in output.jobs],
+            "sent": {str(agent): len(out) for agent, out in output.packets},
+        },
+    )
+    for agent in sorted(packets):
+        for packet in packets[agent]:
+            log.blob(packets_in(agent), log_ns, packet)
+    for job in done:
+        log.json(JOB, log_ns, {"id": job.id, "cost_ops": job.cost_ops, "result": fingerprint(job)})
+    for agent, out in output.packets:
+        for packet in out:
+            log.blob(packets_out(agent), log_ns, packet)
+
+
+def fingerprint(done: JobDone) -> str:
+    """A digest of a job's result, equal for equal results."""
+    return hashlib.blake2b(pickle.dumps(done.result, protocol=5), digest_size=16).hexdigest()
