@@ -26,7 +26,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(STAMP): pyproject.toml | $(BIN)/python
-	@echo "installing kiteline and what it needs into $(VENV) (once; some 300 MB)"
+	@echo "installing kiteline and what it needs into $(VENV) (once; about a minute, 1.2 GB of disk)"
 	$(BIN)/python -m pip install --quiet -e '.[base,lab,dev]'
 	@touch $@
 

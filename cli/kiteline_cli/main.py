@@ -49,7 +49,7 @@ KNOWN_ERRORS = (
 )
 
 # Which extra brings a package that the plain install leaves out.
-EXTRAS = {"gtsam": "base", "websockets": "base", "matplotlib": "lab", "scipy": "lab"}
+EXTRAS = {"gtsam": "base", "websockets": "base", "matplotlib": "lab"}
 
 _EXAMPLES = """\
 examples:

@@ -33,7 +33,7 @@ PLAIN = {  # distribution: module, for what the drone needs
 }
 EXTRAS = {
     "base": {"gtsam": "gtsam", "websockets": "websockets"},
-    "lab": {"matplotlib": "matplotlib", "scipy": "scipy"},
+    "lab": {"matplotlib": "matplotlib"},
 }
 WARMING = ("kiteline_codec.warm", "kiteline_agent.warm", "kiteline_basestation.warm")  # each may have warm()
 MIN_MEMORY_MIB = 400  # an agent takes 250 MiB, and compiling its kernels half as much again
