@@ -40,11 +40,9 @@ def summary(agent: dict[str, object], live: Evaluation, base: Evaluation) -> str
         step = e.rpe_frame
         relative = f"{1e3 * step.translation_m.rmse:7.1f} mm{step.rotation_deg.rmse:8.3f}°" if step else ""
         rows.append(f"{name:22}{1e3 * e.ate_m.rmse:7.1f} mm{1e3 * e.ate_m.max:6.0f} mm {relative}")
-    up = agent["bytes_per_keyframe"]
-    rows.append(
-        f"{agent['tracked']} of {agent['frames']} frames tracked over {base.path_m:.1f} m; {agent['keyframes']} keyframes of "
-        f"{float(str(up)) / 1e3:.1f} kB went up the link"
-    )
+    kilobytes = float(str(agent["bytes_per_keyframe"])) / 1e3
+    rows.append(f"{agent['tracked']} of {agent['frames']} frames tracked over {base.path_m:.1f} m of way")
+    rows.append(f"{agent['keyframes']} keyframes went up the link, {kilobytes:.1f} kB each")
     return "\n".join(rows)
 
 
