@@ -1,0 +1,125 @@
+"""Which keyframes see the same points, and the part of the map that a local bundle adjusts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from kiteline_core.bundle import BundleProblem
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.sparse_map import BIRTH, NO_POSE, SparseMap
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import MeasurementConfig, WindowConfig
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of the map as rows and slots, and the problem made of it: same order, same lengths."""
+
+    rows: I32  # (k,) keyframe rows
+    points: I32  # (n,) slots of roots
+    slots: I32  # (m,) slots of the observations
+    problem: BundleProblem
+
+
+def covisible_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, min_shared: int) -> list[KeyframeId]:
+    """Keyframes of the same submap that share at least min_shared points, most first, newer first among equals."""
+    shared = sparse_map.covisible(sparse_map.points_of(keyframe))
+    rows = np.flatnonzero(shared >= max(min_shared, 1))
+    ids = sparse_map.keyframes.id[rows]
+    mine = submap_of_keyframe(keyframe)
+    order = np.lexsort((-ids, -shared[rows]))
+    return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe and submap_of_keyframe(k) == mine]
+
+
+def local_window(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: WindowConfig, measurement: MeasurementConfig
+) -> Window | None:
+    """The keyframe, its most covisible ones, all they see, and the keyframes that hold these points in place."""
+    free = [keyframe, *covisible_keyframes(sparse_map, keyframe, config.min_shared)[: config.free - 1]]
+    return window(sparse_map, free, config, measurement)
+
+
+def window(
+    sparse_map: SparseMap, free: list[KeyframeId], config: WindowConfig, measurement: MeasurementConfig
+) -> Window | None:
+    """The bundle problem whose free keyframes are `free`, all of one submap; the submap's first keyframe never moves."""
+    table, keyframes = sparse_map.keypoints, sparse_map.keyframes
+    submap = submap_of_keyframe(free[0])
+    points = np.unique(np.concatenate([sparse_map.points_of(k) for k in free])).astype(np.int32)
+    _, known = sparse_map.positions(points)
+    points = points[known]
+    starts, slots = sparse_map.observations(points)
+    which = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(starts))
+
+    # Keep the free keyframes, and of the others those that see most.
+    free_rows = np.array([sparse_map.rows[k] for k in free], np.int32)
+    counts = np.bincount(table.row[slots], minlength=len(sparse_map))
+    inside = np.array([k for k in sparse_map.submaps[submap]], np.int64)
+    rows_inside = np.array([sparse_map.rows[KeyframeId(k)] for k in inside.tolist()], np.int32)
+    mask = np.zeros(len(sparse_map), bool)
+    mask[rows_inside] = True
+    mask &= keyframes.pose_source[: len(sparse_map)] != NO_POSE
+    counts[~mask] = 0
+    counts[free_rows] = 0
+    others = np.flatnonzero(counts > 0)
+    order = np.lexsort((-keyframes.id[others], -counts[others]))
+    others = others[order[: config.fixed]].astype(np.int32)
+    rows = np.concatenate([free_rows, others])
+    rows = rows[np.argsort(keyframes.id[rows])]
+    number = np.full(len(sparse_map), -1, np.int32)
+    number[rows] = np.arange(len(rows))
+    keep = number[table.row[slots]] >= 0
+
+    # Points need two views to say anything about poses.
+    seen = np.bincount(which[keep], minlength=len(points))
+    keep &= seen[which] >= 2
+    points = points[seen >= 2]
+    if len(points) < config.min_points:
+        return None
+    slots = slots[keep]
+    starts = np.concatenate([[0], np.cumsum(seen[seen >= 2])]).astype(np.int32)
+
+    moves = np.isin(rows, free_rows) & (keyframes.id[rows] != sparse_map.submaps[submap][0])
+    if moves.all():
+        moves[0] = False
+    if not moves.any():
+        return None
+    positions, _ = sparse_map.positions(points)
+    measured, sigma = measurements(sparse_map, slots, measurement)
+    problem = BundleProblem(
+        _inverted(keyframes.T_m_k[rows]), keyframes.camera[rows], moves, positions, starts,
+        number[table.row[slots]], measured, sigma,
+    )  # fmt: skip
+    return Window(rows, points, slots, problem)
+
+
+def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -> tuple[F64, F64]:
+    """What observations measured, (m,3) u, v, disparity (-1 none) in px, and how well, (m,2) sigma in px."""
+    table = sparse_map.keypoints
+    rows = table.row[slots]
+    deep = np.zeros(len(sparse_map), bool)
+    for row in np.unique(rows).tolist():
+        agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
+        camera = sparse_map.cameras.get(agent)
+        deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
+    ranged = (table.inv_depth[slots] > 0) & deep[rows]
+    measured = np.empty((len(slots), 3))
+    measured[:, :2] = table.uv[slots]
+    measured[:, 2] = np.where(ranged, sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots], -1.0)
+    scale = np.exp2(table.octave[slots].astype(np.float64))
+    pixel = np.where(table.kind[slots] == BIRTH, config.birth_sigma_px, config.sigma_px)
+    return measured, np.stack([pixel * scale, config.sigma_disparity_px * scale], 1)
+
+
+def _inverted(poses: F64) -> F64:
+    out = np.zeros_like(poses)
+    out[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], poses[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out

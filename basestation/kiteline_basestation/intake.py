@@ -1,0 +1,107 @@
+"""Takes up what the agents wrote, in whatever order it comes, and says which keyframes are ready to be used."""
+
+from __future__ import annotations
+
+from kiteline_codec.schema import Births, Camera, Head, Live, Record, Sightings
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.sparse_map import NO_POSE, SparseMap
+
+import numpy as np
+
+from kiteline_basestation.config import IntakeConfig
+
+# A level camera that looks along x of m: x right is -y, y down is -z, z forward is x.
+_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+class Intake:
+    """The agents' records on their way into the map."""
+
+    def __init__(self, config: IntakeConfig, sparse_map: SparseMap) -> None:
+        self._config = config
+        self._map = sparse_map
+        self._pending: dict[KeyframeId, dict[tuple[bool, int], Births | Sightings]] = {}  # sections before their header
+        self._pending_count = 0
+        self._waiting: dict[KeyframeId, int] = {}  # not used yet -> when the header came
+        self._partial: set[KeyframeId] = set()  # used before they were complete
+        self.live: dict[AgentId, Live] = {}
+        self.last_seen_ns: dict[AgentId, int] = {}
+        self.refused = 0  # records that contradict what is known
+
+    def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int) -> None:
+        """Put an agent's records into the map."""
+        for record in records:
+            self.last_seen_ns[agent] = now_ns
+            if isinstance(record, Camera):
+                self._map.set_camera(record.agent, record.camera)
+            elif isinstance(record, Live):
+                held = self.live.get(record.agent)
+                if held is None or record.t_ns >= held.t_ns:
+                    self.live[record.agent] = record
+            elif isinstance(record, Head):
+                self._take_head(record, now_ns)
+            elif isinstance(record, Births | Sightings):
+                if record.keyframe in self._map:
+                    self._take_section(record)
+                elif self._pending_count < self._config.max_pending:
+                    self._pending.setdefault(record.keyframe, {})[isinstance(record, Births), record.part] = record
+                    self._pending_count += 1
+                else:
+                    self.refused += 1
+
+    def ready(self, now_ns: int) -> list[KeyframeId]:
+        """Keyframes to be used now, in order of id: complete ones, those waited for too long, late completions."""
+        self._adopt_orphans(now_ns)
+        out = []
+        patience_ns = round(self._config.patience_s * 1e9)
+        for keyframe, since_ns in sorted(self._waiting.items()):
+            row = self._map.rows[keyframe]
+            if self._map.keyframes.pose_source[row] == NO_POSE or agent_of_keyframe(keyframe) not in self._map.cameras:
+                continue
+            complete = self._map.complete(keyframe)
+            if complete or now_ns - since_ns >= patience_ns:
+                out.append(keyframe)
+                if not complete:
+                    self._partial.add(keyframe)
+        for keyframe in out:
+            del self._waiting[keyframe]
+        late = [k for k in sorted(self._partial) if k not in out and self._map.complete(k)]
+        self._partial.difference_update(late)
+        return sorted(out + late)
+
+    def _take_head(self, head: Head, now_ns: int) -> None:
+        fresh = head.keyframe not in self._map
+        try:
+            self._map.add_keyframe(head.keyframe, head.t_ns, head.parent, head.T_p_k, head.keypoints)
+        except ValueError:
+            self.refused += 1
+            return
+        if fresh:
+            self._waiting[head.keyframe] = now_ns
+        sections = self._pending.pop(head.keyframe, {})
+        self._pending_count -= len(sections)
+        for _, section in sorted(sections.items(), key=lambda item: item[0]):
+            self._take_section(section)
+
+    def _take_section(self, section: Births | Sightings) -> None:
+        if isinstance(section, Births):
+            self._map.put_births(
+                section.keyframe, section.part, section.index, section.uv, section.inv_depth, section.octave,
+                section.angle, section.descriptor,
+            )  # fmt: skip
+        else:
+            self._map.put_sightings(
+                section.keyframe, section.part, section.index, section.uv, section.inv_depth, section.octave,
+                section.point,
+            )  # fmt: skip
+
+    def _adopt_orphans(self, now_ns: int) -> None:
+        """Begin a submap at its oldest known keyframe when its true beginning never comes (a base without its store)."""
+        orphan_ns = round(self._config.orphan_s * 1e9)
+        late = [k for k, since_ns in self._waiting.items() if now_ns - since_ns >= orphan_ns]
+        for submap in sorted({submap_of_keyframe(k) for k in late}):
+            keyframes = self._map.submaps[submap]
+            if all(self._map.pose(k) is None for k in keyframes):
+                table, row = self._map.keyframes, self._map.rows[keyframes[0]]
+                if table.parent[row] != NO_KEYFRAME:
+                    self._map.set_pose(keyframes[0], _LEVEL)

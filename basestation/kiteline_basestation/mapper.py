@@ -1,0 +1,234 @@
+"""The base's algorithm box: what the agents saw goes in, a better map of it comes out.
+
+Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the point culling of ORB-SLAM2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from kiteline_codec.schema import Kind, Record
+from kiteline_core.bundle import BundleResult
+from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.sparse_map import SparseMap
+from numpy.typing import NDArray
+
+from kiteline_basestation import culling, newpoints, refind
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.covisibility import Window, local_window
+from kiteline_basestation.grid import Grid, GridMap
+from kiteline_basestation.intake import Intake
+from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
+from kiteline_basestation.publisher import Published, Publisher, adopt
+from kiteline_basestation.refinement import apply_bundle
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class MapperInput:
+    """What has come since the last step: records by agent, in order of agent id, and finished jobs."""
+
+    arrivals: tuple[tuple[AgentId, tuple[Record, ...]], ...]
+    done: tuple[JobDone, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class MapperOutput:
+    """What is to be shared with each agent, and the work to be done elsewhere."""
+
+    publish: Published
+    jobs: tuple[Job, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class GridView:
+    """The placed part of the map as `grid.build` takes it, and what its rows mean.
+
+    keyframes: (n,) ids of the rows of positions. point_ids: (m,). observations: (k,2) rows of positions and of points.
+    """
+
+    keyframes: I64
+    positions: F64
+    point_ids: I64
+    points: F64
+    observations: I64
+
+
+@dataclass(slots=True)
+class MapperCounts:
+    """What was done so far."""
+
+    keyframes: int = 0
+    found: int = 0  # births recognised as older points
+    triangulated: int = 0  # points that got their first depth here
+    culled: int = 0
+    bundles: int = 0
+    grids: int = 0
+    loops: int = 0
+    merges: int = 0
+
+
+class Mapper:
+    """A state machine without clock, threads or links: the same inputs give the same outputs."""
+
+    def __init__(self, config: BaseConfig | None = None) -> None:
+        self.config = config or BaseConfig()
+        self.map = SparseMap()
+        self.grid = Grid(self.config.grid)
+        self.placements: dict[SubmapId, F64] = {}  # T_w_m of placed submaps
+        self.counts = MapperCounts()
+        self._intake = Intake(self.config.intake, self.map)
+        self._publisher = Publisher(self.map)
+        self._next_job = 1
+        self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
+        self._stale: dict[SubmapId, KeyframeId] = {}  # submaps to be adjusted -> their newest keyframe
+        self._grid_job = 0  # id of the open grid job, 0 none
+        self._grid_due = 0  # keyframes since the last grid
+
+    def step(self, given: MapperInput, now_ns: int) -> MapperOutput:
+        """Take in what came, and say what is to be published and worked on."""
+        for agent, records in given.arrivals:
+            self._intake.take(agent, records, now_ns)  # sections -> map, whatever their order
+        for done in given.done:
+            self._finish(done)  # refined poses and points, outliers, grid
+        for keyframe in self._intake.ready(now_ns):
+            self._place(keyframe)  # the first submap is the world
+            self.counts.found += refind.refind(self.map, keyframe, self.config.refind, self._publisher)
+            self.counts.triangulated += newpoints.triangulate(
+                self.map, keyframe, self.config.new_points, self.config.measurement, self._publisher
+            )
+            self.counts.culled += culling.cull_weak(self.map, keyframe, self.config.cull, self._publisher)
+            self._stale[submap_of_keyframe(keyframe)] = keyframe
+            self._grid_due += 1
+            self.counts.keyframes += 1
+        jobs = self._bundle_jobs() + self._grid_jobs()
+        return MapperOutput(self._publisher.collect(), tuple(jobs))
+
+    def adopt(self, record: Record) -> None:
+        """Compute on with a published record as the other side will hold it."""
+        adopt(self.map, record)
+
+    @property
+    def idle(self) -> bool:
+        """Whether no job is open and none is due."""
+        return not self._windows and not self._stale and self._grid_job == 0
+
+    def summary(self) -> dict[str, object]:
+        """Numbers for people: what the base knows of each agent, and the size of the map."""
+        agents = {}
+        for agent in sorted(self.map.cameras.keys() | self._intake.last_seen_ns.keys()):
+            live = self._intake.live.get(agent)
+            agents[int(agent)] = {
+                "keyframes": sum(len(ks) for s, ks in self.map.submaps.items() if agent_of_keyframe(ks[0]) == agent),
+                "submaps": sum(1 for ks in self.map.submaps.values() if agent_of_keyframe(ks[0]) == agent),
+                "last_seen_ns": self._intake.last_seen_ns.get(agent),
+                "live_t_ns": live.t_ns if live else None,
+                "quality": live.quality if live else None,
+                "T_w_c": self._live_pose(agent),
+            }
+        return {
+            "keyframes": len(self.map),
+            "points": len(self.map.roots()),
+            "observations": int(np.count_nonzero(self.map.keypoints.usable[: self.map.slots])),
+            "map_bytes": self.map.nbytes(),
+            "agents": agents,
+            "submaps_placed": len(self.placements),
+            "refused_records": self._intake.refused,
+            "found": self.counts.found,
+            "triangulated": self.counts.triangulated,
+            "culled": self.counts.culled,
+            "bundles": self.counts.bundles,
+            "grids": self.counts.grids,
+            "loops": self.counts.loops,
+            "merges": self.counts.merges,
+            "jobs_open": len(self._windows) + (self._grid_job != 0),
+        }
+
+    def world_view(self) -> GridView:
+        """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
+        rows, positions = [], []
+        for submap in sorted(self.placements):
+            T_w_m = self.placements[submap]
+            for keyframe in self.map.submaps.get(submap, []):
+                pose = self.map.pose(keyframe)
+                if pose is not None:
+                    rows.append(self.map.rows[keyframe])
+                    positions.append((T_w_m @ pose)[:3, 3])
+        number = np.full(len(self.map), -1, np.int64)
+        number[rows] = np.arange(len(rows))
+        points = self.map.roots()
+        xyz, known = self.map.positions(points)
+        known &= number[self.map.keypoints.row[points]] >= 0
+        points, xyz = points[known], xyz[known]
+        starts, slots = self.map.observations(points)
+        seen = np.diff(starts)
+        which = np.repeat(np.arange(len(points)), seen)
+        keep = (seen >= 2)[which] & (number[self.map.keypoints.row[slots]] >= 0)
+        renumber = np.cumsum(seen >= 2) - 1
+        pairs = np.stack([number[self.map.keypoints.row[slots[keep]]], renumber[which[keep]]], 1).astype(np.int64)
+        points, xyz = points[seen >= 2], xyz[seen >= 2]
+        for submap in sorted(self.placements):
+            inside = self.map.point_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
+            T = self.placements[submap]
+            xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
+        return GridView(
+            self.map.keyframes.id[rows].copy(), np.array(positions).reshape(-1, 3), self.map.point_ids(points), xyz, pairs
+        )
+
+    # -- inside ------------------------------------------------------------------------------------------------------
+
+    def _place(self, keyframe: KeyframeId) -> None:
+        submap = submap_of_keyframe(keyframe)
+        if not self.placements:
+            self.placements[submap] = np.eye(4)
+            self._publisher.place(submap, np.eye(4))
+
+    def _finish(self, done: JobDone) -> None:
+        if isinstance(done.result, BundleResult):
+            opened = self._windows.pop(done.id, None)
+            if opened is not None:  # else superseded
+                apply_bundle(
+                    self.map, opened[1], done.result, self._publisher, self.config.cull, self.config.publish
+                )  # fmt: skip
+                self.counts.bundles += 1
+        elif isinstance(done.result, GridMap) and done.id == self._grid_job:
+            self._grid_job = 0
+            self.counts.grids += 1
+            tiles = self.grid.adopt(done.result)
+            for agent in sorted({agent_of_keyframe(self.map.submaps[s][0]) for s in self.placements}):
+                for tile in tiles:
+                    self._publisher.send(agent, tile)
+
+    def _bundle_jobs(self) -> list[Job]:
+        """One bundle at a time for each submap, around its newest keyframe."""
+        busy = {submap for submap, _ in self._windows.values()}
+        jobs = []
+        for submap in sorted(self._stale.keys() - busy):
+            keyframe = self._stale.pop(submap)
+            part = local_window(self.map, keyframe, self.config.window, self.config.measurement)
+            if part is not None:
+                jobs.append(Job(self._next_job, "bundle", BundleInputs(part.problem, self.config.bundle)))
+                self._windows[self._next_job] = (submap, part)
+                self._next_job += 1
+        return jobs
+
+    def _grid_jobs(self) -> list[Job]:
+        if self._grid_job or self._grid_due < self.config.publish.grid_every:
+            return []
+        self._grid_due = 0
+        view = self.world_view()
+        self._grid_job = self._next_job
+        self._next_job += 1
+        return [Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.observations))]
+
+    def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
+        live = self._intake.live.get(agent)
+        pose = self.map.pose(live.keyframe) if live else None
+        T_w_m = self.placements.get(submap_of_keyframe(live.keyframe)) if live else None
+        if live is None or pose is None or T_w_m is None:
+            return None
+        out: list[list[float]] = (T_w_m @ pose @ live.T_k_c).tolist()
+        return out

@@ -1,0 +1,87 @@
+"""Gathers what changed in the map and words it as records for the agents that own the keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+from kiteline_codec.schema import Culled, Depths, Found, Kind, Placement, Pose, Record, Removed
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap
+from kiteline_core.sparse_map import BIRTH, CULLED, REFINED, REFINED_POSE, REMOVED, SparseMap
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
+
+
+class Publisher:
+    """The dirty values of the base. A record always tells the whole value, so that a later one replaces an earlier."""
+
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self._map = sparse_map
+        self._dirty: set[tuple[int, KeyframeId]] = set()
+        self._records: list[tuple[AgentId, Record]] = []
+
+    def touch(self, kind: Kind, keyframe: KeyframeId) -> None:
+        """A value of a keyframe has changed."""
+        self._dirty.add((int(kind), keyframe))
+
+    def touch_slots(self, kind: Kind, slots: I32) -> None:
+        """Values of the keyframes that own these slots have changed."""
+        for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
+            self.touch(kind, KeyframeId(keyframe))
+
+    def place(self, submap: SubmapId, T_w_m: F64) -> None:
+        """A submap has a new place in the world."""
+        self._records.append((agent_of_submap(submap), Placement(submap, T_w_m)))
+
+    def send(self, agent: AgentId, record: Record) -> None:
+        """Any other record, as it is."""
+        self._records.append((agent, record))
+
+    def collect(self) -> Published:
+        """All that changed since the last call, by agent, in order of kind and keyframe."""
+        out: dict[AgentId, list[Record]] = {}
+        for agent, record in self._records:
+            out.setdefault(agent, []).append(record)
+        for kind, keyframe in sorted(self._dirty):
+            made = self._record(Kind(kind), keyframe)
+            if made is not None:
+                out.setdefault(agent_of_keyframe(keyframe), []).append(made)
+        self._records.clear()
+        self._dirty.clear()
+        return tuple((agent, tuple(records)) for agent, records in sorted(out.items()))
+
+    def _record(self, kind: Kind, keyframe: KeyframeId) -> Record | None:
+        sparse_map, table = self._map, self._map.keypoints
+        slots = sparse_map.slots_of(keyframe)
+        row = sparse_map.rows[keyframe]
+        born = table.kind[slots] == BIRTH
+        if kind is Kind.POSE:
+            if sparse_map.keyframes.pose_source[row] != REFINED_POSE:
+                return None
+            return Pose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
+        if kind is Kind.DEPTHS:
+            here = slots[born & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)]
+            return Depths(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
+        if kind is Kind.FOUND:
+            here = slots[born & (table.root[slots] != slots)]
+            return Found(keyframe, self._index(here), sparse_map.point_ids(table.root[here]))
+        if kind is Kind.REMOVED:
+            return Removed(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
+        if kind is Kind.CULLED:
+            here = slots[born & (table.flags[slots] & CULLED != 0)]
+            return Culled(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
+        raise ValueError(f"the base writes no {kind.name} of a keyframe")
+
+    def _index(self, slots: I32) -> NDArray[np.uint16]:
+        return self._map.keypoint_of(slots).astype(np.uint16)
+
+
+def adopt(sparse_map: SparseMap, record: Record) -> None:
+    """Compute on with a record as the other side holds it: quantisation changes poses and depths only."""
+    if isinstance(record, Pose):
+        sparse_map.set_pose(record.keyframe, record.T_m_k)
+    elif isinstance(record, Depths):
+        start = int(sparse_map.keyframes.start[sparse_map.rows[record.keyframe]])
+        sparse_map.set_depths((start + record.index.astype(np.int32)).astype(np.int32), record.inv_depth, record.offset)

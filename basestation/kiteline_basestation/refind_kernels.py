@@ -1,0 +1,106 @@
+"""Kernels that match descriptors: of projected points in a circle, of keypoints along epipolar lines."""
+
+from __future__ import annotations
+
+import numpy as np
+from kiteline_core.jit import njit
+
+_M1 = np.uint64(0x5555555555555555)
+_M2 = np.uint64(0x3333333333333333)
+_M4 = np.uint64(0x0F0F0F0F0F0F0F0F)
+_H = np.uint64(0x0101010101010101)
+_S1, _S2, _S4, _S56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
+
+
+@njit
+def hamming(a, i, b, j):  # type: ignore[no-untyped-def]
+    """Bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
+    total = 0
+    for k in range(4):
+        x = a[i, k] ^ b[j, k]
+        x = x - ((x >> _S1) & _M1)
+        x = (x & _M2) + ((x >> _S2) & _M2)
+        x = (x + (x >> _S4)) & _M4
+        total += np.int64((x * _H) >> _S56)
+    return total
+
+
+@njit
+def match_projected(  # type: ignore[no-untyped-def]
+    uv, octave, angle, disparity, descriptor, uv2, octave2, angle2, disparity2, descriptor2,
+    radius_px, octave_gap, angle_gap, disparity_px, max_hamming, ratio, best, distance,
+):  # fmt: skip
+    """The keypoint that shows each projected point, and the point that each keypoint shows, where both agree.
+
+    Points: foreseen uv (n,2) px, octave (n,) float, angle (n,) 1/256 turns, disparity (n,) px, descriptor (n,4) uint64.
+    Keypoints: the same, measured; disparity2 (m,) negative where unknown. Writes best (n,) keypoint or -1, distance (n,).
+    """
+    n, m = uv.shape[0], uv2.shape[0]
+    owner = np.full(m, -1, np.int32)
+    owner_distance = np.full(m, 1 << 20, np.int32)
+    for i in range(n):
+        best[i] = -1
+        first, second, chosen = 1 << 20, 1 << 20, -1
+        for j in range(m):
+            scale = 2.0 ** octave2[j]
+            r = radius_px * scale
+            du, dv = uv2[j, 0] - uv[i, 0], uv2[j, 1] - uv[i, 1]
+            if abs(dv) > r or abs(du) > r or du * du + dv * dv > r * r:
+                continue
+            if abs(octave2[j] - octave[i]) > octave_gap:
+                continue
+            turn = (int(angle2[j]) - int(angle[i])) & 255
+            if min(turn, 256 - turn) > angle_gap:
+                continue
+            if disparity2[j] >= 0.0 and abs(disparity2[j] - disparity[i]) > disparity_px * scale:
+                continue
+            d = hamming(descriptor, i, descriptor2, j)
+            if d < first:
+                first, second, chosen = d, first, j
+            elif d < second:
+                second = d
+        if chosen >= 0 and first <= max_hamming and first <= ratio * second:
+            distance[i] = first
+            if first < owner_distance[chosen]:
+                if owner[chosen] >= 0:
+                    best[owner[chosen]] = -1
+                owner[chosen], owner_distance[chosen] = i, first
+                best[i] = chosen
+
+
+@njit
+def match_epipolar(  # type: ignore[no-untyped-def]
+    uv, octave, descriptor, uv2, octave2, descriptor2, fundamental, epipolar_px, max_hamming, ratio, best, distance
+):
+    """The keypoint of a second view that lies on each keypoint's line and looks like it, each taken once.
+
+    fundamental (3,3): line2 = fundamental @ (u, v, 1). Writes best (n,) int32, -1 none, and distance (n,) in bits.
+    """
+    n, m = uv.shape[0], uv2.shape[0]
+    owner = np.full(m, -1, np.int32)
+    owner_distance = np.full(m, 1 << 20, np.int32)
+    for i in range(n):
+        best[i] = -1
+        a = fundamental[0, 0] * uv[i, 0] + fundamental[0, 1] * uv[i, 1] + fundamental[0, 2]
+        b = fundamental[1, 0] * uv[i, 0] + fundamental[1, 1] * uv[i, 1] + fundamental[1, 2]
+        c = fundamental[2, 0] * uv[i, 0] + fundamental[2, 1] * uv[i, 1] + fundamental[2, 2]
+        norm = np.sqrt(a * a + b * b)
+        if norm < 1e-12:
+            continue
+        first, second, chosen = 1 << 20, 1 << 20, -1
+        for j in range(m):
+            gap = abs(a * uv2[j, 0] + b * uv2[j, 1] + c) / norm
+            if gap > epipolar_px * 2.0 ** octave2[j] or abs(int(octave2[j]) - int(octave[i])) > 1:
+                continue
+            d = hamming(descriptor, i, descriptor2, j)
+            if d < first:
+                first, second, chosen = d, first, j
+            elif d < second:
+                second = d
+        if chosen >= 0 and first <= max_hamming and first <= ratio * second:
+            distance[i] = first
+            if first < owner_distance[chosen]:
+                if owner[chosen] >= 0:
+                    best[owner[chosen]] = -1
+                owner[chosen], owner_distance[chosen] = i, first
+                best[i] = chosen

@@ -1,0 +1,91 @@
+"""Takes the result of a bundle into the map: poses, points, and the observations that did not agree."""
+
+from __future__ import annotations
+
+import numpy as np
+from kiteline_codec.schema import Kind
+from kiteline_core.bundle import BundleResult
+from kiteline_core.ids import KeyframeId
+from kiteline_core.sparse_map import BIRTH, CULLED, REMOVED, SparseMap
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import CullConfig, PublishConfig
+from kiteline_basestation.covisibility import Window
+from kiteline_basestation.publisher import Publisher
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+
+def apply_bundle(
+    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, cull: CullConfig,
+    publish: PublishConfig,
+) -> None:  # fmt: skip
+    """Write what a bundle found where it differs enough from what both sides hold."""
+    if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
+        return
+    _poses(sparse_map, window, result, publisher, publish)
+    dropped = _observations(sparse_map, window, result, publisher, cull)
+    _points(sparse_map, window, result, dropped, publisher, cull, publish)
+
+
+def _poses(
+    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, publish: PublishConfig
+) -> None:
+    for i in np.flatnonzero(window.problem.free).tolist():
+        row = int(window.rows[i])
+        keyframe = KeyframeId(int(sparse_map.keyframes.id[row]))
+        new = np.linalg.inv(result.T_c_m[i])
+        old = sparse_map.keyframes.T_m_k[row]
+        moved = float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
+        turned = float(np.linalg.norm(new[:3, :3] - old[:3, :3])) / np.sqrt(2.0)  # chord: the angle when small
+        if moved > publish.pose_m or turned > publish.pose_rad:
+            sparse_map.set_pose(keyframe, new)
+            publisher.touch(Kind.POSE, keyframe)
+
+
+def _observations(
+    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, cull: CullConfig
+) -> NDArray[np.bool_]:
+    """Remove outliers. Returns which points of the window (n,) have too few observations left, and drops them."""
+    table = sparse_map.keypoints
+    starts = window.problem.starts
+    which = np.repeat(np.arange(len(window.points)), np.diff(starts))
+    current = table.root[window.slots] == window.points[which]  # else it was fused or taken away meanwhile
+    bad = window.slots[~result.inlier & current]
+    if len(bad):
+        sparse_map.set_flags(bad, REMOVED)
+        publisher.touch_slots(Kind.REMOVED, bad)
+    left = np.diff(sparse_map.observations(window.points)[0])
+    dropped = np.asarray((left < cull.min_observations) & (table.root[window.points] == window.points))
+    drop_points(sparse_map, window.points[dropped], publisher)
+    return dropped
+
+
+def _points(
+    sparse_map: SparseMap, window: Window, result: BundleResult, dropped: NDArray[np.bool_], publisher: Publisher,
+    cull: CullConfig, publish: PublishConfig,
+) -> None:  # fmt: skip
+    table = sparse_map.keypoints
+    alive = ~dropped & (table.root[window.points] == window.points) & (table.flags[window.points] & CULLED == 0)
+    points, positions = window.points[alive], result.points[alive]
+    inv, offset, ahead = sparse_map.bearing_of(points, positions)
+    far_off = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > cull.max_offset_px * np.exp2(table.octave[points]))
+    drop_points(sparse_map, points[far_off], publisher)
+    points, inv, offset = points[~far_off], inv[~far_off], offset[~far_off]
+    bf = sparse_map.keyframes.camera[table.row[points], 4]
+    change = np.maximum(
+        np.abs(inv - sparse_map.inverse_depths(points)) * bf, np.abs(offset - table.offset[points]).max(axis=1, initial=0.0)
+    )
+    moved = points[change > publish.depth_px]
+    if len(moved):
+        sparse_map.set_depths(moved, inv[change > publish.depth_px], offset[change > publish.depth_px])
+        publisher.touch_slots(Kind.DEPTHS, moved)
+
+
+def drop_points(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:
+    """Cull points (n,) by their slots."""
+    points = points[sparse_map.keypoints.kind[points] == BIRTH]
+    if len(points):
+        sparse_map.set_flags(points, CULLED)
+        publisher.touch_slots(Kind.CULLED, points)

@@ -1,0 +1,117 @@
+"""A synthetic flight: points on the walls of a room, keyframes along a path, a forgetful tracker, noisy pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
+from kiteline_core import se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+@dataclass
+class Flight:
+    """Records by keyframe, and the truth. agent_T_m_k: the poses that the agent believes in (they drift)."""
+
+    camera: RectifiedCamera
+    agent: AgentId
+    world: F64
+    keyframes: list[KeyframeId] = field(default_factory=list)
+    true_T_m_k: list[F64] = field(default_factory=list)
+    agent_T_m_k: list[F64] = field(default_factory=list)
+    records: list[list[Record]] = field(default_factory=list)
+    point_of: dict[int, int] = field(default_factory=dict)  # point id -> row of world
+
+    def all_records(self) -> list[Record]:
+        """Everything in order, the camera first."""
+        return [Camera(self.agent, self.camera), *(r for part in self.records for r in part)]
+
+
+def fly(
+    keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3, drift_m: float = 0.004,
+    outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0, missed: float = 0.1,
+    no_depth: float = 0.0,
+) -> Flight:  # fmt: skip
+    """Fly a circle of 1.2 m radius, looking outwards. memory: keyframes after which the tracker forgets a point."""
+    rng = np.random.default_rng(seed)
+    camera = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, stereo, np.eye(4))
+    half = np.array([4.0, 3.5, 1.5])
+    world = rng.uniform(-1, 1, (points, 3)) * half
+    wall = rng.integers(0, 2, points)
+    world[np.arange(points), wall] = np.sign(world[np.arange(points), wall]) * half[wall]
+    descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
+    size, direction = rng.uniform(-0.4, 1.4, points), rng.integers(0, 256, points)
+    flight = Flight(camera, AgentId(agent), world)
+    submap = submap_id(agent, 1, 0)
+    tracked: dict[int, tuple[int, int]] = {}  # row of world -> point id, number of the keyframe that last saw it
+    for n in range(keyframes):
+        phi = 2 * np.pi * turns * n / keyframes
+        forward = np.array([np.cos(phi), np.sin(phi), 0.05 * np.sin(3 * phi)])
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward], 1)
+        true = se3.from_rt(rotation, np.array([1.2 * np.cos(phi), 1.2 * np.sin(phi), 0.2 * np.sin(2 * phi)]))
+        if n == 0:
+            parent, T_p_k = NO_KEYFRAME, true
+        else:
+            step = np.concatenate([rng.normal(0, drift_m, 3), rng.normal(0, drift_m / 3, 3)])
+            parent, T_p_k = flight.keyframes[-1], se3.inverse(flight.true_T_m_k[-1]) @ true @ se3.exp(step)
+        believed = T_p_k if n == 0 else flight.agent_T_m_k[-1] @ T_p_k
+        keyframe = keyframe_id(submap, n)
+        local = se3.transform(se3.inverse(true), world)
+        z = np.maximum(local[:, 2], 0.01)
+        uv = np.stack([420 * local[:, 0] / z + 376, 420 * local[:, 1] / z + 240], 1)
+        seen = (local[:, 2] > 0.3) & (uv > 8).all(1) & (uv < [744, 472]).all(1) & (rng.random(points) > missed)
+        rows = rng.permutation(np.flatnonzero(seen))[:300]
+        octave = np.clip(np.rint(size[rows] + np.log2(3.0 / z[rows])), 0, 2).astype(np.uint8)
+        px = np.exp2(octave)[:, None] * rng.normal(0, noise_px, (len(rows), 3))
+        wild = rng.random(len(rows)) < outliers
+        px[wild] += rng.choice([-12.0, 12.0], (int(wild.sum()), 3))
+        measured = (uv[rows] + px[:, :2]).astype(np.float32)
+        disparity = np.maximum(420 * 0.11 / z[rows] + px[:, 2], 0.2)
+        inverse = (disparity / (420 * 0.11)).astype(np.float32)
+        inverse[(not stereo) | (rng.random(len(rows)) < no_depth)] = 0.0
+        known = np.array([r in tracked and n - tracked[r][1] <= memory for r in rows.tolist()], bool)
+        ids = np.array([tracked[r][0] if k else -1 for r, k in zip(rows.tolist(), known, strict=True)], np.int64)
+        flips = np.packbits(rng.random((len(rows), 256)) < 0.06, axis=1)
+        made: list[Record] = [Head(keyframe, 10**9 + n * 250_000_000, parent, T_p_k, len(rows))]
+        index = np.arange(len(rows), dtype=np.uint16)
+        for kind, mask in (("birth", ~known), ("sighting", known)):
+            for part, some in enumerate(np.array_split(np.flatnonzero(mask), 3)):
+                if kind == "birth":
+                    angle = ((direction[rows[some]] + rng.integers(-5, 6, len(some))) & 255).astype(np.uint8)
+                    made.append(
+                        Births(
+                            keyframe, part, index[some], measured[some], inverse[some], octave[some], angle,
+                            descriptors[rows[some]] ^ flips[some],
+                        )  # fmt: skip
+                    )
+                else:
+                    made.append(
+                        Sightings(keyframe, part, index[some], measured[some], inverse[some], octave[some], ids[some])
+                    )
+        for i, r in enumerate(rows.tolist()):
+            if known[i]:
+                tracked[r] = (tracked[r][0], n)
+            else:
+                tracked[r] = (int(point_id(keyframe, i)), n)
+                flight.point_of[tracked[r][0]] = r
+        flight.keyframes.append(keyframe)
+        flight.true_T_m_k.append(true)
+        flight.agent_T_m_k.append(believed)
+        flight.records.append(made)
+    return flight
+
+
+@pytest.fixture
+def make_flight() -> Callable[..., Flight]:
+    """The maker of synthetic flights."""
+    return fly
