@@ -1,0 +1,315 @@
+"""The onboard half: one step takes a frame, inertial samples and packets, and gives a pose and packets. Sans-IO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
+from kiteline_core import se3
+from kiteline_core.cameras import CameraRig, Rectifier
+from kiteline_core.features import build_pyramid
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
+from numpy.typing import NDArray
+
+from kiteline_agent import keyframes
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.inertial import GyroPreintegrator, level_rotation
+from kiteline_agent.keyframe_maker import KeyframeMaker
+from kiteline_agent.local_map import LocalMap
+from kiteline_agent.tracker import Track, Tracker, View
+
+F64 = NDArray[np.float64]
+
+_SHARPEN_INFLATION = 6.0  # successive sightings share the template's error: six of them count as one
+_FAILURES_BEFORE_SUBMAP = 2  # tries to find the old map before a new one opens
+_MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who this agent is. boot: counts starts, never reused."""
+
+    agent: AgentId
+    boot: int
+
+
+@dataclass(frozen=True, slots=True)
+class StepInput:
+    """All that enters a step. cpu_ns: process CPU time that the last frame took, as measured or modelled outside."""
+
+    frame: Frame | None = None
+    imu: ImuBatch | None = None
+    packets: tuple[bytes, ...] = ()
+    cpu_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is known of the vehicle at one frame.
+
+    tracked: T_m_b is measured from at least 15 image inliers. T_m_b: (4,4) body in the submap frame, or None. T_o_b:
+    (4,4) body in the odometry frame, always continuous. keyframe, T_k_c: the same pose relative to a keyframe's camera.
+    T_w_b: (4,4) in the world, once the base has placed the submap. quality: -1 lost, 1..100.
+    """
+
+    t_ns: int
+    tracked: bool
+    bridged: bool
+    T_m_b: F64 | None
+    T_o_b: F64
+    keyframe: KeyframeId
+    T_k_c: F64
+    submap: SubmapId
+    inliers: int
+    quality: int
+    T_w_b: F64 | None
+
+
+@dataclass(frozen=True, slots=True)
+class StepOutput:
+    """All that leaves a step. events: short words for the log, in order."""
+
+    estimate: Estimate | None
+    packets: tuple[bytes, ...]
+    events: tuple[str, ...]
+
+
+class Agent:
+    """Tracks a camera against its own local map, shares keyframes, and takes over what the base makes of them."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        imu: ImuCalibration | None,
+        config: AgentConfig,
+        identity: Identity,
+        channel: RecordChannel,
+    ) -> None:
+        self._config = config
+        self._identity = identity
+        self._channel = channel
+        self._rectifier = Rectifier(rig)
+        self._camera = self._rectifier.camera
+        self._T_c_b = se3.inverse(self._camera.T_b_c)
+        self._has_imu = imu is not None
+        self._gyro = GyroPreintegrator()
+        self.map = LocalMap(self._camera, config.local_map, config.depth_filter)
+        self._tracker = Tracker(self.map, config)
+        self._maker = KeyframeMaker(self.map, self._camera, config, channel)
+        self._events: list[str] = []
+        self._frame_number = 0
+        self._last_t_ns: int | None = None
+        self._submap_number = -1
+        self._sequence = 0
+        self._failures = 0
+        self._T_m_c = np.eye(4)
+        self._T_o_m = np.eye(4)
+        self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame: the motion model
+        self._velocity_m: F64 = np.zeros(3)  # m/s in the submap frame
+        self._reference: KeyframeId = NO_KEYFRAME
+        self._T_k_c = np.eye(4)
+        self._reference_inliers = 0
+        self._keyframe_t_ns = 0
+        self._keyframe_frame = 0
+        self._placements: dict[SubmapId, F64] = {}
+        self.tiles: dict[tuple[int, int], Tile] = {}
+        channel.put(Camera(identity.agent, self._camera))
+
+    # one step
+
+    def step(self, step_input: StepInput, now_ns: int) -> StepOutput:
+        """Take in what arrived, track the frame if there is one, say what is to be sent. Never waits."""
+        self._events = []
+        self._take_corrections(self._channel.receive(step_input.packets, now_ns))
+        estimate = None
+        if step_input.frame is not None:
+            estimate = self._process(step_input.frame, step_input.imu)
+        return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(self._events))
+
+    def _process(self, frame: Frame, imu: ImuBatch | None) -> Estimate:
+        # 1. Rectify and build pyramids.
+        view = self._view(frame)
+        # 2. Predict from the gyro or from the last motion.
+        turn, dt_s = self._turn_since_last(frame.t_ns, imu)
+        predicted = self._predict(turn, dt_s)
+        # 3. Track against the local map, or begin a map.
+        self._frame_number += 1
+        track = None
+        if self._submap_number >= 0:
+            track = self._tracker.track(view, se3.inverse(predicted), self._frame_number)
+        if track is not None and track.inliers >= self._config.pose.min_inliers:
+            self._accept(track, turn, dt_s)
+            # 4. Make a keyframe where the policy asks for one.
+            self._keyframe_if_due(view, track, frame.t_ns)
+            tracked = True
+        else:
+            self._failures += 1
+            self._T_m_c = predicted
+            self._refresh_relative()
+            tracked = self._begin_submap(view, frame.t_ns, imu)
+        inliers = track.inliers if track is not None else 0
+        self._last_t_ns = frame.t_ns
+        self._gyro.remember(imu)
+        return self._estimate(frame.t_ns, inliers, tracked=tracked)
+
+    def _view(self, frame: Frame) -> View:
+        levels = self._config.pyramid.levels
+        left = build_pyramid(self._rectifier.left(frame.left), levels)
+        right = None if frame.right is None else build_pyramid(self._rectifier.right(frame.right), levels)
+        depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
+        return View(left, right, depth)
+
+    # motion model
+
+    def _turn_since_last(self, t_ns: int, imu: ImuBatch | None) -> tuple[F64 | None, float]:
+        """R_b0_b1 by the gyro since the last frame (None without one), and the time passed in s."""
+        if self._last_t_ns is None:
+            return None, 0.0
+        turn = self._gyro.turn(imu, self._last_t_ns, t_ns) if self._has_imu else None
+        return turn, (t_ns - self._last_t_ns) * 1e-9
+
+    def _predict(self, turn_R_b0_b1: F64 | None, dt_s: float) -> F64:
+        """T_m_c of this frame from the last pose: constant velocity, turned by the gyro where there is one."""
+        if turn_R_b0_b1 is None:
+            return se3.orthonormalise(self._T_m_c @ self._step_T)
+        R_b_c = self._camera.T_b_c[:3, :3]
+        T = self._T_m_c.copy()
+        T[:3, :3] = T[:3, :3] @ (R_b_c.T @ turn_R_b0_b1 @ R_b_c)
+        T[:3, 3] += self._velocity_m * dt_s
+        return se3.orthonormalise(T)
+
+    def _accept(self, track: Track, turn_R_b0_b1: F64 | None, dt_s: float) -> None:
+        """Take over a measured pose and what it says of the points and of the motion."""
+        before = self._T_m_c
+        self._T_m_c = se3.inverse(track.T_c_m)
+        self._step_T = se3.orthonormalise(se3.inverse(before) @ self._T_m_c)
+        if dt_s > 0.0:
+            self._velocity_m = (self._T_m_c[:3, 3] - before[:3, 3]) / dt_s
+            if turn_R_b0_b1 is not None and self._failures == 0:
+                R_b_c = self._camera.T_b_c[:3, :3]
+                self._gyro.correct(R_b_c @ self._step_T[:3, :3] @ R_b_c.T, turn_R_b0_b1, dt_s)
+        self._failures = 0
+        self.map.note_tracking(track.rows, track.inlier, self._frame_number)
+        self.map.sharpen(
+            track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, _SHARPEN_INFLATION
+        )
+        self._refresh_relative()
+
+    def _refresh_relative(self) -> None:
+        slot = self.map.slot_of(self._reference)
+        if slot >= 0:
+            self._T_k_c = se3.inverse(self.map.T_m_k[slot]) @ self._T_m_c
+
+    # keyframes and submaps
+
+    def _keyframe_if_due(self, view: View, track: Track, t_ns: int) -> None:
+        slot = self.map.slot_of(self._reference)
+        frames_since = self._frame_number - self._keyframe_frame
+        if frames_since == 1:
+            self._reference_inliers = track.inliers
+        what = keyframes.situation(
+            track, self._camera, self.map.T_m_k[slot], frames_since, (t_ns - self._keyframe_t_ns) * 1e-9,
+            self._reference_inliers,
+        )  # fmt: skip
+        why = keyframes.why_keyframe(what, self._config.keyframe)
+        if why is None:
+            return
+        self._events.append(f"keyframe: {why}")
+        self._sequence += 1
+        self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
+
+    def _add_keyframe(self, view: View, track: Track | None, t_ns: int, parent: KeyframeId, T_p_k: F64) -> None:
+        keyframe = keyframe_id(self.submap, self._sequence)
+        T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
+        # The keyframe's pose is its code's value: move with it by the rounding, and let odometry absorb it.
+        self._reference, self._T_k_c = keyframe, np.eye(4)
+        self._keyframe_t_ns, self._keyframe_frame = t_ns, self._frame_number
+        self._move_map_pose(T_m_k)
+
+    def _begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
+        """Open a submap when the old map was not found again. Returns whether there is a pose now."""
+        first = self._submap_number < 0
+        if not first and self._failures < _FAILURES_BEFORE_SUBMAP:
+            return False
+        if not self._maker.enough(view, _MIN_FIRST_POINTS):
+            return False
+        if first:
+            self._T_m_c = self._first_pose(imu)
+        else:
+            self._T_m_c = self._T_o_m @ self._T_m_c  # the new submap's axes are those of the odometry frame
+            self._T_o_m = np.eye(4)
+        self._events.append("submap: opened")
+        self._submap_number += 1
+        self._sequence = 0
+        self._failures = 0
+        self._step_T = np.eye(4)
+        self._velocity_m = np.zeros(3)
+        self.map.clear()
+        self._add_keyframe(view, None, t_ns, NO_KEYFRAME, self._T_m_c)
+        return True
+
+    def _first_pose(self, imu: ImuBatch | None) -> F64:
+        """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""
+        if self._has_imu and imu is not None and len(imu.t_ns):
+            R_m_b = level_rotation(imu.accel.mean(axis=0))
+        else:
+            R_m_c = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+            R_m_b = R_m_c @ self._T_c_b[:3, :3]
+        return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
+
+    @property
+    def submap(self) -> SubmapId:
+        """The submap in which the agent tracks (the first one before it has begun)."""
+        return submap_id(self._identity.agent, self._identity.boot, max(self._submap_number, 0))
+
+    # what the base sends
+
+    def _take_corrections(self, records: list[Record]) -> None:
+        """Swap in what the base made of the map; the odometry frame stays still."""
+        touched = False
+        for record in records:
+            if isinstance(record, Pose | Depths | Found | Removed | Culled):
+                touched |= self.map.apply(record)
+            elif isinstance(record, Placement):
+                self._placements[record.submap] = record.T_w_m
+            elif isinstance(record, Tile):
+                self.tiles[record.column, record.row] = record
+        if not touched:
+            return
+        self.map.settle()
+        slot = self.map.slot_of(self._reference)
+        if slot >= 0:
+            self._move_map_pose(self.map.T_m_k[slot] @ self._T_k_c)
+
+    def _move_map_pose(self, T_m_c: F64) -> None:
+        """Set the pose in m without moving it in o."""
+        T_o_c = self._T_o_m @ self._T_m_c
+        change = T_m_c[:3, :3] @ self._T_m_c[:3, :3].T
+        self._velocity_m = change @ self._velocity_m
+        self._T_m_c = se3.orthonormalise(T_m_c)
+        self._T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self._T_m_c))
+
+    # what is known
+
+    def _estimate(self, t_ns: int, inliers: int, *, tracked: bool) -> Estimate:
+        T_m_b = self._T_m_c @ self._T_c_b
+        T_w_m = self._placements.get(self.submap)
+        quality = -1 if not tracked else max(1, min(100, inliers * 100 // 150)) if inliers else 50
+        if self._reference != NO_KEYFRAME:
+            self._channel.put(Live(self._identity.agent, t_ns, self._reference, self._T_k_c, quality))
+        return Estimate(
+            t_ns,
+            tracked,
+            False,
+            T_m_b if tracked else None,
+            self._T_o_m @ T_m_b,
+            self._reference,
+            self._T_k_c.copy(),
+            self.submap,
+            inliers,
+            quality,
+            T_w_m @ T_m_b if tracked and T_w_m is not None else None,
+        )

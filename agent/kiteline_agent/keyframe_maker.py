@@ -1,0 +1,121 @@
+"""Making a keyframe: sightings of tracked points, births of new ones, shared and remembered as their codes' values."""
+
+from __future__ import annotations
+
+import numpy as np
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import Births, Head, Sightings
+from kiteline_codec.sections import split_births, split_sightings
+from kiteline_core import alignment_kernels, se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.keyframes import NewPoints, new_points
+from kiteline_agent.local_map import LocalMap
+from kiteline_agent.tracker import Track, View
+
+F64 = NDArray[np.float64]
+
+
+class KeyframeMaker:
+    """Turns a tracked frame into records for the base and into a slot of the local map."""
+
+    def __init__(
+        self, local_map: LocalMap, camera: RectifiedCamera, config: AgentConfig, channel: RecordChannel
+    ) -> None:
+        self._map = local_map
+        self._camera = camera
+        self._config = config
+        self._channel = channel
+        self._fresh: NewPoints | None = None  # found by `enough`, for the keyframe that follows at once
+
+    def enough(self, view: View, points: int) -> bool:
+        """Whether a view by itself gives at least so many points with depth."""
+        self._fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
+        return int(np.count_nonzero(self._fresh.disparity > 0.0)) >= points
+
+    def make(
+        self, view: View, track: Track | None, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
+        frame_number: int,
+    ) -> F64:  # fmt: skip
+        """Share and remember a keyframe; its pose T_m_k (4,4) as both sides hold it. Without a track it begins a map."""
+        if track is None:
+            fresh, rows = self._fresh, np.zeros(0, np.int64)
+            if fresh is None:
+                fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
+            seen = np.zeros((0, 3))
+        else:
+            keep = np.flatnonzero(track.inlier)
+            keep = keep[np.argsort(self._map.point_ids(track.rows[keep]), kind="stable")]
+            rows, seen = track.rows[keep], track.observed[keep]
+            fresh = new_points(view, seen[:, :2], self._camera, self._config)
+        self._fresh = None
+        # Births first, in the order of image rows: neighbours code shortest.
+        order = np.lexsort((fresh.uv[:, 0], fresh.uv[:, 1] // self._config.detector.cell_px))
+        births, strength = self._births(keyframe, fresh, order)
+        sightings = self._sightings(keyframe, rows, seen, len(births.index))
+        head = Head(keyframe, t_ns, parent, T_p_k, len(births.index) + len(sightings.index))
+        shared_head = self._channel.put(head)
+        assert isinstance(shared_head, Head)
+        held = births
+        uv, rho = held.uv.astype(np.float64), held.inv_depth.astype(np.float64)
+        for part in split_births(births, strength):
+            shared = self._channel.put(part)
+            assert isinstance(shared, Births)
+            uv[shared.index], rho[shared.index] = shared.uv, shared.inv_depth
+        for section in split_sightings(sightings, 1.0 / (1.0 + sightings.octave)):
+            self._channel.put(section)
+        T_m_k = self._placed(shared_head)
+        self._remember(view, shared_head, T_m_k, uv, rho, births.octave, frame_number)
+        return T_m_k
+
+    def _births(self, keyframe: KeyframeId, fresh: NewPoints, order: NDArray[np.int64]) -> tuple[Births, F64]:
+        disparity = fresh.disparity[order]
+        n = len(order)
+        births = Births(
+            keyframe,
+            0,
+            np.arange(n, dtype=np.uint16),
+            fresh.uv[order].astype(np.float32),
+            np.where(disparity > 0.0, disparity / self._camera.bf, 0.0).astype(np.float32),
+            fresh.octave[order],
+            fresh.angle[order],
+            fresh.descriptor[order],
+        )
+        return births, np.where(disparity > 0.0, 1.0, 0.0) - order / (2.0 * max(n, 1))
+
+    def _sightings(self, keyframe: KeyframeId, rows: NDArray[np.int64], seen: F64, first: int) -> Sightings:
+        return Sightings(
+            keyframe,
+            0,
+            np.arange(first, first + len(rows), dtype=np.uint16),
+            seen[:, :2].astype(np.float32),
+            np.where(seen[:, 2] > 0.0, seen[:, 2] / self._camera.bf, 0.0).astype(np.float32),
+            self._map.octave[rows],
+            self._map.point_ids(rows),
+        )
+
+    def _placed(self, head: Head) -> F64:
+        if head.parent == NO_KEYFRAME:
+            return head.T_p_k
+        return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(head.parent)] @ head.T_p_k)
+
+    def _remember(
+        self, view: View, head: Head, T_m_k: F64, uv: F64, rho: F64, octave: NDArray[np.uint8], frame_number: int
+    ) -> None:
+        templates = np.empty(
+            (len(uv), alignment_kernels.TEMPLATE_LEVELS, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE),
+            np.uint8,
+        )
+        alignment_kernels.cut_templates(view.left, uv, octave, templates)
+        sigma = self._config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
+        if view.depth_m is not None and not self._camera.stereo:
+            sigma = np.maximum(sigma, _depth_camera_sigma(rho))
+        self._map.add(head, T_m_k, uv, rho, sigma, octave, templates, frame_number)
+
+
+def _depth_camera_sigma(rho: F64) -> F64:
+    """Deviation of inverse depth (n,) 1/m of a structured-light camera (K. Khoshelham, S. Elberink, 2012): it is constant."""
+    return np.full(len(rho), 2.85e-3)

@@ -1,0 +1,117 @@
+"""When a frame becomes a keyframe, and what a keyframe is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from kiteline_core import features, se3, stereo_kernels
+from kiteline_core.cameras import RectifiedCamera
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig, KeyframeConfig
+from kiteline_agent.tracker import Track, View, depth_at
+
+F64 = NDArray[np.float64]
+
+_COVER_CELL_PX = 96  # about 8 x 5 cells at 752x480: coarse enough that an even track fills nearly all
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What the rules look at."""
+
+    frames_since: int
+    seconds_since: float
+    inliers: int
+    reference_inliers: int  # of the first frame that was tracked after the newest keyframe
+    cover: float  # share of coarse image cells with a tracked point
+    moved_ratio: float  # translation since the nearest keyframe over median depth
+    turned_rad: float  # rotation since the nearest keyframe
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One row of the policy: its name and the condition under which it asks for a keyframe."""
+
+    name: str
+    asks: Callable[[Situation, KeyframeConfig], bool]
+
+
+# The policy. A frame becomes a keyframe when min_gap_frames have passed and any row asks for it.
+RULES = (
+    Rule("few points left", lambda s, c: s.inliers < c.min_inliers),
+    Rule("share of the reference", lambda s, c: s.inliers < c.min_share * s.reference_inliers),
+    Rule("bare image regions", lambda s, c: s.cover < c.min_cover),
+    Rule("new viewpoint", lambda s, c: s.moved_ratio > c.baseline_ratio),
+    Rule("new direction", lambda s, c: s.turned_rad > c.rotation_rad),
+    Rule("heartbeat", lambda s, c: s.seconds_since > c.max_gap_s),
+)
+
+
+def why_keyframe(situation: Situation, config: KeyframeConfig) -> str | None:
+    """The name of the first rule that asks for a keyframe, or None."""
+    if situation.frames_since < config.min_gap_frames:
+        return None
+    return next((rule.name for rule in RULES if rule.asks(situation, config)), None)
+
+
+def situation(
+    track: Track, camera: RectifiedCamera, T_m_k: F64, frames_since: int, seconds_since: float, reference_inliers: int
+) -> Situation:
+    """Measure what the rules look at. T_m_k: (4,4) of the keyframe nearest in view."""
+    uv = track.observed[track.inlier, :2]
+    columns = -(-camera.width // _COVER_CELL_PX)
+    rows = -(-camera.height // _COVER_CELL_PX)
+    cells = (uv[:, 1] // _COVER_CELL_PX).astype(np.int64) * columns + (uv[:, 0] // _COVER_CELL_PX).astype(np.int64)
+    T_c_k = track.T_c_m @ T_m_k
+    depth = float(np.median(track.depth_m[track.inlier])) if len(uv) else 1.0
+    return Situation(
+        frames_since,
+        seconds_since,
+        track.inliers,
+        reference_inliers,
+        len(np.unique(cells)) / (columns * rows),
+        float(np.linalg.norm(T_c_k[:3, 3])) / max(depth, 0.1),
+        float(np.linalg.norm(se3.so3_log(T_c_k[:3, :3]))),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class NewPoints:
+    """Births of a keyframe, strongest first. uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,).
+    angle: (n,). descriptor: (n,32).
+    """
+
+    uv: F64
+    disparity: F64
+    octave: NDArray[np.uint8]
+    angle: NDArray[np.uint8]
+    descriptor: NDArray[np.uint8]
+
+
+def new_points(view: View, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:
+    """Corners where no point is tracked, with depth where the row or the depth image gives one."""
+    corners = features.detect(view.left, taken, config.detector)
+    disparity = np.full(len(corners.uv), -1.0)
+    if view.right is not None:
+        stereo = config.stereo
+        widest = min(camera.bf / stereo.min_depth_m, 0.45 * camera.width)
+        stereo_kernels.search_rows(
+            view.left, view.right, corners.uv, corners.octave, widest, stereo.uniqueness, disparity
+        )
+        found = np.zeros(len(disparity), np.bool_)
+        stereo_kernels.refine_rows(
+            view.left, view.right, corners.uv, corners.octave, stereo.iterations, 2.5, stereo.min_ncc, disparity, found
+        )
+        disparity[~found] = -1.0
+        disparity[disparity < camera.fx / config.local_map.max_far_ratio] = -1.0
+    elif view.depth_m is not None:
+        depth = depth_at(view.depth_m, corners.uv)
+        disparity = np.where(depth > 0.0, camera.bf / np.maximum(depth, 1e-3), -1.0)
+    # Points with depth first: they are what a tracker lives on.
+    order = np.argsort(disparity < 0.0, kind="stable")[: config.local_map.births]
+    uv, octave = corners.uv[order], corners.octave[order]
+    angle, descriptor = features.describe(view.left, uv, octave)
+    return NewPoints(uv, disparity[order], octave, angle, descriptor)

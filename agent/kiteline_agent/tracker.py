@@ -1,0 +1,144 @@
+"""From an image pair and a predicted pose to a measured pose: align templates, look along the row, optimise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from kiteline_core import alignment_kernels, pose_kernels, se3, stereo_kernels
+from kiteline_core.features import Pyramid
+from numpy.typing import NDArray
+
+from kiteline_agent import local_map_kernels
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.local_map import Candidates, LocalMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The pyramids of one instant. depth_m: (h,w) float32 aligned with left, or None."""
+
+    left: Pyramid
+    right: Pyramid | None
+    depth_m: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """What the tracker measured. T_c_m: (4,4). rows: (n,) of the local map. observed: (n,3) u, v, disparity px (< 0 none).
+    sigma_px: (n,). depth_m: (n,) of the points in the camera. inlier: (n,). information: (6,6) of T_c_m, left perturbation.
+    inliers: how many. rms: whitened error of the inliers. tried: how many points were looked for.
+    """
+
+    T_c_m: F64
+    rows: I64
+    observed: F64
+    sigma_px: F64
+    depth_m: F64
+    inlier: Bools
+    information: F64
+    inliers: int
+    rms: float
+    tried: int
+
+
+class Tracker:
+    """Stateless but for its buffers: the local map and the prediction are handed in."""
+
+    def __init__(self, local_map: LocalMap, config: AgentConfig) -> None:
+        self._map = local_map
+        self._config = config
+        self._zero_prior = np.zeros(6)
+
+    def track(self, view: View, predicted_T_c_m: F64, frame_number: int) -> Track:
+        """One frame: a coarse pass over few points mends the prediction, a fine pass over many measures the pose."""
+        T_c_m = predicted_T_c_m.copy()
+        # Coarse pass: big steps on small images.
+        coarse = self._map.candidates(T_c_m, _MARGIN_PX, self._config.align.max_scale)
+        chosen = self._choose(coarse, frame_number, self._config.align.coarse_points, per_cell=1, cell_factor=2)
+        rough = self._measure(view, coarse, chosen, T_c_m, coarse_only=True)
+        if rough.inliers >= self._config.pose.min_inliers // 2:
+            T_c_m = rough.T_c_m
+        # Fine pass: sub-pixel, with stereo.
+        fine = self._map.candidates(T_c_m, _MARGIN_PX, self._config.align.max_scale)
+        chosen = self._choose(fine, frame_number, self._config.align.points, per_cell=2, cell_factor=1)
+        return self._measure(view, fine, chosen, T_c_m, coarse_only=False)
+
+    def _choose(self, candidates: Candidates, frame_number: int, limit: int, per_cell: int, cell_factor: int) -> I64:
+        """Candidates spread over the image; those tracked in the last frame first, then the best known."""
+        rows = candidates.rows
+        recent = frame_number - self._map.last_hit[rows] <= 1
+        sigma = self._map.sigma_rho.reshape(-1)[rows]
+        order = np.lexsort((rows, sigma, ~recent))
+        cell = self._config.align.cell_px * cell_factor
+        camera = self._map.camera
+        cells = np.zeros((-(-camera.height // cell), -(-camera.width // cell)), np.int32)
+        chosen = np.empty(limit, np.int64)
+        n = local_map_kernels.select(order, candidates.uv, float(cell), limit, per_cell, cells, chosen)
+        return chosen[:n]
+
+    def _measure(self, view: View, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool) -> Track:
+        config = self._config
+        rows = candidates.rows[chosen]
+        uv = candidates.uv[chosen]
+        octave = self._map.octave[rows]
+        found = np.zeros(len(rows), np.bool_)
+        ncc = np.zeros(len(rows))
+        last = 1 if coarse_only else 0
+        step = config.align.coarse_step_px if coarse_only else config.align.fine_step_px
+        alignment_kernels.align(
+            view.left, self._map.templates, rows, octave, candidates.warp[chosen], uv, 2 if coarse_only else 1, last,
+            config.align.iterations, step, config.align.min_ncc, found, ncc,
+        )  # fmt: skip
+        rows, uv, octave, chosen = rows[found], uv[found], octave[found], chosen[found]
+        scale = (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
+        sigma_px = config.align.sigma_px * scale
+        depth = candidates.depth[chosen]
+        observed = np.column_stack([uv, np.full(len(uv), -1.0)])
+        if not coarse_only:
+            self._add_disparities(view, uv, octave, depth, observed)
+        T = T_c_m.copy()
+        inlier = np.ones(len(rows), np.bool_)
+        information = np.zeros((6, 6))
+        inliers, rms = pose_kernels.optimise_pose(
+            T, candidates.xyz[chosen], candidates.ray[chosen], observed, sigma_px, self._map.intrinsics,
+            T_c_m, self._zero_prior, config.pose.rounds, config.pose.iterations, config.pose.chi2, inlier, information,
+        )  # fmt: skip
+        if not coarse_only:
+            tried = candidates.rows[chosen] if len(rows) == 0 else rows
+            del tried
+        return Track(
+            se3.orthonormalise(T), rows, observed, sigma_px, depth, inlier, information, int(inliers), float(rms), len(found)
+        )
+
+    def _add_disparities(self, view: View, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64) -> None:
+        """Fill observed[:, 2] from the right image or from the depth image, where they agree to be measurable."""
+        bf = self._map.camera.bf
+        if view.right is not None:
+            stereo = self._config.stereo
+            disparity = bf / depth
+            found = np.zeros(len(uv), np.bool_)
+            stereo_kernels.refine_rows(
+                view.left, view.right, uv, octave, stereo.iterations, stereo.search_px, stereo.min_ncc, disparity, found
+            )
+            observed[found, 2] = disparity[found]
+        elif view.depth_m is not None:
+            d = depth_at(view.depth_m, uv)
+            observed[d > 0.0, 2] = bf / d[d > 0.0]
+
+
+def depth_at(depth_m: NDArray[np.float32], uv: F64) -> F64:
+    """Depth (n,) in m at pixels (n,2); 0 where unknown or where the 3x3 neighbourhood is an edge (spread above 5 %)."""
+    h, w = depth_m.shape
+    x = np.clip(np.round(uv[:, 0]).astype(np.int64), 1, w - 2)
+    y = np.clip(np.round(uv[:, 1]).astype(np.int64), 1, h - 2)
+    around = np.stack([depth_m[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]).astype(np.float64)
+    low, high = around.min(axis=0), around.max(axis=0)
+    sure = (low > 0.0) & (high - low < 0.05 * low)
+    return np.where(sure, np.median(around, axis=0), 0.0)

@@ -1,0 +1,28 @@
+"""Compile all kernels of the onboard half before the first frame, by flying two frames of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_core.frame import Frame
+from kiteline_core.ids import AgentId
+from kiteline_core.se3 import from_rt
+
+from kiteline_agent.agent import Agent, Identity, StepInput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+
+
+def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> None:
+    """Run every kernel once, on the types that flights use. A filled cache makes this take a fraction of a second."""
+    state, pixels = 1, np.empty(240 * 320, np.uint8)
+    for i in range(pixels.size):  # deterministic noise: corners everywhere
+        state = state * 1103515245 + 12345 & 0x7FFFFFFF
+        pixels[i] = state >> 16 & 255
+    image = np.kron(pixels.reshape(240, 320)[:60, :80], np.ones((4, 4), np.uint8))
+    camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
+    small = CameraRig(camera, camera, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
+    right = np.ascontiguousarray(np.roll(image, -8, axis=1))
+    agent = Agent(small, None, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    for k in range(4):
+        agent.step(StepInput(Frame(k * 50_000_000, image, right)), k * 50_000_000)
