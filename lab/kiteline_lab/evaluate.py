@@ -96,7 +96,7 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=metrics.MAX_DIFFERENCE_NS / 1e9,
         metavar="S",
-        help="poses further apart in time are not compared (default %(default)s s)",
+        help="truth sparser than 20 Hz: poses further apart in time are not compared (default %(default)s s)",
     )
     p.add_argument("--json", action="store_true", help="print JSON instead of the table")
     p.add_argument("--plot", metavar="F.png", help="draw both: from above, height and error over time")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import Trajectory
-from kiteline_lab.metrics import Alignment, associate, match, position_errors
+from kiteline_lab.metrics import Alignment, match, position_errors, truth_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,8 +67,8 @@ def plot_trajectories(
         top.plot(p[:1, across], p[:1, along], "o", color=colour, ms=5, zorder=3)
         height.plot(*_with_gaps(t_s, sign * p[:, up]), color=colour, lw=1.2, zorder=2)
         if error is not None and truth is not None:
-            i_est, i_true = associate(line.trajectory.t_ns, truth.t_ns)
-            off = np.linalg.norm(p[i_est] - truth.T_w_b[i_true, :3, 3], axis=1)
+            i_est, true = truth_at(line.trajectory.t_ns, truth)
+            off = np.linalg.norm(p[i_est] - true[:, :3, 3], axis=1)
             error.plot(*_with_gaps(t_s[i_est], off), color=colour, lw=1.2)
     if error is not None:
         error.set_ylim(bottom=0.0)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from kiteline_core import se3
 from kiteline_core.frame import Trajectory
 from kiteline_lab import metrics
-from kiteline_lab.metrics import Alignment, associate, evaluate, match, umeyama
+from kiteline_lab.metrics import Alignment, associate, evaluate, match, truth_at, umeyama
 
 F64 = NDArray[np.float64]
 PERIOD_NS = 50_000_000
@@ -191,3 +191,29 @@ def test_a_standing_estimate_has_no_scale() -> None:
     assert evaluate(still, truth).ate_m.rmse > 1.0
     with pytest.raises(ValueError, match="no scale"):
         evaluate(still, truth, Alignment.SIM3)
+
+
+def test_dense_truth_is_met_between_its_stamps() -> None:
+    """A fast steady motion, truth at 50 Hz, frames at 20 Hz: every second frame lies midway between two true poses."""
+
+    def at(t_ns: NDArray[np.int64]) -> Trajectory:
+        poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.2, 1.5]) * t) for t in t_ns / 1e9])
+        poses[:, :3, 3] = np.outer(t_ns / 1e9, [2.0, 1.0, -0.5])
+        return Trajectory(t_ns, poses)
+
+    truth, est = at(20_000_000 * np.arange(101, dtype=np.int64)), at(50_000_000 * np.arange(41, dtype=np.int64))
+    e = evaluate(est, truth, Alignment.ORIGIN)
+    assert e.matched == 41
+    assert e.ate_m.max == pytest.approx(0.0, abs=1e-9)
+    assert e.rpe_frame is not None
+    assert e.rpe_frame.rotation_deg.max == pytest.approx(0.0, abs=1e-5)
+
+
+def test_sparse_truth_is_not_invented_in_between() -> None:
+    truth = flight(20)
+    sparse = part(truth, np.arange(0, 20, 4))  # a pose each 200 ms
+    i, poses = truth_at(truth.t_ns + 3_000_000, sparse)
+    assert i.tolist() == [0, 4, 8, 12, 16]
+    np.testing.assert_array_equal(poses, sparse.T_w_b)
+    outside, _ = truth_at(truth.t_ns[-1:] + 20_000_000, truth)
+    assert outside.tolist() == []
