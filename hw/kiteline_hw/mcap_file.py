@@ -118,6 +118,7 @@ class McapFile:
 
     def _read_index(self) -> bool:
         try:
+            self._file.seek(0)
             reader = SeekingReader(self._file)
             summary = reader.get_summary()
             if summary is None or summary.statistics is None or not summary.chunk_indexes or not summary.channels:

@@ -293,7 +293,7 @@ class LogWriter:
             self._bytes += size
             if self._flushed_ns is None:
                 self._flushed_ns = t_ns
-            elif t_ns - self._flushed_ns >= FLUSH_NS:
+            elif abs(t_ns - self._flushed_ns) >= FLUSH_NS:
                 self._flushed_ns = t_ns
                 self._writer.flush()
         except OSError:

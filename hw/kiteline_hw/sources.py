@@ -102,7 +102,7 @@ def _open_sim(scene: str, mono: bool, imu: bool) -> FrameSource:
         module = import_module("kiteline_hw.sim.source")
     except ModuleNotFoundError as error:
         raise SourceError(f"sim:{scene}: the simulator is not installed ({error})") from error
-    source: FrameSource = module.open_sim(scene)
+    source: FrameSource = module.open_sim(scene, mono=True) if mono else module.open_sim(scene)
     from kiteline_hw.reduced import reduced
 
     return reduced(source, mono, imu)

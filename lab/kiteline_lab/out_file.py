@@ -1,0 +1,28 @@
+"""Files that are either whole or not there: written under another name and renamed at the end."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from kiteline_hw.ports import SourceError
+
+
+@contextmanager
+def whole_file(path: Path, force: bool) -> Iterator[Path]:
+    """Gives the name to write to; it becomes `path` when the block ends well, and is removed when it does not.
+
+    Raises SourceError when `path` is there already (unless force) or its folder is not.
+    """
+    if path.exists() and not force:
+        raise SourceError(f"{path} exists already: choose another name, or overwrite it with --force")
+    if path.is_dir() or not path.parent.is_dir():
+        raise SourceError(f"{path}: cannot be written: expected a file name in a folder that exists")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
