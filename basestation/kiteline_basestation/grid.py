@@ -105,18 +105,23 @@ class Grid:
 
     def adopt(self, new: GridMap) -> tuple[Tile, ...]:
         """Take a grid made by `build` and return the tiles that changed. A tile that vanished comes as unknown."""
-        old = _by_place(self.map)
-        fresh = _by_place(new)
-        unknown = np.full((TILE, TILE), UNKNOWN, np.int8)
+        changed = differences(self.map, new)
         self.revision += 1
-        out = []
-        for place in sorted(old.keys() | fresh.keys()):
-            cells = fresh.get(place, unknown)
-            if place not in old or not np.array_equal(cells, old[place]):
-                self.changed[place] = self.revision
-                out.append(Tile(place[1], place[0], new.cell_m, cells))
+        self.changed.update({(t.row, t.column): self.revision for t in changed})
         self.map = new
-        return tuple(out)
+        return changed
+
+
+def differences(old: GridMap, new: GridMap) -> tuple[Tile, ...]:
+    """The tiles of `new` that `old` does not hold as they are, in order of row, column; vanished ones as unknown."""
+    before, after = _by_place(old), _by_place(new)
+    unknown = np.full((TILE, TILE), UNKNOWN, np.int8)
+    out = []
+    for place in sorted(before.keys() | after.keys()):
+        cells = after.get(place, unknown)
+        if place not in before or not np.array_equal(cells, before[place]):
+            out.append(Tile(place[1], place[0], new.cell_m, cells))
+    return tuple(out)
 
 
 def _by_place(grid: GridMap) -> dict[tuple[int, int], I8]:

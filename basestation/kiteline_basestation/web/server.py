@@ -1,0 +1,202 @@
+"""The status page's server: a few static files, /status.json, and a websocket, in a thread of its own.
+
+It listens on this machine only unless told otherwise, serves the files beside this one and nothing else, and answers
+neither pages of other sites (Origin) nor names that were bent to point here (Host).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from http import HTTPStatus
+from pathlib import Path
+
+from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import serve as websocket_serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from kiteline_basestation.grid import GridMap
+from kiteline_basestation.web.view import Snapshot, map_messages, status
+
+STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read
+MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larger
+RATE_SPAN_S = 2.0  # s over which byte rates are taken: two heartbeats
+MAX_VIEWERS = 16  # browsers at a time; each costs up to 100 kB/s
+LIVE_PATH = "/live"
+
+_FILES = {
+    "/": ("page.html", "text/html; charset=utf-8"),
+    "/page.css": ("page.css", "text/css; charset=utf-8"),
+    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/draw.js": ("draw.js", "text/javascript; charset=utf-8"),
+}
+_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'"
+
+
+def address(text: str) -> tuple[str, int]:
+    """Host and port of HOST:PORT, :PORT or PORT (then of this machine only). Raises ValueError."""
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise ValueError(f"{text!r} is no address: expected HOST:PORT, such as 127.0.0.1:8080")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+class Handle:
+    """A running server."""
+
+    def __init__(self, page: _Page, thread: threading.Thread, url: str) -> None:
+        self._page = page
+        self._thread = thread
+        self.url = url
+
+    def close(self) -> None:
+        """Close all connections and wait for the thread's end. May be called twice."""
+        self._page.stop()
+        self._thread.join(5.0)
+
+
+def serve(host: str, port: int, snapshot: Callable[[], Snapshot]) -> Handle:
+    """Serve the page until close(). Port 0 takes a free one; see Handle.url. Raises OSError when it cannot listen."""
+    page = _Page(snapshot)
+    thread = threading.Thread(target=page.run, args=(host, port), name="kiteline-web", daemon=True)
+    thread.start()
+    page.started.wait()
+    if page.error is not None:
+        thread.join()
+        raise OSError(page.error.errno, page.error.strerror or str(page.error), f"{host}:{port}")
+    shown = f"[{host}]" if ":" in host else host
+    return Handle(page, thread, f"http://{shown}:{page.port}/")
+
+
+class _Page:
+    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
+        self.started = threading.Event()
+        self.error: OSError | None = None
+        self.port = 0
+        self._snapshot = snapshot
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._end: asyncio.Event | None = None
+        self._local = True
+        self._viewers = 0
+        self._recent: list[tuple[float, Snapshot]] = []  # the last RATE_SPAN_S of snapshots, shared by all viewers
+
+    def run(self, host: str, port: int) -> None:
+        """The thread."""
+        asyncio.run(self._serve(host, port))
+
+    def stop(self) -> None:
+        loop, end = self._loop, self._end
+        if loop is not None and end is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(end.set)
+
+    async def _serve(self, host: str, port: int) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._end = asyncio.Event()
+        self._local = host == "localhost" or _is_loopback(host)
+        log = logging.Logger("kiteline.web", logging.CRITICAL)  # a port scan is no reason for a traceback
+        try:
+            server = await websocket_serve(
+                self._view, host, port, process_request=self._answer, compression=None, max_size=1024, logger=log,
+                close_timeout=1.0,
+            )  # fmt: skip
+        except OSError as e:
+            self.error = e
+            self.started.set()
+            return
+        async with server:
+            self.port = server.sockets[0].getsockname()[1]
+            self.started.set()
+            await self._end.wait()
+
+    # -- HTTP --------------------------------------------------------------------------------------------------------
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        host = request.headers.get("Host", "")
+        name = host.rsplit(":", 1)[0].strip("[]") if not host.endswith("]") else host.strip("[]")
+        if self._local and name != "localhost" and not _is_loopback(name):
+            return _response(HTTPStatus.FORBIDDEN, b"this page answers to localhost only\n")
+        path = request.path.split("?", 1)[0]
+        if path == LIVE_PATH:
+            origin = request.headers.get("Origin")
+            if origin is not None and origin.partition("://")[2] != host:
+                return _response(HTTPStatus.FORBIDDEN, b"another site's page may not look\n")
+            if self._viewers >= MAX_VIEWERS:
+                return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many viewers\n")
+            return None
+        if path == "/status.json":
+            now, before = self._look()
+            return _response(HTTPStatus.OK, _json(now, before), "application/json")
+        if path in _FILES:
+            name, kind = _FILES[path]
+            return _response(HTTPStatus.OK, (Path(__file__).parent / name).read_bytes(), kind)
+        return _response(HTTPStatus.NOT_FOUND, b"nothing here; the page is at /\n")
+
+    # -- websocket ---------------------------------------------------------------------------------------------------
+
+    async def _view(self, viewer: ServerConnection) -> None:
+        self._viewers += 1
+        try:
+            await self._show(viewer)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._viewers -= 1
+            if self._viewers == 0:
+                self._recent.clear()
+
+    async def _show(self, viewer: ServerConnection) -> None:
+        revision: int | None = None
+        held: GridMap | None = None
+        map_s = -MAP_PERIOD_S
+        while True:
+            now, before = self._look()
+            await viewer.send(_json(now, before).decode())
+            if now.map_revision != revision and time.monotonic() - map_s >= MAP_PERIOD_S:
+                revision, map_s = now.map_revision, time.monotonic()
+                for message in map_messages(now, held):
+                    await viewer.send(message)
+                held = now.grid if now.grid is not None else held
+            try:
+                async with asyncio.timeout(STATUS_PERIOD_S):
+                    await viewer.recv()  # a page has nothing to say; this notices when it goes
+                    await asyncio.sleep(STATUS_PERIOD_S)
+            except TimeoutError:
+                pass
+
+    def _look(self) -> tuple[Snapshot, Snapshot | None]:
+        """The newest snapshot, taken at most twice a period however many look, and an older one for rates."""
+        now_s = time.monotonic()
+        if not self._recent or now_s - self._recent[-1][0] >= 0.5 * STATUS_PERIOD_S:
+            self._recent.append((now_s, self._snapshot()))
+        while len(self._recent) > 2 and now_s - self._recent[1][0] > RATE_SPAN_S:
+            self._recent.pop(0)
+        return self._recent[-1][1], self._recent[0][1] if len(self._recent) > 1 else None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _json(now: Snapshot, before: Snapshot | None) -> bytes:
+    return json.dumps(status(now, before), separators=(",", ":"), allow_nan=False).encode()
+
+
+def _response(code: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> Response:
+    headers = Headers()
+    headers["Content-Type"] = kind
+    headers["Content-Length"] = str(len(body))
+    headers["Cache-Control"] = "no-cache"
+    headers["Content-Security-Policy"] = _POLICY
+    headers["X-Content-Type-Options"] = "nosniff"
+    headers["Connection"] = "close"
+    return Response(code.value, code.phrase, headers, body)

@@ -1,0 +1,118 @@
+"""What the status page is told: pure functions."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_basestation.grid import UNKNOWN, GridMap
+from kiteline_basestation.web import view
+from kiteline_basestation.web.view import AgentView, Snapshot
+from kiteline_core.ids import AgentId
+
+S = 1_000_000_000
+
+
+def agent(number: int = 0, **changes: object) -> AgentView:
+    plain = AgentView(AgentId(number), 99 * S, 80, np.eye(4), np.zeros((3, 3)), 3, 40, 1, 1000, 500)
+    return replace(plain, **changes)  # type: ignore[arg-type]
+
+
+def grid(*tiles: tuple[int, int], value: int = 10) -> GridMap:
+    cells = np.full((len(tiles), 32, 32), value, np.int8)
+    cells[:, 0, 0] = UNKNOWN
+    return GridMap(0.5, np.array(tiles, np.int64).reshape(-1, 2), cells, np.zeros(0, np.uint8), np.zeros(0))
+
+
+def snapshot(*agents: AgentView, **changes: object) -> Snapshot:
+    plain = Snapshot(100 * S, 40 * S, agents, np.zeros((5, 3)), np.zeros(5, np.uint8), grid((0, 0)), 7)
+    return replace(plain, **changes)  # type: ignore[arg-type]
+
+
+def test_status_says_what_the_snapshot_holds_in_json() -> None:
+    turned = np.eye(4)
+    turned[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    turned[:3, 3] = [1.23456, -2.0, -0.0]
+    out = view.status(snapshot(agent(0, T_w_b=turned), agent(3, T_w_b=None, heard_ns=-1, quality=-1)))
+    assert json.loads(json.dumps(out, allow_nan=False)) == out
+    assert (out["up_s"], out["keyframes"], out["points"]) == (60.0, 6, 5)
+    assert out["grid_m2"] == round(1023 * 0.25, 1)
+    first, second = out["agents"]
+    assert first["position"] == [1.235, -2.0, 0.0] and first["heading_deg"] == 90.0
+    assert (first["link"], first["silent_s"], first["rate_up"]) == ("live", 1.0, None)
+    assert second["position"] is None and second["heading_deg"] is None
+    assert (second["agent"], second["link"], second["silent_s"]) == (3, "never", None)
+
+
+def test_a_pose_that_is_not_finite_is_no_pose() -> None:
+    assert view.status(snapshot(agent(T_w_b=np.full((4, 4), np.nan))))["agents"][0]["position"] is None
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "state"), [(None, "never"), (0.0, "live"), (1.4, "live"), (2.0, "quiet"), (11.0, "lost")]
+)
+def test_link_states(silent_s: float | None, state: str) -> None:
+    assert view.link_state(silent_s) == state
+
+
+def test_rates_come_from_two_snapshots() -> None:
+    before = snapshot(agent(0), now_ns=98 * S)
+    now = snapshot(agent(0, bytes_up=5000, bytes_down=700), agent(1))
+    out = view.status(now, before)["agents"]
+    assert (out[0]["rate_up"], out[0]["rate_down"]) == (2000, 100)
+    assert out[1]["rate_up"] is None  # it was not there before
+
+
+def header(message: bytes) -> tuple[int, int, int, float]:
+    kind, number, zero, n, scale, rest = struct.unpack_from("<BBHIfI", message)
+    assert zero == rest == 0
+    return kind, number, n, scale
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 5000.0), st.integers(0, 50))
+def test_points_survive_within_half_a_step(seed: int, size: float, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-size, size, (n, 3))
+    labels = rng.integers(0, 3, n).astype(np.uint8)
+    message = view.points_message(points, labels)
+    kind, _, count, scale = header(message)
+    assert (kind, count, len(message)) == (view.POINTS, n, 16 + 7 * n)
+    back = np.frombuffer(message, "<i2", 3 * n, 16).reshape(n, 3) * scale
+    np.testing.assert_allclose(back, points, atol=0.5001 * scale + 1e-9)
+    assert scale <= max(size, 1.0) / 32766 * 1.001
+    assert np.array_equal(np.frombuffer(message, np.uint8, n, 16 + 6 * n), labels)
+
+
+def test_many_points_are_thinned_and_bad_ones_left_out() -> None:
+    points = np.zeros((3 * view.MAX_POINTS, 3))
+    points[::2] = np.nan
+    assert header(view.points_message(points, np.zeros(len(points), np.uint8)))[2] == view.MAX_POINTS
+    assert header(view.points_message(points[:5], np.zeros(5, np.uint8)))[2] == 2
+    assert header(view.path_message(4, np.zeros((10**5, 3))))[:3] == (view.PATH, 4, view.MAX_PATH)
+
+
+def tiles(message: bytes) -> dict[tuple[int, int], np.ndarray]:
+    _, _, n, _ = header(message)
+    places = np.frombuffer(message, "<i4", 2 * n, 16).reshape(n, 2)
+    cells = np.frombuffer(message, np.int8, n * 1024, 16 + 8 * n).reshape(n, 32, 32)
+    return {(int(c), int(r)): cells[i] for i, (c, r) in enumerate(places)}
+
+
+def test_a_viewer_gets_the_tiles_that_it_does_not_hold() -> None:
+    old, new = grid((0, 0), (1, -1)), grid((0, 0), (5, 2))
+    first = view.map_messages(snapshot(agent(2), grid=old), None)
+    assert [header(m)[0] for m in first] == [view.PATH, view.POINTS, view.TILES]
+    assert header(first[0])[1] == 2 and header(first[2])[3] == 0.5
+    assert set(tiles(first[2])) == {(0, 0), (1, -1)}
+    second = tiles(view.map_messages(snapshot(grid=new), old)[-1])
+    assert set(second) == {(1, -1), (5, 2)}
+    assert (second[1, -1] == UNKNOWN).all()
+    assert np.array_equal(second[5, 2], new.cells[1])
+    assert [header(m)[0] for m in view.map_messages(snapshot(grid=new), new)] == [view.POINTS]
+    assert [header(m)[0] for m in view.map_messages(snapshot(grid=None), None)] == [view.POINTS]

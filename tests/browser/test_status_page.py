@@ -1,0 +1,164 @@
+"""The status page over loopback: files, status, websocket, who may look, and that it costs nothing unseen."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from kiteline_basestation import web
+from kiteline_basestation.grid import GridMap
+from kiteline_core.ids import AgentId
+
+
+class Base:
+    """A base with one agent, whose snapshots are counted."""
+
+    def __init__(self) -> None:
+        self.taken = 0
+        cells = np.full((1, 32, 32), 3, np.int8)
+        grid = GridMap(0.1, np.zeros((1, 2), np.int64), cells, np.zeros(0, np.uint8), np.zeros(0))
+        agent = web.AgentView(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
+        self.now = web.Snapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)
+
+    def snapshot(self) -> web.Snapshot:
+        self.taken += 1
+        return self.now
+
+
+@pytest.fixture
+def base() -> Base:
+    return Base()
+
+
+@pytest.fixture
+def page(base: Base) -> Iterator[web.Handle]:
+    handle = web.serve("127.0.0.1", 0, base.snapshot)
+    yield handle
+    handle.close()
+
+
+def get(page: web.Handle, path: str, host: str | None = None) -> tuple[int, str, bytes]:
+    at = page.url.removeprefix("http://").rstrip("/")
+    connection = http.client.HTTPConnection(at, timeout=5)
+    connection.request("GET", path, headers={"Host": host or at})
+    answer = connection.getresponse()
+    out = answer.status, answer.getheader("Content-Type", ""), answer.read()
+    connection.close()
+    return out
+
+
+def live(page: web.Handle, **options: object) -> ClientConnection:
+    return connect(page.url.replace("http", "ws") + "live", open_timeout=5, **options)  # type: ignore[arg-type]
+
+
+def test_the_page_and_its_parts_are_served_and_nothing_else(page: web.Handle) -> None:
+    code, kind, body = get(page, "/")
+    assert code == 200 and kind.startswith("text/html") and b"<canvas" in body
+    parts = [p for p in (b"/page.css", b"/page.js", b"/draw.js") if p in body + get(page, "/page.js")[2]]
+    assert len(parts) == 3
+    for part in parts:
+        assert get(page, part.decode())[0] == 200
+    assert b"://" not in body.replace(b"http://www.w3.org/2000/svg", b"")  # nothing from other machines
+    for path in ("/server.py", "/../view.py", "/..%2fview.py", "/web/", "//etc/passwd"):
+        assert get(page, path)[0] == 404
+
+
+def test_status_as_json(page: web.Handle) -> None:
+    code, kind, body = get(page, "/status.json")
+    assert (code, kind) == (200, "application/json")
+    found = json.loads(body)
+    assert found["agents"][0]["agent"] == 5 and found["agents"][0]["link"] == "live"
+
+
+def test_a_viewer_gets_status_and_map_then_only_what_is_new(page: web.Handle, base: Base) -> None:
+    with live(page) as viewer:
+        assert json.loads(viewer.recv(5))["points"] == 9
+        kinds = [viewer.recv(5)[0] for _ in range(3)]  # type: ignore[index]
+        assert kinds == [3, 1, 2]
+        assert isinstance(viewer.recv(5), str)  # the map has not changed
+        base.now = replace(base.now, points=np.zeros((4, 3)), labels=np.zeros(4, np.uint8), map_revision=2)
+        maps: list[bytes] = []
+        texts = 0
+        while len(maps) < 2 or texts < 4:
+            message = viewer.recv(5)
+            if isinstance(message, bytes):
+                maps.append(message)
+            texts += isinstance(message, str)
+        assert [m[0] for m in maps] == [3, 1]  # the same grid is not sent again
+        assert struct.unpack_from("<I", maps[1], 4)[0] == 4
+
+
+def test_nothing_is_computed_while_nobody_looks(page: web.Handle, base: Base) -> None:
+    time.sleep(0.6)
+    assert base.taken == 0
+    with live(page) as viewer:
+        viewer.recv(5)
+    deadline = time.monotonic() + 5
+    while time.monotonic() < deadline:  # it takes the server a moment to see that the viewer went
+        before = base.taken
+        time.sleep(0.7)
+        if base.taken == before:
+            break
+    assert base.taken == before
+
+
+def test_several_viewers_cost_one_snapshot(page: web.Handle, base: Base) -> None:
+    with ExitStack() as stack:
+        for viewer in [stack.enter_context(live(page)) for _ in range(4)]:
+            viewer.recv(5)
+        assert base.taken <= 2
+
+
+def test_other_sites_and_bent_names_are_refused(page: web.Handle) -> None:
+    with pytest.raises(InvalidStatus, match="403"):
+        live(page, origin="http://example.com")
+    own = page.url.rstrip("/")
+    with live(page, origin=own) as viewer:
+        viewer.recv(5)
+    assert get(page, "/", host="example.com")[0] == 403
+    assert get(page, "/", host="localhost:80")[0] == 200
+
+
+def test_noise_on_the_port_does_no_harm(page: web.Handle) -> None:
+    port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
+    for noise in (b"\x00\xff" * 50, b"POST / HTTP/1.1\r\n\r\n", b"GET"):
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as s:
+            s.sendall(noise)
+    assert get(page, "/")[0] == 200
+
+
+def test_closing_ends_viewers_and_thread_and_may_be_repeated(base: Base) -> None:
+    handle = web.serve("127.0.0.1", 0, base.snapshot)
+    with live(handle) as viewer:
+        viewer.recv(5)
+        handle.close()
+        handle.close()
+    assert not any(t.name == "kiteline-web" for t in threading.enumerate())
+
+
+def test_a_taken_port_is_an_error_that_names_it(page: web.Handle, base: Base) -> None:
+    port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
+    with pytest.raises(OSError) as e:
+        web.serve("127.0.0.1", port, base.snapshot)
+    assert e.value.filename == f"127.0.0.1:{port}"
+
+
+def test_addresses() -> None:
+    assert web.address("0.0.0.0:8080") == ("0.0.0.0", 8080)
+    assert web.address(":8080") == web.address("8080") == ("127.0.0.1", 8080)
+    assert web.address("[::1]:80") == ("::1", 80)
+    for bad in ("here", "a:b", "1.2.3.4:99999", ""):
+        with pytest.raises(ValueError, match="expected HOST:PORT"):
+            web.address(bad)

@@ -1,0 +1,152 @@
+"""The status page in a real browser, where there is one: it draws, writes its numbers, and complains of nothing."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from kiteline_basestation import web
+from kiteline_basestation.grid import GridConfig, build
+from kiteline_core import se3
+from kiteline_core.ids import AgentId
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+
+
+class Browser:
+    """A page of a headless Chromium, driven by its DevTools protocol."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self._number = 0
+        self.complaints: list[str] = []
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv(20))
+            if message.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.complaints.append(json.dumps(message["params"])[:400])
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                found: dict[str, Any] = message["result"]
+                return found
+
+    def text(self, script: str) -> str:
+        return str(self.call("Runtime.evaluate", expression=script)["result"].get("value"))
+
+    def wait(self, script: str, wanted: str) -> None:
+        deadline = time.monotonic() + 20
+        while self.text(script) != wanted:
+            assert time.monotonic() < deadline, f"{script}: {self.text(script)!r} is not {wanted!r}; {self.complaints}"
+            time.sleep(0.1)
+
+    def shot(self) -> np.ndarray:
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return np.asarray(image)
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    assert CHROMIUM is not None
+    command = [
+        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars",
+        "--remote-debugging-port=0", f"--user-data-dir={tmp_path}", "--window-size=1360,820", "about:blank",
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        port = next(m[1] for line in process.stderr if (m := re.search(r"listening on ws://[^:]+:(\d+)/", line)))
+        page = next(
+            t for t in _targets(int(port)) if t["type"] == "page"
+        )  # the port speaks before the first page is there
+        with connect(page["webSocketDebuggerUrl"], max_size=None) as socket:
+            found = Browser(socket)
+            for domain in ("Page", "Runtime", "Log"):
+                found.call(f"{domain}.enable")
+            yield found
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+def _targets(port: int) -> Iterator[dict[str, Any]]:
+    import urllib.request
+
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=5) as answer:
+            yield from json.load(answer)
+        time.sleep(0.1)
+
+
+def room() -> web.Snapshot:
+    """Two agents in a room: one flies, the other has been silent for half a minute."""
+    rng = np.random.default_rng(4)
+    floor = np.column_stack([rng.uniform([0, 0], [9, 6], (1500, 2)), rng.normal(0, 0.01, 1500)])
+    along, side = rng.uniform(0, 1, 1500), np.arange(1500) % 4
+    x, y = np.choose(side, [9 * along, 9 * along, 0, 9]), np.choose(side, [0, 6, 6 * along, 6 * along])
+    points = np.concatenate([floor, np.column_stack([x, y, rng.uniform(0.2, 1.8, 1500)])])
+    turn = np.linspace(0, 5.0, 60)
+    path = np.column_stack([4.5 + 3.2 * np.cos(turn), 3 + 1.9 * np.sin(turn), np.full(60, 1.0)])
+    pairs = np.column_stack([rng.integers(0, 60, 12000), rng.integers(0, 3000, 12000)])
+    near = np.linalg.norm(path[pairs[:, 0]] - points[pairs[:, 1]], axis=1) < 4
+    grid = build(GridConfig(), path, points, pairs[near])
+    pose = se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, turn[-1] + np.pi / 2])), path[-1])
+    away = np.eye(4)
+    away[:3, 3] = [2.0, 4.5, 1.0]
+    s = 10**9
+    agents = (
+        web.AgentView(AgentId(0), 999 * s, 86, pose, path, 60, 2100, 1, 410_000, 52_000),
+        web.AgentView(AgentId(1), 968 * s, -1, away, path[:9] * 0.5 + [1, 3, 0.5], 9, 380, 2, 61_000, 8_000),
+    )
+    return web.Snapshot(1000 * s, 246 * s, agents, points, grid.labels, grid, 1, loops=2, merges=1)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_path: Path, scheme: str) -> None:
+    now = room()
+    tick = 0
+
+    def snapshot() -> web.Snapshot:
+        nonlocal tick
+        tick += 1
+        agents = (replace(now.agents[0], bytes_up=410_000 + 1500 * tick), *now.agents[1:])
+        return replace(now, agents=agents, now_ns=now.now_ns + tick * 500_000_000, started_ns=tick * 500_000_000)
+
+    handle = web.serve("127.0.0.1", 0, snapshot)
+    try:
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        browser.call("Page.navigate", url=handle.url)
+        browser.wait("document.querySelectorAll('article').length", "2")
+        browser.wait("document.getElementById('t-points').textContent", "3,000")
+        browser.wait("document.querySelector('article .quality output').textContent", "86 %")
+        browser.wait("document.querySelectorAll('article .traffic dd')[0].textContent", "3.0 kB/s")
+        browser.wait("getComputedStyle(document.getElementById('empty')).display", "none")
+        browser.wait("document.querySelector('article .curve').getAttribute('d') !== null", "True")
+        image = browser.shot()
+        cv2.imwrite(str(tmp_path / f"page-{scheme}.png"), image)
+        canvas = image[70:-20, 20:1000]
+        assert len(np.unique(canvas.reshape(-1, 3), axis=0)) > 30  # grid, points, paths: not an empty field
+        assert (float(image[:40].mean()) > 128) == (scheme == "light")
+        assert browser.complaints == []
+    finally:
+        handle.close()
+    browser.wait("document.getElementById('link').textContent", "base does not answer")
