@@ -35,6 +35,7 @@ COMMANDS = (
     Command("replay", "run an agent or a base again from its log, and compare"),
     Command("convert", "turn a data set or a ROS 2 bag into a kiteline log"),
     Command("log", "look into logs and mend them: info, recover, cut, merge"),
+    Command("log", "look into logs and mend them: info, recover, cut, merge"),
     Command("doctor", "check this machine, and warm the compiled kernels"),
     Command("bench", "measure, and write docs/results.md"),
 )
