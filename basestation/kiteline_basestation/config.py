@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from kiteline_core.bundle import BundleConfig
-
 from kiteline_basestation.grid import GridConfig
+from kiteline_core.bundle import BundleConfig
 
 
 @dataclass(frozen=True, slots=True)

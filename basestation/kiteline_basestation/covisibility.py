@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from kiteline_core.bundle import BundleProblem
-from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
-from kiteline_core.sparse_map import BIRTH, NO_POSE, SparseMap
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import MeasurementConfig, WindowConfig
+from kiteline_core.bundle import BundleProblem
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH, NO_POSE
+from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -48,7 +49,7 @@ def local_window(
 def window(
     sparse_map: SparseMap, free: list[KeyframeId], config: WindowConfig, measurement: MeasurementConfig
 ) -> Window | None:
-    """The bundle problem whose free keyframes are `free`, all of one submap; the submap's first keyframe never moves."""
+    """The bundle problem that moves the keyframes `free`, all of one submap, but never the submap's first one."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     submap = submap_of_keyframe(free[0])
     points = np.unique(np.concatenate([sparse_map.points_of(k) for k in free])).astype(np.int32)
@@ -60,7 +61,7 @@ def window(
     # Keep the free keyframes, and of the others those that see most.
     free_rows = np.array([sparse_map.rows[k] for k in free], np.int32)
     counts = np.bincount(table.row[slots], minlength=len(sparse_map))
-    inside = np.array([k for k in sparse_map.submaps[submap]], np.int64)
+    inside = np.array(sparse_map.submaps[submap], np.int64)
     rows_inside = np.array([sparse_map.rows[KeyframeId(k)] for k in inside.tolist()], np.int32)
     mask = np.zeros(len(sparse_map), bool)
     mask[rows_inside] = True

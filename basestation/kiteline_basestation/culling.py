@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.ids import KeyframeId, submap_of_keyframe
-from kiteline_core.sparse_map import BIRTH, CULLED, SparseMap
 
 from kiteline_basestation.config import CullConfig
 from kiteline_basestation.publisher import Publisher
 from kiteline_basestation.refind import foresee
 from kiteline_basestation.refinement import drop_points
+from kiteline_core.ids import KeyframeId, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH, CULLED
+from kiteline_core.sparse_map import SparseMap
 
 
 def cull_weak(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher) -> int:

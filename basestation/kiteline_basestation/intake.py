@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from kiteline_codec.schema import Births, Camera, Head, Live, Record, Sightings
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
-from kiteline_core.sparse_map import NO_POSE, SparseMap
-
 import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
+from kiteline_codec.schema import Births, Camera, Head, Live, Record, Sightings
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.map_tables import NO_POSE
+from kiteline_core.sparse_map import SparseMap
 
 # A level camera that looks along x of m: x right is -y, y down is -z, z forward is x.
 _LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -96,7 +96,7 @@ class Intake:
             )  # fmt: skip
 
     def _adopt_orphans(self, now_ns: int) -> None:
-        """Begin a submap at its oldest known keyframe when its true beginning never comes (a base without its store)."""
+        """Begin a submap at its oldest known keyframe when its beginning never comes (a base without store)."""
         orphan_ns = round(self._config.orphan_s * 1e9)
         late = [k for k, since_ns in self._waiting.items() if now_ns - since_ns >= orphan_ns]
         for submap in sorted({submap_of_keyframe(k) for k in late}):

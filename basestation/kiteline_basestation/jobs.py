@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from kiteline_core.bundle import BundleConfig, BundleProblem, BundleResult, bundle
 from numpy.typing import NDArray
 
 from kiteline_basestation.grid import GridConfig, GridMap, build
+from kiteline_core.bundle import BundleConfig, BundleProblem, BundleResult, bundle
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -8,10 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from kiteline_codec.schema import Kind, Record
-from kiteline_core.bundle import BundleResult
-from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
-from kiteline_core.sparse_map import SparseMap
 from numpy.typing import NDArray
 
 from kiteline_basestation import culling, newpoints, refind
@@ -22,6 +18,18 @@ from kiteline_basestation.intake import Intake
 from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
+from kiteline_codec.schema import Record
+from kiteline_core.bundle import BundleResult
+from kiteline_core.ids import (
+    KEYPOINT_BITS,
+    SEQUENCE_BITS,
+    AgentId,
+    KeyframeId,
+    SubmapId,
+    agent_of_keyframe,
+    submap_of_keyframe,
+)
+from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -175,7 +183,11 @@ class Mapper:
             T = self.placements[submap]
             xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
         return GridView(
-            self.map.keyframes.id[rows].copy(), np.array(positions).reshape(-1, 3), self.map.point_ids(points), xyz, pairs
+            self.map.keyframes.id[rows].copy(),
+            np.array(positions).reshape(-1, 3),
+            self.map.point_ids(points),
+            xyz,
+            pairs,
         )
 
     # -- inside ------------------------------------------------------------------------------------------------------
@@ -222,7 +234,9 @@ class Mapper:
         view = self.world_view()
         self._grid_job = self._next_job
         self._next_job += 1
-        return [Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.observations))]
+        return [
+            Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.observations))
+        ]
 
     def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
         live = self._intake.live.get(agent)

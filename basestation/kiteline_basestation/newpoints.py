@@ -1,17 +1,12 @@
 """Gives depth to points that stereo could not measure: from their sightings, and from births along epipolar lines.
 
-Source: the analytical initialisation of "Monocular EKF-SLAM with delayed landmark initialisation" (the point nearest to all
-rays), with the tests of parallax and reprojection of ORB-SLAM2.
+Source: the analytical initialisation of "Monocular EKF-SLAM with delayed landmark initialisation" (the point nearest
+to all rays), with the tests of parallax and reprojection of ORB-SLAM2.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from kiteline_codec.schema import Kind
-from kiteline_core.ids import KeyframeId
-from kiteline_core.se3 import skew
-from kiteline_core.sparse_map import BIRTH, CULLED, REMOVED, SparseMap
-from kiteline_core.triangulation import nearest_point, parallax, project, rays
 from numpy.typing import NDArray
 
 from kiteline_basestation import refind_kernels as kernels
@@ -19,6 +14,12 @@ from kiteline_basestation.config import MeasurementConfig, NewPointConfig
 from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.publisher import Publisher
 from kiteline_basestation.refind import descriptors, fuse
+from kiteline_codec.schema import Kind
+from kiteline_core.ids import KeyframeId
+from kiteline_core.map_tables import BIRTH, CULLED, REMOVED
+from kiteline_core.se3 import skew
+from kiteline_core.sparse_map import SparseMap
+from kiteline_core.triangulation import nearest_point, parallax, project, rays
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -26,7 +27,11 @@ Bool = NDArray[np.bool_]
 
 
 def triangulate(
-    sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, measurement: MeasurementConfig, publisher: Publisher
+    sparse_map: SparseMap,
+    keyframe: KeyframeId,
+    config: NewPointConfig,
+    measurement: MeasurementConfig,
+    publisher: Publisher,
 ) -> int:
     """Give depth to what a new keyframe sees and nobody could measure. Returns how many points got one."""
     return _from_sightings(sparse_map, keyframe, config, publisher) + _from_births(
@@ -39,9 +44,7 @@ def _without_depth(sparse_map: SparseMap, points: I32) -> I32:
     return points[~known]
 
 
-def _from_sightings(
-    sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, publisher: Publisher
-) -> int:
+def _from_sightings(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, publisher: Publisher) -> int:
     """Points that several keyframes see: from the two outermost views, tested in all of them."""
     points = _without_depth(sparse_map, sparse_map.points_of(keyframe))
     starts, slots = sparse_map.observations(points)
@@ -53,9 +56,7 @@ def _from_sightings(
     return _make(sparse_map, points, first, last, config, publisher)
 
 
-def _from_births(
-    sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, publisher: Publisher
-) -> int:
+def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, publisher: Publisher) -> int:
     """Births without depth of this keyframe and of covisible ones that are one point."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[keyframe]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_codec.schema import Culled, Depths, Found, Kind, Placement, Pose, Record, Removed
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap
-from kiteline_core.sparse_map import BIRTH, CULLED, REFINED, REFINED_POSE, REMOVED, SparseMap
-from numpy.typing import NDArray
+from kiteline_core.map_tables import BIRTH, CULLED, REFINED, REFINED_POSE, REMOVED
+from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]

@@ -1,21 +1,23 @@
 """Recognises known points where the agent bore new ones, in both directions, and fuses them.
 
-Old points are looked for among a new keyframe's births, and its new points among the births of older keyframes ("DS-PTAM: a
-distributed stereo PTAM", sections 2.4.4 and 3.1.2). Of two points that prove to be one, the older is the root.
+Old points are looked for among a new keyframe's births, and its new points among the births of older keyframes
+("DS-PTAM: a distributed stereo PTAM", sections 2.4.4 and 3.1.2). Of two points that prove to be one, the older is the
+root.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from kiteline_codec.schema import Kind
-from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
-from kiteline_core.sparse_map import BIRTH, CULLED, NO_POSE, REFINED, REMOVED, SparseMap
 from numpy.typing import NDArray
 
 from kiteline_basestation import refind_kernels as kernels
 from kiteline_basestation.config import RefindConfig
 from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.publisher import Publisher
+from kiteline_codec.schema import Kind
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH, CULLED, NO_POSE, REFINED, REMOVED
+from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -61,9 +63,7 @@ def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig
     return covisible + extra[: config.near_keyframes]
 
 
-def _search(
-    sparse_map: SparseMap, points: I32, target: KeyframeId, config: RefindConfig, publisher: Publisher
-) -> int:
+def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: RefindConfig, publisher: Publisher) -> int:
     """Match points (n,) (roots) with the births of a keyframe and fuse what is one."""
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(target)
@@ -81,7 +81,8 @@ def _search(
     distance = np.zeros(len(points), np.int32)
     kernels.match_projected(
         uv, octave, angle, disparity, descriptors(sparse_map, points),
-        table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured, descriptors(sparse_map, slots),
+        table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured,
+        descriptors(sparse_map, slots),
         config.radius_px, config.octave_gap, config.angle_gap, config.disparity_px, config.max_hamming, config.ratio,
         best, distance,
     )  # fmt: skip

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core.jit import njit
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
 
 _M1 = np.uint64(0x5555555555555555)
 _M2 = np.uint64(0x3333333333333333)
@@ -13,7 +20,7 @@ _S1, _S2, _S4, _S56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
 
 
 @njit
-def hamming(a, i, b, j):  # type: ignore[no-untyped-def]
+def hamming(a: U64, i: int, b: U64, j: int) -> int:
     """Bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
     total = 0
     for k in range(4):
@@ -21,19 +28,21 @@ def hamming(a, i, b, j):  # type: ignore[no-untyped-def]
         x = x - ((x >> _S1) & _M1)
         x = (x & _M2) + ((x >> _S2) & _M2)
         x = (x + (x >> _S4)) & _M4
-        total += np.int64((x * _H) >> _S56)
+        total += int((x * _H) >> _S56)
     return total
 
 
 @njit
-def match_projected(  # type: ignore[no-untyped-def]
-    uv, octave, angle, disparity, descriptor, uv2, octave2, angle2, disparity2, descriptor2,
-    radius_px, octave_gap, angle_gap, disparity_px, max_hamming, ratio, best, distance,
-):  # fmt: skip
+def match_projected(
+    uv: F64, octave: F64, angle: U8, disparity: F64, descriptor: U64,
+    uv2: F64, octave2: U8, angle2: U8, disparity2: F64, descriptor2: U64,
+    radius_px: float, octave_gap: float, angle_gap: int, disparity_px: float, max_hamming: int, ratio: float,
+    best: I32, distance: I32,
+) -> None:  # fmt: skip
     """The keypoint that shows each projected point, and the point that each keypoint shows, where both agree.
 
     Points: foreseen uv (n,2) px, octave (n,) float, angle (n,) 1/256 turns, disparity (n,) px, descriptor (n,4) uint64.
-    Keypoints: the same, measured; disparity2 (m,) negative where unknown. Writes best (n,) keypoint or -1, distance (n,).
+    Keypoints: the same, measured; disparity2 (m,) negative where unknown. Writes best (n,), -1 none, and distance.
     """
     n, m = uv.shape[0], uv2.shape[0]
     owner = np.full(m, -1, np.int32)
@@ -69,9 +78,10 @@ def match_projected(  # type: ignore[no-untyped-def]
 
 
 @njit
-def match_epipolar(  # type: ignore[no-untyped-def]
-    uv, octave, descriptor, uv2, octave2, descriptor2, fundamental, epipolar_px, max_hamming, ratio, best, distance
-):
+def match_epipolar(
+    uv: F64, octave: U8, descriptor: U64, uv2: F64, octave2: U8, descriptor2: U64, fundamental: F64,
+    epipolar_px: float, max_hamming: int, ratio: float, best: I32, distance: I32,
+) -> None:  # fmt: skip
     """The keypoint of a second view that lies on each keypoint's line and looks like it, each taken once.
 
     fundamental (3,3): line2 = fundamental @ (u, v, 1). Writes best (n,) int32, -1 none, and distance (n,) in bits.

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_codec.schema import Kind
-from kiteline_core.bundle import BundleResult
-from kiteline_core.ids import KeyframeId
-from kiteline_core.sparse_map import BIRTH, CULLED, REMOVED, SparseMap
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import CullConfig, PublishConfig
 from kiteline_basestation.covisibility import Window
 from kiteline_basestation.publisher import Publisher
+from kiteline_codec.schema import Kind
+from kiteline_core.bundle import BundleResult
+from kiteline_core.ids import KeyframeId
+from kiteline_core.map_tables import BIRTH, CULLED, REMOVED
+from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -75,7 +76,8 @@ def _points(
     points, inv, offset = points[~far_off], inv[~far_off], offset[~far_off]
     bf = sparse_map.keyframes.camera[table.row[points], 4]
     change = np.maximum(
-        np.abs(inv - sparse_map.inverse_depths(points)) * bf, np.abs(offset - table.offset[points]).max(axis=1, initial=0.0)
+        np.abs(inv - sparse_map.inverse_depths(points)) * bf,
+        np.abs(offset - table.offset[points]).max(axis=1, initial=0.0),
     )
     moved = points[change > publish.depth_px]
     if len(moved):

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from kiteline_codec.channel import RecordChannel
-from kiteline_core.ids import AgentId
-
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.channel import RecordChannel
+from kiteline_core.ids import AgentId
 
 
 @dataclass(frozen=True, slots=True)

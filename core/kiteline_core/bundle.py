@@ -1,7 +1,7 @@
 """Bundle adjustment: keyframe poses and points that agree best with robust pixel and disparity residuals.
 
-Source: B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000, section 6 (Schur complement); the two rounds with an
-outlier test between them are those of ORB-SLAM2 and of "DS-PTAM: a distributed stereo PTAM".
+Source: B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000, section 6 (Schur complement); the two rounds
+with an outlier test between them are those of ORB-SLAM2 and of "DS-PTAM: a distributed stereo PTAM".
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import bundle_kernels as kernels
 from kiteline_core.robust import CHI2_2, CHI2_3
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -34,8 +35,8 @@ class BundleConfig:
 class BundleProblem:
     """What is to be adjusted. Arrays are taken as they are and never changed.
 
-    T_c_m: (k,4,4) poses of the cameras. lens: (k,5) fx fy cx cy bf. free: (k,) whether a pose may move. points: (n,3) in m.
-    starts: (n + 1,) int32 rows of each point's observations. camera: (m,) int32, increasing inside a point.
+    T_c_m: (k,4,4) poses of the cameras. lens: (k,5) fx fy cx cy bf. free: (k,) whether a pose may move. points: (n,3)
+    in m. starts: (n + 1,) int32 rows of each point's observations. camera: (m,) int32, increasing inside a point.
     measured: (m,3) u, v, disparity in px, disparity -1 where there is none. sigma: (m,2) px of pixel and disparity.
     """
 
@@ -73,8 +74,8 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     bound = np.array([config.chi2_mono, config.chi2_stereo])
     squared = np.empty(m)
     scratch = (
-        np.empty((f, 6, 6)), np.empty((f, 6)), np.empty((n, 6)), np.empty((n, 3)), np.empty((m, 6, 3)), np.empty((n, 6)),
-        np.empty((6 * f, 6 * f)), np.empty(6 * f), np.empty_like(cameras), np.empty_like(points),
+        np.empty((f, 6, 6)), np.empty((f, 6)), np.empty((n, 6)), np.empty((n, 3)), np.empty((m, 6, 3)),
+        np.empty((n, 6)), np.empty((6 * f, 6 * f)), np.empty(6 * f), np.empty_like(cameras), np.empty_like(points),
     )  # fmt: skip
     counts = np.zeros(3, np.int64)
     model = (problem.starts, problem.camera, problem.measured, weight)
@@ -89,7 +90,7 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
         cost = float(
             kernels.minimise(
                 cameras, problem.lens, points, *model, active, bound, free, trials, config.stop, *scratch, counts
-            )  # fmt: skip
+            )
         )
         kernels.squared_residuals(cameras, problem.lens, points, *model, squared)
         active[:] = squared <= limit
@@ -112,7 +113,12 @@ def unpack(cameras: F64) -> F64:
 
 
 def _operations(counts: NDArray[np.int64], observations: int, free: int) -> int:
-    """Arithmetic operations of a run: the cost model of lock-step flights. A camera system counts as a band of 20 cameras."""
+    """Arithmetic operations of a run, the cost model of lock-step flights; cameras are taken for a band of 20."""
     trials, linearisations, pairs = (int(c) for c in counts)
     band = 6 * min(free, 20)
-    return linearisations * observations * 260 + trials * observations * 110 + pairs * 220 + trials * 6 * free * band * band
+    return (
+        linearisations * observations * 260
+        + trials * observations * 110
+        + pairs * 220
+        + trials * 6 * free * band * band
+    )

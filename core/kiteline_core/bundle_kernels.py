@@ -2,14 +2,15 @@
 
 Arrays throughout: cameras (k,12) = rotation row by row and translation of T_c_m; lens (k,5) = fx fy cx cy bf; points
 (n,3) in m; observations sorted by point, inside a point by camera: starts (n + 1,), camera (m,), measured (m,3) = u, v,
-disparity (negative: none) in px, weight (m,2) = 1/sigma^2 of pixel and disparity, active (m,) uint8. free (k,): the number
-of each camera among the free ones, increasing, -1 for a fixed camera. A camera is turned by T_c_m <- Exp(d) T_c_m with
-d = [translation, rotation].
+disparity (negative: none) in px, weight (m,2) = 1/sigma^2 of pixel and disparity, active (m,) uint8. free (k,):
+the number of each camera among the free ones, increasing, -1 for a fixed camera. A camera moves by T_c_m <- Exp(d) T_c_m
+with d = [translation, rotation].
 """
 
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 NEAR_M = 0.02  # a point nearer than this to the camera plane has no image
@@ -18,7 +19,7 @@ BEHIND = 1.0e12  # squared residual charged for such an observation: no step may
 
 @njit
 def _residual(cameras, c, lens, points, i, measured, weight, o):  # type: ignore[no-untyped-def]
-    """Observation o of point i by camera c: squared norm, residuals, place in the camera (x, y, depth), has an image."""
+    """Observation o of point i by camera c: squared norm, residuals, place in the camera (x, y, depth), is seen."""
     p0, p1, p2 = points[i, 0], points[i, 1], points[i, 2]
     x = cameras[c, 0] * p0 + cameras[c, 1] * p1 + cameras[c, 2] * p2 + cameras[c, 9]
     y = cameras[c, 3] * p0 + cameras[c, 4] * p1 + cameras[c, 5] * p2 + cameras[c, 10]
@@ -136,8 +137,8 @@ def linearise(  # type: ignore[no-untyped-def]
 def reduce(starts, camera, active, free, damping, hcc, bc, hpp, bp, hcp, inv, s, rhs):  # type: ignore[no-untyped-def]
     """The camera system left when the points are eliminated: upper triangle of s (6f,6f) and rhs (6f,).
 
-    Diagonals are damped by the factor 1 + damping (Marquardt). inv (n,6): the inverted point blocks. Returns the number of
-    pairs of observations that were combined.
+    Diagonals are damped by the factor 1 + damping (Marquardt). inv (n,6): the inverted point blocks. Returns the number
+    of pairs of observations that were combined.
     """
     s[:] = 0.0
     for f in range(hcc.shape[0]):
@@ -230,7 +231,9 @@ def solve(s, x):  # type: ignore[no-untyped-def]
 
 
 @njit
-def step(cameras, points, starts, camera, active, free, inv, bp, hcp, dx, new_cameras, new_points):  # type: ignore[no-untyped-def]
+def step(  # type: ignore[no-untyped-def]
+    cameras, points, starts, camera, active, free, inv, bp, hcp, dx, new_cameras, new_points
+):
     """Apply a camera step dx (6f,), and the point steps that follow from it. Returns the largest motion of a camera."""
     largest = 0.0
     r = np.empty((3, 3))
@@ -290,8 +293,8 @@ def minimise(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Levenberg-Marquardt in place of cameras and points. counts (3,): trials, linearisations, pairs. Returns the cost.
 
-    Damping after H. Nielsen, "Damping parameter in Marquardt's method", 1999. Ends after `trials` trials, or when a step
-    lowers the cost by less than the fraction `stop`.
+    Damping after H. Nielsen, "Damping parameter in Marquardt's method", 1999. Ends after `trials` trials, or when a
+    step lowers the cost by less than the fraction `stop`.
     """
     damping, growth = 1e-4, 2.0
     fresh = True

@@ -1,17 +1,19 @@
 """The sparse map: keyframes, their keypoints and the points that hang on them, as structures of arrays keyed by id.
 
-Points hang on keyframes: a point is a pixel of the keyframe of its birth (its *anchor*) and an inverse depth, so that it
-moves with its keyframe. Each keypoint owns one *slot* (its row in `keypoints`); a point is named inside the map by the
-slot of its birth. `root` maps every slot to the point it observes, fused points to the one they were fused into.
+Points hang on keyframes: a point is a pixel of the keyframe of its birth (its *anchor*) and an inverse depth, so that
+it moves with its keyframe. Each keypoint owns one *slot* (its row in `keypoints`); a point is named inside the map by
+the slot of its birth. `root` maps every slot to the point it observes, fused points to the one they were fused into.
 Sections may come in any order and any number of times; what a section does not know yet is linked when it comes.
 """
 
 from __future__ import annotations
 
 from bisect import insort
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import sparse_map_kernels as kernels
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -25,7 +27,22 @@ from kiteline_core.ids import (
     agent_of_keyframe,
     submap_of_keyframe,
 )
-from numpy.typing import NDArray
+from kiteline_core.map_tables import (
+    BIRTH,
+    COMPOSED,
+    CULLED,
+    EMPTY,
+    NO_POSE,
+    REFINED,
+    REFINED_POSE,
+    REMOVED,
+    SIGHTING,
+    KeyframeTable,
+    KeypointTable,
+    empty_keyframes,
+    empty_keypoints,
+    grow,
+)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -34,79 +51,13 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-EMPTY, BIRTH, SIGHTING = 0, 1, 2  # what a keypoint is
-REMOVED, CULLED, REFINED = 1, 2, 4  # bits of its flags: observation rejected; point dropped; point has a base value
-NO_POSE, COMPOSED, REFINED_POSE = 0, 1, 2  # where a keyframe's pose comes from
-
-
-@dataclass(slots=True)
-class KeyframeTable:
-    """One row a keyframe, in order of arrival. Arrays have spare capacity: only the first `len(map)` rows count."""
-
-    id: I64
-    t_ns: I64
-    parent: I64  # keyframe id, NO_KEYFRAME for the first of a submap
-    T_p_k: F64  # (n,4,4) in the parent, as the agent wrote it
-    T_m_k: F64  # (n,4,4) in the submap: the base's value, else composed from the parent's
-    pose_source: U8
-    start: I32  # first slot of its keypoints
-    count: I32  # number of keypoints
-    filled: I32  # number of keypoints that have arrived
-    culled: U8  # 1: its observations no longer count
-    camera: F64  # (n,5) fx fy cx cy bf in px and px*m
-
-
-@dataclass(slots=True)
-class KeypointTable:
-    """One row (slot) a keypoint. Arrays have spare capacity: only the first `slots` rows count."""
-
-    uv: F32  # (n,2) px
-    inv_depth: F32  # 1/m as the agent saw it, 0 unknown
-    octave: U8
-    angle: U8  # 1/256 turns
-    kind: U8  # EMPTY, BIRTH, SIGHTING
-    part: U8  # section from which it came
-    flags: U8
-    usable: U8  # 1: a valid observation: present, not removed, of a keyframe that has a pose and is not culled
-    point: I64  # id of the point that a sighting names; NO_POINT for a birth
-    row: I32  # row of its keyframe
-    root: I32  # slot of the point it observes, -1 while unknown
-    first: I32  # newest observation that hangs on the point born here, -1 none
-    next: I32  # next observation of the same point, -1 none
-    refined: F32  # 1/m: inverse depth of the point born here by the base, valid with flag REFINED
-    offset: F32  # (n,2) px from the keypoint to the point's bearing by the base
-    descriptor: U8  # (n,32) of a birth
-
-
-def _grown(table: KeyframeTable | KeypointTable, capacity: int) -> None:
-    for field in fields(table):
-        old = getattr(table, field.name)
-        new = np.zeros((capacity, *old.shape[1:]), old.dtype)
-        new[: len(old)] = old
-        setattr(table, field.name, new)
-
-
-def _empty_keyframes() -> KeyframeTable:
-    i64, u8, i32 = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int32)
-    t = np.zeros((0, 4, 4))
-    return KeyframeTable(i64, i64, i64, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)))
-
-
-def _empty_keypoints() -> KeypointTable:
-    f32, u8, i32 = np.zeros(0, np.float32), np.zeros(0, np.uint8), np.zeros(0, np.int32)
-    f32x2 = np.zeros((0, 2), np.float32)
-    return KeypointTable(
-        f32x2, f32, u8, u8, u8, u8, u8, u8, np.zeros(0, np.int64), i32, i32, i32, i32, f32, f32x2,
-        np.zeros((0, 32), np.uint8),
-    )  # fmt: skip
-
 
 class SparseMap:
     """Keyframes, keypoints and points of any number of agents and submaps. Row and slot numbers never change."""
 
     def __init__(self) -> None:
-        self.keyframes = _empty_keyframes()
-        self.keypoints = _empty_keypoints()
+        self.keyframes = empty_keyframes()
+        self.keypoints = empty_keypoints()
         self.slots = 0
         self.rows: dict[KeyframeId, int] = {}
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes of each submap in order of id
@@ -147,7 +98,7 @@ class SparseMap:
         if row is None:
             row = len(self.rows)
             if row == len(table.id):
-                _grown(table, row + max(32, row // 4))
+                grow(table, row + max(32, row // 4))
             self.rows[keyframe] = row
             insort(self.submaps.setdefault(submap_of_keyframe(keyframe), []), keyframe)
             table.id[row] = keyframe
@@ -171,8 +122,8 @@ class SparseMap:
         return row
 
     def put_births(
-        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8, angle: U8,
-        descriptor: U8,
+        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,
+        angle: U8, descriptor: U8,
     ) -> None:  # fmt: skip
         """Births of a keyframe whose header is here (see codec schema Births); a newer part replaces an older one."""
         slots, keep = self._section(keyframe, part, index, BIRTH)
@@ -190,7 +141,14 @@ class SparseMap:
         self._refresh_usable(self.rows[keyframe])
 
     def put_sightings(
-        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8, point: I64
+        self,
+        keyframe: KeyframeId,
+        part: int,
+        index: NDArray[np.uint16],
+        uv: F32,
+        inv_depth: F32,
+        octave: U8,
+        point: I64,
     ) -> None:
         """Sightings of a keyframe whose header is here (see codec schema Sightings); a newer part replaces an older."""
         slots, keep = self._section(keyframe, part, index, SIGHTING)
@@ -280,7 +238,7 @@ class SparseMap:
     def observed(self, keyframe: KeyframeId) -> I32:
         """Slots of a keyframe's valid observations whose point is known and not culled."""
         slots = self.slots_of(keyframe)
-        return slots[self._counts(slots)]
+        return np.asarray(slots[self._counts(slots)])
 
     def points_of(self, keyframe: KeyframeId) -> I32:
         """Sorted slots of the points that a keyframe observes."""
@@ -292,7 +250,7 @@ class SparseMap:
         n = self.slots
         here = np.arange(n, dtype=np.int32)
         live = (table.kind[:n] == BIRTH) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
-        return here[live]
+        return np.asarray(here[live])
 
     def observations(self, points: I32) -> tuple[I32, I32]:
         """Valid observations of points (n,), in order of keyframe id, one a keyframe.
@@ -334,12 +292,14 @@ class SparseMap:
         z = 1.0 / np.where(valid, inv, 1.0)
         fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
         uv = table.uv[points].astype(np.float64) + table.offset[points]
-        local = np.stack([(uv[:, 0] - cx) / np.where(fx > 0, fx, 1.0) * z, (uv[:, 1] - cy) / np.where(fy > 0, fy, 1.0) * z, z], 1)
+        local = np.stack(
+            [(uv[:, 0] - cx) / np.where(fx > 0, fx, 1.0) * z, (uv[:, 1] - cy) / np.where(fy > 0, fy, 1.0) * z, z], 1
+        )
         pose = self.keyframes.T_m_k[rows]
         return np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3], valid & (fx > 0)
 
     def bearing_of(self, points: I32, positions: F64) -> tuple[F32, F32, Bool]:
-        """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, and whether each lies before its anchor."""
+        """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, whether each lies before its anchor."""
         rows = self.keypoints.row[points]
         pose = self.keyframes.T_m_k[rows]
         local = np.einsum("nji,nj->ni", pose[:, :3, :3], positions - pose[:, :3, 3])
@@ -355,7 +315,7 @@ class SparseMap:
         row = self.rows.get(keyframe)
         if row is None or self.keyframes.pose_source[row] == NO_POSE:
             return None
-        return self.keyframes.T_m_k[row].copy()
+        return np.asarray(self.keyframes.T_m_k[row]).copy()
 
     def complete(self, keyframe: KeyframeId) -> bool:
         """Whether all keypoints that the header announced have arrived."""
@@ -373,7 +333,7 @@ class SparseMap:
         start, table = self.slots, self.keypoints
         self.slots += keypoints
         if self.slots > len(table.row):
-            _grown(table, self.slots + max(8192, self.slots // 4))
+            grow(table, self.slots + max(8192, self.slots // 4))
         new = slice(start, self.slots)
         table.row[new] = row
         table.root[new] = -1
@@ -419,7 +379,7 @@ class SparseMap:
         root = table.root[slots]
         alive = (table.usable[slots] != 0) & (root >= 0)
         alive[alive] = (table.flags[root[alive]] & CULLED == 0) & (table.kind[root[alive]] == BIRTH)
-        return alive
+        return np.asarray(alive)
 
     def _refresh_usable(self, row: int) -> None:
         table = self.keypoints

@@ -1,18 +1,19 @@
 """Kernels of the sparse map: the lists of observations that hang on each point, kept inside flat arrays.
 
 Every keypoint of every keyframe owns one *slot*. `root[s]` is the slot of the point that keypoint s observes (-1 while
-unknown). `first[p]` is the newest observation of point p and `next_[s]` the one that follows s in that list (-1 ends it).
+unknown). `first[p]` is the newest observation of point p and `next_[s]` the one that follows s in that list (-1: end).
 """
 
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 
 @njit
 def link(slots, roots, root, first, next_):  # type: ignore[no-untyped-def]
-    """Let observation slots[i] (n,) int32 hang on point roots[i]; a slot that hangs on another point leaves that list."""
+    """Let observation slots[i] (n,) int32 hang on point roots[i]; a slot that hangs on another point leaves it."""
     for i in range(slots.shape[0]):
         s = slots[i]
         old = root[s]

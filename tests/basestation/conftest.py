@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+
 from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
@@ -35,9 +36,9 @@ class Flight:
 
 
 def fly(
-    keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3, drift_m: float = 0.004,
-    outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0, missed: float = 0.1,
-    no_depth: float = 0.0,
+    keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3,
+    drift_m: float = 0.004, outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0,
+    missed: float = 0.1, no_depth: float = 0.0,
 ) -> Flight:  # fmt: skip
     """Fly a circle of 1.2 m radius, looking outwards. memory: keyframes after which the tracker forgets a point."""
     rng = np.random.default_rng(seed)
@@ -90,9 +91,15 @@ def fly(
                     angle = ((direction[rows[some]] + rng.integers(-5, 6, len(some))) & 255).astype(np.uint8)
                     made.append(
                         Births(
-                            keyframe, part, index[some], measured[some], inverse[some], octave[some], angle,
+                            keyframe,
+                            part,
+                            index[some],
+                            measured[some],
+                            inverse[some],
+                            octave[some],
+                            angle,
                             descriptors[rows[some]] ^ flips[some],
-                        )  # fmt: skip
+                        )
                     )
                 else:
                     made.append(

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
 from kiteline_core import bundle_kernels as kernels
 from kiteline_core import se3
 from kiteline_core.bundle import BundleConfig, BundleProblem, bundle, pack, unpack
 from kiteline_core.robust import huber_cost, huber_weight
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
 
 
-def scene(cameras: int, points: int, noise_px: float, seed: int, fixed: int = 1, outliers: float = 0.0) -> tuple[BundleProblem, F64, F64]:
+def scene(
+    cameras: int, points: int, noise_px: float, seed: int, fixed: int = 1, outliers: float = 0.0
+) -> tuple[BundleProblem, F64, F64]:
     """A row of cameras that look at a cloud; returns the disturbed problem, true poses and true points."""
     rng = np.random.default_rng(seed)
-    world = np.stack([rng.uniform(-4, 4 + 0.1 * cameras, points), rng.uniform(-3, 3, points), rng.uniform(4, 9, points)], 1)
-    truth = np.stack([se3.inverse(se3.exp(np.concatenate([[0.1 * i, 0, 0], rng.normal(0, 0.05, 3)]))) for i in range(cameras)])
+    world = np.stack(
+        [rng.uniform(-4, 4 + 0.1 * cameras, points), rng.uniform(-3, 3, points), rng.uniform(4, 9, points)], 1
+    )
+    truth = np.stack(
+        [se3.inverse(se3.exp(np.concatenate([[0.1 * i, 0, 0], rng.normal(0, 0.05, 3)]))) for i in range(cameras)]
+    )
     rows: list[tuple[int, int, float, float, float]] = []
     starts = [0]
     for p in range(points):
@@ -49,7 +56,14 @@ def residuals(problem: BundleProblem, poses: F64, points: F64) -> F64:
     which = np.repeat(np.arange(len(points)), np.diff(problem.starts))
     q = np.einsum("nij,nj->ni", poses[problem.camera][:, :3, :3], points[which]) + poses[problem.camera][:, :3, 3]
     lens = problem.lens[problem.camera]
-    r = np.stack([lens[:, 0] * q[:, 0] / q[:, 2] + lens[:, 2], lens[:, 1] * q[:, 1] / q[:, 2] + lens[:, 3], lens[:, 4] / q[:, 2]], 1)
+    r = np.stack(
+        [
+            lens[:, 0] * q[:, 0] / q[:, 2] + lens[:, 2],
+            lens[:, 1] * q[:, 1] / q[:, 2] + lens[:, 3],
+            lens[:, 4] / q[:, 2],
+        ],
+        1,
+    )
     r -= problem.measured
     r[problem.measured[:, 2] < 0, 2] = 0.0
     return r / problem.sigma[:, [0, 0, 1]]
@@ -81,11 +95,28 @@ def test_normal_equations_agree_with_numeric_differences() -> None:
     problem, _, _ = scene(3, 12, 0.5, 2)
     n, m, f = len(problem.points), len(problem.camera), 2
     free = np.array([-1, 0, 1], np.int32)
-    hcc, bc, hpp, bp, hcp = np.empty((f, 6, 6)), np.empty((f, 6)), np.empty((n, 6)), np.empty((n, 3)), np.zeros((m, 6, 3))
+    hcc, bc, hpp, bp, hcp = (
+        np.empty((f, 6, 6)),
+        np.empty((f, 6)),
+        np.empty((n, 6)),
+        np.empty((n, 3)),
+        np.zeros((m, 6, 3)),
+    )
     model = (problem.starts, problem.camera, problem.measured, 1.0 / np.square(problem.sigma))
     huge = np.array([1e12, 1e12])
     cost = kernels.linearise(
-        pack(problem.T_c_m), problem.lens, problem.points, *model, np.ones(m, np.uint8), huge, free, hcc, bc, hpp, bp, hcp
+        pack(problem.T_c_m),
+        problem.lens,
+        problem.points,
+        *model,
+        np.ones(m, np.uint8),
+        huge,
+        free,
+        hcc,
+        bc,
+        hpp,
+        bp,
+        hcp,
     )
 
     def move(x: F64) -> F64:
@@ -119,7 +150,13 @@ def test_reduced_system_and_its_solution_agree_with_dense_algebra() -> None:
     problem, _, _ = scene(6, 40, 0.5, 3)
     n, m, f = len(problem.points), len(problem.camera), 5
     free = np.arange(-1, 5, dtype=np.int32)
-    hcc, bc, hpp, bp, hcp = np.empty((f, 6, 6)), np.empty((f, 6)), np.empty((n, 6)), np.empty((n, 3)), np.zeros((m, 6, 3))
+    hcc, bc, hpp, bp, hcp = (
+        np.empty((f, 6, 6)),
+        np.empty((f, 6)),
+        np.empty((n, 6)),
+        np.empty((n, 3)),
+        np.zeros((m, 6, 3)),
+    )
     model = (problem.starts, problem.camera, problem.measured, 1.0 / np.square(problem.sigma))
     active, bound = np.ones(m, np.uint8), np.array([5.99, 7.81])
     cameras = pack(problem.T_c_m)
@@ -197,7 +234,7 @@ def test_reaches_the_cost_of_an_independent_solver(outliers: float) -> None:
 
 
 def test_finds_truth_from_exact_pixels_and_outliers_among_noisy_ones() -> None:
-    problem, truth, world = scene(5, 60, 0.0, 11, fixed=2)
+    problem, truth, _ = scene(5, 60, 0.0, 11, fixed=2)
     result = bundle(problem, BundleConfig(robust_trials=30, final_trials=0, stop=1e-12))
     assert result.final_cost < 1e-6
     assert np.allclose(result.T_c_m, truth, atol=1e-5)
