@@ -19,6 +19,14 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
+
+from kiteline_agent.agent import Agent, Identity, StepInput, StepOutput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.camera import Camera
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.flight_log import write_step
+from kiteline_agent.tally import Tally, live_line, odometry_line
+from kiteline_agent.warm import warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
@@ -28,18 +36,10 @@ from kiteline_hw import process
 from kiteline_hw.cpu import rss_mib
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
-from kiteline_hw.ports import FrameSource, LinkError
+from kiteline_hw.ports import FrameSource, LinkError, SourceError
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
 from kiteline_hw.zenoh_lockstep import LockstepClient
-
-from kiteline_agent.agent import Agent, Identity, StepInput, StepOutput
-from kiteline_agent.alone import AloneChannel
-from kiteline_agent.camera import Camera
-from kiteline_agent.config import AgentConfig
-from kiteline_agent.flight_log import write_step
-from kiteline_agent.tally import Tally, live_line, odometry_line
-from kiteline_agent.warm import warm
 
 _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
@@ -281,7 +281,7 @@ def fly_lockstep(spec: AgentSpec, parent: process.Parent, stop: process.StopSign
                 parent.tell("awaiting_base")
                 line.meet_again()
                 up = onboard.hello()
-        parent.tell("result", report={**onboard.report(), "base_lost": line.times_lost > 0, "digest_equal": up.digest_equal})
+        parent.tell("result", report={**onboard.report(), "base_lost": line.times_lost})
     finally:
         line.close()
         onboard.close()
@@ -322,3 +322,35 @@ class Barrier:
         if self._client is not None:
             self._client.close()
             self._client = None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """`kiteline agent`, and a child of `kiteline fly` (with --spec); the exit status."""
+    a = parser().parse_args(argv)
+    stop = process.StopSignal()
+    if a.spec:
+        spec = from_json(a.spec)
+        return run_child(spec, stop)
+    return 0
+
+
+def run_child(spec: AgentSpec, stop: process.StopSignal) -> int:
+    """Fly as a child process; an error that a user can mend ends in one line."""
+    parent = process.Parent()
+    try:
+        fly_lockstep(spec, parent, stop)
+    except (SourceError, LinkError, ValueError) as error:
+        parent.tell("error", text=str(error))
+        return 2
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline agent`."""
+    p = argparse.ArgumentParser(prog="kiteline agent", description="The onboard half.")
+    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
+    return p
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

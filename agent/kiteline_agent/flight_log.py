@@ -11,10 +11,10 @@ from dataclasses import fields
 from typing import Any, Protocol
 
 import numpy as np
-from kiteline_core.frame import Frame, ImuBatch
 from numpy.typing import NDArray
 
 from kiteline_agent.agent import Estimate, StepInput, StepOutput
+from kiteline_core.frame import Frame, ImuBatch
 
 STEP, IMU, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
     "/step", "/imu", "/packets/in", "/packets/out", "/estimate", "/events",
@@ -60,7 +60,7 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
         if estimate.tracked and pose is not None:
             log.pose("/pose", log_ns, "submap" if estimate.T_w_b is None else "world", pose)
     if output.events:
-        log.json(EVENTS, log_ns, {"events": [repr(event) for event in output.events]})
+        log.json(EVENTS, log_ns, {"events": list(output.events)})
     for packet in output.packets:
         log.blob(PACKETS_OUT, log_ns, packet)
 

@@ -11,10 +11,9 @@ import pickle
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from kiteline_core.ids import AgentId
-
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import StationOutput
+from kiteline_core.ids import AgentId
 
 STEP, JOB = "/step", "/job"
 

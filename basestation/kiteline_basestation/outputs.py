@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.ids import KeyframeId
 from numpy.typing import NDArray
 
 from kiteline_basestation.export import map_ply
 from kiteline_basestation.grid import build, to_pgm, to_yaml
 from kiteline_basestation.mapper import Mapper
+from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[np.float64]
 

@@ -1,8 +1,8 @@
 """The processes of one flight on this machine: started, listened to, and never left behind.
 
-    with Crew() as crew:
-        crew.start("base", "kiteline_basestation", spec, folder)
-        for event in crew.events(): ...
+with Crew() as crew:
+    crew.start("base", "kiteline_basestation", spec, folder)
+    for event in crew.events(): ...
 """
 
 from __future__ import annotations

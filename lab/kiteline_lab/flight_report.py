@@ -1,4 +1,4 @@
-"""What a flight leaves: the refined trajectory composed from both halves, the report, its table, and a check of it all."""
+"""What a flight leaves: the refined trajectory composed from both halves, the report, its table, a check of it all."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import se3, tum
 from kiteline_core.ids import KeyframeId, SubmapId
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 Report = dict[str, Any]
@@ -47,7 +48,7 @@ def compose(frames: Sequence[TrackedFrame], T_w_k: Mapping[int, F64], T_b_c: F64
 
     A frame whose keyframe the base does not hold (still on its way when the flight ended) hangs on the agent's own
     submap, placed where the nearest earlier keyframe that the base does hold puts it; before the first such keyframe,
-    where that first one puts it. Frames of a submap of which the base holds nothing have no place in w and are left out.
+    where that first one puts it. Frames of a submap of which the base holds nothing have no place in w: left out.
     """
     poses: list[tuple[int, F64]] = []
     placed: dict[int, F64] = {}  # submap -> T_w_m that its latest known keyframe implies

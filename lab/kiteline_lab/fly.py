@@ -15,7 +15,6 @@ from kiteline_basestation.__main__ import BaseSpec
 from kiteline_core.frame import Frame
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
 from kiteline_hw.sources import open_source
-
 from kiteline_lab.flight import Flight, Outcome, fly_here, fly_processes
 from kiteline_lab.flight_report import table
 from kiteline_lab.judge import judge
@@ -67,8 +66,8 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline fly`."""
     p = argparse.ArgumentParser(
         prog="kiteline fly",
-        description="Fly recordings or a simulation: one agent a SOURCE, and a base, as processes of this machine over a "
-        "real link, in lock-step unless --realtime. Leaves trajectories, map, grid, logs, a plot and report.json.",
+        description="Fly recordings or a simulation: one agent a SOURCE, and a base, as processes of this machine over "
+        "a real link, in lock-step unless --realtime. Leaves trajectories, map, grid, logs, a plot and report.json.",
         epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path.",
     )
     p.add_argument("sources", metavar="SOURCE", nargs="+")
@@ -152,7 +151,7 @@ def plan(o: Options) -> Plan:
 
 
 def flight_starts(sources: list[FrameSource]) -> list[int]:
-    """The stamp of each source that is flight time 0: sources whose times overlap share a clock, others start together."""
+    """The stamp of each source that is flight time 0: sources that overlap in time share a clock, others begin together."""
     spans = [_span_ns(source, several=len(sources) > 1) for source in sources]
     if max(first for first, _ in spans) < min(last for _, last in spans):
         return [min(first for first, _ in spans)] * len(spans)
@@ -184,7 +183,7 @@ def clear(out: Path) -> None:
 
 
 def fly(o: Options, quiet: bool = False) -> tuple[dict[str, object], Outcome]:
-    """Fly and judge; the report as it was written, and how the flight went. Raises SourceError, LinkError, ConfigError."""
+    """Fly and judge; the report as written, and how the flight went. Raises SourceError, LinkError, ConfigError."""
     if o.realtime and o.mode != "distributed":
         raise LinkError(f"--realtime flies processes over a link: it does not go with --mode {o.mode}")
     made = plan(o)
@@ -192,7 +191,7 @@ def fly(o: Options, quiet: bool = False) -> tuple[dict[str, object], Outcome]:
         clear(o.out)
         flight = Flight(made.agents, made.base, made.frames, quiet)
         if o.mode == "distributed":
-            outcome = fly_processes(flight, o.link, o.realtime, o.restart_base_at_s)
+            outcome = fly_processes(flight, o.link, o.realtime)
         else:
             outcome = fly_here(flight, made.sources, o.mode)
         report = judge(o.out, made.sources, made.agents, outcome, align_scale=o.mono)
