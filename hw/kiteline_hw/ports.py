@@ -6,6 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
 
@@ -94,6 +97,27 @@ class Framer(Protocol):
     def feed(self, data: bytes) -> list[bytes]:
         """Take what the stream delivered, any bytes in any pieces; the whole and sound packets completed by it."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSample:
+    """A pose for a flight controller. T_o_b: (4,4) body in the continuous odometry frame, z up. t_ns: capture time on
+    the clock whose times are handed to the sink. quality: -1 failed, 0 unknown, 1..100. epoch: bumped only when the
+    odometry frame itself began anew (a restart of the agent), never for a map correction.
+    """
+
+    t_ns: int
+    T_o_b: NDArray[np.float64]
+    tracked: bool
+    quality: int
+    epoch: int = 0
+
+
+class PoseSink(Protocol):
+    """Somebody who wants poses as they come. `push` never blocks and never raises for a peer that is away."""
+
+    def push(self, pose: PoseSample, now_ns: int) -> None: ...
+    def close(self) -> None: ...
 
 
 class Clock(Protocol):

@@ -1,0 +1,154 @@
+"""What goes to a flight controller, and when: HEARTBEAT, ODOMETRY, answers to TIMESYNC. Time is handed in.
+
+The controller gets the continuous odometry frame. Corrections of the map never reach it: they would be jumps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kiteline_core.se3 import F64
+from kiteline_hw.mavlink_frames import body_rates, local_covariance, local_pose, upper_triangle
+from kiteline_hw.mavlink_messages import Heartbeat, HighresImu, MavlinkCodec, Odometry, TimeSync
+from kiteline_hw.ports import PoseSample
+
+_FARTHEST_M = 1e6  # m; beyond it something is broken, and a float32 has lost its centimetres
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """How poses are sent."""
+
+    rate_hz: float = 30.0  # Hz; PX4 wants 30 to 50, ArduPilot at least 4; 245 bytes each
+    rate_slack_ns: int = 4_000_000  # ns; a frame that comes this early is not late for its turn: cameras jitter
+    heartbeat_ns: int = 1_000_000_000  # ns; the MAVLink routine
+    longest_gap_ns: int = 250_000_000  # ns; velocities are not taken across a longer gap between poses
+    shortest_gap_ns: int = 2_000_000  # ns; nor across a shorter one: noise over time
+    position_sigma_m: float = 0.03  # m; of a good pose. Both controllers read the diagonal as noise of a measurement
+    angle_sigma_rad: float = 0.02  # rad; likewise
+    velocity_sigma_m_s: float = 0.1  # m/s; of two poses a frame apart
+    rate_sigma_rad_s: float = 0.1  # rad/s; likewise
+    imu_samples: int = 4096  # samples kept for who asks; 20 s at 200 Hz
+
+
+@dataclass(slots=True)
+class OdometryCounters:
+    """What was sent and why poses were not."""
+
+    odometry: int = 0
+    heartbeats: int = 0
+    timesync_answers: int = 0
+    rate_limited: int = 0
+    without_velocity: int = 0  # first of a row: there is nothing to take a velocity from
+    broken: int = 0  # not finite, or absurdly far away
+    stale: int = 0  # not newer than the one before
+
+
+class OdometryStream:
+    """Poses in, MAVLink bytes out. T_b_f: (4,4) flight controller (FRD) in the body frame: mavlink_frames.mounting."""
+
+    def __init__(self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None) -> None:
+        self.config = config or OdometryConfig()
+        self.codec = codec or MavlinkCodec()
+        self.counters = OdometryCounters()
+        self._T_b_f = T_b_f
+        self._period_ns = round(1e9 / self.config.rate_hz)
+        self._next_heartbeat_ns: int | None = None
+        self._next_odometry_ns: int | None = None
+        self._before: PoseSample | None = None
+        self._autopilot: tuple[Heartbeat, int] | None = None
+        self._imu: list[HighresImu] = []
+
+    def step(self, pose: PoseSample | None, now_ns: int) -> list[bytes]:
+        """Messages to send now: a heartbeat if it is time, the pose (the newest, or None) if it is its turn."""
+        out = []
+        if self._next_heartbeat_ns is None or now_ns >= self._next_heartbeat_ns:
+            self._next_heartbeat_ns = now_ns + self.config.heartbeat_ns
+            self.counters.heartbeats += 1
+            out.append(self.codec.heartbeat())
+        if pose is not None:
+            message = self._odometry(pose, now_ns)
+            if message is not None:
+                self.counters.odometry += 1
+                out.append(self.codec.odometry(message))
+        return out
+
+    def _odometry(self, pose: PoseSample, now_ns: int) -> Odometry | None:
+        before = self._before
+        if not np.all(np.isfinite(pose.T_o_b)) or float(np.abs(pose.T_o_b[:3, 3]).max()) > _FARTHEST_M:
+            self.counters.broken += 1
+            return None
+        if before is not None and pose.epoch == before.epoch and pose.t_ns <= before.t_ns:
+            self.counters.stale += 1
+            return None
+        self._before = pose
+        gap_ns = pose.t_ns - before.t_ns if before is not None and pose.epoch == before.epoch else 0
+        if before is None or not self.config.shortest_gap_ns <= gap_ns <= self.config.longest_gap_ns:
+            self.counters.without_velocity += 1  # ArduPilot would take NaN velocities into its filter
+            return None
+        if not self._is_turn(now_ns):
+            self.counters.rate_limited += 1
+            return None
+        velocity, rate = body_rates(before.T_o_b, pose.T_o_b, gap_ns * 1e-9, self._T_b_f)
+        position, q = local_pose(pose.T_o_b, self._T_b_f)
+        quality = max(-1, min(100, pose.quality)) if pose.tracked else -1
+        pose_cov, velocity_cov = self._covariances(quality)
+        return Odometry(
+            time_usec=pose.t_ns // 1000,
+            position_m=position.tolist(),
+            q=q.tolist(),
+            velocity_m_s=velocity.tolist(),
+            rate_rad_s=rate.tolist(),
+            pose_covariance=pose_cov,
+            velocity_covariance=velocity_cov,
+            reset_counter=pose.epoch & 0xFF,
+            quality=quality,
+        )
+
+    def _is_turn(self, now_ns: int) -> bool:
+        """Whether the rate allows a message now. Early turns are paid back, so that the mean rate holds."""
+        due_ns = self._next_odometry_ns
+        if due_ns is None or now_ns - due_ns >= self._period_ns:
+            self._next_odometry_ns = now_ns + self._period_ns
+            return True
+        if now_ns + self.config.rate_slack_ns < due_ns:
+            return False
+        self._next_odometry_ns = due_ns + self._period_ns
+        return True
+
+    def _covariances(self, quality: int) -> tuple[list[float], list[float]]:
+        """Diagonal ones; they grow as the quality falls, tenfold in standard deviation where it failed."""
+        c = self.config
+        worse = 100.0 / max(10, quality)
+        sigma = worse * np.array([c.position_sigma_m] * 3 + [c.angle_sigma_rad] * 3)
+        sigma_v = worse * np.array([c.velocity_sigma_m_s] * 3 + [c.rate_sigma_rad_s] * 3)
+        return upper_triangle(local_covariance(np.diag(sigma**2))), upper_triangle(np.diag(sigma_v**2))
+
+    def receive(self, data: bytes, now_ns: int, *, datagram: bool = False) -> list[bytes]:
+        """Take what came from the flight controller, any bytes; the answers to send at once."""
+        out = []
+        for message in self.codec.receive(data, datagram=datagram):
+            if isinstance(message, TimeSync):
+                if message.tc1_ns == 0:
+                    self.counters.timesync_answers += 1
+                    out.append(self.codec.timesync(now_ns, message.ts1_ns))
+            elif isinstance(message, Heartbeat):
+                if message.is_autopilot:
+                    self._autopilot = message, now_ns
+            elif isinstance(message, HighresImu):
+                self._imu.append(message)
+                del self._imu[: -self.config.imu_samples]
+        return out
+
+    def autopilot(self, now_ns: int) -> Heartbeat | None:
+        """The flight controller at the other end, or None when it has been silent for three heartbeats."""
+        if self._autopilot is None or now_ns - self._autopilot[1] > 3 * self.config.heartbeat_ns:
+            return None
+        return self._autopilot[0]
+
+    def take_imu(self) -> list[HighresImu]:
+        """The controller's inertial samples since the last call."""
+        samples, self._imu = self._imu, []
+        return samples
