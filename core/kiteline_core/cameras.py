@@ -17,6 +17,7 @@ from kiteline_core import se3
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 
+WIDEST = 1.75  # x/z at the side of a rectified image, 60 degrees: wider costs resolution in the middle
 VIRTUAL_BASELINE_M = 0.1  # gives cameras without a right eye a scale for coded inverse depths
 
 
@@ -97,6 +98,7 @@ class Rectifier:
         left = rig.left
         self._size = (left.width, left.height)
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self._depth_map: NDArray[np.int16] | None = None
         if rig.right is None:
             if left.lens is not Lens.NONE:
                 self._maps[0] = _undistortion_maps(left, np.eye(3), left.matrix())
@@ -125,7 +127,15 @@ class Rectifier:
         # A point of the raw left camera is turned by r_left into the rectified one.
         t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
         self.camera = RectifiedCamera(
-            left.width, left.height, new[0, 0], new[1, 1], new[0, 2], new[1, 2], baseline_m, True, t_b_c
+            left.width,
+            left.height,
+            float(new[0, 0]),
+            float(new[1, 1]),
+            float(new[0, 2]),
+            float(new[1, 2]),
+            baseline_m,
+            True,
+            t_b_c,
         )
 
     def left(self, image: U8) -> U8:
@@ -138,10 +148,19 @@ class Rectifier:
 
     def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Bring depth (h, w) onto the rectified left pixels, without blending across edges."""
-        maps = self._maps[0]
-        if maps is None:
-            return depth_m
-        return np.asarray(cv2.remap(depth_m, maps[0], None, cv2.INTER_NEAREST), np.float32)  # type: ignore[call-overload]
+        if depth_m.shape != (self._size[1], self._size[0]):
+            raise CalibrationError(
+                f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
+            )
+        if self._depth_map is None:
+            maps = self._maps[0]
+            if maps is None:
+                return depth_m
+            # Fixed-point maps hold whole pixels rounded down, and the rest in 1/32 px (5 bits for x, 5 for y).
+            whole, rest = maps[0].astype(np.int32), maps[1].astype(np.int32)
+            rest_xy = np.stack([rest & 31, (rest >> 5) & 31], axis=-1)
+            self._depth_map = (whole + (rest_xy >= 16)).astype(np.int16)
+        return np.asarray(cv2.remap(depth_m, self._depth_map, np.empty(0), cv2.INTER_NEAREST), np.float32)
 
     def _apply(self, eye: int, image: U8) -> U8:
         if image.shape != (self._size[1], self._size[0]):
@@ -195,6 +214,8 @@ def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:
     sides = [_side_rays(rig.left, r_left), _side_rays(rig.right, r_right)]
     left, right = max(s[0] for s in sides), min(s[1] for s in sides)
     top, bottom = max(s[2] for s in sides), min(s[3] for s in sides)
+    if right - left < 0.1 or bottom - top < 0.1:
+        raise CalibrationError("the two cameras hardly look the same way: expected the extrinsics of a stereo pair")
     width, height = rig.left.width, rig.left.height
     focal = max((width - 1) / (right - left), (height - 1) / (bottom - top))
     cx = 0.5 * (width - 1) - focal * 0.5 * (left + right)
@@ -211,5 +232,8 @@ def _side_rays(camera: CameraModel, rotation: F64) -> tuple[float, float, float,
         rays = cv2.fisheye.undistortPoints(pixels, camera.matrix(), d, R=rotation)
     else:
         rays = cv2.undistortPoints(pixels, camera.matrix(), d, R=rotation)
-    rays = rays.reshape(4, 2)
-    return float(rays[0, 0]), float(rays[1, 0]), float(rays[2, 1]), float(rays[3, 1])
+    x, y = rays.reshape(4, 2).T
+    # Beyond 180 degrees a lens has no such point, and far below that the ideal image is mostly stretched corners.
+    left, top = (v if -WIDEST < v < 0 else -WIDEST for v in (float(x[0]), float(y[2])))
+    right, bottom = (v if 0 < v < WIDEST else WIDEST for v in (float(x[1]), float(y[3])))
+    return left, right, top, bottom
