@@ -1,4 +1,4 @@
-"""A byte budget that holds in every one-second window, wherever the window begins."""
+"""A byte budget that holds in every one-second window, wherever the window begins, and is spent evenly."""
 
 from __future__ import annotations
 
@@ -8,12 +8,19 @@ WINDOW_NS = 1_000_000_000
 
 
 class SlidingBudget:
-    """Bytes spent within the last second, both ends of the window included. A limit of 0 means unlimited."""
+    """Bytes within the last second, both ends included, of which `burst_bytes` at once. A limit of 0 means unlimited.
 
-    def __init__(self, limit_bytes: int) -> None:
+    The window alone would let a sender spend a second's bytes at once and then wait for a second; the bucket, which
+    fills at the rate of the limit, spreads them, so that a new value waits for no longer than a packet takes.
+    """
+
+    def __init__(self, limit_bytes: int, burst_bytes: int) -> None:
         self._limit = limit_bytes
+        self._burst = min(burst_bytes, limit_bytes)
         self._spent: deque[tuple[int, int]] = deque()
         self._sum = 0
+        self._bucket = self._burst * WINDOW_NS  # byte nanoseconds: whole numbers, so that nothing depends on rounding
+        self._filled_ns: int | None = None
 
     def left(self, now_ns: int) -> int:
         """How many bytes may be sent now."""
@@ -21,13 +28,18 @@ class SlidingBudget:
             return 1 << 30
         while self._spent and now_ns - self._spent[0][0] > WINDOW_NS:
             self._sum -= self._spent.popleft()[1]
-        return self._limit - self._sum
+        if self._filled_ns is not None:
+            more = max(0, now_ns - self._filled_ns) * self._limit
+            self._bucket = min(self._burst * WINDOW_NS, self._bucket + more)
+        self._filled_ns = now_ns
+        return min(self._limit - self._sum, self._bucket // WINDOW_NS)
 
     def spend(self, now_ns: int, n_bytes: int) -> None:
         """Book bytes that are sent now."""
         if not self._limit:
             return
         self._sum += n_bytes
+        self._bucket -= n_bytes * WINDOW_NS
         if self._spent and self._spent[-1][0] == now_ns:
             n_bytes += self._spent.pop()[1]
         self._spent.append((now_ns, n_bytes))

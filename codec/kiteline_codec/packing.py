@@ -74,7 +74,7 @@ class Writer:
         self._out += data
 
     def columns(self, values: I64) -> None:
-        """Columns (c, n) of integers, |value| < 2^40; nothing is written for n = 0."""
+        """Columns (c, n) of integers, |value| < 2^38; nothing is written for n = 0."""
         c, n = values.shape
         if n and c:
             out = np.zeros(c * (5 * n + 16) + 8, np.uint8)

@@ -48,7 +48,7 @@ def _width(value: int) -> int:
 
 @njit(cache=True, nogil=True)
 def pack_columns(values: I64, out: U8) -> int:
-    """Pack values (c, n) int64, n >= 1, |value| < 2^40, into `out` (zeroed, at least c * (5 * n + 16) + 8 bytes).
+    """Pack values (c, n) int64, n >= 1, |value| < 2^38, into `out` (zeroed, at least c * (5 * n + 16) + 8 bytes).
 
     Returns the number of bytes written. Each column is coded by offsets from its least value, or by differences of
     neighbours when that is shorter.

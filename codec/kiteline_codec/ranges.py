@@ -23,6 +23,8 @@ def add(ranges: Ranges, start: int, stop: int) -> Ranges:
 
 def cut(ranges: Ranges, start: int, stop: int) -> Ranges:
     """What remains without [start, stop)."""
+    if start >= stop:
+        return ranges
     out = []
     for a, b in ranges:
         if a < min(b, start):

@@ -94,6 +94,11 @@ class SyncConfig:
             return self.packet_bytes
         return max(_MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 4 - self.overhead_bytes))
 
+    @property
+    def burst_bytes(self) -> int:
+        """How many bytes may leave at once: a packet, and what adds up between two frames at 10 Hz."""
+        return max(self.filled_bytes + self.overhead_bytes, self.budget_bytes // 8)
+
 
 @dataclass(frozen=True, slots=True)
 class SyncStats:
@@ -129,7 +134,7 @@ class Endpoint:
         self.name = name
         self._out = Outbox(config.filled_bytes, config.oldest_every)
         self._in = Inbox()
-        self._budget = SlidingBudget(config.budget_bytes)
+        self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self._peer = 0
         self._legacy: dict[Key, bytes] = {}
         self._peer_verified = -1  # our version that the peer found equal

@@ -86,7 +86,7 @@ def read_columns_slowly(data: bytes, c: int, n: int) -> tuple[list[list[int]], i
 COLUMNS = st.integers(1, 40).flatmap(
     lambda n: st.lists(
         st.one_of(
-            st.lists(st.integers(-(1 << 39), 1 << 39), min_size=n, max_size=n),
+            st.lists(st.integers(1 - (1 << 38), (1 << 38) - 1), min_size=n, max_size=n),
             st.lists(st.integers(0, 9), min_size=n, max_size=n),
             st.lists(st.integers(0, 1 << 20), min_size=n, max_size=n).map(sorted),
         ),
@@ -118,7 +118,7 @@ def test_sorted_columns_are_shorter_than_shuffled_ones() -> None:
     straight, shuffled = Writer(), Writer()
     straight.columns(values[None])
     shuffled.columns(np.random.default_rng(0).permutation(values)[None])
-    assert len(straight) == 4
+    assert len(straight) == 3
     assert len(shuffled) >= 100 * 12 // 8
 
 
@@ -138,5 +138,5 @@ def test_ranges_are_sets(steps: list[tuple[bool, int, int]]) -> None:
     for add, a, b in steps:
         got = ranges.add(got, a, b) if add else ranges.cut(got, a, b)
         expected = expected | set(range(a, b)) if add else expected - set(range(a, b))
-        assert [i for a, b in got for i in range(a, b)] == sorted(expected)
-        assert all(x[1] < y[0] for x, y in zip(got, got[1:], strict=False)) or not add
+        assert [i for start, stop in got for i in range(start, stop)] == sorted(expected)
+        assert all(x[1] < y[0] for x, y in zip(got, got[1:], strict=False))

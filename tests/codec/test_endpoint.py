@@ -1,0 +1,438 @@
+"""Two endpoints over a bad link: what each property of the endpoint promises."""
+
+from __future__ import annotations
+
+import random
+import time
+import zlib
+from collections import deque
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kiteline_codec.packet import parse
+from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.sync import Endpoint, SyncConfig
+
+MS = 1_000_000
+PLAIN = SyncConfig(overhead_bytes=0)
+
+
+class Pair:
+    """Two endpoints and a seeded link between them, in steps of 10 ms."""
+
+    def __init__(self, config: SyncConfig = PLAIN, loss: float = 0.0, delay_ms: tuple[int, int] = (1, 5)) -> None:
+        self.config = config
+        self.loss = loss
+        self.delay_ms = delay_ms
+        self.rng = random.Random(1)
+        self.now_ns = 0
+        self.ends = [Endpoint(config, 1), Endpoint(config, 1)]
+        self.wire: list[tuple[int, int, int, bytes]] = []
+        self.sent: list[list[tuple[int, bytes]]] = [[], []]
+        self.updates: list[list[tuple[Key, bytes | None]]] = [[], []]
+
+    @property
+    def a(self) -> Endpoint:
+        return self.ends[0]
+
+    @property
+    def b(self) -> Endpoint:
+        return self.ends[1]
+
+    def restart(self, end: int) -> None:
+        self.ends[end] = Endpoint(self.config, self.ends[end].session + 1)
+
+    def step(self) -> None:
+        self.now_ns += 10 * MS
+        for i in (0, 1):
+            while (packet := self.ends[i].poll(self.now_ns)) is not None:
+                self.sent[i].append((self.now_ns, packet))
+                copies = 0 if self.rng.random() < self.loss else 2 if self.rng.random() < self.loss / 4 else 1
+                for _ in range(copies):
+                    at = self.now_ns + MS * self.rng.randint(*self.delay_ms)
+                    self.wire.append((at, len(self.sent[i]), 1 - i, packet))
+        due = sorted(w for w in self.wire if w[0] <= self.now_ns)
+        self.wire = [w for w in self.wire if w[0] > self.now_ns]
+        for _, _, to, packet in due:
+            self.updates[to] += [(u.key, u.code) for u in self.ends[to].receive(packet, self.now_ns)]
+
+    def run(self, ms: int) -> None:
+        for _ in range(ms // 10):
+            self.step()
+
+    def settle(self, limit_ms: int = 60_000) -> None:
+        end_ns = self.now_ns + limit_ms * MS
+        while not all(e.digest_equal for e in self.ends):
+            assert self.now_ns < end_ns, [e.stats for e in self.ends]
+            self.step()
+        assert self.a.digests == self.b.digests[::-1]
+
+
+def fill(end: Endpoint, seed: int, n: int, kind: Kind, longest: int = 900) -> dict[Key, bytes]:
+    rng = random.Random(seed)
+    values = {Key(kind, 1000 + i): rng.randbytes(rng.randrange(longest)) for i in range(n)}
+    for key, code in values.items():
+        end.put(key, code)
+    return values
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2, 0.5])
+@pytest.mark.parametrize("packet_bytes", [128, 1200, 65536])
+def test_both_sides_agree_whatever_the_link_does(loss: float, packet_bytes: int) -> None:
+    pair = Pair(replace(PLAIN, packet_bytes=packet_bytes), loss, (1, 90))
+    ours = fill(pair.a, 1, 40, Kind.BIRTHS, 3000)
+    theirs = fill(pair.b, 2, 60, Kind.POSE, 20)
+    pair.run(200)
+    for key in list(ours)[::3]:
+        pair.a.remove(key)
+        del ours[key]
+    ours |= fill(pair.a, 3, 10, Kind.BIRTHS)
+    pair.settle()
+    assert pair.b.peer_values() == ours
+    assert pair.a.peer_values() == theirs
+    assert pair.a.stats.mismatches == pair.b.stats.mismatches == 0
+    if loss and packet_bytes < 65536:
+        assert pair.a.stats.lost > 0
+    elif not loss:
+        assert pair.a.stats.rejected == pair.b.stats.rejected == 0
+    seen: dict[Key, bytes] = {}
+    for key, code in pair.updates[1]:
+        seen.pop(key, None)
+        if code is not None:
+            seen[key] = code
+    assert seen == ours  # the updates alone tell the state
+
+
+def test_without_loss_little_is_sent_twice() -> None:
+    pair = Pair(delay_ms=(5, 30))
+    total = sum(map(len, fill(pair.a, 1, 300, Kind.BIRTHS).values()))
+    pair.settle()
+    assert pair.a.stats.bytes_sent < 1.2 * total
+
+
+def test_the_newest_version_is_what_is_sent() -> None:
+    pair = Pair()
+    pair.run(50)
+    for i in range(100):
+        pair.a.put(Key(Kind.LIVE, 1), bytes([i]) * 30)
+    pair.settle()
+    assert pair.updates[1] == [(Key(Kind.LIVE, 1), bytes([99]) * 30)]
+
+
+def test_the_same_code_again_costs_nothing() -> None:
+    pair = Pair()
+    pair.a.put(Key(Kind.POSE, 1), b"x")
+    pair.settle()
+    before = pair.a.stats.bytes_sent
+    pair.a.put(Key(Kind.POSE, 1), b"x")
+    assert pair.a.digest_equal
+    assert pair.a.poll(pair.now_ns) is None
+    assert pair.a.stats.bytes_sent == before
+
+
+def test_order_of_sending() -> None:
+    pair = Pair()
+    pair.run(50)
+    for kind, id_, part in ((Kind.TILE, 9, 0), (Kind.BIRTHS, 1, 1), (Kind.BIRTHS, 1, 0), (Kind.BIRTHS, 2, 0),
+                            (Kind.SIGHTINGS, 2, 0), (Kind.HEAD, 1, 0), (Kind.POSE, 1, 0), (Kind.LIVE, 0, 0)):  # fmt: skip
+        pair.a.put(Key(kind, id_, part), b"x" * 100)
+    pair.settle()
+    got = [(key.kind, key.id, key.part) for key, _ in pair.updates[1]]
+    assert got == [
+        (Kind.LIVE, 0, 0), (Kind.POSE, 1, 0), (Kind.HEAD, 1, 0), (Kind.BIRTHS, 2, 0), (Kind.BIRTHS, 1, 0),
+        (Kind.SIGHTINGS, 2, 0), (Kind.BIRTHS, 1, 1), (Kind.TILE, 9, 0),
+    ]  # fmt: skip
+
+
+def test_nothing_starves() -> None:
+    pair = Pair(replace(PLAIN, budget_bytes=4000))
+    pair.a.put(Key(Kind.TILE, 1), b"t" * 100)
+    pair.run(100)
+    for i in range(1500):
+        for part in range(3):
+            pair.a.put(Key(Kind.BIRTHS, i, part), b"b" * 300)
+        pair.step()
+    assert Key(Kind.TILE, 1) in pair.b.peer_values()
+    assert Key(Kind.BIRTHS, 0, 2) in pair.b.peer_values()
+
+
+@pytest.mark.parametrize(("budget", "overhead"), [(500, 28), (1000, 28), (8000, 17), (300, 0)])
+def test_the_budget_holds_in_every_window(budget: int, overhead: int) -> None:
+    pair = Pair(SyncConfig(budget_bytes=budget, overhead_bytes=overhead), 0.2, (1, 300))
+    for i in range(1500):
+        if i % 7 == 0:
+            pair.a.put(Key(Kind.LIVE, 1), i.to_bytes(40, "big"))
+            pair.a.put(Key(Kind.BIRTHS, i), random.Random(i).randbytes(700))
+        pair.step()
+    window: deque[tuple[int, int]] = deque()
+    total = used = 0
+    for at, packet in pair.sent[0]:
+        window.append((at, len(packet) + overhead))
+        total += window[-1][1]
+        while at - window[0][0] > 1_000_000_000:
+            total -= window.popleft()[1]
+        assert total <= budget
+        used += len(packet) + overhead
+    assert used == pair.a.stats.bytes_sent
+    assert used > 0.7 * 15 * budget  # a full link is used
+
+
+def test_a_thin_link_carries_the_live_pose_first() -> None:
+    pair = Pair(SyncConfig(budget_bytes=1000), delay_ms=(20, 40))
+    pair.run(500)
+    ages = []
+    for i in range(600):
+        pair.a.put(Key(Kind.BIRTHS, i // 20, i % 8), random.Random(i).randbytes(900))
+        pair.a.put(Key(Kind.LIVE, 1), i.to_bytes(40, "big"))
+        pair.step()
+        live = pair.b.peer_values().get(Key(Kind.LIVE, 1))
+        if live is not None:
+            ages.append(i - int.from_bytes(live, "big"))
+    assert sum(ages) / len(ages) * 10 < 400  # ms
+
+
+def test_long_values_cross_in_fragments() -> None:
+    pair = Pair(replace(PLAIN, packet_bytes=128, budget_bytes=20_000), 0.1)
+    long = random.Random(0).randbytes(20_000)
+    pair.a.put(Key(Kind.TILE, 1), long)
+    pair.run(300)
+    assert pair.b.peer_values() == {}
+    assert not pair.b.quiet
+    long = long[::-1]
+    pair.a.put(Key(Kind.TILE, 1), long)
+    pair.settle()
+    assert pair.b.peer_values() == {Key(Kind.TILE, 1): long}
+    assert pair.updates[1] == [(Key(Kind.TILE, 1), long)]
+    assert pair.b._in.assembly_bytes == 0
+
+
+def test_removals_are_forgotten_once_they_have_arrived_and_old_packets_do_not_undo_them() -> None:
+    pair = Pair()
+    keys = list(fill(pair.a, 1, 30, Kind.POSE, 40))
+    pair.settle()
+    for key in keys:
+        pair.a.remove(key)
+    pair.settle()
+    assert pair.b.peer_values() == {}
+    assert pair.b._in.tombstones == 0
+    assert len(pair.a._out) == 0
+    for _, packet in pair.sent[0]:
+        pair.b.receive(packet, pair.now_ns)
+    assert pair.b.peer_values() == {}
+    assert pair.b.stats.duplicates > 0
+
+
+def test_what_was_never_sent_is_removed_without_a_word() -> None:
+    pair = Pair()
+    pair.a.put(Key(Kind.POSE, 1), b"x")
+    pair.a.remove(Key(Kind.POSE, 1))
+    pair.a.remove(Key(Kind.POSE, 2))
+    pair.settle()
+    assert pair.updates[1] == []
+
+
+def test_a_base_that_starts_again_gets_everything_again() -> None:
+    pair = Pair(loss=0.2)
+    ours = fill(pair.a, 1, 30, Kind.BIRTHS)
+    theirs = fill(pair.b, 2, 30, Kind.POSE, 20)
+    pair.settle()
+    pair.restart(1)
+    pair.run(1000)
+    pair.b.put(Key(Kind.POSE, 1000), b"new")
+    pair.settle()
+    assert pair.b.peer_values() == ours
+    assert pair.a.stats.restarts == 1
+    assert pair.a.peer_values() == {Key(Kind.POSE, 1000): b"new"}
+    assert pair.a.legacy_values() == {k: v for k, v in theirs.items() if k.id != 1000}
+    pair.a.forget_legacy()
+    assert pair.a.stats.legacy == 0
+
+
+def test_an_agent_that_starts_again_leaves_its_old_values_readable() -> None:
+    pair = Pair(loss=0.2)
+    old = fill(pair.a, 1, 30, Kind.BIRTHS)
+    pair.settle()
+    pair.restart(0)
+    pair.a.put(Key(Kind.BIRTHS, 5), b"new")
+    pair.settle()
+    assert pair.b.peer_values() == {Key(Kind.BIRTHS, 5): b"new"}
+    assert pair.b.legacy_values() == old
+    assert pair.b.peer_session == 2
+
+
+def test_packets_of_dead_sessions_change_nothing() -> None:
+    pair = Pair()
+    fill(pair.a, 1, 10, Kind.BIRTHS)
+    pair.settle()
+    old = [packet for _, packet in pair.sent[0]]
+    pair.restart(0)
+    pair.settle()
+    for packet in old:
+        assert pair.b.receive(packet, pair.now_ns) == []
+    pair.restart(1)
+    current = [packet for _, packet in pair.sent[0] if packet not in old]
+    for packet in current:  # for the forerunner of b
+        assert pair.b.receive(packet, pair.now_ns) == []
+    reasons = dict(pair.b.stats.reasons)
+    assert reasons["for an earlier session of this side"] > 0
+    pair.settle()
+    assert pair.b.peer_values() == {}
+
+
+def test_a_session_number_that_went_back_is_told() -> None:
+    pair = Pair()
+    pair.restart(0)
+    pair.settle()
+    pair.ends[0] = Endpoint(PLAIN, 1)
+    pair.run(2000)
+    assert dict(pair.b.stats.reasons).keys() == {"from an earlier session of the peer"}
+    assert any("went back" in reason for reason, _ in pair.a.stats.reasons)
+
+
+def test_another_protocol_version_is_refused_by_name() -> None:
+    a, b = Endpoint(PLAIN, 1), Endpoint(PLAIN, 1)
+    packet = a.poll(0)
+    assert packet is not None
+    other = bytes([9]) + packet[1:-4]
+    assert b.receive(other + zlib.crc32(other).to_bytes(4, "little"), 0) == []
+    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 1", 1),)
+    assert b.receive(packet[:-1] + b"?", 0) == []
+    assert b.stats.rejected == 2
+    assert b.peer_session == 0
+
+
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_states_that_differ_are_found_and_mended(end: int, loss: float) -> None:
+    pair = Pair(loss=loss)
+    values = [fill(pair.a, 1, 20, Kind.BIRTHS), fill(pair.b, 2, 20, Kind.POSE, 30)]
+    pair.settle()
+    inbox = pair.ends[end]._in
+    first = min(inbox.values)
+    inbox._drop_value(first)  # as if memory had been damaged
+    inbox.values[Key(60, 1)] = (3, b"never sent")
+    pair.ends[1 - end].put(Key(Kind.LIVE, 2), b"anything new makes them compare")
+    values[1 - end][Key(Kind.LIVE, 2)] = b"anything new makes them compare"
+    inbox.digest.add(Key(60, 1), 3, b"never sent")
+    pair.settle()
+    assert pair.ends[end].stats.mismatches >= 1
+    assert pair.ends[end].peer_values() == values[1 - end]
+    assert pair.ends[1 - end].peer_values() == values[end]
+
+
+def test_an_idle_link_carries_only_heartbeats() -> None:
+    pair = Pair(SyncConfig())
+    fill(pair.a, 1, 5, Kind.POSE, 20)
+    pair.settle()
+    pair.run(500)
+    before, sent = pair.a.stats.bytes_sent, len(pair.sent[0])
+    pair.run(10_000)
+    assert 9 <= len(pair.sent[0]) - sent <= 11
+    assert pair.a.stats.bytes_sent - before < 11 * 50
+
+
+def test_a_silent_peer_costs_little_and_is_found_again() -> None:
+    pair = Pair()
+    pair.settle()
+    pair.loss = 1.0
+    fill(pair.a, 1, 200, Kind.BIRTHS)
+    pair.run(10_000)
+    sent = len(pair.sent[0])
+    pair.run(10_000)
+    assert len(pair.sent[0]) - sent < 25
+    assert pair.a.stats.in_flight <= 1
+    pair.loss = 0.0
+    pair.settle(5000)
+
+
+def test_memory_is_bounded_while_there_is_no_peer() -> None:
+    a = Endpoint(PLAIN, 1)
+    for i in range(5000):
+        a.put(Key(Kind.LIVE, 1), i.to_bytes(4, "big"), (i % 7,))
+        a.put(Key(Kind.POSE, i), b"x")
+        a.remove(Key(Kind.POSE, i))
+        a.poll(i * MS)
+    out = a._out
+    assert len(out) == 1
+    assert max(len(out._queue), len(out._oldest), len(out._versions), len(out._flights)) <= 70
+
+
+def test_a_peer_that_sends_too_much_is_refused() -> None:
+    pair = Pair()
+    pair.ends[1] = Endpoint(replace(PLAIN, max_inbox_bytes=5000), 1)
+    fill(pair.a, 1, 100, Kind.BIRTHS)
+    pair.run(3000)
+    assert sum(map(len, pair.b.peer_values().values())) <= 5000
+    assert dict(pair.b.stats.reasons)["no memory left for it"] > 0
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_harmless(packet: bytes) -> None:
+    b = Endpoint(PLAIN, 1)
+    assert b.receive(packet, 0) == []
+    checked = packet + zlib.crc32(packet).to_bytes(4, "little")
+    try:
+        parse(checked, 1000)
+    except WireError:
+        assert b.receive(checked, 0) == []
+        assert b.stats.rejected == 2
+
+
+@given(st.integers(0, 1000), st.data())
+def test_damaged_packets_with_a_good_checksum_are_harmless(seed: int, data: st.DataObject) -> None:
+    pair = Pair()
+    fill(pair.a, seed, 5, Kind.BIRTHS, 2000)
+    pair.run(60)
+    body = bytearray(data.draw(st.sampled_from([p for _, p in pair.sent[0]]))[:-4])
+    for _ in range(data.draw(st.integers(1, 3))):
+        body[data.draw(st.integers(0, min(60, len(body) - 1)))] = data.draw(st.integers(0, 255))
+    pair.b.receive(bytes(body) + zlib.crc32(body).to_bytes(4, "little"), pair.now_ns)
+    while pair.b.poll(pair.now_ns) is not None:
+        pass
+
+
+def test_the_same_inputs_give_the_same_packets() -> None:
+    runs = []
+    for _ in range(2):
+        pair = Pair(loss=0.3, delay_ms=(1, 50))
+        fill(pair.a, 1, 50, Kind.BIRTHS)
+        fill(pair.b, 2, 50, Kind.DEPTHS)
+        pair.settle()
+        runs.append(pair.sent)
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"packet_bytes": 100}, "packet_bytes"),
+        ({"packet_bytes": 1 << 17}, "packet_bytes"),
+        ({"budget_bytes": 100}, "budget"),
+    ],
+)
+def test_impossible_configurations_are_refused(changes: dict[str, int], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        SyncConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_impossible_values_are_refused() -> None:
+    a = Endpoint(PLAIN, 1)
+    with pytest.raises(ValueError, match="does not fit"):
+        a.put(Key(64, 0), b"")
+    with pytest.raises(ValueError, match="expected at most"):
+        a.put(Key(1, 0), bytes((1 << 20) + 1))
+    with pytest.raises(ValueError, match="session"):
+        Endpoint(PLAIN, 0)
+
+
+def test_a_packet_takes_little_time() -> None:
+    best = 1e9
+    for _ in range(3):
+        pair = Pair(delay_ms=(1, 1))
+        fill(pair.a, 1, 1500, Kind.BIRTHS, 100)
+        start = time.process_time()
+        pair.settle()
+        best = min(best, (time.process_time() - start) / sum(map(len, pair.sent)))
+    assert best < 1e-3  # typically 0.2 ms for both ends, twelve values a packet

@@ -1,0 +1,227 @@
+"""Records: fixed bytes, round trips, damage, and what a keyframe costs."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kiteline_codec import messages, sections
+from kiteline_codec.schema import (
+    Births,
+    Camera,
+    Culled,
+    Depths,
+    Found,
+    Head,
+    Key,
+    Kind,
+    Live,
+    Placement,
+    Pose,
+    Record,
+    Removed,
+    Sightings,
+    Tile,
+    WireError,
+)
+from kiteline_core import se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
+
+GOLDEN = Path(__file__).parent / "golden" / "records.json"
+
+
+def some_records(seed: int, n: int) -> list[Record]:
+    """One record of each kind, with n rows."""
+    rng = np.random.default_rng(seed)
+    submap = submap_id(int(rng.integers(64)), int(rng.integers(1 << 14)), int(rng.integers(1 << 12)))
+    keyframe = keyframe_id(submap, int(rng.integers(50, 1 << 20)))
+    pose = se3.exp(np.concatenate([rng.normal(0, 3, 3), rng.normal(0, 0.5, 3)]))
+    index = np.sort(rng.permutation(2048)[:n]).astype(np.uint16)
+    uv = rng.uniform(-10, 1300, (n, 2)).astype(np.float32)
+    inv_depth = rng.uniform(-0.1, 2.0, n).astype(np.float32)
+    octave = rng.integers(0, 4, n).astype(np.uint8)
+    point = (keyframe - rng.integers(0, 50, n)) << 11 | rng.integers(0, 2048, n)
+    T_b_c = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, -0.05, 0.025]))
+    camera = RectifiedCamera(752, 480, 458.5, 457.25, 367.0, 248.5, 0.11, bool(rng.integers(2)), T_b_c)
+    return [
+        Camera(AgentId(3), camera),
+        Live(AgentId(63), int(rng.integers(1 << 62)), keyframe, pose, int(rng.integers(-1, 101))),
+        Live(AgentId(0), 0, NO_KEYFRAME, np.eye(4), -1),
+        Head(keyframe, int(rng.integers(1 << 62)), KeyframeId(keyframe - 3), pose, n),
+        Head(keyframe, 5, NO_KEYFRAME, pose, 0),
+        Births(
+            keyframe, 4, index, uv, inv_depth, octave, rng.integers(0, 256, n).astype(np.uint8),
+            rng.integers(0, 256, (n, 32)).astype(np.uint8),
+        ),
+        Sightings(keyframe, 2, rng.permutation(index), uv, inv_depth, octave, point),
+        Pose(keyframe, pose),
+        Depths(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
+        Found(keyframe, index, point),
+        Removed(keyframe, index),
+        Culled(keyframe, index, int(rng.integers(2))),
+        Placement(submap, pose),
+        Tile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
+    ]  # fmt: skip
+
+
+def assert_same(a: object, b: object) -> None:
+    assert type(a) is type(b)
+    for f in fields(a):  # type: ignore[arg-type]
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype
+            assert np.array_equal(x, y), f.name
+        elif isinstance(x, RectifiedCamera):
+            assert_same(x, y)
+        else:
+            assert x == y, f.name
+
+
+def test_golden_bytes() -> None:
+    """The format does not change unnoticed; with a new one, PROTOCOL_VERSION rises and the file is written anew."""
+    golden = json.loads(GOLDEN.read_text())
+    records = some_records(1, 3)
+    assert len(golden) == len(records)
+    for entry, record in zip(golden, records, strict=True):
+        key = Key(*entry["key"])
+        assert key == messages.key(record)
+        assert messages.encode(record).hex() == entry["code"], Kind(key.kind).name
+        assert_same(messages.decode(key, bytes.fromhex(entry["code"])), messages.decode(key, messages.encode(record)))
+
+
+def test_every_kind_is_covered() -> None:
+    assert {messages.key(r).kind for r in some_records(0, 1)} == set(Kind)
+
+
+@given(st.integers(0, 1 << 30), st.integers(0, 60))
+def test_decoding_gives_what_encodes_to_the_same_code(seed: int, n: int) -> None:
+    for record in some_records(seed, n):
+        key, code = messages.key(record), messages.encode(record)
+        decoded = messages.decode(key, code)
+        assert messages.key(decoded) == key
+        assert messages.encode(decoded) == code
+        assert_same(messages.decode(key, code), decoded)
+        for name in ("index", "octave", "angle", "descriptor", "point", "t_ns", "quality", "parent", "keypoints"):
+            if hasattr(record, name):
+                assert np.array_equal(getattr(record, name), getattr(decoded, name)), name
+        if hasattr(record, "uv"):
+            assert np.abs(record.uv - decoded.uv).max(initial=0.0) <= 1 / 32 + 1e-4
+
+
+@given(st.sampled_from(list(Kind)), st.integers(-1, 1 << 60), st.integers(0, 300), st.binary(max_size=200))
+def test_any_bytes_are_a_record_or_an_error(kind: int, id_: int, part: int, code: bytes) -> None:
+    try:
+        record = messages.decode(Key(kind, id_, part), code)
+    except WireError:
+        return
+    messages.encode(record)
+
+
+@given(st.integers(0, 1000), st.integers(1, 12), st.data())
+def test_damaged_codes_are_a_record_or_an_error(seed: int, n: int, data: st.DataObject) -> None:
+    record = data.draw(st.sampled_from(some_records(seed, n)))
+    code = bytearray(messages.encode(record))
+    for _ in range(data.draw(st.integers(1, 4))):
+        code[data.draw(st.integers(0, len(code) - 1))] = data.draw(st.integers(0, 255))
+    code = code[: data.draw(st.integers(0, len(code)))]
+    try:
+        decoded = messages.decode(messages.key(record), bytes(code))
+    except WireError:
+        return
+    again = messages.encode(decoded)
+    assert messages.encode(messages.decode(messages.key(record), again)) == again
+
+
+def test_errors_say_what_was_expected() -> None:
+    with pytest.raises(WireError, match="kind 9 is unknown"):
+        messages.decode(Key(9, 0), b"")
+    with pytest.raises(WireError, match="out of range"):
+        messages.decode(Key(Kind.LIVE, 64), b"")
+    pose = messages.encode(Pose(KeyframeId(1), np.eye(4)))
+    with pytest.raises(WireError, match="1 bytes too many"):
+        messages.decode(Key(Kind.POSE, 1), pose + b"\0")
+    with pytest.raises(ValueError, match="indices must increase"):
+        messages.encode(Removed(KeyframeId(1), np.array([2, 2], np.uint16)))
+    with pytest.raises(ValueError, match="rigid motion"):
+        messages.encode(Placement(SubmapId(1), np.zeros((4, 4))))
+    with pytest.raises(ValueError, match="descriptors"):
+        births = some_records(0, 3)[5]
+        assert isinstance(births, Births)
+        messages.encode(Births(**{f.name: getattr(births, f.name) for f in fields(births)} | {"descriptor": np.zeros((2, 32))}))  # type: ignore[arg-type]  # fmt: skip  # noqa: E501
+    tile = some_records(0, 1)[-1]
+    code = messages.encode(tile)
+    with pytest.raises(WireError, match="tile"):
+        messages.decode(messages.key(tile), code[:-3])
+
+
+def a_keyframe() -> tuple[Head, Births, Sightings]:
+    """300 sightings of points from 12 keyframes and 180 births, in an image of 752x480 px. Indices as an agent gives
+    them: sightings by point id, then births by image row.
+    """
+    rng = np.random.default_rng(5)
+    submap = submap_id(2, 17, 1)
+    keyframe = keyframe_id(submap, 240)
+
+    def keypoints(n: int) -> dict[str, np.ndarray]:
+        uv = rng.uniform(0, (752, 480), (n, 2))
+        return {
+            "uv": uv[np.argsort(uv[:, 1])].astype(np.float32),
+            "inv_depth": rng.uniform(0.1, 0.6, n).astype(np.float32),
+            "octave": rng.integers(0, 4, n).astype(np.uint8),
+        }
+
+    point = np.sort((keyframe - rng.integers(1, 13, 300)) << 11 | rng.integers(0, 480, 300))
+    sightings = Sightings(keyframe, 0, np.arange(300, dtype=np.uint16), point=point, **keypoints(300))  # type: ignore[arg-type]
+    births = Births(
+        keyframe, 0, np.arange(300, 480, dtype=np.uint16), angle=rng.integers(0, 256, 180).astype(np.uint8),
+        descriptor=rng.integers(0, 256, (180, 32)).astype(np.uint8), **keypoints(180),  # type: ignore[arg-type]
+    )  # fmt: skip
+    T_p_k = se3.exp(np.array([0.2, 0.01, 0.1, 0.02, 0.1, 0.01]))
+    return Head(keyframe, 1_700_000_000_123_456_789, KeyframeId(keyframe - 1), T_p_k, 480), births, sightings
+
+
+def test_a_keyframe_is_short_and_its_sections_fit_packets() -> None:
+    head, births, sightings = a_keyframe()
+    value = np.random.default_rng(6).uniform(size=480)
+    parts = sections.split_births(births, value[:180]) + sections.split_sightings(sightings, value[180:])  # type: ignore[operator]
+    sizes = [len(messages.encode(record)) for record in (head, *parts)]
+    assert max(sizes) <= sections.SECTION_BYTES
+    assert sum(sizes) <= 9500
+    assert len(messages.encode(births)) + len(messages.encode(sightings)) <= 9100
+    assert np.mean(sizes[1:]) > 700  # sections are no crumbs
+
+
+@given(st.integers(0, 1000), st.integers(0, 200), st.integers(150, 3000))
+def test_sections_hold_each_row_once_best_first(seed: int, n: int, section_bytes: int) -> None:
+    births = some_records(seed, n)[5]
+    assert isinstance(births, Births)
+    value = np.random.default_rng(seed).integers(0, 50, n).astype(np.float64)
+    parts = sections.split_births(births, value, section_bytes)
+    assert [p.part for p in parts] == list(range(len(parts)))
+    index = np.concatenate([p.index for p in parts] or [births.index])
+    assert np.array_equal(np.sort(index), births.index)
+    order = {int(i): float(v) for i, v in zip(births.index, value, strict=True)}
+    for a, b in zip(parts, parts[1:], strict=False):
+        assert min(order[int(i)] for i in a.index) >= max(order[int(i)] for i in b.index)
+    for p in parts:
+        assert len(messages.encode(p)) <= section_bytes
+        rows = np.searchsorted(births.index, p.index)
+        assert np.array_equal(births.descriptor[rows], p.descriptor)
+
+
+def test_a_keyframe_is_coded_quickly() -> None:
+    head, births, sightings = a_keyframe()
+    best = 1e9
+    for _ in range(5):
+        start = time.process_time()
+        for record in (head, births, sightings):
+            messages.decode(messages.key(record), messages.encode(record))
+        best = min(best, time.process_time() - start)
+    assert best < 0.005  # typically 0.4 ms
