@@ -5,6 +5,7 @@ The controller gets the continuous odometry frame. Corrections of the map never 
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ class OdometryConfig:
     rate_slack_ns: int = 4_000_000  # ns; a frame that comes this early is not late for its turn: cameras jitter
     heartbeat_ns: int = 1_000_000_000  # ns; the MAVLink routine
     longest_gap_ns: int = 250_000_000  # ns; velocities are not taken across a longer gap between poses
-    shortest_gap_ns: int = 2_000_000  # ns; nor across a shorter one: noise over time
+    shortest_gap_ns: int = 20_000_000  # ns; nor across a shorter one: noise over time
     position_sigma_m: float = 0.03  # m; of a good pose. Both controllers read the diagonal as noise of a measurement
     angle_sigma_rad: float = 0.02  # rad; likewise
     velocity_sigma_m_s: float = 0.1  # m/s; of two poses a frame apart
@@ -41,7 +42,7 @@ class OdometryCounters:
     heartbeats: int = 0
     timesync_answers: int = 0
     rate_limited: int = 0
-    without_velocity: int = 0  # first of a row: there is nothing to take a velocity from
+    without_velocity: int = 0  # the first of a row: there is nothing to take a velocity from
     broken: int = 0  # not finite, or absurdly far away
     stale: int = 0  # not newer than the one before
 
@@ -57,7 +58,7 @@ class OdometryStream:
         self._period_ns = round(1e9 / self.config.rate_hz)
         self._next_heartbeat_ns: int | None = None
         self._next_odometry_ns: int | None = None
-        self._before: PoseSample | None = None
+        self._past: deque[PoseSample] = deque()
         self._autopilot: tuple[Heartbeat, int] | None = None
         self._imu: list[HighresImu] = []
 
@@ -76,22 +77,24 @@ class OdometryStream:
         return out
 
     def _odometry(self, pose: PoseSample, now_ns: int) -> Odometry | None:
-        before = self._before
         if not np.all(np.isfinite(pose.T_o_b)) or float(np.abs(pose.T_o_b[:3, 3]).max()) > _FARTHEST_M:
             self.counters.broken += 1
             return None
-        if before is not None and pose.epoch == before.epoch and pose.t_ns <= before.t_ns:
+        if self._past and self._past[-1].epoch != pose.epoch:
+            self._past.clear()
+        if self._past and pose.t_ns <= self._past[-1].t_ns:
             self.counters.stale += 1
             return None
-        self._before = pose
-        gap_ns = pose.t_ns - before.t_ns if before is not None and pose.epoch == before.epoch else 0
-        if before is None or not self.config.shortest_gap_ns <= gap_ns <= self.config.longest_gap_ns:
+        before = self._earlier(pose.t_ns)
+        self._past.append(pose)
+        if before is None:
             self.counters.without_velocity += 1  # ArduPilot would take NaN velocities into its filter
             return None
         if not self._is_turn(now_ns):
             self.counters.rate_limited += 1
             return None
-        velocity, rate = body_rates(before.T_o_b, pose.T_o_b, gap_ns * 1e-9, self._T_b_f)
+        dt_s = (pose.t_ns - before.t_ns) * 1e-9
+        velocity, rate = body_rates(before.T_o_b, pose.T_o_b, dt_s, self._T_b_f)
         position, q = local_pose(pose.T_o_b, self._T_b_f)
         quality = max(-1, min(100, pose.quality)) if pose.tracked else -1
         pose_cov, velocity_cov = self._covariances(quality)
@@ -106,6 +109,12 @@ class OdometryStream:
             reset_counter=pose.epoch & 0xFF,
             quality=quality,
         )
+
+    def _earlier(self, t_ns: int) -> PoseSample | None:
+        """The newest pose that is far enough back to take a velocity from. Forgets those too far back."""
+        while self._past and t_ns - self._past[0].t_ns > self.config.longest_gap_ns:
+            self._past.popleft()
+        return next((p for p in reversed(self._past) if t_ns - p.t_ns >= self.config.shortest_gap_ns), None)
 
     def _is_turn(self, now_ns: int) -> bool:
         """Whether the rate allows a message now. Early turns are paid back, so that the mean rate holds."""
