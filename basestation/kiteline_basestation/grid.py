@@ -16,7 +16,7 @@ nor the floor under a high ray.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -69,24 +69,27 @@ class GridMap:
 
     tiles: (t, 2) int64 column, row of each tile, in order of row, column. cells: (t, 32, 32) int8, 0..100 percent
     occupied, -1 unknown, row 0 the lowest y. A tile's corner lies at (column, row) * 32 * cell_m in w.
-    labels: (m,) uint8, of the points it was built from. ground_m: (m,) z of the ground at each point, NaN unknown.
+    points: (m,3) what it was built from, in w. labels: (m,) uint8 of the points. ground_m: (m,) z of the ground at each point, NaN unknown.
     """
 
     cell_m: float
     tiles: I64
     cells: I8
+    points: F64
     labels: U8
     ground_m: F64
 
 
-def empty(config: GridConfig, points: int = 0) -> GridMap:
-    """A grid that knows nothing."""
+def empty(config: GridConfig, points: F64 | None = None) -> GridMap:
+    """A grid that knows nothing of any cell. points: (m,3)."""
+    points = np.zeros((0, 3)) if points is None else points
     return GridMap(
         config.cell_m,
         np.zeros((0, 2), np.int64),
         np.zeros((0, TILE, TILE), np.int8),
-        np.zeros(points, np.uint8),
-        np.full(points, np.nan),
+        points,
+        np.zeros(len(points), np.uint8),
+        np.full(len(points), np.nan),
     )
 
 
@@ -146,7 +149,7 @@ def build(config: GridConfig, positions: F64, points: F64, observations: I64) ->
     near = length <= config.max_ray_m
     seen, length = seen[near], length[near]
     if not len(seen):
-        return empty(config, len(points))
+        return empty(config, points)
     distance = np.full(len(points), np.inf)
     np.minimum.at(distance, seen[:, 1], length)
     camera_z = np.full(len(points), np.inf)
@@ -254,8 +257,7 @@ def _overlong(config: GridConfig, seen: I64, length: F64, labels: U8) -> Bool:
 def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: U8, views: I64, seen: I64) -> GridMap:
     """Draw obstacle points and rays into tiles, and turn counts into percent."""
     if not len(seen):
-        grid = empty(config, len(points))
-        return GridMap(grid.cell_m, grid.tiles, grid.cells, labels, ground)
+        return replace(empty(config, points), labels=labels, ground_m=ground)
     obstacle = np.flatnonzero(labels == OBSTACLE)
     cameras, ends = np.unique(seen[:, 0]), np.flatnonzero(np.bincount(seen[:, 1]))
     first_tile, last_tile = _tile_box(config.cell_m, positions[cameras, :2], points[ends, :2], points[obstacle, :2])
@@ -290,7 +292,7 @@ def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: 
     cells = percent(config, hits[:used], free[:used], through[:used])
     r, c = np.nonzero(slots >= 0)
     order = slots[r, c]
-    return GridMap(config.cell_m, np.stack([c, r], axis=1) + first_tile, cells[order], labels, ground)
+    return GridMap(config.cell_m, np.stack([c, r], axis=1) + first_tile, cells[order], points, labels, ground)
 
 
 def _cells(cell_m: float, points: F64) -> I64:

@@ -27,7 +27,9 @@ def agent(number: int = 0, **changes: object) -> AgentView:
 def grid(*tiles: tuple[int, int], value: int = 10) -> GridMap:
     cells = np.full((len(tiles), 32, 32), value, np.int8)
     cells[:, 0, 0] = UNKNOWN
-    return GridMap(0.5, np.array(tiles, np.int64).reshape(-1, 2), cells, np.zeros(0, np.uint8), np.zeros(0))
+    return GridMap(
+        0.5, np.array(tiles, np.int64).reshape(-1, 2), cells, np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0)
+    )
 
 
 def snapshot(*agents: AgentView, **changes: object) -> Snapshot:
@@ -37,9 +39,9 @@ def snapshot(*agents: AgentView, **changes: object) -> Snapshot:
 
 def test_status_says_what_the_snapshot_holds_in_json() -> None:
     turned = np.eye(4)
-    turned[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    turned[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]  # level, looking along y
     turned[:3, 3] = [1.23456, -2.0, -0.0]
-    out = view.status(snapshot(agent(0, T_w_b=turned), agent(3, T_w_b=None, heard_ns=-1, quality=-1)))
+    out = view.status(snapshot(agent(0, T_w_c=turned), agent(3, T_w_c=None, heard_ns=-1, quality=-1)))
     assert json.loads(json.dumps(out, allow_nan=False)) == out
     assert (out["up_s"], out["keyframes"], out["points"]) == (60.0, 6, 5)
     assert out["grid_m2"] == round(1023 * 0.25, 1)
@@ -51,7 +53,7 @@ def test_status_says_what_the_snapshot_holds_in_json() -> None:
 
 
 def test_a_pose_that_is_not_finite_is_no_pose() -> None:
-    assert view.status(snapshot(agent(T_w_b=np.full((4, 4), np.nan))))["agents"][0]["position"] is None
+    assert view.status(snapshot(agent(T_w_c=np.full((4, 4), np.nan))))["agents"][0]["position"] is None
 
 
 @pytest.mark.parametrize(

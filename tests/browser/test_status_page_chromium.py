@@ -109,7 +109,8 @@ def room() -> web.Snapshot:
     pairs = np.column_stack([rng.integers(0, 60, 12000), rng.integers(0, 3000, 12000)])
     near = np.linalg.norm(path[pairs[:, 0]] - points[pairs[:, 1]], axis=1) < 4
     grid = build(GridConfig(), path, points, pairs[near])
-    pose = se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, turn[-1] + np.pi / 2])), path[-1])
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
+    pose = se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, turn[-1] + np.pi / 2])) @ level, path[-1])
     away = np.eye(4)
     away[:3, 3] = [2.0, 4.5, 1.0]
     s = 10**9

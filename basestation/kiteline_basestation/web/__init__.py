@@ -1,15 +1,20 @@
 """The base's status page: what every agent does, and the map from above, in a browser.
 
-handle = serve("127.0.0.1", 8080, snapshot)   # snapshot() -> Snapshot, see view.py; called from the page's own thread
-handle.url, handle.close()
+    page = serve(*address("127.0.0.1:8080"), lambda: latest)
+    ... once or twice a second, in the loop that steps the station:
+    if page.watched:
+        latest = overview(station, now_ns, started_ns)
+    ... at the end:
+    page.close()
 
-Nothing is computed while nobody looks. `snapshot` must be quick and safe to call from another thread: let the mapper's
-loop put a finished, frozen Snapshot into a variable, and return that.
+`latest` starts as `nothing(now_ns)`. A snapshot is frozen, and the page's own thread only reads it: the mapper never
+waits, and while nobody looks nothing is computed.
 """
 
 from __future__ import annotations
 
+from kiteline_basestation.web.overview import nothing, overview
 from kiteline_basestation.web.server import Handle, address, serve
 from kiteline_basestation.web.view import AgentView, Snapshot, status
 
-__all__ = ["AgentView", "Handle", "Snapshot", "address", "serve", "status"]
+__all__ = ["AgentView", "Handle", "Snapshot", "address", "nothing", "overview", "serve", "status"]

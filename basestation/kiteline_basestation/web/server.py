@@ -27,6 +27,7 @@ from kiteline_basestation.web.view import Snapshot, map_messages, status
 
 STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read
 MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larger
+WATCHED_S = 3.0  # s since the last look for which a page counts as watched
 RATE_SPAN_S = 2.0  # s over which byte rates are taken: two heartbeats
 MAX_VIEWERS = 16  # browsers at a time; each costs up to 100 kB/s
 LIVE_PATH = "/live"
@@ -55,6 +56,11 @@ class Handle:
         self._page = page
         self._thread = thread
         self.url = url
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody looks: only then is a new snapshot worth making."""
+        return self._page.watched
 
     def close(self) -> None:
         """Close all connections and wait for the thread's end. May be called twice."""
@@ -85,7 +91,12 @@ class _Page:
         self._end: asyncio.Event | None = None
         self._local = True
         self._viewers = 0
+        self._looked_s = -WATCHED_S
         self._recent: list[tuple[float, Snapshot]] = []  # the last RATE_SPAN_S of snapshots, shared by all viewers
+
+    @property
+    def watched(self) -> bool:
+        return self._viewers > 0 or time.monotonic() - self._looked_s < WATCHED_S
 
     def run(self, host: str, port: int) -> None:
         """The thread."""
@@ -172,7 +183,7 @@ class _Page:
 
     def _look(self) -> tuple[Snapshot, Snapshot | None]:
         """The newest snapshot, taken at most twice a period however many look, and an older one for rates."""
-        now_s = time.monotonic()
+        now_s = self._looked_s = time.monotonic()
         if not self._recent or now_s - self._recent[-1][0] >= 0.5 * STATUS_PERIOD_S:
             self._recent.append((now_s, self._snapshot()))
         while len(self._recent) > 2 and now_s - self._recent[1][0] > RATE_SPAN_S:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.grid import UNKNOWN, GridMap, differences
+from kiteline_basestation.grid import UNKNOWN, GridConfig, GridMap, differences, empty
 from kiteline_codec.schema import Tile
 from kiteline_core.ids import AgentId
 
@@ -34,14 +34,14 @@ _S = 1e-9  # s in a ns
 
 @dataclass(frozen=True, slots=True)
 class AgentView:
-    """One agent as the base knows it. T_w_b: (4,4) newest pose in w, or None while unplaced. path: (k,3) its keyframes
+    """One agent as the base knows it. T_w_c: (4,4) newest camera in w, None while unplaced. path: (k,3) its keyframes
     in w, in order of time, m. quality: -1 failed, 0 unknown, 1..100. bytes_up, bytes_down: totals on the wire.
     """
 
     agent: AgentId
     heard_ns: int  # when its last packet came, by the clock of Snapshot.now_ns; -1 never
     quality: int
-    T_w_b: F64 | None
+    T_w_c: F64 | None
     path: F64
     keyframes: int
     points: int
@@ -88,7 +88,7 @@ def status(now: Snapshot, before: Snapshot | None = None) -> dict[str, Any]:
 
 def _agent(a: AgentView, before: AgentView | None, now_ns: int, span_s: float) -> dict[str, Any]:
     silent_s = (now_ns - a.heard_ns) * _S if a.heard_ns >= 0 else None
-    pose = a.T_w_b
+    pose = a.T_w_c
     placed = pose is not None and bool(np.isfinite(pose).all())
     up = down = None
     if before is not None and span_s > 0:
@@ -119,8 +119,8 @@ def link_state(silent_s: float | None) -> str:
 
 
 def _heading_deg(pose: F64) -> float:
-    """Where the body's x axis (its z axis when that is upright) points, counter-clockwise from x of w, in degrees."""
-    axis = pose[:2, 0] if np.hypot(pose[0, 0], pose[1, 0]) > 0.1 else pose[:2, 2]
+    """Where the camera looks (a camera that looks down: where its image's top is), from x of w to the left, degrees."""
+    axis = pose[:2, 2] if np.hypot(pose[0, 2], pose[1, 2]) > 0.1 else -pose[:2, 1]
     return _rounded(float(np.degrees(np.arctan2(axis[1], axis[0]))), 1)
 
 
@@ -133,8 +133,7 @@ def map_messages(now: Snapshot, held: GridMap | None) -> list[bytes]:
     out = [path_message(a.agent, a.path) for a in now.agents]
     out.append(points_message(now.points, now.labels))
     if now.grid is not None and now.grid is not held:
-        nothing = GridMap(now.grid.cell_m, now.grid.tiles[:0], now.grid.cells[:0], now.grid.labels[:0], np.zeros(0))
-        tiles = differences(held if held is not None else nothing, now.grid)
+        tiles = differences(held if held is not None else empty(GridConfig()), now.grid)
         if tiles:
             out.append(tiles_message(now.grid.cell_m, tiles))
     return out

@@ -1,0 +1,49 @@
+"""The status page's snapshot of a station that has flown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.station import Station
+from kiteline_basestation.web import nothing, overview, status
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.sync import SyncConfig
+from kiteline_core.ids import AgentId
+
+S = 1_000_000_000
+
+
+def test_a_fresh_base_has_nothing_to_show() -> None:
+    shown = status(nothing(5 * S))
+    assert (shown["agents"], shown["points"], shown["up_s"]) == ([], 0, 0.0)
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    assert status(overview(station, 5 * S, 5 * S)) == shown
+
+
+def test_overview_follows_a_flight(make_flight: Callable[..., Any]) -> None:
+    flight = make_flight(keyframes=6, points=300)
+    agent = CodedChannel(SyncConfig(), 1)
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    for record in flight.all_records():
+        agent.put(record)
+    done: tuple[JobDone, ...] = ()
+    for tick in range(40):
+        now_ns = (tick + 1) * S // 10
+        out = station.step({AgentId(0): agent.poll(now_ns)}, done, now_ns)
+        done = tuple(run_job(job) for job in out.jobs)
+        for _, packets in out.packets:
+            agent.receive(packets, now_ns)
+    now = overview(station, 4 * S, 0)
+    shown = status(now)
+    (only,) = shown["agents"]
+    assert only["agent"] == 0 and only["keyframes"] == 6 and only["submaps"] == 1
+    assert only["bytes_up"] > 10_000 and only["bytes_down"] > 0
+    assert only["points"] > 100
+    assert now.agents[0].path.shape == (6, 3)
+    radius = np.linalg.norm(now.agents[0].path - now.agents[0].path.mean(axis=0), axis=1)
+    np.testing.assert_allclose(radius, 1.2, atol=0.1)
