@@ -239,7 +239,7 @@ class Onboard:
 
 
 def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig) -> dict[str, str]:
-    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
+    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config", "link")}
     return {
         "role": "agent",
         "source": source.name,

@@ -239,7 +239,9 @@ class Ground:
 
 
 def _log_metadata(spec: BaseSpec, config: BaseConfig) -> dict[str, str]:
-    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config", "store", "web")}
+    plain = {
+        key: value for key, value in asdict(spec).items() if key not in ("folder", "config", "link", "store", "web")
+    }
     return {"role": "base", "spec": json.dumps(plain), "config": configuration.describe(config)}
 
 

@@ -151,7 +151,7 @@ def plan(o: Options) -> Plan:
 
 
 def flight_starts(sources: list[FrameSource]) -> list[int]:
-    """The stamp of each source that is flight time 0: sources that overlap in time share a clock, others begin together."""
+    """Each source's stamp of flight time 0: sources that overlap in time share a clock, others begin together."""
     spans = [_span_ns(source, several=len(sources) > 1) for source in sources]
     if max(first for first, _ in spans) < min(last for _, last in spans):
         return [min(first for first, _ in spans)] * len(spans)
