@@ -113,9 +113,11 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     measured = np.empty((len(slots), 3))
     measured[:, :2] = table.uv[slots]
     measured[:, 2] = np.where(ranged, sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots], -1.0)
-    scale = np.exp2(table.octave[slots].astype(np.float64))
-    pixel = np.where(table.kind[slots] == BIRTH, config.birth_sigma_px, config.sigma_px)
-    return measured, np.stack([pixel * scale, config.sigma_disparity_px * scale], 1)
+    octave = table.octave[slots].astype(np.float64)
+    aligned = config.sigma_growth**octave
+    fused = (table.kind[slots] == BIRTH) & (table.root[slots] != slots)
+    pixel = np.where(fused, config.fused_px * config.fused_growth**octave, config.sigma_px * aligned)
+    return measured, np.stack([pixel, config.sigma_disparity_px * aligned], 1)
 
 
 def _inverted(poses: F64) -> F64:

@@ -69,7 +69,8 @@ class GridMap:
 
     tiles: (t, 2) int64 column, row of each tile, in order of row, column. cells: (t, 32, 32) int8, 0..100 percent
     occupied, -1 unknown, row 0 the lowest y. A tile's corner lies at (column, row) * 32 * cell_m in w.
-    points: (m,3) what it was built from, in w. labels: (m,) uint8 of the points. ground_m: (m,) z of the ground at each point, NaN unknown.
+    points: (m,3) what it was built from, in w. labels: (m,) uint8 of the points. ground_m: (m,) z of the ground at each
+    point, NaN unknown.
     """
 
     cell_m: float

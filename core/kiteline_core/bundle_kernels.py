@@ -3,8 +3,8 @@
 Arrays throughout: cameras (k,12) = rotation row by row and translation of T_c_m; lens (k,5) = fx fy cx cy bf; points
 (n,3) in m; observations sorted by point, inside a point by camera: starts (n + 1,), camera (m,), measured (m,3) = u, v,
 disparity (negative: none) in px, weight (m,2) = 1/sigma^2 of pixel and disparity, active (m,) uint8. free (k,):
-the number of each camera among the free ones, increasing, -1 for a fixed camera. A camera moves by T_c_m <- Exp(d) T_c_m
-with d = [translation, rotation].
+the number of each camera among the free ones, increasing, -1 for a fixed camera. It moves by T_c_m <- Exp(d) T_c_m with
+d = [translation, rotation].
 """
 
 from __future__ import annotations
