@@ -18,6 +18,7 @@ U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 
 WIDEST = 1.75  # x/z at the side of a rectified image, 60 degrees: wider costs resolution in the middle
+LEAST_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 degrees little is seen by both eyes
 VIRTUAL_BASELINE_M = 0.1  # gives cameras without a right eye a scale for coded inverse depths
 
 
@@ -211,11 +212,11 @@ def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:
     turn = np.stack([x, y, np.cross(x, y)])
     r_left = turn @ half.T
     r_right = turn @ half.T @ rig.T_c_r[:3, :3]
+    if min(r_left[2, 2], r_right[2, 2]) < LEAST_COSINE:
+        raise CalibrationError("the two cameras hardly look the same way: expected the extrinsics of a stereo pair")
     sides = [_side_rays(rig.left, r_left), _side_rays(rig.right, r_right)]
     left, right = max(s[0] for s in sides), min(s[1] for s in sides)
     top, bottom = max(s[2] for s in sides), min(s[3] for s in sides)
-    if right - left < 0.1 or bottom - top < 0.1:
-        raise CalibrationError("the two cameras hardly look the same way: expected the extrinsics of a stereo pair")
     width, height = rig.left.width, rig.left.height
     focal = max((width - 1) / (right - left), (height - 1) / (bottom - top))
     cx = 0.5 * (width - 1) - focal * 0.5 * (left + right)

@@ -170,9 +170,9 @@ def test_unusable_calibrations_say_why() -> None:
     other = CameraModel(640, 480, 458.0, 458.0, 320.0, 240.0)
     with pytest.raises(CalibrationError, match="640x480"):
         Rectifier(CameraRig(eye, other, np.eye(4), se3.inverse(swapped)))
+    apart = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 1.6, 0.0]))
+    apart[:3, 3] = [0.1, 0.0, 0.0]
     with pytest.raises(CalibrationError, match="hardly look the same way"):
-        apart = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 1.6, 0.0]))
-        apart[:3, 3] = [0.1, 0.0, 0.0]
         Rectifier(CameraRig(eye, eye, np.eye(4), apart))
     with pytest.raises(CalibrationError, match="image is 100x50"):
         Rectifier(CameraRig(eye, None, np.eye(4), None)).left(np.zeros((50, 100), np.uint8))
