@@ -5,7 +5,7 @@ first. Textures are mip pyramids; a pixel reads the level of its footprint on th
 long axis of a grazing footprint. Pixels on the outline of a solid are cast again with four sub-pixel rays.
 
 Arrays shared by the kernels (see world.py for their meaning):
-boxes (n, 8) float64: centre x y z, half-extent x y z, cos yaw, sin yaw. faces (n, 6, 8) float64: texels per metre
+boxes (n, 8) float64: centre x y z, half-extent x y z, cos yaw, sin yaw. faces (6 n, 8) float64: texels per metre
 along u and v (signed), offset u and v in texels, brightness, contrast, texture, 1 where u and v are swapped.
 Faces are numbered 2 * axis + (1 where the outward normal is positive). A hit is 6 * box + face, or SKY or GROUND.
 """
@@ -24,6 +24,7 @@ U8 = NDArray[np.uint8]
 TILE = 16  # px, side of a screen tile
 SKY = -1
 GROUND = -2
+_WRAP = float(1 << 26)  # makes texel coordinates positive; a multiple of every texture's side
 _FACE_LIGHT = (0.86, 0.74, 0.95, 0.80, 0.70, 1.0)  # brightness by outward normal -x +x -y +y -z +z: light from above
 
 
@@ -94,38 +95,37 @@ def tile_lists(boxes: F64, items: I32, count: int, o: F64, rot: F64, rays: F32, 
         lengths[tile] = n
 
 
-@njit(cache=True, nogil=True)
-def box_hit(b: F64, o: F64, dx: float, dy: float, dz: float, from_inside: bool) -> tuple[float, int]:
-    """Distance and face at which a ray enters a box (leaves it, `from_inside`), or (inf, 0). Slab method (Kay, 1986)."""
-    ox, oy = o[0] - b[0], o[1] - b[1]
-    low, high, face_low, face_high = -np.inf, np.inf, 0, 0
-    for axis in range(3):
-        if axis == 0:
-            p, d = b[6] * ox + b[7] * oy, b[6] * dx + b[7] * dy
-        elif axis == 1:
-            p, d = b[6] * oy - b[7] * ox, b[6] * dy - b[7] * dx
-        else:
-            p, d = o[2] - b[2], dz
-        if abs(d) < 1e-12:
-            d = 1e-12
-        inverse = 1.0 / d
-        size = b[3 + axis] * abs(inverse)
-        middle = -p * inverse
-        positive = 1 if d > 0.0 else 0
-        if middle - size > low:
-            low, face_low = middle - size, 2 * axis + 1 - positive
-        if middle + size < high:
-            high, face_high = middle + size, 2 * axis + positive
-    if low > high or high <= 0.0:
-        return np.inf, 0
+@njit(cache=True, nogil=True, forceinline=True)
+def box_hit(boxes: F64, i: int, o: F64, dx: float, dy: float, dz: float, from_inside: bool) -> tuple[float, int]:
+    """Distance and face at which a ray enters box i (leaves it, `from_inside`), or (inf, 0). Slabs (Kay, Kajiya 1986)."""
+    ox, oy, c, s = o[0] - boxes[i, 0], o[1] - boxes[i, 1], boxes[i, 6], boxes[i, 7]
+    ex, ey, ez = c * dx + s * dy, c * dy - s * dx, dz
+    ex = ex if abs(ex) > 1e-12 else 1e-12
+    ey = ey if abs(ey) > 1e-12 else 1e-12
+    ez = ez if abs(ez) > 1e-12 else 1e-12
+    ix, iy, iz = 1.0 / ex, 1.0 / ey, 1.0 / ez
+    mx, my, mz = -(c * ox + s * oy) * ix, -(c * oy - s * ox) * iy, (boxes[i, 2] - o[2]) * iz
+    sx, sy, sz = boxes[i, 3] * abs(ix), boxes[i, 4] * abs(iy), boxes[i, 5] * abs(iz)
     if from_inside:
-        return high, face_high
-    if low <= 0.0:
+        high = min(mx + sx, my + sy, mz + sz)
+        if high <= 0.0:
+            return np.inf, 0
+        if high == mx + sx:
+            return high, 1 if ix > 0.0 else 0
+        if high == my + sy:
+            return high, 3 if iy > 0.0 else 2
+        return high, 5 if iz > 0.0 else 4
+    low = max(mx - sx, my - sy, mz - sz)
+    if low <= 0.0 or low > min(mx + sx, my + sy, mz + sz):
         return np.inf, 0
-    return low, face_low
+    if low == mx - sx:
+        return low, 0 if ix > 0.0 else 1
+    if low == my - sy:
+        return low, 2 if iy > 0.0 else 3
+    return low, 4 if iz > 0.0 else 5
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _ground(field: F32, frame: F64, x: float, y: float, channel: int) -> float:
     """Bilinear height (channel 0) or distance to the path (channel 1). frame: x0, y0, cell, largest slope, top."""
     u = min(max((x - frame[0]) / frame[2], 0.0), field.shape[2] - 1.001)
@@ -137,38 +137,46 @@ def _ground(field: F32, frame: F64, x: float, y: float, channel: int) -> float:
     return a * (1.0 - fv) + b * fv
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def ground_hit(field: F32, frame: F64, o: F64, dx: float, dy: float, dz: float, limit: float) -> float:
-    """Distance at which a ray meets the height field, or inf beyond `limit`. Steps never pass the surface (Lipschitz)."""
+    """Distance at which a ray meets the height field, or inf beyond `limit`.
+
+    Steps by the largest slope never pass the surface; close to it, secant steps finish.
+    """
     fall = frame[3] * np.sqrt(dx * dx + dy * dy) - dz
     if fall <= 1e-9:
         return np.inf
-    t = 0.0
-    for _ in range(64):
+    t, rate, last_t, last_above = 0.0, fall, 0.0, 0.0
+    for k in range(64):
         above = o[2] + t * dz - _ground(field, frame, o[0] + t * dx, o[1] + t * dy, 0)
-        if above < 1e-4 + 2e-5 * t:
+        if abs(above) < 1e-4 + 2e-5 * t:
             return t
-        t += above / fall
+        if k > 0 and above < 0.4 and t != last_t:
+            rate = min(fall, max((last_above - above) / (t - last_t), 0.2 * fall))
+        else:
+            rate = fall
+        last_t, last_above = t, above
+        t += above / rate
         if t > limit:
             return np.inf
     return t
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _cast(
-    boxes: F64, shell: int, field: F32, frame: F64, near: F64, items: I32, row: I32, length: int,
+    boxes: F64, shell: int, field: F32, frame: F64, near: F64, items: I32, lists: I32, tile: int, length: int,
     o: F64, dx: float, dy: float, dz: float, far: float,
 ) -> tuple[float, int]:  # fmt: skip
     best, hit = far, SKY
     if shell >= 0:
-        t, face = box_hit(boxes[shell], o, dx, dy, dz, True)
+        t, face = box_hit(boxes, shell, o, dx, dy, dz, True)
         if t < best:
             best, hit = t, 6 * shell + face
     for k in range(length):
-        m = row[k]
+        m = lists[tile, k]
         if near[m] >= best:
             break
-        t, face = box_hit(boxes[items[m]], o, dx, dy, dz, False)
+        t, face = box_hit(boxes, items[m], o, dx, dy, dz, False)
         if t < best:
             best, hit = t, 6 * items[m] + face
     if field.shape[0] > 0:
@@ -178,71 +186,76 @@ def _cast(
     return best, hit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _bilinear(atlas: U8, base: int, bits: int, u: float, v: float) -> float:
-    u -= 0.5
-    v -= 0.5
-    i, j = int(np.floor(u)), int(np.floor(v))
+    u += _WRAP - 0.5
+    v += _WRAP - 0.5
+    i, j = int(u), int(v)
     fu, fv = u - i, v - j
     mask = (1 << bits) - 1
     i0, i1 = i & mask, (i + 1) & mask
     r0, r1 = base + ((j & mask) << bits), base + (((j + 1) & mask) << bits)
-    a = atlas[r0 + i0] * (1.0 - fu) + atlas[r0 + i1] * fu
-    b = atlas[r1 + i0] * (1.0 - fu) + atlas[r1 + i1] * fu
-    return a * (1.0 - fv) + b * fv
+    # Unsigned indices: no test for negative ones.
+    a00, a01 = float(atlas[np.uint64(r0 + i0)]), float(atlas[np.uint64(r0 + i1)])
+    a10, a11 = float(atlas[np.uint64(r1 + i0)]), float(atlas[np.uint64(r1 + i1)])
+    low, high = a00 + fu * (a01 - a00), a10 + fu * (a11 - a10)
+    return low + fv * (high - low)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def texture_value(atlas: U8, table: NDArray[np.int64], k: int, u: float, v: float, lod: float) -> float:
-    """Trilinear value, 0..255, of texture k at texel (u, v) of its finest level. table (n, 1 + levels): bits, offsets."""
-    bits = table[k, 0]
-    if lod <= 0.0:
-        return _bilinear(atlas, table[k, 1], bits, u, v)
+    """Value, 0..255, of texture k at texel (u, v) of its finest level. table (n, 1 + levels): log2 of side, offsets.
+
+    Blends two mip levels in the middle half between them and takes the nearer one alone elsewhere.
+    """
     last = table.shape[1] - 2
+    lod = min(max(lod, 0.0), float(last))
     level = int(lod)
-    if level >= last:
-        scale = 1.0 / (1 << last)
-        return _bilinear(atlas, table[k, 1 + last], bits - last, u * scale, v * scale)
+    fraction = (lod - level) * 2.0 - 0.5
+    if fraction >= 1.0:
+        level += 1
+        fraction = 0.0
+    bits = table[k, 0] - level
     scale = 1.0 / (1 << level)
-    fraction = lod - level
-    a = _bilinear(atlas, table[k, 1 + level], bits - level, u * scale, v * scale)
-    b = _bilinear(atlas, table[k, 2 + level], bits - level - 1, u * scale * 0.5, v * scale * 0.5)
+    a = _bilinear(atlas, table[k, 1 + level], bits, u * scale, v * scale)
+    if fraction <= 0.0:
+        return a
+    b = _bilinear(atlas, table[k, 2 + level], bits - 1, u * scale * 0.5, v * scale * 0.5)
     return a + (b - a) * fraction
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _surface(
-    atlas: U8, table: NDArray[np.int64], face: F64, u: float, v: float, eu: float, ev: float,
+    atlas: U8, table: NDArray[np.int64], faces: F64, n: int, u: float, v: float, eu: float, ev: float,
     across: float, along: float, detail_m: float,
 ) -> float:  # fmt: skip
     """Radiance of a surface point. u, v in m; (eu, ev) unit direction of the footprint's long side; sides in m."""
-    scale = abs(face[0])
+    scale = abs(faces[n, 0])
     along = min(along, 12.0 * across)
     probes = min(6, max(1, int(0.7 * along / across + 0.5)))
     lod = np.log2(max(across, along / probes) * scale) - 0.3
-    k = int(face[6])
+    k = int(faces[n, 6])
     total = 0.0
     for i in range(probes):
         s = along * ((i + 0.5) / probes - 0.5) if probes > 1 else 0.0
-        total += texture_value(atlas, table, k, (u + eu * s) * face[0] + face[2], (v + ev * s) * face[1] + face[3], lod)
-    value = 1.0 + face[5] * (total / probes - 128.0) / 128.0
+        total += texture_value(atlas, table, k, (u + eu * s) * faces[n, 0] + faces[n, 2], (v + ev * s) * faces[n, 1] + faces[n, 3], lod)
+    value = 1.0 + faces[n, 5] * (total / probes - 128.0) / 128.0
     fine = np.log2(max(along, across) / detail_m)
     if fine < 3.0:  # texture 0 adds what lies below the texels of the others, until it blurs away
-        d = texture_value(atlas, table, 0, u / detail_m + face[3], v / detail_m + face[2], fine)
+        d = texture_value(atlas, table, 0, u / detail_m + faces[n, 3], v / detail_m + faces[n, 2], fine)
         value += 0.10 * min(1.0, 3.0 - fine) * (d - 128.0) / 128.0
-    return face[4] * value
+    return faces[n, 4] * value
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def _shade(
     boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: NDArray[np.int64],
     detail_m: float, o: F64, dx: float, dy: float, dz: float, t: float, hit: int, pixel: float,
 ) -> float:  # fmt: skip
     if hit == SKY:
-        sky = ground[3]
         s = 1.0 / (max(dz, 0.0) + 0.25)
-        value = texture_value(atlas, table, int(sky[6]), dx * s * 400.0, dy * s * 400.0, 1.0)
-        return sky[4] * (1.0 + 0.3 * max(dz, 0.0) + sky[5] * (value - 128.0) / 128.0)
+        value = texture_value(atlas, table, int(ground[3, 6]), dx * s * 400.0, dy * s * 400.0, 1.0)
+        return ground[3, 4] * (1.0 + 0.3 * max(dz, 0.0) + ground[3, 5] * (value - 128.0) / 128.0)
     across = t * pixel
     if hit == GROUND:
         x, y = o[0] + t * dx, o[1] + t * dy
@@ -254,34 +267,35 @@ def _shade(
         kerb = min(1.0, max(0.0, (side - frame[5]) / blend + 0.5))
         lawn = min(1.0, max(0.0, (side - frame[6]) / blend + 0.5))
         if kerb < 1.0:
-            v0 = _surface(atlas, table, ground[0], x, y, dx / flat, dy / flat, across, along, detail_m)
+            v0 = _surface(atlas, table, ground, 0, x, y, dx / flat, dy / flat, across, along, detail_m)
             values += (1.0 - kerb) * v0
         if kerb > 0.0 and lawn < 1.0:
-            v1 = _surface(atlas, table, ground[1], x, y, dx / flat, dy / flat, across, along, detail_m)
+            v1 = _surface(atlas, table, ground, 1, x, y, dx / flat, dy / flat, across, along, detail_m)
             values += kerb * (1.0 - lawn) * v1
         if lawn > 0.0:
-            values += lawn * _surface(atlas, table, ground[2], x, y, dx / flat, dy / flat, across, along, detail_m)
+            values += lawn * _surface(atlas, table, ground, 2, x, y, dx / flat, dy / flat, across, along, detail_m)
         return values
     index, number = hit // 6, hit % 6
-    b, face = boxes[index], faces[index, number]
-    px, py, pz = o[0] + t * dx - b[0], o[1] + t * dy - b[1], o[2] + t * dz - b[2]
-    lx, ly = b[6] * px + b[7] * py, b[6] * py - b[7] * px
-    ex, ey = b[6] * dx + b[7] * dy, b[6] * dy - b[7] * dx
+    px, py = o[0] + t * dx - boxes[index, 0], o[1] + t * dy - boxes[index, 1]
+    pz = o[2] + t * dz - boxes[index, 2]
+    c, s = boxes[index, 6], boxes[index, 7]
+    lx, ly = c * px + s * py, c * py - s * px
+    ex, ey = c * dx + s * dy, c * dy - s * dx
     if number < 2:
         u, v, eu, ev, slope = ly, pz, ey, dz, abs(ex)
     elif number < 4:
         u, v, eu, ev, slope = lx, pz, ex, dz, abs(ey)
     else:
         u, v, eu, ev, slope = lx, ly, ex, ey, abs(dz)
-    if face[7] != 0.0:
+    if faces[hit, 7] != 0.0:
         u, v, eu, ev = v, u, ev, eu
     length = np.sqrt(eu * eu + ev * ev) + 1e-12
     light = _FACE_LIGHT[number ^ 1 if index == shell else number]
-    floor_gap = pz + b[5]
+    floor_gap = pz + boxes[index, 5]
     if number < 4 and index != shell:  # contact shadow where a solid stands on something
         light *= 1.0 - 0.3 * np.exp(-8.0 * floor_gap)
     return light * _surface(
-        atlas, table, face, u, v, eu / length, ev / length, across, across / max(slope, 0.02), detail_m
+        atlas, table, faces, hit, u, v, eu / length, ev / length, across, across / max(slope, 0.02), detail_m
     )
 
 
@@ -298,12 +312,12 @@ def render(
         x0, y0 = (tile % columns) * TILE, (tile // columns) * TILE
         for y in range(y0, min(y0 + TILE, height)):
             for x in range(x0, min(x0 + TILE, width)):
-                r = rays[y + 1, x + 1]
-                dx = rot[0, 0] * r[0] + rot[0, 1] * r[1] + rot[0, 2] * r[2]
-                dy = rot[1, 0] * r[0] + rot[1, 1] * r[1] + rot[1, 2] * r[2]
-                dz = rot[2, 0] * r[0] + rot[2, 1] * r[1] + rot[2, 2] * r[2]
+                r0, r1, r2 = rays[y + 1, x + 1, 0], rays[y + 1, x + 1, 1], rays[y + 1, x + 1, 2]
+                dx = rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2
+                dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
+                dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
                 t, hit = _cast(
-                    boxes, shell, field, frame, near, items, lists[tile], lengths[tile], o, dx, dy, dz, far
+                    boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
                 )
                 hits[y, x] = hit
                 distance[y, x] = t if hit != SKY else np.inf
@@ -333,7 +347,7 @@ def render(
                 dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
                 dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
                 t, hit = _cast(
-                    boxes, shell, field, frame, near, items, lists[tile], lengths[tile], o, dx, dy, dz, far
+                    boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
                 )
                 total += _shade(
                     boxes, faces, shell, field, frame, ground, atlas, table, detail_m, o, dx, dy, dz, t, hit, pixel

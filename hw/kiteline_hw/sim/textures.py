@@ -246,7 +246,7 @@ def facade(rng: Rng, side: int) -> F32:
     """A house front: windows of unequal size and curtain in plaster or brick, a door now and then, pipes."""
     image = 0.5 * brick(rng, side) if rng.random() < 0.5 else 0.8 * plaster(rng, side)
     image += 15.0 * pink(rng, side, 1.5)
-    storey = side // 8 if side >= 1024 else side // 2
+    storey = side // 4 if side >= 1024 else side // 2
     inside = leaves(rng, side)
     for floor in range(0, side, storey):
         x = int(rng.integers(0, storey // 2))

@@ -23,7 +23,7 @@ NO_GROUND = np.zeros((0, 1, 1), np.float32)
 class World:
     """Solids, ground and textures.
 
-    boxes (n, 8): centre x y z, half-extents x y z in m, cos yaw, sin yaw. faces (n, 6, 8): see raycast_kernels.
+    boxes (n, 8): centre x y z, half-extents x y z in m, cos yaw, sin yaw. faces (6 n, 8): see raycast_kernels.
     shell: the box whose inside is the room, or -1 outdoors.
     field (2, rows, columns) float32: ground height and distance to the path in m, empty indoors; field_frame (7,): x0 y0
     cell in m, largest slope, then unused, road half-width, far side of the pavement. ground (4, 8): the surfaces of
@@ -115,8 +115,8 @@ class Builder:
         return True
 
     def arrays(self) -> tuple[F64, F64]:
-        """All boxes (n, 8) and faces (n, 6, 8) in order of addition."""
-        return np.array(self._boxes).reshape(-1, 8), np.array(self._faces).reshape(-1, 6, 8)
+        """All boxes (n, 8) and faces (6 n, 8) in order of addition."""
+        return np.array(self._boxes).reshape(-1, 8), np.array(self._faces).reshape(-1, 8)
 
 
 def occupancy(
