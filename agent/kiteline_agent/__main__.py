@@ -27,6 +27,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.flight_log import write_step
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm
+from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
@@ -123,6 +124,7 @@ class Onboard:
         self.rss_mib = 0.0
         config = agent_config(spec.config)
         begin_ns = time.process_time_ns()
+        codec_warm.warm()
         warm(source.rig, config)
         self.warm_ms = (time.process_time_ns() - begin_ns) / 1e6
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None

@@ -25,6 +25,8 @@ from kiteline_basestation.flight_log import write_step
 from kiteline_basestation.jobs import Job, JobDone, run_job
 from kiteline_basestation.outputs import counts, keyframe_poses, map_files
 from kiteline_basestation.station import Station, StationOutput
+from kiteline_basestation.warm import warm
+from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
@@ -140,6 +142,8 @@ class Ground:
         cv2.setNumThreads(1)
         self.spec = spec
         self.config = base_config(spec.config)
+        codec_warm.warm()
+        warm(self.config)
         self.station = Station(self.config, open_channel)
         self.jobs = LockstepJobs()
         self.phase = Phase.FLY
@@ -239,9 +243,8 @@ class Ground:
 
 
 def _log_metadata(spec: BaseSpec, config: BaseConfig) -> dict[str, str]:
-    plain = {
-        key: value for key, value in asdict(spec).items() if key not in ("folder", "config", "link", "store", "web")
-    }
+    unlogged = ("folder", "config", "link", "store", "web")
+    plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
     return {"role": "base", "spec": json.dumps(plain), "config": configuration.describe(config)}
 
 
