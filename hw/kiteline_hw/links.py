@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Literal, overload
 
 from kiteline_hw.ports import ByteLink, Framer, LinkError, LinkHub
 from kiteline_hw.serial_port import parse_serial
 
 LINK_FORMS = "zenoh:tcp/HOST:PORT, serial:DEVICE:BAUD or none"
+
+
+@dataclass(frozen=True, slots=True)
+class Framing:
+    """A Framer put together from two functions: `encode` frames a packet, `feed` finds packets in a stream's bytes."""
+
+    encode: Callable[[bytes], bytes]
+    feed: Callable[[bytes], list[bytes]]
 
 
 class NoLink:

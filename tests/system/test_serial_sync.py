@@ -1,0 +1,50 @@
+"""The link's endpoints over a serial line with noise: both sides end with the same values."""
+
+from __future__ import annotations
+
+import random
+import time
+
+from kiteline_codec.framing import Deframer, frame
+from kiteline_codec.schema import Key, Kind
+from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_hw.links import Framing, open_link
+from kiteline_hw.ports import ByteLink
+from kiteline_hw.sim.serial_pair import SerialPair
+
+
+def framing() -> Framing:
+    return Framing(frame, Deframer().feed)
+
+
+def turn(endpoint: Endpoint, link: ByteLink) -> None:
+    now_ns = time.monotonic_ns()
+    for packet in link.receive():
+        endpoint.receive(packet, now_ns)
+    while (out := endpoint.poll(now_ns)) is not None:
+        link.send(out)
+
+
+def test_endpoints_agree_over_a_noisy_serial_line() -> None:
+    draw = random.Random(3)
+    config = SyncConfig(packet_bytes=200, budget_bytes=0, first_rto_ns=100_000_000)
+    agent, base = Endpoint(config, 1), Endpoint(config, 1)
+    with SerialPair(bit_errors=0.0005, seed=2) as pair:
+        up = open_link(f"serial:{pair.a}:57600", "agent", 1, framer=framing)
+        hub = open_link(f"serial:{pair.b}:57600", "base", 1, framer=framing)
+        down = hub.links()[1]
+        try:
+            for i in range(60):
+                agent.put(Key(Kind.BIRTHS, i), draw.randbytes(draw.randrange(1, 900)))
+                base.put(Key(Kind.POSE, i), draw.randbytes(20))
+            end_s = time.monotonic() + 20.0
+            while not (agent.quiet and base.quiet and agent.digest_equal and base.digest_equal):
+                assert time.monotonic() < end_s, (agent.stats, base.stats)
+                turn(agent, up)
+                turn(base, down)
+                time.sleep(0.001)
+        finally:
+            up.close()
+            hub.close()
+    assert len(base.peer_values()) == len(agent.peer_values()) == 60
+    assert agent.stats.lost > 0  # the noise has cost packets
