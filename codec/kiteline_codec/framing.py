@@ -69,3 +69,11 @@ class Deframer:
             self.damaged += 1
             return None
         return body
+
+
+class StreamFramer(Deframer):
+    """Both directions of one byte stream."""
+
+    def encode(self, packet: bytes) -> bytes:
+        """The bytes of one framed packet."""
+        return frame(packet)
