@@ -56,7 +56,9 @@ class _Span:
 
 
 class McapFile:
-    """An open MCAP file. Raises SourceError when it is none; a cut or damaged one opens, see `cut` and `notes`."""
+    """An MCAP file, open only while it is read. Raises SourceError when it is none; for a cut or damaged one see `cut`
+    and `notes`.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -70,24 +72,19 @@ class McapFile:
         self.first_ns = self.last_ns = 0
         self._spans: list[_Span] = []
         try:
-            self._file: BinaryIO = path.open("rb")
+            with path.open("rb") as file:
+                head = file.read(len(MAGIC))
+                if head != MAGIC:
+                    raise SourceError(f"{path}: no MCAP file: starts with {head!r}" if head else f"{path}: empty file")
+                self._size = path.stat().st_size
+                if not self._read_index(file):
+                    self._walk(file)
         except OSError as error:
             raise SourceError(f"{path}: {error.strerror}") from error
-        head = self._file.read(len(MAGIC))
-        if head != MAGIC:
-            self._file.close()
-            raise SourceError(f"{path}: no MCAP file: it starts with {head!r}" if head else f"{path}: empty file")
-        self._size = path.stat().st_size
-        if not self._read_index():
-            self._walk()
         used = [span for span in self._spans if span.last_ns]
         if used:
             self.first_ns = min(span.first_ns for span in used)
             self.last_ns = max(span.last_ns for span in used)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
     def schema_of(self, channel: int) -> Schema | None:
         """The schema of a channel's messages, or None."""
@@ -97,16 +94,20 @@ class McapFile:
         """Messages of the channels (None: all), in order of log time, or (ordered False) as they stand in the file."""
         wanted = None if channels is None else frozenset(channels)
         spans = [s for s in self._spans if wanted is None or s.channels is None or s.channels & wanted]
-        if not ordered:
-            for span in spans:
-                yield from self._span(span, wanted)
-            return
+        with self.path.open("rb") as file:
+            yield from self._merged(file, spans, wanted) if ordered else self._in_file_order(file, spans, wanted)
+
+    def _in_file_order(self, file: BinaryIO, spans: list[_Span], wanted: frozenset[int] | None) -> Iterator[RawMessage]:
+        for span in spans:
+            yield from self._span(file, span, wanted)
+
+    def _merged(self, file: BinaryIO, spans: list[_Span], wanted: frozenset[int] | None) -> Iterator[RawMessage]:
         heap: list[tuple[int, int, RawMessage]] = []
         order = 0
         for span in sorted(spans, key=lambda s: (s.first_ns, s.offset)):
             while heap and heap[0][0] < span.first_ns:
                 yield heapq.heappop(heap)[2]
-            for message in self._span(span, wanted):
+            for message in self._span(file, span, wanted):
                 heapq.heappush(heap, (message.log_ns, order, message))
                 order += 1
         while heap:
@@ -116,10 +117,10 @@ class McapFile:
         """The first message of a channel in the file."""
         return next(self.messages((channel,), ordered=False), None)
 
-    def _read_index(self) -> bool:
+    def _read_index(self, file: BinaryIO) -> bool:
         try:
-            self._file.seek(0)
-            reader = SeekingReader(self._file)
+            file.seek(0)
+            reader = SeekingReader(file)
             summary = reader.get_summary()
             if summary is None or summary.statistics is None or not summary.chunk_indexes or not summary.channels:
                 return False
@@ -139,7 +140,7 @@ class McapFile:
         self.indexed = True
         return True
 
-    def _walk(self) -> None:
+    def _walk(self, file: BinaryIO) -> None:
         """Find spans, schemas and channels from the front, up to the end or the cut."""
         self._spans, self.metadata = [], []
         offset = len(MAGIC)
@@ -153,15 +154,15 @@ class McapFile:
             run_start, run_times, run_channels = 0, [0, 0], set()
 
         while True:
-            self._file.seek(offset)
-            head = self._file.read(_RECORD.size)
+            file.seek(offset)
+            head = file.read(_RECORD.size)
             if len(head) < _RECORD.size:
                 self.cut = f"cut after {self._size} bytes, without the end that a finished file has"
                 break
             opcode, length = _RECORD.unpack(head)
             end = offset + _RECORD.size + length
             if opcode == Opcode.MESSAGE and end <= self._size:
-                channel, _, log_ns, _ = _MESSAGE.unpack(self._file.read(_MESSAGE.size))
+                channel, _, log_ns, _ = _MESSAGE.unpack(file.read(_MESSAGE.size))
                 if not run_start:
                     run_start, run_times = offset, [log_ns, log_ns]
                 run_times = [min(run_times[0], log_ns), max(run_times[1], log_ns)]
@@ -178,22 +179,20 @@ class McapFile:
                 self.cut = f"damaged at byte {offset} of {self._size}"
                 break
             if opcode == Opcode.CHUNK:
-                self._add_chunk(offset, min(end, self._size) - offset)
+                self._add_chunk(file, offset, min(end, self._size) - offset)
             if end > self._size:
                 self.cut = f"cut after {self._size} bytes, inside a record that needs {end - self._size} more"
                 break
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._learn(opcode, self._file.read(length))
-            elif opcode == Opcode.METADATA:
-                self.metadata.append(Metadata.read(ReadDataStream(BytesIO(self._file.read(length)))))
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+                self._learn(opcode, file.read(length))
             offset = end
         end_run()
 
-    def _add_chunk(self, offset: int, length: int) -> None:
+    def _add_chunk(self, file: BinaryIO, offset: int, length: int) -> None:
         span = _Span(offset, length, 0, 0, True, None)
         channels: set[int] = set()
         first_ns, last_ns = 2**64, 0
-        for message in self._span(span, None):
+        for message in self._span(file, span, None):
             channels.add(message.channel)
             self.counts[message.channel] = self.counts.get(message.channel, 0) + 1
             first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
@@ -206,15 +205,17 @@ class McapFile:
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream)
                 self.schemas[schema.id] = schema
+            elif opcode == Opcode.METADATA:
+                self.metadata.append(Metadata.read(stream))
             else:
                 channel = Channel.read(stream)
                 self.channels[channel.id] = channel
         except (McapError, struct.error, ValueError, UnicodeDecodeError) as error:
-            self._note(f"unreadable schema or channel ({error})")
+            self._note(f"unreadable schema, channel or metadata ({error})")
 
-    def _span(self, span: _Span, wanted: frozenset[int] | None) -> Iterator[RawMessage]:
-        self._file.seek(span.offset)
-        body = self._file.read(span.length)
+    def _span(self, file: BinaryIO, span: _Span, wanted: frozenset[int] | None) -> Iterator[RawMessage]:
+        file.seek(span.offset)
+        body = file.read(span.length)
         if span.chunk:
             body = self._unpack(body, span.offset)
         at, size = 0, len(body)
@@ -254,7 +255,7 @@ class McapFile:
                 body = lz4.frame.LZ4FrameDecompressor().decompress(packed)
             else:
                 raise ValueError(f"unknown compression {compression!r}")
-        except (struct.error, ValueError, RuntimeError, zstandard.ZstdError, UnicodeDecodeError) as error:
+        except (struct.error, ValueError, RuntimeError, MemoryError, OverflowError, zstandard.ZstdError) as error:
             self._note(f"damaged chunk at byte {offset} ({error})")
             return b""
         if whole and crc and zlib.crc32(body) != crc:

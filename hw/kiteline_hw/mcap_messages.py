@@ -144,7 +144,8 @@ def image_of(message: Any, notes: Mapping[str, str]) -> EncodedImage | RawPixels
         data = message.data if isinstance(message.data, bytes) else _bytes(message.data)
         if hasattr(message, "encoding"):
             big_endian = bool(getattr(message, "is_bigendian", False))
-            return RawPixels(message.width, message.height, message.encoding, message.step, data, big_endian)
+            width, height, step = int(message.width), int(message.height), int(message.step)
+            return RawPixels(width, height, str(message.encoding), step, data, big_endian)
         scale, name = notes.get("depth_scale"), str(message.format)
         if scale:
             return EncodedImage(data, f"png/{scale}")

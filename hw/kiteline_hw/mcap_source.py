@@ -47,16 +47,11 @@ _DYNAMIC_MOST = 2000  # messages of moving transforms that are looked at when st
 
 def open_mcap(path: Path, *, mono: bool = False, imu: bool = True) -> McapSource:
     """Open a recording. Raises SourceError."""
-    file = McapFile(path)
-    try:
-        return McapSource(file, mono, imu)
-    except BaseException:
-        file.close()
-        raise
+    return McapSource(McapFile(path), mono, imu)
 
 
 class McapSource:
-    """A FrameSource over an MCAP file. It holds the file open; messages are read while iterating."""
+    """A FrameSource over an MCAP file. Messages are read while iterating."""
 
     def __init__(self, file: McapFile, mono: bool, imu: bool) -> None:
         self.name = f"mcap:{file.path}"
@@ -100,8 +95,7 @@ class McapSource:
         return self._truth
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Nothing is held open between two readings."""
 
     def __iter__(self) -> Iterator[Frame | ImuBatch]:
         self.report.skipped.clear()
@@ -128,7 +122,9 @@ class McapSource:
         self.rig = rig
         topics = {c.topic: i for i, c in self._file.channels.items()}
         if LEFT not in topics:
-            raise SourceError(f"{self.name}: no images: expected {LEFT}; a base station's log has none")
+            several = sorted(topic for topic in topics if topic.endswith(LEFT))
+            why = f"it merges several recordings ({', '.join(several)})" if several else "a base station's log has none"
+            raise SourceError(f"{self.name}: no images on {LEFT}: {why}")
         self._left = topics[LEFT]
         self._right = topics.get(RIGHT) if rig.right is not None else None
         self._depth = topics.get(DEPTH) if rig.has_depth else None
@@ -263,8 +259,6 @@ class McapSource:
             while depths and depths[0][0] < t:
                 depths.popleft()
             yield Capture(t, left, other, depths.popleft()[1] if depths and depths[0][0] == t else None)
-        for note in self._file.notes:
-            self.report.skip("damaged chunk", note)
 
     def _in_order(self, with_imu: bool) -> Iterator[tuple[int, int, Any]]:
         """Images and samples (t_ns, channel, item) in order of their own stamps, not of their recording."""
@@ -300,3 +294,5 @@ class McapSource:
         while heap:
             t_ns, _, _, channel, item = heapq.heappop(heap)
             yield t_ns, channel, item
+        for note in self._file.notes:
+            self.report.skip("damaged chunk", note)

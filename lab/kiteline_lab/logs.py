@@ -53,38 +53,35 @@ def main(argv: list[str]) -> int:
 
 def _info(path: Path, as_json: bool) -> int:
     file = McapFile(path)
-    try:
-        for _ in () if not file.indexed else file.messages(ordered=False):
-            pass  # reading is the check: damaged chunks are noted on the way
-        topics = []
-        span_s = (file.last_ns - file.first_ns) * 1e-9
-        for number, channel in sorted(file.channels.items(), key=lambda item: item[1].topic):
-            schema, count = file.schema_of(number), file.counts.get(number, 0)
-            hz = round(count / span_s, 1) if span_s > 0 and count > 1 else None
-            name = schema.name if schema is not None else ""
-            topics.append(
-                {
-                    "topic": channel.topic,
-                    "messages": count,
-                    "hz": hz,
-                    "schema": name,
-                    "encoding": channel.message_encoding,
-                }
-            )
-        facts = {
-            "file": str(path),
-            "bytes": path.stat().st_size,
-            "seconds": round(span_s, 6),
-            "first_ns": file.first_ns,
-            "last_ns": file.last_ns,
-            "indexed": file.indexed,
-            "cut": file.cut,
-            "damage": file.notes,
-            "metadata": {record.name: record.metadata for record in file.metadata},
-            "topics": topics,
-        }
-    finally:
-        file.close()
+    for _ in () if not file.indexed else file.messages(ordered=False):
+        pass  # reading is the check: damaged chunks are noted on the way
+    topics = []
+    span_s = (file.last_ns - file.first_ns) * 1e-9
+    for number, channel in sorted(file.channels.items(), key=lambda item: item[1].topic):
+        schema, count = file.schema_of(number), file.counts.get(number, 0)
+        hz = round(count / span_s, 1) if span_s > 0 and count > 1 else None
+        name = schema.name if schema is not None else ""
+        topics.append(
+            {
+                "topic": channel.topic,
+                "messages": count,
+                "hz": hz,
+                "schema": name,
+                "encoding": channel.message_encoding,
+            }
+        )
+    facts = {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "seconds": round(span_s, 6),
+        "first_ns": file.first_ns,
+        "last_ns": file.last_ns,
+        "indexed": file.indexed,
+        "cut": file.cut,
+        "damage": file.notes,
+        "metadata": {record.name: record.metadata for record in file.metadata},
+        "topics": topics,
+    }
     if as_json:
         print(json.dumps(facts, indent=2))
     else:
@@ -110,11 +107,8 @@ def _print(facts: dict[str, object], topics: list[dict[str, object]], file: Mcap
 
 def _recover(path: Path, out: Path, force: bool) -> int:
     file = McapFile(path)
-    try:
-        with whole_file(out, force) as part:
-            count = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
-    finally:
-        file.close()
+    with whole_file(out, force) as part:
+        count = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
     print(f"{out}: {count} messages; {path} was {file.cut or 'whole'}")
     for note in file.notes:
         print(f"  {note}")
@@ -125,17 +119,14 @@ def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> in
     if not begin_s < end_s:
         raise SourceError(f"nothing lies between {begin_s:g} s and {end_s:g} s: expected --from before --to")
     file = McapFile(path)
-    try:
-        begin_ns = file.first_ns + round(begin_s * 1e9)
-        end_ns = file.first_ns + round(end_s * 1e9) if end_s != float("inf") else 2**64 - 1
-        if begin_ns > file.last_ns:
-            raise SourceError(
-                f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"
-            )
-        with whole_file(out, force) as part:
-            count = _write(part, [file], ((0, m) for m in _stretch(file, begin_ns, end_ns)), [""])
-    finally:
-        file.close()
+    begin_ns = file.first_ns + round(begin_s * 1e9)
+    end_ns = file.first_ns + round(end_s * 1e9) if end_s != float("inf") else 2**64 - 1
+    if begin_ns > file.last_ns:
+        raise SourceError(
+            f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"
+        )
+    with whole_file(out, force) as part:
+        count = _write(part, [file], ((0, m) for m in _stretch(file, begin_ns, end_ns)), [""])
     print(f"{out}: {count} messages")
     return 0
 
@@ -165,16 +156,12 @@ def _is_sticky(file: McapFile, channel: int) -> bool:
 
 def _merge(out: Path, paths: list[Path], force: bool) -> int:
     files: list[McapFile] = []
-    try:
-        for path in paths:
-            files.append(McapFile(path))
-        numbered = [_numbered(i, file) for i, file in enumerate(files)]
-        merged = heapq.merge(*numbered, key=lambda item: (item[1].log_ns, item[0]))
-        with whole_file(out, force) as part:
-            count = _write(part, files, merged, _prefixes(files))
-    finally:
-        for file in files:
-            file.close()
+    for path in paths:
+        files.append(McapFile(path))
+    numbered = [_numbered(i, file) for i, file in enumerate(files)]
+    merged = heapq.merge(*numbered, key=lambda item: (item[1].log_ns, item[0]))
+    with whole_file(out, force) as part:
+        count = _write(part, files, merged, _prefixes(files))
     print(f"{out}: {count} messages of {len(paths)} files")
     return 0
 
