@@ -1,0 +1,262 @@
+"""Two endpoints under any sequence of writes, faults and restarts: what one wrote is what the other holds.
+
+That the machine would notice a defect is tested too: with each of a few defects planted it must fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from kiteline_codec import inbox, outbox, ranges, sync
+from kiteline_codec.inbox import Inbox, Update
+from kiteline_codec.outbox import Outbox
+from kiteline_codec.packet import Item
+from kiteline_codec.schema import Key
+from kiteline_codec.sync import Endpoint, SyncConfig
+
+MS = 1_000_000
+CONFIG = SyncConfig(packet_bytes=160, overhead_bytes=10, budget_bytes=1500, window_packets=16, ack_packets=4)
+END = st.integers(0, 1)
+KEY = st.builds(Key, st.sampled_from([2, 22]), st.integers(0, 1), st.integers(0, 1))
+LENGTH = st.sampled_from([0, 1, 10, 60, 300])
+
+
+class TwoEnds(RuleBasedStateMachine):
+    """`held[i]` is what end i has put since its start, `history[i]` the order in which it put each (key, code)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_ns = 0
+        self.ends = [Endpoint(CONFIG, 1), Endpoint(CONFIG, 1)]
+        self.held: list[dict[Key, bytes]] = [{}, {}]
+        self.history: list[dict[bytes, int]] = [{}, {}]
+        self.known: list[dict[Key, int]] = [{}, {}]  # place in the other end's history of what end i holds
+        self.shown: list[dict[Key, bytes]] = [{}, {}]  # what the updates told
+        self.wire: list[tuple[int, bytes]] = []
+        self.spent: list[list[tuple[int, int]]] = [[], []]
+        self.writes = 0
+
+    @initialize(greeted=st.booleans())
+    def greet(self, greeted: bool) -> None:
+        if greeted:
+            self.settle()
+
+    @rule(end=END, values=st.lists(st.tuples(KEY, LENGTH), min_size=1, max_size=4), ms=st.sampled_from([None, 0, 120]))
+    def put(self, end: int, values: list[tuple[Key, int]], ms: int | None) -> None:
+        for key, length in values:
+            self.writes += 1
+            code = self.writes.to_bytes(3, "big") + bytes(length)
+            self.history[end][code] = self.writes
+            self.held[end][key] = code
+            self.ends[end].put(key, code)
+            if ms is not None:
+                self.send(ms)
+
+    @rule(end=END, key=KEY, ms=st.sampled_from([None, 0, 120]))
+    def remove(self, end: int, key: Key, ms: int | None) -> None:
+        self.held[end].pop(key, None)
+        self.ends[end].remove(key)
+        if ms is not None:
+            self.send(ms)
+
+    @rule(ms=st.sampled_from([0, 20, 100, 150, 700, 3000]))
+    def send(self, ms: int) -> None:
+        self.now_ns += ms * MS
+        for i, end in enumerate(self.ends):
+            while (packet := end.poll(self.now_ns)) is not None:
+                self.wire.append((1 - i, packet))
+                self.spent[i].append((self.now_ns, len(packet) + CONFIG.overhead_bytes))
+
+    @precondition(lambda self: self.wire)
+    @rule(data=st.data(), keep=st.booleans())
+    def deliver(self, data: st.DataObject, keep: bool) -> None:
+        """Any packet, early or late; kept, it will come again."""
+        i = data.draw(st.integers(0, len(self.wire) - 1))
+        to, packet = self.wire[i] if keep else self.wire.pop(i)
+        self.arrive(to, packet)
+
+    @rule(n=st.integers(1, 12))
+    def deliver_in_order(self, n: int) -> None:
+        for to, packet in self.wire[:n]:
+            self.arrive(to, packet)
+        del self.wire[:n]
+
+    @precondition(lambda self: len(self.wire) > 1)
+    @rule(data=st.data())
+    def shuffle(self, data: st.DataObject) -> None:
+        self.wire = data.draw(st.permutations(self.wire[:8])) + self.wire[8:]
+
+    @precondition(lambda self: self.wire)
+    @rule(data=st.data())
+    def lose(self, data: st.DataObject) -> None:
+        del self.wire[data.draw(st.integers(0, len(self.wire) - 1))]
+
+    @precondition(lambda self: self.wire)
+    @rule(data=st.data())
+    def corrupt(self, data: st.DataObject) -> None:
+        to, packet = data.draw(st.sampled_from(self.wire))
+        damaged = bytearray(packet)
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
+        before = self.ends[to].stats.rejected
+        assert self.ends[to].receive(bytes(damaged), self.now_ns) == []
+        assert self.ends[to].stats.rejected == before + 1
+
+    @rule(end=END, chance=st.integers(0, 3))
+    def restart(self, end: int, chance: int) -> None:
+        if chance:
+            return
+        self.ends[end] = Endpoint(CONFIG, self.ends[end].session + 1)
+        self.held[end] = {}
+        self.history[end] = {}
+        self.shown[end] = {}
+        self.spent[end] = []
+
+    @rule(chance=st.integers(0, 3))
+    def settle_sometimes(self, chance: int) -> None:
+        if not chance:
+            self.settle()
+
+    def settle(self) -> None:
+        """With a good link both sides come to agree, late packets notwithstanding."""
+        for _ in range(4000):
+            if all(e.digest_equal for e in self.ends) and not self.wire:
+                break
+            self.deliver_in_order(1000)
+            self.send(10)
+        else:
+            pytest.fail(f"no agreement: {[e.stats for e in self.ends]}")
+        a, b = self.ends
+        assert a.digests == b.digests[::-1]
+        for i, end in enumerate(self.ends):
+            assert end.peer_values() == self.held[1 - i]
+            assert {k: v for k, v in self.shown[i].items() if k not in end.legacy_values()} == self.held[1 - i]
+            assert end._in.tombstones == 0
+            assert end.stats.dirty == 0
+
+    def arrive(self, to: int, packet: bytes) -> None:
+        for update in self.ends[to].receive(packet, self.now_ns):
+            if update.code is None:
+                self.shown[to].pop(update.key, None)
+            else:
+                self.shown[to][update.key] = update.code
+
+    @invariant()
+    def values_are_whole_and_no_older_than_before(self) -> None:
+        for i, end in enumerate(self.ends):
+            history, last = self.history[1 - i], self.known[i]
+            now = {}
+            for key, code in end.peer_values().items():
+                if code in history:  # else of a session that has ended unnoticed
+                    now[key] = history[code]
+                    assert now[key] >= last.get(key, 0)
+            self.known[i] = now
+
+    @invariant()
+    def the_budget_holds(self) -> None:
+        for spent in self.spent:
+            if spent:
+                end_ns = spent[-1][0]
+                assert sum(n for t, n in spent if end_ns - t <= 1_000 * MS) <= CONFIG.budget_bytes
+
+    def teardown(self) -> None:
+        self.settle()
+        for end in self.ends:
+            assert end.stats.mismatches == 0
+
+
+TwoEnds.TestCase.settings = settings(max_examples=120, stateful_step_count=40)
+TestAgreement = TwoEnds.TestCase
+
+
+def older_versions_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    apply = Inbox.apply
+
+    def planted(self: Inbox, item: Item) -> Update | None:
+        if item.whole and item.key in self.values:
+            self._drop_value(item.key)
+        return apply(self, item)
+
+    monkeypatch.setattr(Inbox, "apply", planted)
+
+
+def losses_are_not_repaired(monkeypatch: pytest.MonkeyPatch) -> None:
+    def planted(self: Outbox, flight: outbox.Flight) -> None:
+        flight.lost = True
+        self.in_flight -= 1
+
+    monkeypatch.setattr(Outbox, "_lose", planted)
+
+
+def removals_are_forgotten_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    apply = Inbox.apply
+
+    def planted(self: Inbox, item: Item) -> Update | None:
+        update = apply(self, item)
+        self._removed.clear()
+        return update
+
+    monkeypatch.setattr(Inbox, "apply", planted)
+
+
+def acknowledgements_clear_newer_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    arrived = Outbox._arrived
+
+    def planted(self: Outbox, key: Key, version: int, start: int, stop: int) -> None:
+        entry = self._entries.get(key)
+        arrived(self, key, entry.version if entry is not None else version, start, stop)
+
+    monkeypatch.setattr(Outbox, "_arrived", planted)
+
+
+def a_restart_goes_unnoticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Outbox, "restart", lambda self: None)
+
+
+def fragments_complete_too_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        inbox.ranges,
+        "add",
+        lambda r, a, b: ((0, max(b, r[-1][1] if r else 0)),) if r or a else ranges.cut(((a, b),), 0, 0),
+    )
+
+
+def the_budget_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sync.SlidingBudget, "spend", lambda self, now_ns, n: None)
+
+
+DEFECTS: list[Callable[[pytest.MonkeyPatch], Any]] = [
+    older_versions_win,
+    losses_are_not_repaired,
+    removals_are_forgotten_at_once,
+    acknowledgements_clear_newer_versions,
+    a_restart_goes_unnoticed,
+    fragments_complete_too_early,
+    the_budget_forgets,
+]
+
+
+@pytest.mark.parametrize("plant", DEFECTS, ids=lambda f: f.__name__)
+def test_a_planted_defect_is_found(plant: Callable[[pytest.MonkeyPatch], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    plant(monkeypatch)
+    quick = settings(
+        max_examples=400,
+        stateful_step_count=40,
+        phases=[Phase.generate],
+        derandomize=True,
+        database=None,
+        deadline=None,
+    )
+    with pytest.raises((AssertionError, pytest.fail.Exception)):
+        run_state_machine_as_test(TwoEnds, settings=quick)  # type: ignore[no-untyped-call]
