@@ -19,6 +19,7 @@ def njit(
     cache: bool = ...,
     nogil: bool = ...,
     inline: str = ...,
+    forceinline: bool = ...,
     boundscheck: bool = ...,
     error_model: str = ...,
     locals: dict[str, Any] = ...,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.frame import ImuBatch, ImuCalibration
 from numpy.typing import NDArray
 
-from kiteline_hw.sim.trajectory import GRAVITY, Path
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_hw.sim.trajectory import GRAVITY, Path, flight_s
 
 START_GYRO_BIAS = 0.003  # rad/s, deviation of the bias at switch-on
 START_ACCEL_BIAS = 0.05  # m/s^2, the same
@@ -15,11 +15,11 @@ START_ACCEL_BIAS = 0.05  # m/s^2, the same
 def measure(
     path: Path, t_ns: NDArray[np.int64], start_ns: int, calibration: ImuCalibration, seed: int, noise: bool = True
 ) -> ImuBatch:
-    """Samples at the stamps t_ns (n,): angular rate, and acceleration less gravity, plus white noise and biases that walk.
+    """Samples at the stamps t_ns (n,): angular rate, and acceleration less gravity, with noise and biases that walk.
 
     A longer flight with the same seed has the shorter one's samples as its beginning.
     """
-    motion = path.motion((t_ns - start_ns) * 1e-9)
+    motion = path.motion(flight_s(t_ns, start_ns))
     force = motion.acceleration + [0.0, 0.0, GRAVITY]
     accel = np.einsum("nji,nj->ni", motion.T_w_b[:, :3, :3], force)
     gyro = motion.rate

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import se3
 from kiteline_hw.sim.trajectory import Path, fit
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
@@ -79,7 +80,9 @@ def _corridor(t: F64, agent: int) -> tuple[F64, F64]:
     lap = 2 * (20.0 + 8.0) + 4 * 0.5 * np.pi * 2.0
     xy, heading = _ring(t / 70.0 * lap + 9.0 * agent, 24.0, 12.0, 2.0)
     sway = 0.15 * np.sin(0.8 * t + agent)
-    p = np.stack([xy[:, 0] - sway * np.sin(heading), xy[:, 1] + sway * np.cos(heading), 1.3 + 0.15 * np.sin(0.6 * t)], 1)
+    p = np.stack(
+        [xy[:, 0] - sway * np.sin(heading), xy[:, 1] + sway * np.cos(heading), 1.3 + 0.15 * np.sin(0.6 * t)], 1
+    )
     return p, heading + 0.25 * np.sin(0.7 * t)
 
 

@@ -97,7 +97,10 @@ def tile_lists(boxes: F64, items: I32, count: int, o: F64, rot: F64, rays: F32, 
 
 @njit(cache=True, nogil=True, forceinline=True)
 def box_hit(boxes: F64, i: int, o: F64, dx: float, dy: float, dz: float, from_inside: bool) -> tuple[float, int]:
-    """Distance and face at which a ray enters box i (leaves it, `from_inside`), or (inf, 0). Slabs (Kay, Kajiya 1986)."""
+    """Distance and face at which a ray enters box i (leaves it, `from_inside`), or (inf, 0).
+
+    Slab method (T. Kay, J. Kajiya, 1986).
+    """
     ox, oy, c, s = o[0] - boxes[i, 0], o[1] - boxes[i, 1], boxes[i, 6], boxes[i, 7]
     ex, ey, ez = c * dx + s * dy, c * dy - s * dx, dz
     ex = ex if abs(ex) > 1e-12 else 1e-12
@@ -134,7 +137,7 @@ def _ground(field: F32, frame: F64, x: float, y: float, channel: int) -> float:
     fu, fv = u - i, v - j
     a = field[channel, j, i] * (1.0 - fu) + field[channel, j, i + 1] * fu
     b = field[channel, j + 1, i] * (1.0 - fu) + field[channel, j + 1, i + 1] * fu
-    return a * (1.0 - fv) + b * fv
+    return float(a * (1.0 - fv) + b * fv)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -238,13 +241,14 @@ def _surface(
     total = 0.0
     for i in range(probes):
         s = along * ((i + 0.5) / probes - 0.5) if probes > 1 else 0.0
-        total += texture_value(atlas, table, k, (u + eu * s) * faces[n, 0] + faces[n, 2], (v + ev * s) * faces[n, 1] + faces[n, 3], lod)
+        us, vs = (u + eu * s) * faces[n, 0] + faces[n, 2], (v + ev * s) * faces[n, 1] + faces[n, 3]
+        total += texture_value(atlas, table, k, us, vs, lod)
     value = 1.0 + faces[n, 5] * (total / probes - 128.0) / 128.0
     fine = np.log2(max(along, across) / detail_m)
     if fine < 3.0:  # texture 0 adds what lies below the texels of the others, until it blurs away
         d = texture_value(atlas, table, 0, u / detail_m + faces[n, 3], v / detail_m + faces[n, 2], fine)
         value += 0.10 * min(1.0, 3.0 - fine) * (d - 128.0) / 128.0
-    return faces[n, 4] * value
+    return float(faces[n, 4] * value)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -255,7 +259,7 @@ def _shade(
     if hit == SKY:
         s = 1.0 / (max(dz, 0.0) + 0.25)
         value = texture_value(atlas, table, int(ground[3, 6]), dx * s * 400.0, dy * s * 400.0, 1.0)
-        return ground[3, 4] * (1.0 + 0.3 * max(dz, 0.0) + ground[3, 5] * (value - 128.0) / 128.0)
+        return float(ground[3, 4] * (1.0 + 0.3 * max(dz, 0.0) + ground[3, 5] * (value - 128.0) / 128.0))
     across = t * pixel
     if hit == GROUND:
         x, y = o[0] + t * dx, o[1] + t * dy
@@ -316,9 +320,7 @@ def render(
                 dx = rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2
                 dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
                 dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
-                t, hit = _cast(
-                    boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
-                )
+                t, hit = _cast(boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far)
                 hits[y, x] = hit
                 distance[y, x] = t if hit != SKY else np.inf
                 radiance[y, x] = _shade(
@@ -346,12 +348,8 @@ def render(
                 dx = rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2
                 dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
                 dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
-                t, hit = _cast(
-                    boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
-                )
+                t, hit = _cast(boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far)
                 total += _shade(
                     boxes, faces, shell, field, frame, ground, atlas, table, detail_m, o, dx, dy, dz, t, hit, pixel
                 )
             radiance[y, x] = 0.25 * total
-
-

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core import se3
-from kiteline_core.cameras import CameraModel
 from numpy.typing import NDArray
 
+from kiteline_core import se3
+from kiteline_core.cameras import CameraModel
 from kiteline_hw.sim import lens
 from kiteline_hw.sim.raycast_kernels import TILE, render, tile_lists, visible_boxes
 from kiteline_hw.sim.sensor_kernels import expose, motion_blur
@@ -70,8 +70,9 @@ class Eye:
     def see(
         self, T_w_b: F64, velocity: F64, rate: F64, exposure_s: float, gain: float, noise: tuple[float, float], key: int
     ) -> U8:
-        """The image (h, w) taken around this pose. velocity (3,) in w, rate (3,) in b, noise: read and shot; key: of the
-        noise.
+        """The image (h, w) taken around this pose.
+
+        velocity (3,) in w, rate (3,) in b. noise: read and shot (see `expose`), drawn from `key`.
         """
         radiance, distance, _ = self.cast(T_w_b)
         to_camera = (T_w_b[:3, :3] @ self.T_b_c[:3, :3]).T

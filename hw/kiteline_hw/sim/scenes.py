@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_hw.sim.textures import make_pool
 from kiteline_hw.sim.world import NO_GROUND, Builder, World
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 

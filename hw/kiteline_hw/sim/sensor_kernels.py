@@ -15,7 +15,9 @@ _MOST_TAPS = 17
 
 
 @njit(cache=True, nogil=True)
-def motion_blur(radiance: F32, distance: F32, rays: F32, linear: F64, angular: F64, exposure_s: float, out: F32) -> None:
+def motion_blur(
+    radiance: F32, distance: F32, rays: F32, linear: F64, angular: F64, exposure_s: float, out: F32
+) -> None:
     """Average each pixel along its streak of one exposure. linear, angular: the camera's twist in its own frame.
 
     A point at distance t along the unit ray d moves by -(v/t + w x d) per second, seen from the camera. The streak

@@ -85,7 +85,7 @@ def pink(rng: Rng, side: int, slope: float = 1.0, stretch: float = 1.0) -> F32:
     white[0, 0] = 0.0
     out = np.fft.irfft2(white * f**-slope, s=(small, small)).astype(np.float32)
     out /= out.std()
-    return np.tile(out, (side // small, side // small))
+    return np.asarray(np.tile(out, (side // small, side // small)), np.float32)
 
 
 def shapes(
@@ -119,7 +119,7 @@ def leaves(rng: Rng, side: int) -> F32:
     image = np.zeros((side, side), np.float32)
     smallest = float(rng.uniform(2.5, 4.5))
     paint(*shapes(rng, side, 5.0, smallest, side * 0.12), image)
-    return image + 4.0 * pink(rng, side)
+    return np.asarray(image + 4.0 * pink(rng, side), np.float32)
 
 
 def clutter(rng: Rng, side: int) -> F32:
@@ -130,7 +130,7 @@ def clutter(rng: Rng, side: int) -> F32:
     busy = pink(rng, side, 1.6)
     here = busy[small[:, 1].astype(int) % side, small[:, 0].astype(int) % side] > 0.3
     paint(np.ascontiguousarray(small[here]), np.ascontiguousarray(kinds[here]), image)
-    return image + 5.0 * pink(rng, side, 0.8)
+    return np.asarray(image + 5.0 * pink(rng, side, 0.8), np.float32)
 
 
 def plaster(rng: Rng, side: int) -> F32:
@@ -223,7 +223,7 @@ def posters(rng: Rng, side: int) -> F32:
                         image[cells] = base - 55.0 + 12.0 * rng.standard_normal()
                     column += word + int(rng.integers(2, 5))
                 row += size + int(rng.integers(3, 9))
-    return image + 3.0 * pink(rng, side, 0.8)
+    return np.asarray(image + 3.0 * pink(rng, side, 0.8), np.float32)
 
 
 def asphalt(rng: Rng, side: int) -> F32:
@@ -232,14 +232,14 @@ def asphalt(rng: Rng, side: int) -> F32:
     paint(*shapes(rng, side, 0.15, 40.0, side * 0.12, 16.0), image)
     paint(*_strokes(rng, side, 120, (30.0, 260.0), (0.8, 2.2), -35.0), image)
     paint(*shapes(rng, side, 0.08, 1.5, 20.0, 30.0), image)
-    return image + 6.0 * pink(rng, side, 0.5)
+    return np.asarray(image + 6.0 * pink(rng, side, 0.5), np.float32)
 
 
 def foliage(rng: Rng, side: int) -> F32:
     """Small leaves, dark gaps between them."""
     image = 25.0 * pink(rng, side, 1.4) - 30.0
     paint(*shapes(rng, side, 2.0, 3.0, 60.0, 34.0, 2.6), image)
-    return image + 18.0 * pink(rng, side, 1.4) + 5.0 * pink(rng, side, 0.6)
+    return np.asarray(image + 18.0 * pink(rng, side, 1.4) + 5.0 * pink(rng, side, 0.6), np.float32)
 
 
 def facade(rng: Rng, side: int) -> F32:
@@ -265,7 +265,7 @@ def facade(rng: Rng, side: int) -> F32:
                 image[np.ix_(inner_y, inner_x[bar - 1 : bar + 2])] = 35.0
             x += w + int(storey * rng.uniform(0.12, 0.7))
     paint(*shapes(rng, side, 0.05, 2.0, 50.0, 25.0), image)
-    return image + 3.0 * pink(rng, side, 0.8)
+    return np.asarray(image + 3.0 * pink(rng, side, 0.8), np.float32)
 
 
 def clouds(rng: Rng, side: int) -> F32:

@@ -7,15 +7,16 @@ smoothing with B-splines and penalties", 1996). A path starts at rest: time is w
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from math import comb, factorial
 from pathlib import Path as FilePath
 
 import numpy as np
-from kiteline_core import se3
-from kiteline_core.frame import Trajectory
 from numpy.typing import NDArray
 
+from kiteline_core import se3
+from kiteline_core.frame import Trajectory
 from kiteline_hw.ports import SourceError
 
 F64 = NDArray[np.float64]
@@ -114,7 +115,8 @@ class Path:
         w0 = u[:, None] ** p
         w1 = np.where(p > 0, p * u[:, None] ** np.maximum(p - 1, 0), 0.0) / self.knot_s
         w2 = np.where(p > 1, p * (p - 1) * u[:, None] ** np.maximum(p - 2, 0), 0.0) / self.knot_s**2
-        return tuple(np.einsum("nj,njd->nd", w @ _BASIS, c) for w in (w0, w1, w2))  # type: ignore[return-value]
+        value, first, second = (np.einsum("nj,njd->nd", w @ _BASIS, c) for w in (w0, w1, w2))
+        return value, first, second
 
 
 def fit(t_s: F64, poses: F64, knot_s: float, smoothing: float) -> Path:
@@ -181,7 +183,9 @@ def read_trajectory(file: FilePath, camera_in_body: F64) -> Path:
     camera_in_body: T_b_c (4, 4), which turns KITTI's camera poses into body poses. Raises SourceError.
     """
     try:
-        rows = np.loadtxt(file, ndmin=2, comments="#")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty file is told of below
+            rows = np.loadtxt(file, ndmin=2, comments="#")
     except OSError as error:
         raise SourceError(f"trajectory {file} cannot be read: {error.strerror or error}") from error
     except ValueError as error:
@@ -196,7 +200,7 @@ def read_trajectory(file: FilePath, camera_in_body: F64) -> Path:
         poses[:, :3] = rows.reshape(-1, 3, 4)
         turn = se3.from_rt(_R_UP, np.zeros(3))
         poses = turn @ poses @ se3.inverse(camera_in_body)
-        return fit(0.1 * np.arange(len(rows)), poses, 0.2, 0.3)
+        return fit(np.asarray(0.1 * np.arange(len(rows)), np.float64), poses, 0.2, 0.3)
     t = rows[:, 0] - rows[0, 0]
     if not (np.diff(t) > 0).all():
         raise SourceError(f"trajectory {file}: times must increase from row to row")
@@ -206,4 +210,9 @@ def read_trajectory(file: FilePath, camera_in_body: F64) -> Path:
 
 def to_trajectory(path: Path, t_ns: NDArray[np.int64], start_ns: int) -> Trajectory:
     """Ground truth at the stamps t_ns (n,), where `start_ns` is flight time zero."""
-    return Trajectory(t_ns, path.motion((t_ns - start_ns) * 1e-9).T_w_b)
+    return Trajectory(t_ns, path.motion(flight_s(t_ns, start_ns)).T_w_b)
+
+
+def flight_s(t_ns: NDArray[np.int64], start_ns: int) -> F64:
+    """Flight times in seconds of stamps (n,)."""
+    return np.asarray((t_ns - start_ns) * 1e-9, np.float64)

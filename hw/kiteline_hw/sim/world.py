@@ -25,7 +25,7 @@ class World:
 
     boxes (n, 8): centre x y z, half-extents x y z in m, cos yaw, sin yaw. faces (6 n, 8): see raycast_kernels.
     shell: the box whose inside is the room, or -1 outdoors.
-    field (2, rows, columns) float32: ground height and distance to the path in m, empty indoors; field_frame (7,): x0 y0
+    field (2, rows, columns) float32: ground height and distance to the path in m, empty indoors; its frame (7,): x0 y0
     cell in m, largest slope, then unused, road half-width, far side of the pavement. ground (4, 8): the surfaces of
     road, pavement, lawn and sky, laid out as faces. floor_m: z of the floor, outdoors at the path's start.
     """
@@ -67,7 +67,7 @@ def box_distances(box: F64, points: F64) -> F64:
     x = np.abs(box[6] * d[:, 0] + box[7] * d[:, 1]) - box[3]
     y = np.abs(box[6] * d[:, 1] - box[7] * d[:, 0]) - box[4]
     z = np.abs(d[:, 2]) - box[5]
-    return np.sqrt(np.maximum(x, 0) ** 2 + np.maximum(y, 0) ** 2 + np.maximum(z, 0) ** 2)
+    return np.asarray(np.sqrt(np.maximum(x, 0) ** 2 + np.maximum(y, 0) ** 2 + np.maximum(z, 0) ** 2))
 
 
 class Builder:
@@ -122,9 +122,9 @@ class Builder:
 def occupancy(
     world: World, low_m: float, high_m: float, resolution_m: float = 0.05, margin_m: float = 0.3
 ) -> tuple[U8, F64]:
-    """True occupancy between two heights above the floor: image (rows, columns), first row the highest y, and origin (2,).
+    """True occupancy between two heights above the floor: image (rows, columns), first row the highest y; origin (2,).
 
-    A cell is OCCUPIED where a solid or a wall reaches into it, FREE elsewhere inside the shell (outdoors: within the ground's
+    A cell is OCCUPIED where a solid or a wall reaches into it, FREE elsewhere inside the shell (outdoors: within the
     field), UNKNOWN behind the walls. The origin is the lower left corner of the lower left cell in w.
     """
     if world.shell >= 0:
@@ -176,5 +176,3 @@ def write_occupancy(image: U8, origin: F64, resolution_m: float, file: FilePath)
         f"image: {picture.name}\nresolution: {resolution_m}\norigin: [{origin[0]:.6f}, {origin[1]:.6f}, 0.0]\n"
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
-
-

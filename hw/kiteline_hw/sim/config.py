@@ -1,0 +1,78 @@
+"""What a simulated flight is made of, and how it is asked for in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from kiteline_core.cameras import Lens
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sim.scenes import SCENES
+from kiteline_hw.sim.trajectory import REST_S
+
+
+@dataclass(frozen=True, slots=True)
+class SimConfig:
+    """How a flight is simulated. Everything that is seen follows from these values."""
+
+    scene: str = "room"
+    seed: int = 0
+    trajectory: str = ""  # file to fly, "" for the scene's own course
+    also: tuple[str, ...] = ()  # what the other agents fly in the same world, in order
+    agent: int = 0  # which of them this is
+    seconds: float = 0.0  # 0: to the end of the file, or 20 of the built-in course
+    start: float = 0.0  # s into the trajectory
+    rest: float = REST_S  # s of standing still before the flight; 0 starts in full motion
+    mono: bool = False
+    depth: bool = False  # depth in place of the right eye, like an RGB-D camera
+    imu: bool = True
+    lens: str = "radtan"  # or equidistant, none
+    baseline: float = 0.11  # m
+    scale: float = 1.0  # of image size and focal length
+    exposure_s: float = 0.006  # indoor exposure of a small drone camera
+    read_noise: float = 1.0  # grey values
+    shot_noise: float = 0.012  # variance per grey value
+    texture_bits: int = 11  # log2 of a texture's side; less only for tests
+
+
+def read_config(scene: str, **options: object) -> SimConfig:
+    """The configuration of `SCENE[?key=value&…]`, where `options`, fields of SimConfig, go before what the text says.
+
+    Raises SourceError for an unknown scene, option or value.
+    """
+    name, _, query = scene.partition("?")
+    values: dict[str, object] = {"scene": name}
+    for item in filter(None, query.split("&")):
+        key, sign, text = item.partition("=")
+        values[key] = _parse(key, text if sign else "1")
+    for key, value in options.items():
+        _default(key)
+        values[key] = value
+    config = SimConfig(**values)  # type: ignore[arg-type]
+    if config.scene not in SCENES:
+        raise SourceError(f"unknown scene {config.scene!r}: expected one of {', '.join(SCENES)}")
+    if config.lens not in [kind.value for kind in Lens]:
+        raise SourceError(f"unknown lens {config.lens!r}: expected radtan, equidistant or none")
+    if not 0 <= config.agent <= len(config.also):
+        raise SourceError(f"agent {config.agent} has no trajectory: {1 + len(config.also)} are given")
+    if config.seed < 0 or config.seconds < 0 or config.start < 0 or not 0.05 <= config.scale <= 4:
+        raise SourceError("seed, seconds and start of a simulated scene cannot be negative; scale must be 0.05 to 4")
+    return config
+
+
+def _default(key: str) -> object:
+    known = {field.name: field.default for field in fields(SimConfig)}
+    if key not in known:
+        raise SourceError(f"unknown option {key!r} of a simulated scene: expected one of {', '.join(known)}")
+    return known[key]
+
+
+def _parse(key: str, text: str) -> object:
+    default = _default(key)
+    try:
+        if isinstance(default, bool):
+            return {"1": True, "true": True, "0": False, "false": False}[text.lower()]
+        if isinstance(default, tuple):
+            return tuple(text.split(","))
+        return type(default)(text)  # type: ignore[call-arg]
+    except (KeyError, ValueError) as error:
+        raise SourceError(f"option {key}={text!r} of a simulated scene: expected a {type(default).__name__}") from error
