@@ -167,7 +167,9 @@ class Bag:
                 stream.seek(0)
                 stream.truncate()
                 writer._writer.start("ros2", "test")
-            kinds = {kind: writer.register_msgdef(kind, ROS2[kind] + LEAVES) for _, _, kind, _ in self.messages}
+            kinds = {
+                kind: writer.register_msgdef(kind, ROS2[kind] + LEAVES) for kind in {m[2]: 0 for m in self.messages}
+            }
             for t_ns, topic, kind, value in self.messages:
                 writer.write_message(topic, kinds[kind], value, t_ns, t_ns)
             writer.finish()
