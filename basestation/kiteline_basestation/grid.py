@@ -16,13 +16,14 @@ nor the floor under a high ray.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation import grid_kernels as kernels
+from kiteline_basestation.floor import FloorConfig, ground_heights
 from kiteline_codec.schema import Tile
 
 F64 = NDArray[np.float64]
@@ -48,19 +49,15 @@ class GridConfig:
     obstacle_low_m: float = 0.1  # m; lower than this is ground: a vehicle rolls, and noise reaches this far
     vehicle_height_m: float = 2.0  # m; what hangs higher is passed below
     noise_per_m: float = 0.01  # m of height per m of distance from the nearest view: stereo noise grows with distance
-    free_below_m: float = 1.0  # m; a ray higher above the ground says nothing about the floor below it
-    camera_above_m: float = 0.1  # m; ground points lie at least this far below every camera that sees them
-    patch_m: float = 2.0  # m; side of the neighbourhoods (three by three of them) that share a ground height
-    height_bin_m: float = 0.05  # m; half of obstacle_low_m, so that a peak falls into the ground's band
-    slope: float = 0.15  # m/m; how fast the ground may rise from one neighbourhood to the next
-    peak_share: float = 0.25  # of the highest peak: a lower peak with this share is the ground, below it is noise
-    peak_points: float = 4.0  # points; fewer make no peak
+    free_below_m: float = 0.7  # m; a ray to the ground that is still higher says nothing about the floor below it
+    clear_below_m: float = 0.5  # m; the same of a ray to an obstacle: higher up it passes over boxes and chairs
     log_hit: float = 0.6  # log-odds of one view of an obstacle point (p = 0.65): two views make 0.77
     log_through: float = -0.3  # log-odds of one ray through an obstacle's heights (p = 0.43)
     log_free: float = -0.7  # log-odds of one ray over a cell without obstacle (p = 0.33)
     log_limit: float = 3.5  # log-odds; p within 0.03..0.97, so that the grid can still change its mind
     quartile: float = 0.675  # standard deviations from the mean to a quartile of a normal distribution
     fence: float = 1.5  # interquartile ranges above the upper quartile: longer rays are outliers (Segfloor eq. 5.3)
+    floor: FloorConfig = field(default_factory=FloorConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +155,7 @@ def build(config: GridConfig, positions: F64, points: F64, observations: I64) ->
     used = np.isfinite(distance)
 
     ground = np.full(len(points), np.nan)
-    ground[used] = ground_heights(config, points[used], camera_z[used])
+    ground[used] = ground_heights(config.floor, points[used], camera_z[used])
     labels = label(config, points[:, 2] - ground, distance)
     views = np.bincount(seen[:, 1], minlength=len(points))
     keep = (labels[seen[:, 1]] != UNLABELLED) & ~_overlong(config, seen, length, labels)
@@ -172,75 +169,6 @@ def label(config: GridConfig, height_m: F64, distance_m: F64) -> U8:
     out[np.abs(height_m) <= band] = GROUND  # comparisons with NaN are false: points without ground stay unlabelled
     out[(height_m > band) & (height_m <= config.vehicle_height_m)] = OBSTACLE
     return out
-
-
-def ground_heights(config: GridConfig, points: F64, camera_z: F64) -> F64:
-    """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that sees each.
-
-    The floor is the lowest peak of the heights below the cameras: first in the best filled neighbourhood, then from
-    neighbour to neighbour no steeper than the config's slope. NaN where no peak was found at all.
-    """
-    below = points[:, 2] < camera_z - config.camera_above_m
-    if not below.any():
-        return np.full(len(points), np.nan)
-    corner = points[:, :2].min(axis=0)
-    patch = ((points[:, :2] - corner) // config.patch_m).astype(np.int64)
-    columns, rows = (int(v) + 1 for v in patch.max(axis=0))
-    z = points[below, 2]
-    base = float(np.median(z)) - 128 * config.height_bin_m
-    bins = 256  # 12.8 m of heights
-    b = np.floor((z - base) / config.height_bin_m).astype(np.int64)
-    inside = (b >= 0) & (b < bins)
-    place = patch[below][inside]
-    flat = (place[:, 1] * columns + place[:, 0]) * bins + b[inside]
-    count = np.bincount(flat, minlength=rows * columns * bins).reshape(rows, columns, bins).astype(np.float32)
-    for axis in range(3):  # three by three neighbourhoods, three bins
-        count = _box3(count, axis)
-    total = count.sum(axis=(0, 1))
-    floor_bin = _lowest_peak(total, config.peak_share, config.peak_points)
-    if floor_bin < 0:
-        return np.full(len(points), np.nan)
-    reach = max(1, round(config.slope * config.patch_m / config.height_bin_m))
-    band = count[:, :, max(0, floor_bin - reach) : floor_bin + reach + 1].sum(axis=2)
-    seed = int(np.argmax(band))
-    seed_bin = _lowest_peak(count[seed // columns, seed % columns], config.peak_share, config.peak_points)
-    ground = np.zeros((rows, columns), np.int32)
-    queue = np.zeros(rows * columns, np.int32)
-    kernels.spread_ground(
-        count, seed, seed_bin if seed_bin >= 0 else floor_bin, reach, config.peak_share, config.peak_points,
-        ground, queue,
-    )  # fmt: skip
-    height = base + (ground.astype(np.float64) + 0.5) * config.height_bin_m
-    return _between(height, (points[:, :2] - corner) / config.patch_m - 0.5)
-
-
-def _between(height: F64, at: F64) -> F64:
-    """Bilinear interpolation of height (rows, columns) at (n,2) column, row; level beyond the outermost values."""
-    last = np.array([height.shape[1] - 1, height.shape[0] - 1])
-    at = np.clip(at, 0.0, last)
-    c, r = np.minimum(at.astype(np.int64), np.maximum(last - 1, 0)).T
-    u, v = at[:, 0] - c, at[:, 1] - r
-    c1, r1 = np.minimum(c + 1, last[0]), np.minimum(r + 1, last[1])
-    return np.asarray(
-        (1 - v) * ((1 - u) * height[r, c] + u * height[r, c1]) + v * ((1 - u) * height[r1, c] + u * height[r1, c1])
-    )
-
-
-def _box3(a: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Sum of each element and its two neighbours along an axis."""
-    out = a.copy()
-    head, tail = [slice(None)] * 3, [slice(None)] * 3
-    head[axis], tail[axis] = slice(1, None), slice(None, -1)
-    out[tuple(head)] += a[tuple(tail)]
-    out[tuple(tail)] += a[tuple(head)]
-    return out
-
-
-def _lowest_peak(count: NDArray[np.float32], share: float, least: float) -> int:
-    """The lowest bin that is a peak, with at least `share` of the highest count and `least` points; -1 none."""
-    after = np.append(count[1:], 0.0)
-    peaks = np.flatnonzero((count >= max(share * float(count.max()), least)) & (count >= after))
-    return int(peaks[0]) if len(peaks) else -1
 
 
 def _overlong(config: GridConfig, seen: I64, length: F64, labels: U8) -> Bool:
@@ -275,8 +203,9 @@ def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: 
         solid[:, 0], solid[:, 1], points[obstacle, 2], views[obstacle], slots, 0, hits, low, high
     )
     z = np.stack([positions[seen[:, 0], 2], points[seen[:, 1], 2]], axis=1)
-    ceiling = ground[seen[:, 1]] + config.free_below_m
-    short = np.where(labels[seen[:, 1]] == OBSTACLE, 1, 0).astype(np.int64)
+    to_obstacle = labels[seen[:, 1]] == OBSTACLE
+    ceiling = ground[seen[:, 1]] + np.where(to_obstacle, config.clear_below_m, config.free_below_m)
+    short = to_obstacle.astype(np.int64)
     start = _cells(config.cell_m, positions[seen[:, 0]]) - origin
     end = _cells(config.cell_m, points[seen[:, 1]]) - origin
     done = 0

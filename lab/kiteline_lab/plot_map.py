@@ -86,7 +86,7 @@ def plot_map(out: Path, png: Path, title: str = "") -> None:
         p = points.xyz[points.label == label]
         if len(p):
             axes.plot(
-                p[:, 0], p[:, 1], ".", ms=1.6, mew=0, color=colour, alpha=0.6, label=name, zorder=2, rasterized=True
+                p[:, 0], p[:, 1], "o", ms=1.9, mew=0, color=colour, alpha=0.65, label=name, zorder=2, rasterized=True
             )
     for i, way in enumerate(ways):
         colour = COLOURS[i % len(COLOURS)]
@@ -104,7 +104,7 @@ def plot_map(out: Path, png: Path, title: str = "") -> None:
     )  # fmt: skip
     for handle in legend.legend_handles:
         if handle is not None and hasattr(handle, "set_markersize") and handle.get_label() in dict(LABELS):
-            handle.set_markersize(7)
+            handle.set_markersize(5)
             handle.set_alpha(1.0)
     png.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(png, metadata={"Software": None})  # no version inside: equal runs give equal files

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kiteline_basestation.floor import FloorConfig, ground_heights
 from kiteline_basestation.grid import (
     GROUND,
     OBSTACLE,
@@ -18,7 +19,6 @@ from kiteline_basestation.grid import (
     GridMap,
     build,
     dense,
-    ground_heights,
     label,
     to_pgm,
     to_yaml,
@@ -52,14 +52,14 @@ def at(grid: GridMap, x: float, y: float) -> int:
     return int(cells[row, column]) if row < cells.shape[0] and column < cells.shape[1] else UNKNOWN
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.06])
+@pytest.mark.parametrize("slope", [0.0, 0.06, 0.12])
 def test_room_is_free_inside_solid_at_the_walls_and_unknown_outside(slope: float) -> None:
     cameras, points, pairs = room(slope)
     grid = build(GridConfig(), cameras, points, pairs)
     assert np.mean(grid.labels[:600] == GROUND) > 0.95
     assert np.mean(grid.labels[600:] == OBSTACLE) > 0.95
     seen = np.unique(pairs[:, 1])
-    np.testing.assert_allclose(grid.ground_m[seen], -1.0 + slope * points[seen, 0], atol=0.12)
+    np.testing.assert_allclose(grid.ground_m[seen], -1.0 + slope * points[seen, 0], atol=0.03)
     cells, corner = dense(grid)
     rows, columns = np.indices(cells.shape)
     x, y = corner[0] + (columns + 0.5) * grid.cell_m, corner[1] + (rows + 0.5) * grid.cell_m
@@ -110,7 +110,7 @@ def test_ground_is_the_floor_and_neither_a_table_nor_noise_below() -> None:
     table = np.column_stack([rng.uniform(1, 3, (500, 2)), rng.normal(0.7, 0.01, 500)])
     noise = np.column_stack([rng.uniform(0, 4, (30, 2)), rng.uniform(-2.0, -0.2, 30)])
     points = np.concatenate([floor, table, noise])
-    ground = ground_heights(GridConfig(), points, np.full(len(points), 1.2))
+    ground = ground_heights(FloorConfig(), points, np.full(len(points), 1.2))
     np.testing.assert_allclose(ground, 0.0, atol=0.06)
 
 
