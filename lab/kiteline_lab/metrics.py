@@ -19,7 +19,6 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 MAX_DIFFERENCE_NS = 10_000_000  # two poses further apart in time are not of the same instant (as evo and TUM's tools)
-MAX_INTERPOLATED_NS = 100_000_000  # a wider hole in the truth is not bridged
 MAX_BRIDGE_NS = 50_000_000  # truth at 20 Hz or more is interpolated: a drone's own way in between is below 1 mm
 GAP_FACTOR = 1.5  # a step longer than this many usual ones is a gap: poses are missing there
 SECOND_TOLERANCE = 0.1  # an RPE pair "one second apart" may be 10 % off
@@ -169,31 +168,6 @@ def umeyama(source: F64, target: F64, with_scale: bool = False) -> tuple[F64, fl
             raise ValueError("the estimate does not move: no scale can be found")
         scale = float(d @ sign) / variance
     return se3.from_rt(rotation, mean_t - scale * rotation @ mean_s), scale
-
-
-def interpolate(truth: Trajectory, t_ns: I64) -> Trajectory:
-    """The truth with poses added at the times t_ns (n,) that lie between two true poses at most 0.1 s apart.
-
-    Positions go along the chord and rotations along the arc: at 1 m/s, 5 m/s^2 and 50 Hz of truth that is 0.3 mm off,
-    where the nearest true pose would be 10 mm off.
-    """
-    after = np.searchsorted(truth.t_ns, t_ns)
-    inside = (after > 0) & (after < len(truth.t_ns))
-    inside[inside] &= truth.t_ns[after[inside]] != t_ns[inside]
-    inside[inside] &= truth.t_ns[after[inside]] - truth.t_ns[after[inside] - 1] <= MAX_INTERPOLATED_NS
-    j, wanted = after[inside], t_ns[inside]
-    if len(j) == 0:
-        return truth
-    share = (wanted - truth.t_ns[j - 1]) / (truth.t_ns[j] - truth.t_ns[j - 1])
-    first, second = truth.T_w_b[j - 1], truth.T_w_b[j]
-    poses = first.copy()
-    poses[:, :3, 3] += share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    for k in range(len(j)):
-        turn = se3.so3_log(first[k, :3, :3].T @ second[k, :3, :3])
-        poses[k, :3, :3] = first[k, :3, :3] @ se3.so3_exp(share[k] * turn)
-    times = np.concatenate([truth.t_ns, wanted])
-    order = np.argsort(times, kind="stable")
-    return Trajectory(times[order], np.concatenate([truth.T_w_b, poses])[order])
 
 
 def match(
