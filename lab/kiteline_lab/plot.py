@@ -56,6 +56,7 @@ def plot_trajectories(
         p = truth.T_w_b[:, :3, 3]
         top.plot(p[:, across], p[:, along], color=TRUTH_COLOUR, lw=2.6, label="truth", zorder=1)
         height.plot((truth.t_ns - start_ns) / 1e9, sign * p[:, up], color=TRUTH_COLOUR, lw=2.2, zorder=1)
+    errors: list[tuple[F64, F64, str]] = []
     for i, line in enumerate(drawn):
         colour = COLOURS[i % len(COLOURS)]
         t_s = (line.trajectory.t_ns - start_ns) / 1e9
@@ -69,9 +70,9 @@ def plot_trajectories(
         if error is not None and truth is not None:
             i_est, true = truth_at(line.trajectory.t_ns, truth)
             off = np.linalg.norm(p[i_est] - true[:, :3, 3], axis=1)
-            error.plot(*_with_gaps(t_s[i_est], off), color=colour, lw=1.2)
+            errors.append((t_s[i_est], off, colour))
     if error is not None:
-        error.set_ylim(bottom=0.0)
+        _draw_errors(error, errors)
     if title:
         figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
     if top.get_legend_handles_labels()[0]:
@@ -89,8 +90,18 @@ def _panels(figure: Figure, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
     _style(top, "from above, m", "", "")
     _style(height, "height, m", "" if with_error else "time, s", "")
     if error is not None:
-        _style(error, "distance from the truth, m", "time, s", "")
+        _style(error, "", "time, s", "")
     return top, height, error
+
+
+def _draw_errors(axes: Axes, errors: Sequence[tuple[F64, F64, str]]) -> None:
+    """Distances in the unit in which the largest reads well."""
+    largest_m = max((float(off.max()) for _, off, _ in errors if len(off)), default=0.0)
+    per_m, unit = (1e3, "mm") if largest_m < 0.1 else (1e2, "cm") if largest_m < 1.0 else (1.0, "m")
+    for t_s, off, colour in errors:
+        axes.plot(*_with_gaps(t_s, per_m * off), color=colour, lw=1.2)
+    axes.set_title(f"distance from the truth, {unit}", loc="left", fontsize=10, color=INK)
+    axes.set_ylim(bottom=0.0)
 
 
 def _style(axes: Axes, title: str, x: str, y: str) -> None:
@@ -116,7 +127,9 @@ def _aligned(line: Line, truth: Trajectory) -> Line:
 
 def _length(errors: F64) -> str:
     rmse = float(np.sqrt((errors**2).mean()))
-    return f"{1000 * rmse:.0f} mm" if rmse < 1.0 else f"{rmse:.2f} m"
+    if rmse >= 1.0:
+        return f"{rmse:.2f} m"
+    return f"{1000 * rmse:.1f} mm" if rmse < 0.01 else f"{1000 * rmse:.0f} mm"
 
 
 def _axes(reference: Trajectory | None) -> tuple[int, int, int, float]:
