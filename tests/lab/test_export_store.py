@@ -1,0 +1,83 @@
+"""Exports of a map that was made by the real mapper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.schema import Births, Camera, Head, Record
+from kiteline_core import se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from kiteline_lab import trajectories
+from kiteline_lab.export import ExportError, files
+from kiteline_lab.grid_eval import read_grid
+from kiteline_lab.plot_map import read_map_ply
+
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
+
+
+def records(agent: int) -> tuple[Record, ...]:
+    """Three keyframes, half a metre apart, each with its own forty points."""
+    rng = np.random.default_rng(agent)
+    camera = RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, True, np.eye(4))
+    out: list[Record] = [Camera(AgentId(agent), camera)]
+    submap = submap_id(agent, 1, 0)
+    parent = NO_KEYFRAME
+    for i in range(3):
+        keyframe = keyframe_id(submap, i)
+        step = se3.from_rt(LEVEL, np.zeros(3)) if i == 0 else se3.from_rt(np.eye(3), np.array([0.0, 0.0, 0.5]))
+        out.append(Head(keyframe, 1_700_000_000_123_456_789 + i * 10**9, parent, step, 40))
+        index = np.arange(40, dtype=np.uint16)
+        uv = rng.uniform([10, 10], [630, 470], (40, 2)).astype(np.float32)
+        depth = rng.uniform(2, 6, 40).astype(np.float32)
+        zeros = np.zeros(40, np.uint8)
+        descriptor = rng.integers(0, 256, (40, 32), dtype=np.uint8)
+        out.append(Births(keyframe, 0, index, uv, 1 / depth, zeros, zeros, descriptor))
+        parent = keyframe
+    return tuple(out)
+
+
+@pytest.fixture
+def mapper() -> Mapper:
+    made = Mapper()
+    made.step(MapperInput(((AgentId(0), records(0)),)), 0)
+    return made
+
+
+def test_tum_is_the_trajectory_of_keyframes(mapper: Mapper, tmp_path: Path) -> None:
+    ((name, content),) = files(mapper, "tum", "a.tum").items()
+    (tmp_path / name).write_bytes(content)
+    found = trajectories.read(str(tmp_path / name)).trajectory
+    assert found.t_ns.tolist() == [1_700_000_000_123_456_789 + i * 10**9 for i in range(3)]
+    np.testing.assert_allclose(found.T_w_b[:, :3, 3], [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]], atol=1e-8)
+
+
+def test_one_trajectory_is_of_one_agent(mapper: Mapper) -> None:
+    with pytest.raises(ExportError, match=r"agents \[0\], none with number 4"):
+        files(mapper, "tum", "a.tum", agent=4)
+    mapper.step(MapperInput(((AgentId(2), records(2)),)), 10**9)
+    mapper.placements[submap_id(2, 1, 0)] = np.eye(4)
+    with pytest.raises(ExportError, match=r"agents \[0, 2\].*--agent"):
+        files(mapper, "tum", "a.tum")
+    assert files(mapper, "tum", "a.tum", agent=2)["a.tum"].count(b"\n") == 3
+
+
+def test_graph_holds_every_keyframe_and_parent(mapper: Mapper, tmp_path: Path) -> None:
+    (tmp_path / "a.g2o").write_bytes(files(mapper, "g2o", "a.g2o")["a.g2o"])
+    graph, values = gtsam.readG2o(str(tmp_path / "a.g2o"), True)
+    assert (graph.size(), values.size()) == (2, 3)
+    assert graph.error(values) < 1e-12
+
+
+def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
+    made = files(mapper, "pgm", "plan.pgm") | files(mapper, "ply", "a.ply")
+    assert sorted(made) == ["a.ply", "plan.pgm", "plan.yaml"]
+    for name, content in made.items():
+        (tmp_path / name).write_bytes(content)
+    assert read_grid(tmp_path / "plan.yaml").cell_m == mapper.config.grid.cell_m
+    assert read_map_ply(tmp_path / "a.ply").xyz.shape[1] == 3
