@@ -120,9 +120,10 @@ class LogWriter:
     def image(self, topic: str, t_ns: int, image: EncodedImage, frame_id: str) -> None:
         """An encoded image. A depth format "png/5000" leaves "png" in the message and its scale in the channel."""
         kind, _, scale = image.format.partition("/")
-        message = schemas.CompressedImage(frame_id=frame_id, data=image.data, format=kind)
+        message = schemas.CompressedImage(frame_id=frame_id, format=kind)
         self._stamp(message, t_ns)
-        self._add(topic, t_ns, message, {"depth_scale": scale} if scale else {})
+        notes = {"depth_scale": scale} if scale else {}
+        self._add(topic, t_ns, message, notes, schemas.bytes_field(schemas.CompressedImage, "data", image.data))
 
     def imu(self, topic: str, t_ns: int, batch: ImuBatch) -> None:
         """A batch of inertial samples."""
@@ -254,10 +255,13 @@ class LogWriter:
     def _stamp(self, message: Any, t_ns: int) -> None:
         message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, 1_000_000_000)
 
-    def _add(self, topic: str, t_ns: int, message: Any, notes: dict[str, str] | None = None) -> None:
+    def _add(
+        self, topic: str, t_ns: int, message: Any, notes: dict[str, str] | None = None, rest: tuple[bytes, ...] = ()
+    ) -> None:
         name: str = message.DESCRIPTOR.full_name
         schema = schemas.schema_data(type(message))
-        self._write(topic, t_ns, "protobuf", name, "protobuf", schema, message.SerializeToString(), notes or {})
+        data = b"".join((message.SerializeToString(), *rest))
+        self._write(topic, t_ns, "protobuf", name, "protobuf", schema, data, notes or {})
 
     def _write(
         self,

@@ -60,3 +60,16 @@ def schema_data(message_class: Any) -> bytes:
     if name not in _schema_data:
         _schema_data[name] = build_file_descriptor_set(message_class).SerializeToString()
     return _schema_data[name]
+
+
+def bytes_field(message_class: Any, name: str, data: bytes) -> tuple[bytes, bytes]:
+    """A bytes field in protobuf's wire format, in two pieces: joined to a message it is the same as having set the
+    field, without the copies of a large image that setting and serialising would make.
+    """
+    head = bytearray([message_class.DESCRIPTOR.fields_by_name[name].number << 3 | 2])
+    size = len(data)
+    while size > 0x7F:
+        head.append(size & 0x7F | 0x80)
+        size >>= 7
+    head.append(size)
+    return bytes(head), data
