@@ -44,7 +44,7 @@ UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of map points
 class GridConfig:
     """The grid's numbers. Heights are relative to the local ground."""
 
-    cell_m: float = 0.1  # m; finer than the spacing of sparse points only costs bytes; 0.2 suits streets
+    cell_m: float = 0.1  # m; finer cells fall between the rays to sparse points; 0.2 suits streets
     max_ray_m: float = 20.0  # m; beyond, a stereo point is wrong by more than a cell
     obstacle_low_m: float = 0.1  # m; lower than this is ground: a vehicle rolls, and noise reaches this far
     vehicle_height_m: float = 2.0  # m; what hangs higher is passed below
