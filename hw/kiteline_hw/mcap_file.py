@@ -8,6 +8,7 @@ are asked for in order. Format: mcap.dev/spec.
 from __future__ import annotations
 
 import heapq
+import os
 import struct
 import zlib
 from collections.abc import Collection, Iterator
@@ -174,6 +175,9 @@ class McapFile:
                 continue
             end_run()
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                file.seek(-len(MAGIC), os.SEEK_END)
+                if file.read() != MAGIC:
+                    self.cut = f"cut after {self._size} bytes, inside its index: no message is lost"
                 break
             if opcode == 0 or (opcode > Opcode.DATA_END and opcode < 0x80):
                 self.cut = f"damaged at byte {offset} of {self._size}"
