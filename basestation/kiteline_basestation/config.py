@@ -21,9 +21,9 @@ class IntakeConfig:
 class MeasurementConfig:
     """How well an agent measures."""
 
-    sigma_px: float = 0.3  # one standard deviation of an aligned pixel coordinate at octave 0
+    sigma_px: float = 0.25  # one standard deviation of an aligned pixel coordinate at octave 0
     sigma_growth: float = 1.4  # by which it grows with each octave: alignment is finer than its pixels
-    sigma_disparity_px: float = 0.2  # the same of a disparity; one row of a well-known geometry
+    sigma_disparity_px: float = 0.4  # the same of a disparity; sightings of a point share its template's error
     fused_px: float = 0.6  # the same of a birth that shows an older point: two detections of one corner
     fused_growth: float = 2.0  # corners are found to a share of their level's pixels
 

@@ -52,7 +52,7 @@ def window(
     """The bundle problem that moves the keyframes `free`, all of one submap, but never the submap's first one."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     submap = submap_of_keyframe(free[0])
-    points = np.unique(np.concatenate([sparse_map.points_of(k) for k in free])).astype(np.int32)
+    points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in free]))
     _, known = sparse_map.positions(points)
     points = points[known]
     starts, slots = sparse_map.observations(points)

@@ -30,8 +30,8 @@ def refind(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig, pu
     if not others:
         return 0
     found = 0
-    known = np.unique(np.concatenate([sparse_map.points_of(k) for k in others])).astype(np.int32)
-    known = np.setdiff1d(known, sparse_map.points_of(keyframe)).astype(np.int32)
+    known = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in others]))
+    known = known[~np.isin(known, sparse_map.points_of(keyframe))]
     found += _search(sparse_map, known, keyframe, config, publisher)
     for other in others:
         new = sparse_map.points_of(keyframe)

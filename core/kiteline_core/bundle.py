@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import bundle_kernels as kernels
-from kiteline_core.robust import CHI2_2, CHI2_3
+from kiteline_core.robust import CHI2_2, CHI2_2_MEDIAN, CHI2_3, CHI2_3_MEDIAN
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -27,8 +27,9 @@ class BundleConfig:
     robust_trials: int = 5  # Levenberg-Marquardt trials before the outlier test
     final_trials: int = 5  # trials after it
     stop: float = 1e-4  # relative gain in cost below which more trials change nothing that can be seen
-    chi2_mono: float = CHI2_2  # squared normalised residual of a pixel: outlier bound and knee of Huber's cost
+    chi2_mono: float = CHI2_2  # squared normalised residual of a pixel at the knee of Huber's cost: 95 %
     chi2_stereo: float = CHI2_3  # the same of a pixel with disparity
+    outlier: float = 1.0  # an outlier lies this many times beyond the knee
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,10 @@ class BundleResult:
 
 
 def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
-    """Minimise the sum of Huber costs, drop outliers, minimise again without them."""
+    """Minimise the sum of Huber costs, drop outliers, minimise again without them.
+
+    Where the camera measures worse than `sigma` says, the outlier bound grows with the spread that is found.
+    """
     cameras = pack(problem.T_c_m)
     points = problem.points.astype(np.float64, copy=True)
     free = np.full(len(cameras), -1, np.int32)
@@ -84,6 +88,7 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     initial = float(kernels.robust_cost(cameras, problem.lens, points, *model, active, bound))
     cost = initial
     limit = np.where(problem.measured[:, 2] >= 0, config.chi2_stereo, config.chi2_mono)
+    typical = np.where(problem.measured[:, 2] >= 0, CHI2_3_MEDIAN, CHI2_2_MEDIAN)
     for trials in (config.robust_trials, config.final_trials):
         if trials == 0:
             continue
@@ -93,7 +98,8 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
             )
         )
         kernels.squared_residuals(cameras, problem.lens, points, *model, squared)
-        active[:] = squared <= limit
+        scale = float(np.median(squared[active != 0] / typical[active != 0])) if active.any() else 1.0
+        active[:] = squared <= config.outlier * limit * max(scale, 1.0)
     return BundleResult(unpack(cameras), points, active != 0, initial, cost, int(counts[0]), _operations(counts, m, f))
 
 

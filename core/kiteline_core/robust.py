@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 CHI2_2 = 5.991  # 95 % of a chi-square with 2 degrees of freedom: a pixel
+CHI2_2_MEDIAN, CHI2_3_MEDIAN = 1.386, 2.366
 CHI2_3 = 7.815  # 95 % with 3 degrees of freedom: a pixel and a disparity
 
 

@@ -241,16 +241,21 @@ class SparseMap:
         return np.asarray(slots[self._counts(slots)])
 
     def points_of(self, keyframe: KeyframeId) -> I32:
-        """Sorted slots of the points that a keyframe observes."""
-        return np.unique(self.keypoints.root[self.observed(keyframe)])
+        """Slots of the points that a keyframe observes, in order of id."""
+        return self.in_order(self.keypoints.root[self.observed(keyframe)])
+
+    def in_order(self, points: I32) -> I32:
+        """Points without repetition in order of id: an order that does not tell what arrived first."""
+        points = np.unique(points)
+        return np.asarray(points[np.argsort(self.point_ids(points))])
 
     def roots(self) -> I32:
-        """Sorted slots of all points that live: born, not fused into another, not culled."""
+        """Slots of all points that live, in order of id: born, not fused into another, not culled."""
         table = self.keypoints
         n = self.slots
         here = np.arange(n, dtype=np.int32)
         live = (table.kind[:n] == BIRTH) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
-        return np.asarray(here[live])
+        return self.in_order(here[live])
 
     def observations(self, points: I32) -> tuple[I32, I32]:
         """Valid observations of points (n,), in order of keyframe id, one a keyframe.

@@ -28,6 +28,8 @@ class Flight:
     true_T_m_k: list[F64] = field(default_factory=list)
     agent_T_m_k: list[F64] = field(default_factory=list)
     records: list[list[Record]] = field(default_factory=list)
+    sightings: set[tuple[KeyframeId, int]] = field(default_factory=set)  # keyframe and keypoint
+    wild: set[tuple[KeyframeId, int]] = field(default_factory=set)  # sightings that are wrong by 12 px or more
     point_of: dict[int, int] = field(default_factory=dict)  # point id -> row of world
 
     def all_records(self) -> list[Record]:
@@ -73,7 +75,7 @@ def fly(
         seen = (local[:, 2] > 0.3) & (uv > 8).all(1) & (uv < [744, 472]).all(1) & (rng.random(points) > missed)
         rows = rng.permutation(np.flatnonzero(seen))[:300]
         octave = np.clip(np.rint(size[rows] + np.log2(3.0 / z[rows])), 0, 2).astype(np.uint8)
-        px = np.exp2(octave)[:, None] * rng.normal(0, noise_px, (len(rows), 3))
+        px = 1.4 ** octave[:, None] * rng.normal(0, noise_px, (len(rows), 3))
         wild = rng.random(len(rows)) < outliers
         px[wild] += rng.choice([-12.0, 12.0], (int(wild.sum()), 3))
         measured = (uv[rows] + px[:, :2]).astype(np.float32)
@@ -105,6 +107,8 @@ def fly(
                     made.append(
                         Sightings(keyframe, part, index[some], measured[some], inverse[some], octave[some], ids[some])
                     )
+        flight.sightings |= {(keyframe, int(i)) for i in np.flatnonzero(known)}
+        flight.wild |= {(keyframe, int(i)) for i in np.flatnonzero(wild & known)}
         for i, r in enumerate(rows.tolist()):
             if known[i]:
                 tracked[r] = (tracked[r][0], n)

@@ -1,0 +1,264 @@
+"""The mapper on synthetic flights: it refines, recognises, removes, and is the same every time."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
+from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.schema import Births, Camera, Culled, Depths, Found, Head, Live, Placement, Pose, Record, Removed
+from kiteline_core import se3
+from kiteline_core.ids import KeyframeId, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH, CULLED, REMOVED
+
+F64 = NDArray[np.float64]
+MakeFlight = Callable[..., Any]
+STEP_NS = 250_000_000
+
+
+def feed(mapper: Mapper, flight: Any, groups: Sequence[Sequence[Record]]) -> list[Record]:
+    """Hand in one group of records a step, run every job at once, and collect all that is published."""
+    done: tuple[JobDone, ...] = ()
+    published: list[Record] = []
+    for n, records in enumerate([[Camera(flight.agent, flight.camera)], *groups, [], []]):
+        output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * STEP_NS)
+        done = tuple(run_job(job) for job in output.jobs)
+        for _, out in output.publish:
+            published.extend(out)
+    return published
+
+
+def errors_m(mapper: Mapper, flight: Any) -> F64:
+    poses = [mapper.map.pose(k) for k in flight.keyframes]
+    return np.array([np.linalg.norm(p[:3, 3] - t[:3, 3]) for p, t in zip(poses, flight.true_T_m_k) if p is not None])
+
+
+def drift_m(flight: Any) -> F64:
+    return np.array([np.linalg.norm(a[:3, 3] - t[:3, 3]) for a, t in zip(flight.agent_T_m_k, flight.true_T_m_k)])
+
+
+def test_two_rounds_of_a_room_drift_less_than_what_the_agent_believed(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=2.0, memory=3)
+    mapper = Mapper()
+    feed(mapper, flight, flight.records)
+    assert len(mapper.map) == 60
+    assert np.sqrt(np.mean(errors_m(mapper, flight) ** 2)) < 0.5 * np.sqrt(np.mean(drift_m(flight) ** 2))
+
+
+def test_refind_fuses_doubles_and_nothing_else(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=2.0, memory=3)
+    mapper = Mapper()
+    feed(mapper, flight, flight.records)
+    table = mapper.map.keypoints
+    slots = np.flatnonzero((table.kind == BIRTH) & (table.root != np.arange(len(table.root)))).astype(np.int32)
+    aliases, roots = mapper.map.point_ids(slots).tolist(), mapper.map.point_ids(table.root[slots]).tolist()
+    doubles = len(flight.point_of) - len(set(flight.point_of.values()))
+    assert len(aliases) > 0.8 * doubles
+    assert all(flight.point_of[a] == flight.point_of[r] for a, r in zip(aliases, roots))
+    assert all(r < a for a, r in zip(aliases, roots))
+
+
+def test_without_refind_the_second_round_does_not_join_the_first(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=2.0, memory=3)
+    mapper = Mapper(replace(BaseConfig(), refind=RefindConfig(max_hamming=-1)))
+    feed(mapper, flight, flight.records)
+    assert mapper.counts.found == 0
+    joined = Mapper()
+    feed(joined, flight, flight.records)
+    assert np.mean(errors_m(joined, flight)[40:]) < np.mean(errors_m(mapper, flight)[40:])
+
+
+def test_wild_observations_are_removed_and_good_ones_kept(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=20, outliers=0.05, turns=0.5)
+    mapper = Mapper()
+    published = feed(mapper, flight, flight.records)
+    table = mapper.map.keypoints
+    slots = np.flatnonzero(table.flags & REMOVED).astype(np.int32)
+    keyframes = mapper.map.keyframes.id[table.row[slots]].tolist()
+    removed = set(zip(keyframes, mapper.map.keypoint_of(slots).tolist()))
+    assert removed == {(r.keyframe, int(i)) for r in published if isinstance(r, Removed) for i in r.index}
+    sightings = {(k, int(i)) for k, i in flight.sightings if k in flight.keyframes[2:-2]}
+    wild = flight.wild & sightings
+    assert len(removed & wild) > 0.9 * len(wild) > 50
+    assert len(removed & (sightings - wild)) < 0.08 * len(sightings)  # a wild birth spoils its point
+
+
+def test_points_that_are_not_seen_again_are_culled(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=16, turns=0.15)
+    ghosts: set[tuple[KeyframeId, int]] = set()
+    rng = np.random.default_rng(3)
+    records = []
+    for part in flight.records:
+        head = next(r for r in part if isinstance(r, Head))
+        index = np.arange(head.keypoints, head.keypoints + 15, dtype=np.uint16)
+        ghosts |= {(head.keyframe, int(i)) for i in index}
+        births = Births(
+            head.keyframe, 9, index, rng.uniform(300, 450, (15, 2)).astype(np.float32),
+            np.full(15, 0.4, np.float32), np.zeros(15, np.uint8), np.zeros(15, np.uint8),
+            rng.integers(0, 256, (15, 32), dtype=np.uint8),
+        )  # fmt: skip
+        records.append([replace(head, keypoints=head.keypoints + 15), *part[1:], births])
+    mapper = Mapper()
+    published = feed(mapper, flight, records)
+    last = {r.keyframe: r for r in published if isinstance(r, Culled)}
+    culled = {(k, int(i)) for k, r in last.items() for i in r.index}
+    judged = {g for g in ghosts if g[0] <= flight.keyframes[-5]}
+    assert len(culled & judged) > 0.8 * len(judged)
+    assert len(culled - ghosts) < 0.1 * len(flight.point_of)
+
+
+@pytest.mark.parametrize("stereo", [True, False])
+def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight, stereo: bool) -> None:
+    flight = make_flight(keyframes=14, turns=0.4, no_depth=0.4 if stereo else 0.0, stereo=True, drift_m=0.0005)
+    if not stereo:  # all births and sightings without depth: the poses alone place the points
+        flight = make_flight(keyframes=14, turns=0.4, no_depth=1.0, drift_m=0.0005)
+    mapper = Mapper()
+    published = feed(mapper, flight, flight.records)
+    assert mapper.counts.triangulated > 40
+    points = mapper.map.roots()
+    seen = np.diff(mapper.map.observations(points)[0])
+    blind = mapper.map.keypoints.inv_depth[points] == 0
+    xyz, known = mapper.map.positions(points)
+    placed = known & blind & (seen >= 3)
+    truth = np.array([flight.world[flight.point_of[i]] for i in mapper.map.point_ids(points[placed]).tolist()])
+    error = np.linalg.norm(xyz[placed] - truth, axis=1)
+    assert placed.sum() > 30
+    assert np.median(error) < 0.08
+    assert any(isinstance(r, Depths) for r in published)
+
+
+def test_strict_new_point_rules_refuse_two_views_that_are_one(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=8, turns=0.2, no_depth=1.0)
+    mapper = Mapper(replace(BaseConfig(), new_points=NewPointConfig(max_cosine=-1.0)))
+    feed(mapper, flight, flight.records)
+    assert mapper.counts.triangulated == 0
+
+
+def test_order_and_grouping_of_records_do_not_change_what_is_taken_in(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=12, turns=0.4)
+    rng = np.random.default_rng(9)
+    maps = []
+    for shuffle in (False, True):
+        mapper = Mapper()
+        records = [r for part in flight.records for r in part]
+        if shuffle:
+            records = [records[i] for i in rng.permutation(len(records))]
+            records += records[:10]
+        # Everything in one step: the same work on the same knowledge, whatever the order.
+        published = feed(mapper, flight, [records])
+        maps.append((pickle.dumps(published), mapper.summary()["points"]))
+    assert maps[0][1] == maps[1][1]
+    assert maps[0][0] == maps[1][0]
+
+
+def test_two_runs_publish_the_same_bytes(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=25, turns=1.2)
+    runs = []
+    for _ in range(2):
+        runs.append(pickle.dumps(feed(Mapper(), flight, flight.records)))
+    assert runs[0] == runs[1]
+
+
+def test_late_sections_are_waited_for_then_done_without_and_taken_up_when_they_come(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=8, turns=0.2)
+    late = flight.records[5].pop()
+    mapper = Mapper()
+    camera: tuple[Record, ...] = (Camera(flight.agent, flight.camera),)
+    now_ns = 0
+    for part in flight.records:
+        mapper.step(MapperInput(((flight.agent, (*camera, *part)),)), now_ns)
+        camera = ()
+        now_ns += STEP_NS
+    assert mapper.counts.keyframes == 7
+    mapper.step(MapperInput(()), now_ns + 2_500_000_000)
+    assert mapper.counts.keyframes == 8
+    before = len(mapper.map.observed(flight.keyframes[5]))
+    mapper.step(MapperInput(((flight.agent, (late,)),)), now_ns + 3_000_000_000)
+    assert mapper.counts.keyframes == 9  # the completed keyframe is searched once more
+    assert len(mapper.map.observed(flight.keyframes[5])) > before
+
+
+def test_what_is_published_replaces_older_values_and_matches_the_map(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=20, turns=1.0)
+    mapper = Mapper()
+    published = feed(mapper, flight, flight.records)
+    first = flight.keyframes[0]
+    assert [r.submap for r in published if isinstance(r, Placement)] == [submap_of_keyframe(first)]
+    poses = {r.keyframe: r.T_m_k for r in published if isinstance(r, Pose)}
+    assert first not in poses  # the first keyframe of a submap holds the gauge
+    for keyframe, T_m_k in poses.items():
+        held = mapper.map.pose(keyframe)
+        assert held is not None
+        assert np.array_equal(held, T_m_k)
+        assert np.allclose(T_m_k[:3, :3] @ T_m_k[:3, :3].T, np.eye(3), atol=1e-12)
+    found = {r.keyframe: r for r in published if isinstance(r, Found)}
+    for keyframe, same in found.items():
+        births = mapper.map.slots_of(keyframe)[same.index]
+        assert np.array_equal(mapper.map.point_ids(mapper.map.keypoints.root[births]), same.point)
+    for record in {r.keyframe: r for r in published if isinstance(r, Depths)}.values():
+        births = mapper.map.slots_of(record.keyframe)[record.index]
+        current = mapper.map.keypoints.root[births] == births
+        assert current.all()
+        assert np.array_equal(mapper.map.keypoints.refined[births], record.inv_depth)
+
+
+def test_a_superseded_or_unknown_job_changes_nothing(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=6, turns=0.1)
+    mapper = Mapper()
+    jobs = []
+    for n, part in enumerate(flight.records):
+        camera: list[Record] = [Camera(flight.agent, flight.camera)]
+        output = mapper.step(MapperInput(((flight.agent, tuple(camera + part)),)), n * STEP_NS)
+        jobs += [job for job in output.jobs if job.kind == "bundle"]
+    assert len(jobs) == 1  # one bundle at a time
+    done = run_job(jobs[0])
+    assert done.cost_ops > 10_000
+    output = mapper.step(MapperInput((), (replace(done, id=999),)), 10 * STEP_NS)
+    assert not output.jobs
+    output = mapper.step(MapperInput((), (done,)), 11 * STEP_NS)
+    assert any(job.kind == "bundle" for job in output.jobs)  # the next one, about what came meanwhile
+    assert not mapper.step(MapperInput((), (done,)), 12 * STEP_NS).publish  # a second answer to the same job
+
+
+def test_a_base_without_its_store_begins_at_the_oldest_keyframe_it_gets(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=12, turns=0.3)
+    mapper = Mapper()
+    camera: tuple[Record, ...] = (Camera(flight.agent, flight.camera),)
+    for part in flight.records[4:]:
+        mapper.step(MapperInput(((flight.agent, (*camera, *part)),)), 0)
+        camera = ()
+    assert mapper.counts.keyframes == 0
+    mapper.step(MapperInput(()), 20_000_000_000)
+    assert mapper.counts.keyframes == 8
+    a, b = mapper.map.pose(flight.keyframes[4]), mapper.map.pose(flight.keyframes[9])
+    assert a is not None and b is not None
+    true = se3.inverse(flight.true_T_m_k[4]) @ flight.true_T_m_k[9]
+    assert np.allclose(se3.inverse(a) @ b, true, atol=0.05)
+
+
+def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=5, turns=0.1, agent=3)
+    mapper = Mapper()
+    live = Live(flight.agent, 77, flight.keyframes[-1], np.eye(4), 80)
+    feed(mapper, flight, [*flight.records, [live]])
+    summary = mapper.summary()
+    agents = summary["agents"]
+    assert isinstance(agents, dict)
+    assert summary["keyframes"] == 5
+    assert agents[3]["keyframes"] == 5
+    assert agents[3]["quality"] == 80
+    assert agents[3]["T_w_c"] is not None
+    view = mapper.world_view()
+    assert len(view.positions) == 5
+    assert view.observations[:, 1].max() == len(view.points) - 1
+    assert np.bincount(view.observations[:, 1]).min() >= 2
+    table = mapper.map.keypoints
+    assert not (table.flags[mapper.map.find_points(view.point_ids)] & CULLED).any()

@@ -1,0 +1,68 @@
+"""The station over real channels: both sides end with the same numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import run_job
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
+from kiteline_codec.schema import Camera, Depths, Pose, Record
+from kiteline_codec.sync import SyncConfig
+from kiteline_core.ids import AgentId
+
+STEP_NS = 100_000_000
+
+
+def fly(station: Station, agent_end: RecordChannel, flight: Any) -> list[Record]:
+    heard: list[Record] = []
+    agent_end.put(Camera(flight.agent, flight.camera))
+    done: list[Any] = []
+    packets: tuple[bytes, ...] = ()
+    for n in range(len(flight.records) + 30):
+        now_ns = n * STEP_NS
+        heard += agent_end.receive(packets, now_ns)
+        for record in flight.records[n] if n < len(flight.records) else ():
+            agent_end.put(record)
+        output = station.step({flight.agent: agent_end.poll(now_ns)}, done, now_ns)
+        done = [run_job(job) for job in output.jobs]
+        packets = dict(output.packets)[flight.agent]
+    return heard
+
+
+def test_the_agent_holds_what_the_base_computes_with(make_flight: Callable[..., Any]) -> None:
+    flight = make_flight(keyframes=12, turns=0.4)
+    base_end, agent_end = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
+    station = Station(BaseConfig(), lambda agent: base_end)
+    heard = fly(station, agent_end, flight)
+    sparse_map = station.mapper.map
+    poses = {r.keyframe: r for r in heard if isinstance(r, Pose)}
+    depths = {r.keyframe: r for r in heard if isinstance(r, Depths)}
+    assert len(poses) == 11
+    assert len(depths) > 5
+    for keyframe, pose in poses.items():
+        held = sparse_map.pose(keyframe)
+        assert held is not None
+        assert np.array_equal(held, pose.T_m_k)
+    for keyframe, record in depths.items():
+        births = sparse_map.slots_of(keyframe)[record.index]
+        assert np.array_equal(sparse_map.keypoints.refined[births], record.inv_depth)
+        assert np.array_equal(sparse_map.keypoints.offset[births], record.offset)
+    assert base_end.endpoint.digest_equal
+    assert station.mapper.idle
+
+
+def test_plain_channels_serve_as_well_and_agents_are_served_in_order(make_flight: Callable[..., Any]) -> None:
+    ends = {agent: plain_pair() for agent in (AgentId(0), AgentId(2))}
+    station = Station(BaseConfig(), lambda agent: ends[agent][0])
+    flights = [make_flight(keyframes=5, turns=0.1, agent=int(a), seed=int(a)) for a in (2, 0)]
+    for flight in flights:
+        fly(station, ends[flight.agent][1], flight)
+    output = station.step({}, (), 10**10)
+    assert [agent for agent, _ in output.packets] == [0, 2]
+    assert len(station.mapper.map.submaps) == 2
+    assert len(station.mapper.placements) == 1  # where the second agent began is not known

@@ -1,0 +1,56 @@
+"""Lists of observations in flat arrays, against sets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_core import sparse_map_kernels as kernels
+
+
+def test_links_and_fusions_agree_with_plain_sets() -> None:
+    rng = np.random.default_rng(4)
+    n, rows = 60, 12
+    root, first, next_ = np.full(n, -1, np.int32), np.full(n, -1, np.int32), np.full(n, -1, np.int32)
+    row = rng.integers(0, rows, n).astype(np.int32)
+    usable = (rng.random(n) < 0.8).astype(np.uint8)
+    keyframe_id = rng.permutation(rows).astype(np.int64) + 100
+    members: dict[int, set[int]] = {p: set() for p in range(n)}
+    for _ in range(300):
+        if rng.random() < 0.85:
+            slots = rng.choice(n, 3, replace=False).astype(np.int32)
+            points = rng.integers(-1, 10, 3).astype(np.int32)
+            kernels.link(slots, points, root, first, next_)
+            for s, p in zip(slots.tolist(), points.tolist(), strict=True):
+                for some in members.values():
+                    some.discard(s)
+                if p >= 0:
+                    members[p].add(s)
+        else:
+            a, b = rng.choice(10, 2, replace=False).tolist()
+            if root[a] not in (-1, a):
+                continue  # slot a hangs elsewhere as an observation: it is no root
+            moved = np.empty(n, np.int32)
+            count = kernels.fuse(a, b, root, first, next_, moved)
+            assert set(moved[:count].tolist()) == members[a]
+            members[b] |= members[a]
+            members[a] = set()
+            if a not in members[b]:
+                root[a] = -1  # it was no observation of itself: undo the mark, which `link` would follow
+        points = np.arange(10, dtype=np.int32)
+        assert kernels.count(points, first, next_) == sum(len(members[p]) for p in range(10))
+        starts, seen = np.empty(11, np.int32), np.empty(n, np.int32)
+        kernels.gather(points, first, next_, row, usable, keyframe_id, starts, seen)
+        shared = np.zeros(rows, np.int32)
+        kernels.covisibility(points, first, next_, row, usable, shared)
+        assert shared.tolist() == [
+            sum(1 for p in range(10) for s in members[p] if usable[s] and row[s] == r) for r in range(rows)
+        ]
+        for p in range(10):
+            lowest: dict[int, int] = {}
+            for s in sorted(members[p]):
+                if usable[s]:
+                    lowest.setdefault(int(keyframe_id[row[s]]), s)
+            assert seen[starts[p] : starts[p + 1]].tolist() == [lowest[k] for k in sorted(lowest)]
+        a, b = rng.choice(10, 2, replace=False).tolist()
+        both = {int(row[s]) for s in members[a] if usable[s]} & {int(row[s]) for s in members[b] if usable[s]}
+        assert kernels.share_keyframe(a, b, first, next_, row, usable) == bool(both)
