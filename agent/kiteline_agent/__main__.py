@@ -11,33 +11,37 @@ import json
 import os
 import signal
 import time
-import tomllib
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
 
-from kiteline_agent.agent import Agent, Identity, StepInput, StepOutput
-from kiteline_agent.alone import AloneChannel
+from kiteline_agent.agent import Agent, Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.camera import Camera
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.flight_log import write_step
+from kiteline_agent.cost import VirtualCpu, frame_ops
+from kiteline_agent.flight_log import StepLog, write_step
+from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.framing import StreamFramer
 from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw import process
-from kiteline_hw.cpu import rss_mib
+from kiteline_hw.clock import MonotonicClock
+from kiteline_hw.cpu import CpuQuota, rss_mib
+from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.mavlink_frames import mounting
+from kiteline_hw.mavlink_out import MavlinkPoseSink
 from kiteline_hw.mcap_log import LogWriter
-from kiteline_hw.ports import FrameSource, LinkError, SourceError
+from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, SourceError
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
 from kiteline_hw.zenoh_lockstep import LockstepClient
@@ -46,57 +50,6 @@ _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 5.0  # s that a live flight waits at its end for the link to become quiet
 _PROGRESS_FRAMES = 10  # frames between two words to the parent; also between two looks at the memory
-
-
-@dataclass(frozen=True, slots=True)
-class AgentSpec:
-    """All that one agent's flight is told. Plain values, so that it travels as JSON."""
-
-    source: str
-    folder: str  # for the log and the trajectories
-    log_name: str = "log.mcap"
-    agent: int = 0
-    boot: int = 0
-    link: str = "none"  # LINK, or lockstep:ENDPOINT
-    mono: bool = False
-    imu: bool = True
-    config: str = ""  # a TOML file
-    start_ns: int = 0  # the stamp that is flight time 0
-    seconds: float = 0.0  # s of flight time to fly; 0: all
-    up_bytes_s: int = 0  # B/s that the link takes; 0: any number
-    loss: float = 0.0  # probability that a packet is lost
-    disorder: float = 0.0  # probability that it is doubled, and that it is late
-    seed: int = 0
-    cpu_percent: float = 0.0  # of one core; 0: all of it
-    mavlink: str = ""
-    kill_at_s: float = -1.0  # end like a crash at this flight time
-    await_base_at_s: float = -1.0  # look for a base again at this flight time
-
-
-def from_json(text: str) -> AgentSpec:
-    """A spec from its JSON; unknown keys are an error."""
-    values: dict[str, Any] = json.loads(text)
-    known = {f.name for f in fields(AgentSpec)}
-    if unknown := set(values) - known:
-        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
-    return AgentSpec(**values)
-
-
-def agent_config(path: str) -> AgentConfig:
-    """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError."""
-    if not path:
-        return AgentConfig()
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise configuration.ConfigError(f"{path}: {error}") from error
-    unknown = set(table) - {"agent", "base"}
-    if unknown:
-        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
-    section = table.get("agent", {})
-    if not isinstance(section, dict):
-        raise configuration.ConfigError(f"{path}: [agent] is a section")
-    return configuration.apply(AgentConfig(), section, "agent")
 
 
 def settled(channel: RecordChannel) -> tuple[bool, bool]:
@@ -130,14 +83,21 @@ class Onboard:
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
         self.camera = Camera(source, until_ns, time.process_time_ns)
         self.agent = Agent(source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel)
-        folder = Path(spec.folder)
-        folder.mkdir(parents=True, exist_ok=True)
         self._files = ExitStack()
         self._log_shift_ns = spec.start_ns  # log time minus the time handed to the agent: logs stand in source time
-        self.log = self._files.enter_context(LogWriter(folder / spec.log_name, _log_metadata(spec, source, config)))
-        self.log.rig(self._log_shift_ns, source.rig, source.imu)
-        self._live = self._open(folder / "live.tum")
-        self._odometry = self._open(folder / "odometry.tum")
+        self._log: StepLog | None = None
+        self._live: TextIO | None = None
+        self._odometry: TextIO | None = None
+        if spec.log_name:
+            folder = Path(spec.folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            log = self._files.enter_context(
+                LogWriter(folder / spec.log_name, _log_metadata(spec, source, config, channel))
+            )
+            log.rig(self._log_shift_ns, source.rig, source.imu)
+            self._log = log
+            self._live = self._open(folder / "live.tum")
+            self._odometry = self._open(folder / "odometry.tum")
         disorder = LinkModelConfig(loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder)
         self._wire = LinkModel(disorder, spec.seed)
         self._overhead_bytes = channel.endpoint.config.overhead_bytes if isinstance(channel, CodedChannel) else 0
@@ -145,7 +105,10 @@ class Onboard:
         self._mark_ns = time.process_time_ns()
         self._decode_mark_ns = self.camera.decode_ns
         self._spent_ns = 0
-        self._told_cpu_ns = 0
+        self._told_cpu_ns = 0  # what the last frame cost: modelled in lock-step, measured in a live flight
+        self._live_clock = False
+        self._core = VirtualCpu(spec.cpu_percent)
+        self.estimate: Estimate | None = None  # of the last frame
 
     def _open(self, path: Path) -> TextIO:
         return self._files.enter_context(path.open("w", buffering=1))
@@ -166,10 +129,28 @@ class Onboard:
             self.frames_are_over()
         frame = imu = None
         if self.next_ns is not None and self.next_ns <= down.now_ns:
-            frame, imu = self.camera.take()
+            if self._core.newest_wins(self.next_ns, self.camera.period_ns):
+                self.camera.drop()
+                self.tally.dropped += 1
+            else:
+                frame, imu = self.camera.take()
         sent = self.step(frame, imu, down.packets, down.now_ns)
         quiet, equal = settled(self.channel)
         return Up(self._next_or_end(), quiet, equal, tuple(sent))
+
+    def begin_at(self, begin_ns: int) -> None:
+        """A live flight begins: `begin_ns` of its clock is flight time 0."""
+        assert self.camera.next_ns is not None
+        self._live_clock = True
+        self.spec = replace(self.spec, start_ns=self.camera.next_ns)
+        self._log_shift_ns = self.spec.start_ns - begin_ns
+
+    def drop_stale(self, flight_ns: int) -> bool:
+        """Pass over frames until the next one is the newest there is at a flight time; whether one is left."""
+        while self.next_ns is not None and 0 < self.camera.period_ns <= flight_ns - self.next_ns:
+            self.camera.drop()
+            self.tally.dropped += 1
+        return self.next_ns is not None
 
     def frames_are_over(self) -> None:
         """What follows is draining: it is reported apart."""
@@ -185,9 +166,14 @@ class Onboard:
         begin_ns = time.process_time_ns()
         step_input = StepInput(frame, imu, tuple(packets), self._told_cpu_ns)
         output = self.agent.step(step_input, now_ns)
-        write_step(self.log, step_input, output, now_ns, now_ns + self._log_shift_ns)
+        if self._log is not None:
+            write_step(self._log, step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
             self._record(output)
+            if not self._live_clock:
+                ops = frame_ops(frame, output)
+                self._core.spend(ops, now_ns)
+                self._told_cpu_ns = ops
         for packet in output.packets:
             self._wire.send(packet, now_ns)
         sent = self._wire.deliver(now_ns)
@@ -197,8 +183,9 @@ class Onboard:
         return sent
 
     def _record(self, output: StepOutput) -> None:
+        self.estimate = output.estimate
         self.tally.count(output.estimate)
-        if output.estimate is not None:
+        if output.estimate is not None and self._live is not None and self._odometry is not None:
             self._live.write(live_line(output.estimate))
             self._odometry.write(odometry_line(output.estimate))
 
@@ -211,6 +198,8 @@ class Onboard:
         if not with_frame:
             return
         self.cpu_ms.append(self._spent_ns / 1e6)
+        if self._live_clock:
+            self._told_cpu_ns = self._spent_ns
         self._spent_ns = 0
         if len(self.cpu_ms) % _PROGRESS_FRAMES == 1:
             self.rss_mib = max(self.rss_mib, rss_mib())
@@ -240,21 +229,15 @@ class Onboard:
         self._files.close()
 
 
-def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig) -> dict[str, str]:
+def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
     plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config", "link")}
     return {
         "role": "agent",
+        "channel": type(channel).__name__,
         "source": source.name,
         "spec": json.dumps(plain),
         "config": configuration.describe(config),
     }
-
-
-def channel_for(spec: AgentSpec) -> RecordChannel:
-    """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1."""
-    if spec.link == "none":
-        return AloneChannel()
-    return CodedChannel(SyncConfig(budget_bytes=spec.up_bytes_s), spec.boot + 1)
 
 
 def fly_lockstep(spec: AgentSpec, parent: process.Parent, stop: process.StopSignal) -> None:
@@ -326,13 +309,92 @@ class Barrier:
             self._client = None
 
 
+def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopSignal) -> None:
+    """Fly on real clocks: frames are paced by their stamps, the newest wins, and the tracker waits for nobody."""
+    source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
+    with ExitStack() as stack:
+        stack.callback(source.close)
+        onboard = Onboard(spec, source, channel_for(spec), whole_process=True)
+        stack.callback(onboard.close)
+        link = open_link(spec.link, "agent", spec.agent, framer=StreamFramer, required=False)
+        stack.callback(link.close)
+        clock = MonotonicClock()
+        sink = _pose_sink(spec, source, clock, stack)
+        if spec.cpu_percent > 0.0:
+            stack.enter_context(CpuQuota(spec.cpu_percent)).add(os.getpid())
+        if parent is not None:
+            parent.tell("ready", frames=source.frame_count)
+        process.notify("READY=1")
+        begin_ns = clock.now_ns()
+        onboard.begin_at(begin_ns)
+        while not stop and onboard.next_ns is not None:
+            wait_s = (begin_ns + onboard.next_ns - clock.now_ns()) / 1e9
+            if wait_s > 0.0 and stop.wait(min(wait_s, _IDLE_TICK_S)):
+                break
+            now_ns = clock.now_ns()
+            frame = imu = None
+            if now_ns >= begin_ns + onboard.next_ns:
+                if not onboard.drop_stale(now_ns - begin_ns):
+                    break
+                captured_ns = begin_ns + onboard.next_ns
+                frame, imu = onboard.camera.take()
+            for packet in onboard.step(frame, imu, link.receive(), now_ns):
+                link.send(packet)
+            if frame is not None and sink is not None and onboard.estimate is not None:
+                e = onboard.estimate
+                sink.push(PoseSample(captured_ns, e.T_o_b, e.tracked, e.quality, spec.boot), clock.now_ns())
+            process.notify("WATCHDOG=1")
+            if parent is not None and onboard.tally.frames % _PROGRESS_FRAMES == 0:
+                parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
+        _drain_live(onboard, link, clock, parent, stop)
+        if parent is not None:
+            parent.tell("result", report=onboard.report())
+
+
+def _drain_live(
+    onboard: Onboard, link: ByteLink, clock: MonotonicClock, parent: process.Parent | None, stop: process.StopSignal
+) -> None:
+    """After the last frame: until both sides were seen to hold the same, or patience ends."""
+    onboard.frames_are_over()
+    if parent is not None:
+        parent.tell("frames_over")
+    end_ns = clock.now_ns() + round(_DRAIN_S * 1e9)
+    while not stop and clock.now_ns() < end_ns and not all(settled(onboard.channel)):
+        stop.wait(_IDLE_TICK_S / 2)
+        for packet in onboard.step(None, None, link.receive(), clock.now_ns()):
+            link.send(packet)
+        process.notify("WATCHDOG=1")
+
+
+def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stack: ExitStack) -> MavlinkPoseSink | None:
+    """Where poses for the flight controller go, if anywhere. Raises LinkError."""
+    if not spec.mavlink:
+        return None
+    axes = spec.axes or ("flu" if source.rig.has_body else "rdf")
+    try:
+        return stack.enter_context(MavlinkPoseSink(spec.mavlink, mounting(axes), clock, required=False))
+    except ValueError as error:
+        raise LinkError(f"--axes: {error}") from error
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """`kiteline agent`, and a child of `kiteline fly` (with --spec); the exit status."""
-    a = parser().parse_args(argv)
+    p = parser()
+    a = p.parse_args(argv)
     stop = process.StopSignal()
     if a.spec:
-        spec = from_json(a.spec)
-        return run_child(spec, stop)
+        return run_child(from_json(a.spec), stop)
+    if not a.source:
+        p.error("a SOURCE is needed")
+    state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
+    folder = (Path(a.log) if a.log else state) / f"agent{a.agent}"
+    boot = process.next_number(folder / "boot")
+    spec = AgentSpec(
+        source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
+        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, cpu_percent=a.cpu,
+        mavlink=a.mavlink, axes=a.axes,
+    )  # fmt: skip
+    fly_live(spec, None, stop)
     return 0
 
 
@@ -340,7 +402,7 @@ def run_child(spec: AgentSpec, stop: process.StopSignal) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
     parent = process.Parent()
     try:
-        fly_lockstep(spec, parent, stop)
+        (fly_lockstep if spec.link.startswith("lockstep:") else fly_live)(spec, parent, stop)
     except (SourceError, LinkError, ValueError) as error:
         parent.tell("error", text=str(error))
         return 2
@@ -349,7 +411,25 @@ def run_child(spec: AgentSpec, stop: process.StopSignal) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline agent`."""
-    p = argparse.ArgumentParser(prog="kiteline agent", description="The onboard half.")
+    p = argparse.ArgumentParser(
+        prog="kiteline agent",
+        description="The onboard half: tracks a camera, sends poses to a flight controller and thin diffs to a base.",
+        epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path. "
+        "LINK is zenoh:tcp/HOST:PORT serial:DEVICE:BAUD none. URL is udp:HOST:PORT udpin:HOST:PORT serial:DEVICE:BAUD.",
+    )
+    p.add_argument("source", metavar="SOURCE", nargs="?")
+    p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
+    p.add_argument(
+        "--agent", metavar="N", type=int, default=0, help="number of this agent, 0 to 63, its own in a group"
+    )
+    p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
+    p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
+    p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
+    p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
+    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
+    p.add_argument("--mono", action="store_true", help="the left camera alone")
+    p.add_argument("--no-imu", action="store_true", help="without inertial samples")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
 

@@ -11,84 +11,49 @@ import contextlib
 import json
 import os
 import signal
+import sys
 import time
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.flight_log import write_step
+from kiteline_basestation.flight_log import RESTORED, write_step
 from kiteline_basestation.jobs import Job, JobDone, run_job
 from kiteline_basestation.outputs import counts, keyframe_poses, map_files
+from kiteline_basestation.spec import BaseSpec, base_config, from_json
 from kiteline_basestation.station import Station, StationOutput
+from kiteline_basestation.store import Codes, pack, restore
 from kiteline_basestation.warm import warm
+from kiteline_basestation.worker import Worker
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
+from kiteline_codec.framing import StreamFramer
+from kiteline_codec.schema import WireError
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_hw import process
+from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.cpu import rss_mib
+from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
-from kiteline_hw.ports import LinkError
+from kiteline_hw.ports import LinkError, LinkHub
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.zenoh_lockstep import LockstepServer
 
 _COLLECT_S = 120.0  # s that an agent may take for one tick of a lock-step flight before it counts as gone
 _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
 _DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is still not quiet is given up
+_LIVE_WAIT_S = 0.005  # s between two looks at the links of a live base: small beside the camera's period
+_LIVE_STEP_NS = 50_000_000  # ns between two steps without news: keeps acknowledgements and heartbeats moving
+_KEEP_NS = 5_000_000_000  # ns between two copies of the shared values on disk
+_PAGE_NS = 400_000_000  # ns between two snapshots for the status page
 _MEMORY_STEPS = 10  # steps between two looks at the memory
-
-
-@dataclass(frozen=True, slots=True)
-class BaseSpec:
-    """All that the base's flight is told. Plain values, so that it travels as JSON."""
-
-    folder: str  # for the log, the map and the grid
-    log_name: str = "log.mcap"
-    agents: tuple[int, ...] = ()
-    session: int = 1  # higher than that of any base before it
-    link: str = "none"  # LINK, or lockstep:ENDPOINT
-    config: str = ""  # a TOML file
-    start_ns: int = 0  # the stamp that is flight time 0, so that the log stands in the time of the first source
-    down_bytes_s: int = 0  # B/s that the link to each agent takes; 0: any number
-    loss: float = 0.0  # probability that a packet is lost
-    disorder: float = 0.0  # probability that it is doubled, and that it is late
-    seed: int = 0
-    kill_at_s: float = -1.0  # end like a crash at this flight time
-    store: str = ""
-    web: str = ""
-
-
-def from_json(text: str) -> BaseSpec:
-    """A spec from its JSON; unknown keys are an error."""
-    values: dict[str, Any] = json.loads(text)
-    known = {f.name for f in fields(BaseSpec)}
-    if unknown := set(values) - known:
-        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
-    values["agents"] = tuple(values.get("agents", ()))
-    return BaseSpec(**values)
-
-
-def base_config(path: str) -> BaseConfig:
-    """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
-    if not path:
-        return BaseConfig()
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise configuration.ConfigError(f"{path}: {error}") from error
-    if unknown := set(table) - {"agent", "base"}:
-        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
-    section = table.get("base", {})
-    if not isinstance(section, dict):
-        raise configuration.ConfigError(f"{path}: [base] is a section")
-    return configuration.apply(BaseConfig(), section, "base")
 
 
 def settled(channel: RecordChannel) -> tuple[bool, bool]:
@@ -115,7 +80,7 @@ class LockstepJobs:
             self._free_ns = max(now_ns, self._free_ns) + done.cost_ops
             self._waiting.append((self._free_ns, done))
 
-    def due(self, now_ns: int) -> tuple[JobDone, ...]:
+    def done(self, now_ns: int) -> tuple[JobDone, ...]:
         """What is done by now, in order."""
         done = tuple(result for end_ns, result in self._waiting if end_ns <= now_ns)
         self._waiting = self._waiting[len(done) :]
@@ -138,14 +103,16 @@ class Flown:
 class Ground:
     """The base in flight: a station, and to each agent a modelled link. open_channel: our end of the codec."""
 
-    def __init__(self, spec: BaseSpec, open_channel: Callable[[AgentId], RecordChannel]) -> None:
+    def __init__(
+        self, spec: BaseSpec, open_channel: Callable[[AgentId], RecordChannel], jobs: Worker | None = None
+    ) -> None:
         cv2.setNumThreads(1)
         self.spec = spec
         self.config = base_config(spec.config)
         codec_warm.warm()
         warm(self.config)
         self.station = Station(self.config, open_channel)
-        self.jobs = LockstepJobs()
+        self.jobs: LockstepJobs | Worker = LockstepJobs() if jobs is None else jobs
         self.phase = Phase.FLY
         self.now_ns = -1
         self.rss_mib = 0.0
@@ -156,10 +123,18 @@ class Ground:
         self.agents_lost: set[int] = set()
         self._last_frame_ns = 0
         self._folder = Path(spec.folder)
-        self._folder.mkdir(parents=True, exist_ok=True)
-        self.log = LogWriter(self._folder / spec.log_name, _log_metadata(spec, self.config))
-        model = LinkModelConfig(loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder)
-        self._wires = {agent: LinkModel(model, spec.seed * 64 + 32 + agent) for agent in spec.agents}
+        self._log: LogWriter | None = None
+        if spec.log_name:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._log = LogWriter(self._folder / spec.log_name, _log_metadata(spec, self.config))
+        self._log_shift_ns = spec.start_ns
+        self._wires: dict[AgentId, LinkModel] = {}
+
+    def restore(self, kept: bytes, now_ns: int) -> None:
+        """Go on from what an earlier base kept. Raises WireError."""
+        if self._log is not None:
+            self._log.blob(RESTORED, now_ns + self._log_shift_ns, kept)
+        restore(self.station, kept, now_ns)
 
     def turn(self, ups: Mapping[int, Up]) -> dict[int, Down]:
         """One tick of a lock-step flight: every agent's message in, the next tick and the packets for it out.
@@ -168,15 +143,14 @@ class Ground:
         """
         if self.now_ns >= 0:
             packets = {agent: up.packets for agent, up in ups.items()}
-            output = self.step(packets, self.jobs.due(self.now_ns), self.now_ns)
-            self.jobs.add(output.jobs, self.now_ns)
+            self.step(packets, self.jobs.done(self.now_ns), self.now_ns)
         frames = [up.next_ns for up in ups.values() if up.next_ns != NO_MORE_FRAMES_NS]
         if frames:
             self.now_ns = min(frames)
         else:
             self._drain(ups)
-        arrived = {agent: tuple(self._wires[agent].deliver(self.now_ns)) for agent in sorted(ups)}
-        return {agent: Down(self.now_ns, self.phase, packets) for agent, packets in arrived.items()}
+        sent = self.outgoing(self.now_ns)
+        return {agent: Down(self.now_ns, self.phase, sent.get(AgentId(agent), ())) for agent in sorted(ups)}
 
     def _drain(self, ups: Mapping[int, Up]) -> None:
         if self.phase is Phase.FLY:
@@ -196,8 +170,9 @@ class Ground:
         """What follows is draining: the map is written, and kept in mind, as it stands now."""
         if self.flown is None:
             self.flown = self.snapshot()
-            for name, content in map_files(self.station.mapper).items():
-                (self._folder / name).write_bytes(content)
+            if self._log is not None:
+                for name, content in map_files(self.station.mapper).items():
+                    (self._folder / name).write_bytes(content)
 
     def snapshot(self) -> Flown:
         """The base as it stands."""
@@ -209,16 +184,28 @@ class Ground:
         begin_ns = time.process_time_ns()
         arrived = {AgentId(agent): tuple(packets[agent]) for agent in sorted(packets)}
         output = self.station.step(arrived, done, now_ns)
-        write_step(self.log, arrived, done, output, now_ns, now_ns + self.spec.start_ns)
+        if self._log is not None:
+            write_step(self._log, arrived, done, output, now_ns, now_ns + self._log_shift_ns)
         for agent, out in output.packets:
-            wire = self._wires.get(agent)
-            if wire is not None:
-                for packet in out:
-                    wire.send(packet, now_ns)
+            for packet in out:
+                self._wire(agent).send(packet, now_ns)
         self.step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
+        self.jobs.add(output.jobs, now_ns)
         if len(self.step_ms) % _MEMORY_STEPS == 1:
             self.rss_mib = max(self.rss_mib, rss_mib())
         return output
+
+    def _wire(self, agent: AgentId) -> LinkModel:
+        """The modelled link to an agent, made at first use."""
+        if agent not in self._wires:
+            spec = self.spec
+            model = LinkModelConfig(loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder)
+            self._wires[agent] = LinkModel(model, spec.seed * 64 + 32 + agent)
+        return self._wires[agent]
+
+    def outgoing(self, now_ns: int) -> dict[AgentId, tuple[bytes, ...]]:
+        """What leaves the modelled links by now."""
+        return {agent: tuple(wire.deliver(now_ns)) for agent, wire in sorted(self._wires.items())}
 
     def report(self) -> dict[str, Any]:
         """The base's part of report.json, with raw samples in place of statistics."""
@@ -239,7 +226,8 @@ class Ground:
 
     def close(self) -> None:
         """Finish the log."""
-        self.log.close()
+        if self._log is not None:
+            self._log.close()
 
 
 def _log_metadata(spec: BaseSpec, config: BaseConfig) -> dict[str, str]:
@@ -290,12 +278,125 @@ def _collect(server: LockstepServer, here: set[int], ground: Ground, parent: pro
     return {}
 
 
+def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSignal) -> None:
+    """Serve any number of agents on real clocks until told to stop; long work is done by a process beside."""
+    clock = MonotonicClock()
+    with contextlib.ExitStack() as stack:
+        hub = open_link(spec.link, "base", framer=StreamFramer, required=False)
+        stack.callback(hub.close)
+        worker = Worker()
+        stack.callback(worker.close)
+        ground = Ground(spec, coded_channels(spec), worker)
+        stack.callback(ground.close)
+        keeper = Keeper(Path(spec.store), ground, clock.now_ns()) if spec.store else None
+        page = Page(spec.web, ground, clock.now_ns(), stack) if spec.web else None
+        if parent is not None:
+            parent.tell("ready")
+        process.notify("READY=1")
+        stepped_ns = 0
+        while not stop:
+            now_ns = clock.now_ns()
+            packets = {agent: received for agent, link in hub.links().items() if (received := link.receive())}
+            done = worker.done(now_ns)
+            if packets or done or now_ns - stepped_ns >= _LIVE_STEP_NS:
+                ground.step(packets, done, now_ns)
+                stepped_ns = now_ns
+                _send(hub, ground.outgoing(now_ns))
+            if page is not None:
+                page.renew(now_ns)
+            if keeper is not None:
+                keeper.keep_at_times(now_ns)
+            if parent is not None and parent.said() == "frames_over":
+                ground.frames_are_over()
+            process.notify("WATCHDOG=1")
+            stop.wait(_LIVE_WAIT_S)
+        ground.frames_are_over()
+        ends = [settled(channel) for channel in ground.station.channels.values()]
+        ground.digest_equal = bool(ends) and all(equal for _, equal in ends)
+        if keeper is not None:
+            keeper.keep()
+        if parent is not None and ground.flown is not None:
+            parent.tell("flown", keyframes=ground.flown.keyframes)
+            parent.tell("result", report=ground.report(), keyframes=ground.snapshot().keyframes)
+
+
+def _send(hub: LinkHub, packets: Mapping[AgentId, Sequence[bytes]]) -> None:
+    links = hub.links()
+    for agent, out in packets.items():
+        link = links.get(agent)
+        if link is not None:
+            for packet in out:
+                link.send(packet)
+
+
+class Keeper:
+    """Keeps what both sides wrote in a file, now and then, so that the next base goes on from there."""
+
+    def __init__(self, folder: Path, ground: Ground, now_ns: int) -> None:
+        self._path = folder / "values.klstore"
+        self._ground = ground
+        self._kept_ns = now_ns
+        if self._path.exists():
+            ground.restore(self._path.read_bytes(), now_ns)
+
+    def keep_at_times(self, now_ns: int) -> None:
+        """Keep, if the last time is long ago."""
+        if now_ns - self._kept_ns >= _KEEP_NS:
+            self._kept_ns = now_ns
+            self.keep()
+
+    def keep(self) -> None:
+        """Write the file."""
+        agents = {}
+        for agent, channel in self._ground.station.channels.items():
+            if isinstance(channel, CodedChannel):
+                end = channel.endpoint
+                agents[agent] = Codes({**end.legacy_values(), **end.peer_values()}, end.own_values())
+        process.write_atomically(self._path, pack(agents))
+
+
+class Page:
+    """The status page; it shows a snapshot that the mapper's own loop renews."""
+
+    def __init__(self, where: str, ground: Ground, now_ns: int, stack: contextlib.ExitStack) -> None:
+        from kiteline_basestation.web.overview import nothing, overview
+        from kiteline_basestation.web.server import address, serve
+
+        self._overview = overview
+        self._ground = ground
+        self._started_ns = now_ns
+        self._taken_ns = 0
+        self._snapshot = nothing(now_ns)
+        try:
+            handle = serve(*address(where), lambda: self._snapshot)
+        except ValueError as error:
+            raise LinkError(f"--web: {error}") from error
+        stack.callback(handle.close)
+        print(f"status page: {handle.url}", file=sys.stderr)
+
+    def renew(self, now_ns: int) -> None:
+        """Take a new snapshot, if the last one is old enough."""
+        if now_ns - self._taken_ns >= _PAGE_NS:
+            self._taken_ns = now_ns
+            self._snapshot = self._overview(self._ground.station, now_ns, self._started_ns)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """`kiteline base`, and a child of `kiteline fly` (with --spec); the exit status."""
-    a = parser().parse_args(argv)
+    p = parser()
+    a = p.parse_args(argv)
     stop = process.StopSignal()
     if a.spec:
         return run_child(from_json(a.spec), stop)
+    if not a.link:
+        p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
+    state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline" / "base"
+    session = process.next_number((Path(a.store) if a.store else state) / "session")
+    spec = BaseSpec(
+        folder=a.log, log_name=f"session{session:05d}.mcap" if a.log else "", session=session, link=a.link,
+        config=a.config, down_bytes_s=a.down_bytes, store=a.store, web=a.web,
+    )  # fmt: skip
+    fly_live(spec, None, stop)
     return 0
 
 
@@ -303,8 +404,8 @@ def run_child(spec: BaseSpec, stop: process.StopSignal) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
     parent = process.Parent()
     try:
-        fly_lockstep(spec, parent, stop)
-    except (LinkError, ValueError) as error:
+        (fly_lockstep if spec.link.startswith("lockstep:") else fly_live)(spec, parent, stop)
+    except (LinkError, WireError, ValueError) as error:
         parent.tell("error", text=str(error))
         return 2
     return 0
@@ -312,7 +413,17 @@ def run_child(spec: BaseSpec, stop: process.StopSignal) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline base`."""
-    p = argparse.ArgumentParser(prog="kiteline base", description="The base station.")
+    p = argparse.ArgumentParser(
+        prog="kiteline base",
+        description="The base station: makes one better map of what any number of agents send, and sends it back.",
+        epilog="LINK is zenoh:tcp/HOST:PORT (0.0.0.0 listens on all addresses) or serial:DEVICE:BAUD.",
+    )
+    p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
+    p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")
+    p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
+    p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
+    p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
 

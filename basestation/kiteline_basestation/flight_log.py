@@ -7,15 +7,17 @@ from the same inputs and hands it in at the same step.
 from __future__ import annotations
 
 import hashlib
-import pickle
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from typing import Protocol
+
+import numpy as np
 
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import StationOutput
 from kiteline_core.ids import AgentId
 
-STEP, JOB = "/step", "/job"
+STEP, JOB, RESTORED = "/step", "/job", "/restored"
 
 
 class StepLog(Protocol):
@@ -66,5 +68,20 @@ def write_step(
 
 
 def fingerprint(done: JobDone) -> str:
-    """A digest of a job's result, equal for equal results."""
-    return hashlib.blake2b(pickle.dumps(done.result, protocol=5), digest_size=16).hexdigest()
+    """A digest of a job's result, equal for results that are equal bit for bit."""
+    digest = hashlib.blake2b(digest_size=16)
+    _feed(digest, done.result)
+    return digest.hexdigest()
+
+
+def _feed(digest: hashlib.blake2b, value: object) -> None:
+    """Every field by name, type, shape and content."""
+    if is_dataclass(value):
+        for field in fields(value):
+            digest.update(field.name.encode())
+            _feed(digest, getattr(value, field.name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    else:
+        digest.update(repr(value).encode())

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
-from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
+from kiteline_codec.channel import plain_pair
+from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 
 _KEYFRAMES = 8  # enough for a bundle, a grid, and points old enough to be judged
 _POINTS = 120

@@ -85,6 +85,10 @@ class Outbox:
         """How many values there are, removals not counted."""
         return sum(e.code is not None for e in self._entries.values())
 
+    def codes(self) -> dict[Key, bytes]:
+        """The newest code of each value that was not removed, by key."""
+        return {key: entry.code for key, entry in self._entries.items() if entry.code is not None}
+
     def put(self, key: Key, code: bytes, order: Order) -> None:
         """A new value, or a new version of one; the same code again changes nothing but its order."""
         entry = self._entries.get(key)

@@ -169,6 +169,10 @@ class Endpoint:
         """Take a value back; unknown keys are ignored."""
         self._out.remove(key)
 
+    def own_values(self) -> dict[Key, bytes]:
+        """What this side shares, by key; a copy."""
+        return self._out.codes()
+
     def peer_values(self) -> dict[Key, bytes]:
         """What the peer's session wrote, by key; a copy."""
         return {key: code for key, (_, code) in self._in.values.items()}

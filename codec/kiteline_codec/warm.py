@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.ids import keyframe_id, submap_id
 
 from kiteline_codec import messages
 from kiteline_codec.schema import Births
+from kiteline_core.ids import keyframe_id, submap_id
 
 
 def warm() -> None:

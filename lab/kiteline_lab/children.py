@@ -110,6 +110,19 @@ class Crew:
         except queue.Empty:
             return None
 
+    def say(self, name: str, word: str) -> None:
+        """Write a line to a child's stdin."""
+        pipe = self.children[name].process.stdin
+        if pipe is not None:
+            with contextlib.suppress(OSError, ValueError):
+                pipe.write(word + "\n")
+                pipe.flush()
+
+    def ask_to_end(self, name: str) -> None:
+        """Tell a child to end in its own way."""
+        with contextlib.suppress(ProcessLookupError):
+            self.children[name].process.terminate()
+
     def running(self) -> list[str]:
         """Names of the children that have not ended."""
         return [name for name, child in self.children.items() if child.process.poll() is None]

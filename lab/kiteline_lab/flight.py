@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.__main__ import AgentSpec, Onboard
+from kiteline_agent.__main__ import Onboard
 from kiteline_agent.alone import AloneChannel
-from kiteline_basestation.__main__ import BaseSpec, Ground, coded_channels
+from kiteline_agent.spec import AgentSpec
+from kiteline_basestation.__main__ import Ground, coded_channels
+from kiteline_basestation.spec import BaseSpec
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
 from kiteline_codec.sync import SyncConfig
-from kiteline_core.ids import AgentId
 from kiteline_hw.lockstep_messages import Down, Phase
 from kiteline_hw.ports import FrameSource, LinkError
 from kiteline_lab.children import Crew, Event, ended_by
@@ -102,8 +103,6 @@ def _fly_alone(onboards: Mapping[int, Onboard], progress: Progress | None) -> No
 
 
 def _fly_joined(onboards: Mapping[int, Onboard], ground: Ground, progress: Progress | None) -> None:
-    for agent in onboards:
-        ground.station.join(AgentId(agent))
     ups = {agent: onboard.hello() for agent, onboard in onboards.items()}
     while True:
         downs = ground.turn(ups)
@@ -164,6 +163,8 @@ class _Supervisor:
         self._bases = 1
         self._flying = {f"agent{spec.agent}" for spec in agents}
         self._base_up = True
+        self._live = base.link.startswith("zenoh:")
+        self._over: set[str] = set()  # live agents that have flown their last frame
         self._errors: dict[str, str] = {}
 
     def run(self) -> None:
@@ -180,11 +181,10 @@ class _Supervisor:
         agent = int(event.child.removeprefix("agent")) if event.child.startswith("agent") else None
         match event.kind:
             case "progress" if agent is not None:
-                self._frames[agent] = event.values["frames"]
-                if self._progress is not None:
-                    self._progress.update(sum(self._frames))
+                self._show(agent, event.values["frames"])
             case "result" if agent is not None:
                 self.outcome.agents[agent] = event.values["report"]
+                self._show(agent, event.values["report"]["frames"])
             case "result":
                 self.outcome.base = event.values["report"]
                 self.outcome.drained = poses_from_json(event.values["keyframes"])
@@ -199,8 +199,17 @@ class _Supervisor:
                     self._note(f"agent {number} ended in mid-flight; the base kept its map")
             case "awaiting_base":
                 self._restart_base()
+            case "frames_over":  # live: the base cannot see for itself when the last frame has come
+                self._over.add(event.child)
+                if self._over >= self._flying:
+                    self._crew.say(self._base_name, "frames_over")
             case "exit":
                 self._ended(event, agent)
+
+    def _show(self, agent: int, frames: int) -> None:
+        self._frames[agent] = frames
+        if self._progress is not None:
+            self._progress.update(sum(self._frames))
 
     def _ended(self, event: Event, agent: int | None) -> None:
         code = event.values["code"]
@@ -211,6 +220,8 @@ class _Supervisor:
             wanted = self._base.kill_at_s >= 0 and self._bases == 1
         else:
             self._flying.discard(event.child)
+            if self._live and not self._flying:
+                self._crew.ask_to_end(self._base_name)
             wanted = self._agents[agent].kill_at_s >= 0
             if wanted:
                 self._note(f"agent {agent} was ended at {self._agents[agent].kill_at_s:g} s of flight, as asked")

@@ -10,8 +10,8 @@ import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from kiteline_agent.__main__ import AgentSpec
-from kiteline_basestation.__main__ import BaseSpec
+from kiteline_agent.spec import AgentSpec
+from kiteline_basestation.spec import BaseSpec
 from kiteline_core.frame import Frame
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
 from kiteline_hw.sources import open_source

@@ -1,0 +1,74 @@
+"""What one agent's flight is told, and what is made of it: configuration and channel."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+from kiteline_codec.channel import CodedChannel, RecordChannel
+from kiteline_codec.sync import SyncConfig
+from kiteline_core import config as configuration
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSpec:
+    """All that one agent's flight is told. Plain values, so that it travels as JSON."""
+
+    source: str
+    folder: str  # for the log and the trajectories
+    log_name: str = "log.mcap"  # "": no log and no trajectories
+    agent: int = 0
+    boot: int = 0
+    link: str = "none"  # LINK, or lockstep:ENDPOINT
+    mono: bool = False
+    imu: bool = True
+    config: str = ""  # a TOML file
+    start_ns: int = 0  # the stamp that is flight time 0
+    seconds: float = 0.0  # s of flight time to fly; 0: all
+    up_bytes_s: int = 0  # B/s that the link takes; 0: any number
+    loss: float = 0.0  # probability that a packet is lost
+    disorder: float = 0.0  # probability that it is doubled, and that it is late
+    seed: int = 0
+    cpu_percent: float = 0.0  # of one core; 0: all of it
+    mavlink: str = ""  # URL of a flight controller
+    axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
+    kill_at_s: float = -1.0  # end like a crash at this flight time
+    await_base_at_s: float = -1.0  # look for a base again at this flight time
+
+
+def from_json(text: str) -> AgentSpec:
+    """A spec from its JSON; unknown keys are an error."""
+    values: dict[str, Any] = json.loads(text)
+    known = {f.name for f in fields(AgentSpec)}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
+    return AgentSpec(**values)
+
+
+def agent_config(path: str) -> AgentConfig:
+    """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError."""
+    if not path:
+        return AgentConfig()
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise configuration.ConfigError(f"{path}: {error}") from error
+    unknown = set(table) - {"agent", "base"}
+    if unknown:
+        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
+    section = table.get("agent", {})
+    if not isinstance(section, dict):
+        raise configuration.ConfigError(f"{path}: [agent] is a section")
+    return configuration.apply(AgentConfig(), section, "agent")
+
+
+def channel_for(spec: AgentSpec) -> RecordChannel:
+    """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1."""
+    if spec.link == "none":
+        return AloneChannel()
+    return CodedChannel(SyncConfig(budget_bytes=spec.up_bytes_s), spec.boot + 1)

@@ -1,0 +1,58 @@
+"""What a base's flight is told, and the configuration made of it."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_core import config as configuration
+
+
+@dataclass(frozen=True, slots=True)
+class BaseSpec:
+    """All that the base's flight is told. Plain values, so that it travels as JSON."""
+
+    folder: str  # for the log, the map and the grid
+    log_name: str = "log.mcap"
+    agents: tuple[int, ...] = ()
+    session: int = 1  # higher than that of any base before it
+    link: str = "none"  # LINK, or lockstep:ENDPOINT
+    config: str = ""  # a TOML file
+    start_ns: int = 0  # the stamp that is flight time 0, so that the log stands in the time of the first source
+    down_bytes_s: int = 0  # B/s that the link to each agent takes; 0: any number
+    loss: float = 0.0  # probability that a packet is lost
+    disorder: float = 0.0  # probability that it is doubled, and that it is late
+    seed: int = 0
+    kill_at_s: float = -1.0  # end like a crash at this flight time
+    store: str = ""
+    web: str = ""
+
+
+def from_json(text: str) -> BaseSpec:
+    """A spec from its JSON; unknown keys are an error."""
+    values: dict[str, Any] = json.loads(text)
+    known = {f.name for f in fields(BaseSpec)}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
+    values["agents"] = tuple(values.get("agents", ()))
+    return BaseSpec(**values)
+
+
+def base_config(path: str) -> BaseConfig:
+    """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
+    if not path:
+        return BaseConfig()
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise configuration.ConfigError(f"{path}: {error}") from error
+    if unknown := set(table) - {"agent", "base"}:
+        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
+    section = table.get("base", {})
+    if not isinstance(section, dict):
+        raise configuration.ConfigError(f"{path}: [base] is a section")
+    return configuration.apply(BaseConfig(), section, "base")

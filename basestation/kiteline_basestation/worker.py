@@ -1,0 +1,99 @@
+"""A process for jobs, so that the mapper's loop never waits for one."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+import time
+from collections import deque
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+
+import cv2
+
+from kiteline_basestation.jobs import Job, JobDone, run_job
+from kiteline_basestation.warm import warm
+
+_END_S = 0.5  # s that a worker may take to end before it is killed
+
+
+def _work(pipe: Connection) -> None:
+    """The worker: one job in, its result and its CPU time in ms out, until the other side is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the base, which then closes the pipe
+    cv2.setNumThreads(1)
+    warm()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            job = pipe.recv()
+            begin_ns = time.process_time_ns()
+            done = run_job(job)
+            pipe.send((done, (time.process_time_ns() - begin_ns) / 1e6))
+
+
+class Worker:
+    """One process that runs jobs in order. A worker that dies is replaced; its job is given to the next."""
+
+    def __init__(self) -> None:
+        self.cpu_ms: dict[str, list[float]] = {}
+        self.deaths = 0
+        self._queue: deque[Job] = deque()
+        self._open: Job | None = None
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(theirs,), name="kiteline-worker", daemon=True)
+        self._process.start()
+        theirs.close()  # so that its end is noticed here, and ours there
+
+    def add(self, jobs: Sequence[Job], now_ns: int) -> None:
+        """Queue jobs."""
+        self._queue.extend(jobs)
+        self._feed()
+
+    def done(self, now_ns: int) -> tuple[JobDone, ...]:
+        """What has been finished since the last call. Never blocks."""
+        results = []
+        try:
+            while self._pipe.poll():
+                result, cpu_ms = self._pipe.recv()
+                if self._open is not None:
+                    self.cpu_ms.setdefault(self._open.kind, []).append(cpu_ms)
+                self._open = None
+                results.append(result)
+                self._feed()
+        except (EOFError, OSError):
+            self._replace()
+        return tuple(results)
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is running or waiting."""
+        return self._open is None and not self._queue
+
+    def _feed(self) -> None:
+        if self._open is None and self._queue:
+            self._open = self._queue.popleft()
+            try:
+                self._pipe.send(self._open)
+            except OSError:
+                self._replace()
+
+    def _replace(self) -> None:
+        self.deaths += 1
+        self.close()
+        if self._open is not None:
+            self._queue.appendleft(self._open)
+            self._open = None
+        self._start()
+        self._feed()
+
+    def close(self) -> None:
+        """End the worker, whatever it does."""
+        self._pipe.close()
+        self._process.join(0.0 if self._open is not None else _END_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
