@@ -13,6 +13,8 @@ from kiteline_hw.ports import SourceReport
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
+_LEAP_NS = 1_000_000_000  # ns; no IMU pauses that long and then goes back in time
+
 
 class ImuSamples(Protocol):
     """Where a source keeps the samples that no frame has claimed yet."""
@@ -77,9 +79,16 @@ class ImuStream:
 
 
 def _usable(t_ns: I64, gyro: F64, accel: F64, last_ns: int, report: SourceReport) -> NDArray[np.bool_]:
-    finite = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    finite = np.asarray(np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1))
     for t in t_ns[~finite]:
         report.skip("imu sample not finite", f"at {t} ns")
+    if len(t_ns) > 2:
+        # One stamp far ahead of both neighbours is itself wrong; else all that follow would count as late.
+        ahead = np.zeros(len(t_ns), np.bool_)
+        ahead[1:-1] = (t_ns[1:-1] - t_ns[:-2] > _LEAP_NS) & (t_ns[1:-1] > t_ns[2:])
+        for t in t_ns[ahead & finite]:
+            report.skip("imu stamp not increasing", f"at {t} ns, far ahead of its neighbours")
+        finite &= ~ahead
     newest = np.maximum.accumulate(np.concatenate([[last_ns], np.where(finite, t_ns, last_ns)]))[:-1]
     late = finite & (t_ns <= newest)
     for t in t_ns[late]:

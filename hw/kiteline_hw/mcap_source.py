@@ -6,9 +6,13 @@ import heapq
 import json
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
@@ -42,6 +46,8 @@ from kiteline_hw.rig_json import rig_from_json
 _HOLD_NS = 200_000_000  # ns; how long a message waits for older ones that were recorded later
 _HOLD_MOST_NS = 1_000_000_000  # ns; how long it waits for a stream that has fallen behind or silent
 _TRUTH_WORDS = ("truth", "ground", "gt", "vicon", "mocap", "optitrack", "leica")
+_GRAVITY_MESSAGES = 200  # messages that tell the unit of acceleration: a second or so
+STANDARD_GRAVITY = 9.80665  # m/s^2
 _DYNAMIC_MOST = 2000  # messages of moving transforms that are looked at when static ones do not connect the sensors
 
 
@@ -58,6 +64,7 @@ class McapSource:
         self.report = SourceReport()
         self._file = file
         self._reader = MessageReader()
+        self._in_g = False
         self._truth: Trajectory | None = None
         self._truth_read = False
         self._notes: tuple[str, ...] = ()
@@ -144,6 +151,9 @@ class McapSource:
         self.imu = None
         if self._imu_channel is not None:
             self.imu = ImuCalibration(rate_hz=self._rate_hz(self._imu_channel) or ImuCalibration().rate_hz)
+            self._in_g = self._accelerations_in_g(self._imu_channel)
+            if self._in_g:
+                self._notes += ("accelerations were in g and are turned to m/s^2",)
         self._truth_topic = None
         self._own = False
 
@@ -176,6 +186,14 @@ class McapSource:
             raise SourceError(f"{self.name}: {faults[0]}")
         best = max(imus, default=None)
         return images, calibrations, best[1] if best else None, best[2] if best else None
+
+    def _accelerations_in_g(self, channel: int) -> bool:
+        """Some drivers send g where ROS wants m/s^2: then gravity has a length near 1."""
+        norms = []
+        for raw in islice(self._file.messages((channel,), ordered=False), _GRAVITY_MESSAGES):
+            with suppress(BadMessage):
+                norms += [float(np.linalg.norm(row[3:])) for _, row in imu_of(self._decode(raw), raw.log_ns)]
+        return bool(norms) and 0.5 < float(np.median(norms)) < 2.0
 
     def _transforms(self) -> list[Transform]:
         channels = [c for c, kind in self._channels() if kind is Kind.TRANSFORM]
@@ -237,7 +255,7 @@ class McapSource:
             for t_ns, channel, item in self._in_order(imu is not None):
                 if channel == self._imu_channel:
                     assert imu is not None
-                    imu.add(t_ns, item)
+                    imu.add(t_ns, (*item[:3], *(a * STANDARD_GRAVITY for a in item[3:])) if self._in_g else item)
                 elif both and channel == self._depth:
                     depths.append((t_ns, item))
                 else:

@@ -385,6 +385,17 @@ def test_faults_in_a_bag_are_skipped_and_counted(tmp_path: Path) -> None:
     assert sum(len(b.t_ns) for b in batches) == 70  # what leads up to a skipped frame comes with the next
 
 
+def test_accelerations_in_g_become_metres_a_second_squared(tmp_path: Path) -> None:
+    bag = stereo_bag(2)
+    for _, _, kind, value in bag.messages:
+        if kind == "sensor_msgs/msg/Imu":
+            value["linear_acceleration"] = xyz(np.array([0.0, 0.0, 1.0]))
+    source = open_source(str(bag.write(tmp_path / "a.mcap")))
+    _, batches = read(source)
+    np.testing.assert_allclose(batches[-1].accel, [[0, 0, 9.80665]] * 10)
+    assert "in g" in source.report.notes[0]
+
+
 def test_raw_pixels_and_depth(tmp_path: Path) -> None:
     bag = Bag()
     bag.info(START_NS, "rgb", d=())
