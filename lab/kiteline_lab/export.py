@@ -2,25 +2,48 @@
 
 from __future__ import annotations
 
+import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.export import g2o, tum
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.outputs import keyframe_poses, map_files
+from kiteline_basestation.station import Station
+from kiteline_basestation.store import restore
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.schema import WireError
+from kiteline_codec.sync import SyncConfig
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
 
 I64 = NDArray[np.int64]
 
+STORE_FILE = "values.klstore"  # what `kiteline base --store DIR` keeps in DIR
 FORMATS = ("tum", "ply", "pgm", "g2o")
 ESSENTIAL_POINTS = 100  # points that two keyframes share for an edge of the essential graph (ORB-SLAM2)
 
 
 class ExportError(Exception):
     """A map that cannot be exported so. The text says what was found and what was expected."""
+
+
+def load(store: Path) -> Mapper:
+    """The map that a base kept. store: the folder of `--store`, or the file in it. Raises ExportError."""
+    path = store / STORE_FILE if store.is_dir() else store
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    try:
+        restore(station, path.read_bytes(), 0)
+    except OSError as e:
+        raise ExportError(f"{path}: {e.strerror or e}; expected what `kiteline base --store` keeps") from None
+    except WireError as e:
+        raise ExportError(f"{path}: {e}") from None
+    return station.mapper
 
 
 def files(mapper: Mapper, kind: str, name: str, agent: int | None = None) -> dict[str, bytes]:
@@ -64,3 +87,25 @@ def _graph(mapper: Mapper) -> bytes:
         pairs |= {(min(i, number[n]), max(i, number[n])) for n in near if n in number}
     edges: I64 = np.array(sorted(pairs), np.int64).reshape(-1, 2)
     return g2o(np.array(list(poses), np.int64), np.array(list(poses.values())).reshape(-1, 4, 4), edges)
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; the exit status."""
+    parser = argparse.ArgumentParser(prog="kiteline export", description="A base's map in the formats of other tools.")
+    parser.add_argument("store", type=Path, metavar="STORE", help="the folder given to `kiteline base --store`")
+    parser.add_argument("--format", choices=FORMATS, required=True)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="F", help="file to write; pgm: a YAML file beside it"
+    )
+    parser.add_argument("--agent", type=int, help="tum: whose trajectory, where there are several")
+    args = parser.parse_args(argv)
+    try:
+        made = files(load(args.store), args.format, args.out.name, args.agent)
+    except ExportError as e:
+        print(f"kiteline export: {e}", file=sys.stderr)
+        return 2
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    for name, content in made.items():
+        (args.out.parent / name).write_bytes(content)
+        print(args.out.parent / name)
+    return 0

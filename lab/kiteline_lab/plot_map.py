@@ -98,15 +98,8 @@ def plot_map(out: Path, png: Path, title: str = "") -> None:
     axes.set_ylim(y0, y1)
     if title:
         axes.set_title(title, loc="left", fontsize=11, color=INK, fontweight="bold")
-    legend = figure.legend(
-        loc="outside lower center",
-        ncols=5,
-        frameon=False,
-        fontsize=9,
-        labelcolor=INK,
-        handlelength=1.4,
-        columnspacing=1.6,
-    )
+    look = {"frameon": False, "fontsize": 9, "labelcolor": INK, "handlelength": 1.4, "columnspacing": 1.6}
+    legend = figure.legend(loc="outside lower center", ncols=5, **look)
     for handle in legend.legend_handles:
         if handle is not None and hasattr(handle, "set_markersize") and handle.get_label() in dict(LABELS):
             handle.set_markersize(5)

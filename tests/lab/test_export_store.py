@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.store import Codes, pack
+from kiteline_codec import messages
 from kiteline_codec.schema import Births, Camera, Head, Record
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_lab import trajectories
-from kiteline_lab.export import ExportError, files
+from kiteline_lab.export import STORE_FILE, ExportError, files, main
 from kiteline_lab.grid_eval import read_grid
 from kiteline_lab.plot_map import read_map_ply
 
@@ -81,3 +83,22 @@ def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     assert read_grid(tmp_path / "plan.yaml").cell_m == mapper.config.grid.cell_m
     assert read_map_ply(tmp_path / "a.ply").xyz.shape[1] == 3
+
+
+def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = {messages.key(r): messages.encode(r) for r in records(0)}
+    (tmp_path / STORE_FILE).write_bytes(pack({AgentId(0): Codes(codes, {})}))
+    assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")
+    found = trajectories.read(str(tmp_path / "new" / "a.tum")).trajectory.T_w_b[:, :3, 3]
+    np.testing.assert_allclose(found, [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]], atol=2e-3)  # as coarse as codes are
+    assert main([str(tmp_path / STORE_FILE), "--format", "pgm", "--out", str(tmp_path / "plan.pgm")]) == 0
+    assert read_grid(tmp_path / "plan.yaml").cell_m > 0
+
+
+def test_stores_that_are_none_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "wrong").write_bytes(b"hello")
+    for store in ("wrong", "missing"):
+        assert main([str(tmp_path / store), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 2
+        assert store in capsys.readouterr().err
+    assert not (tmp_path / "a.ply").exists()
