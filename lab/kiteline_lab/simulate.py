@@ -21,7 +21,7 @@ from kiteline_lab.progress import Progress
 
 GRID_LOW_M, GRID_HIGH_M = 0.1, 2.0  # above the floor: what stands in the way of a small vehicle
 GRID_CELL_M = 0.05
-JPEG_QUALITY = 95
+JPEG_QUALITY = 92
 COURSE = "course"  # in place of a trajectory: the scene's own course
 
 

@@ -109,17 +109,16 @@ def box_hit(boxes: F64, i: int, o: F64, dx: float, dy: float, dz: float, from_in
     ix, iy, iz = 1.0 / ex, 1.0 / ey, 1.0 / ez
     mx, my, mz = -(c * ox + s * oy) * ix, -(c * oy - s * ox) * iy, (boxes[i, 2] - o[2]) * iz
     sx, sy, sz = boxes[i, 3] * abs(ix), boxes[i, 4] * abs(iy), boxes[i, 5] * abs(iz)
+    low, high = max(mx - sx, my - sy, mz - sz), min(mx + sx, my + sy, mz + sz)
+    if low > high or high <= 0.0:
+        return np.inf, 0
     if from_inside:
-        high = min(mx + sx, my + sy, mz + sz)
-        if high <= 0.0:
-            return np.inf, 0
         if high == mx + sx:
             return high, 1 if ix > 0.0 else 0
         if high == my + sy:
             return high, 3 if iy > 0.0 else 2
         return high, 5 if iz > 0.0 else 4
-    low = max(mx - sx, my - sy, mz - sz)
-    if low <= 0.0 or low > min(mx + sx, my + sy, mz + sz):
+    if low <= 0.0:
         return np.inf, 0
     if low == mx - sx:
         return low, 0 if ix > 0.0 else 1

@@ -10,7 +10,7 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 
-_STILL_PX = 0.25  # a shorter streak is not worth resampling
+_STILL_PX = 0.7  # a shorter streak blurs less than resampling it would
 _MOST_TAPS = 17
 
 
