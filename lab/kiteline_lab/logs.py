@@ -97,7 +97,8 @@ def _print(facts: dict[str, object], topics: list[dict[str, object]], file: Mcap
     if file.cut or file.notes:
         print("  mend it with: kiteline log recover FILE OUT")
     for record in file.metadata:
-        for key, value in record.metadata.items():
+        for key, text in record.metadata.items():
+            value = " ".join(text.split())
             print(f"  {record.name}.{key}: {value if len(value) <= 100 else value[:97] + '...'}")
     width = max((len(str(t["topic"])) for t in topics), default=0)
     for t in topics:
