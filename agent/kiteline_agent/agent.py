@@ -5,13 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
-from kiteline_core import se3
-from kiteline_core.cameras import CameraRig, Rectifier
-from kiteline_core.features import build_pyramid
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 from numpy.typing import NDArray
 
 from kiteline_agent import keyframes
@@ -20,6 +13,13 @@ from kiteline_agent.inertial import GyroPreintegrator, level_rotation
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.tracker import Track, Tracker, View
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
+from kiteline_core import se3
+from kiteline_core.cameras import CameraRig, Rectifier
+from kiteline_core.features import build_pyramid
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
 F64 = NDArray[np.float64]
 
@@ -193,9 +193,7 @@ class Agent:
                 self._gyro.correct(R_b_c @ self._step_T[:3, :3] @ R_b_c.T, turn_R_b0_b1, dt_s)
         self._failures = 0
         self.map.note_tracking(track.rows, track.inlier, self._frame_number)
-        self.map.sharpen(
-            track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, _SHARPEN_INFLATION
-        )
+        self.map.sharpen(track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, _SHARPEN_INFLATION)
         self._refresh_relative()
 
     def _refresh_relative(self) -> None:

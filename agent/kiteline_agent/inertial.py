@@ -1,11 +1,12 @@
-"""What the IMU tells the tracker: which way is up at the start, and how far the vehicle has turned since the last frame."""
+"""What the IMU tells the tracker: which way is up at the start, how far it has turned since the last frame."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import se3
 from kiteline_core.frame import ImuBatch
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Births, Head, Sightings
-from kiteline_codec.sections import split_births, split_sightings
-from kiteline_core import alignment_kernels, se3
-from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.keyframes import NewPoints, new_points
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.tracker import Track, View
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import Births, Head, Sightings
+from kiteline_codec.sections import split_births, split_sightings
+from kiteline_core import alignment_kernels, se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class KeyframeMaker:
         self, view: View, track: Track | None, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
         frame_number: int,
     ) -> F64:  # fmt: skip
-        """Share and remember a keyframe; its pose T_m_k (4,4) as both sides hold it. Without a track it begins a map."""
+        """Share and remember a keyframe; its pose T_m_k (4,4) as both sides hold it. Without a track, a map begins."""
         if track is None:
             fresh, rows = self._fresh, np.zeros(0, np.int64)
             if fresh is None:
@@ -65,7 +65,7 @@ class KeyframeMaker:
             shared = self._channel.put(part)
             assert isinstance(shared, Births)
             uv[shared.index], rho[shared.index] = shared.uv, shared.inv_depth
-        for section in split_sightings(sightings, 1.0 / (1.0 + sightings.octave)):
+        for section in split_sightings(sightings, 1.0 / (1.0 + sightings.octave.astype(np.float64))):
             self._channel.put(section)
         T_m_k = self._placed(shared_head)
         self._remember(view, shared_head, T_m_k, uv, rho, births.octave, frame_number)
@@ -117,5 +117,5 @@ class KeyframeMaker:
 
 
 def _depth_camera_sigma(rho: F64) -> F64:
-    """Deviation of inverse depth (n,) 1/m of a structured-light camera (K. Khoshelham, S. Elberink, 2012): it is constant."""
+    """Deviation of inverse depth (n,) 1/m of a structured-light camera: constant (K. Khoshelham, S. Elberink, 2012)."""
     return np.full(len(rho), 2.85e-3)

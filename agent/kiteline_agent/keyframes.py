@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from kiteline_core import features, se3, stereo_kernels
-from kiteline_core.cameras import RectifiedCamera
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, KeyframeConfig
 from kiteline_agent.tracker import Track, View, depth_at
+from kiteline_core import features, se3, stereo_kernels
+from kiteline_core.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 

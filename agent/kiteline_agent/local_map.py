@@ -9,15 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent import local_map_kernels as kernels
+from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_codec.schema import Culled, Depths, Found, Head, Pose, Removed
 from kiteline_core import se3
 from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, PointId, point_id
-from numpy.typing import NDArray
-
-from kiteline_agent import local_map_kernels as kernels
-from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -92,7 +92,7 @@ class LocalMap:
 
     def point_ids(self, rows: I64) -> I64:
         """Point ids (n,) of rows (n,)."""
-        return (self.keyframe[rows // self.births] << KEYPOINT_BITS) | (rows % self.births)
+        return np.asarray((self.keyframe[rows // self.births] << KEYPOINT_BITS) | (rows % self.births))
 
     def add(
         self, head: Head, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
@@ -100,7 +100,8 @@ class LocalMap:
     ) -> int:  # fmt: skip
         """Remember a keyframe with its births; the slot that it got. The slot seen least recently makes room.
 
-        uv: (n,2) px. rho, sigma_rho: (n,) 1/m, rho 0: depth unknown, the point waits for the base. templates: (n,3,21,21).
+        uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: depth unknown, the point waits for the base.
+        templates: (n,3,21,21).
         """
         slot = self._free_slot(head.parent)
         n = min(len(uv), self.births)
@@ -124,7 +125,7 @@ class LocalMap:
 
     def _bearings(self, uv: F64) -> F64:
         c = self.camera
-        return (uv - np.array([c.cx, c.cy])) / np.array([c.fx, c.fy])
+        return np.asarray((uv - np.array([c.cx, c.cy])) / np.array([c.fx, c.fy]))
 
     def _free_slot(self, parent: KeyframeId) -> int:
         empty = np.flatnonzero(self.keyframe == NO_KEYFRAME)
@@ -140,11 +141,11 @@ class LocalMap:
             T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.counts, self.usable,
             self.bearing, self.rho, self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip
-        return Candidates(
-            self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n]
-        )
+        return Candidates(self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n])
 
-    def sharpen(self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float) -> None:
+    def sharpen(
+        self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float
+    ) -> None:
         """Mend the inverse depths of rows by where they were seen from T_c_m."""
         floor = self._filtering.floor_px / self.camera.bf
         kernels.sharpen(
@@ -212,4 +213,4 @@ class LocalMap:
         if slot < 0 or index >= self.counts[slot]:
             return None
         b = np.array([self.bearing[slot, index, 0], self.bearing[slot, index, 1], 1.0]) / self.rho[slot, index]
-        return se3.transform(self.T_m_k[slot], b[None, :])[0]
+        return np.asarray(se3.transform(self.T_m_k[slot], b[None, :])[0])

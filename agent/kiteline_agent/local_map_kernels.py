@@ -3,17 +3,37 @@
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 
 @njit
-def project(T_c_m, camera, size, margin_px, max_scale, slots, T_m_k, counts, usable, bearing, rho, sigma_rho, out_row, out_uv, out_warp, out_xyz, out_ray, out_depth):  # type: ignore[no-untyped-def]
+def project(  # type: ignore[no-untyped-def]
+    T_c_m,
+    camera,
+    size,
+    margin_px,
+    max_scale,
+    slots,
+    T_m_k,
+    counts,
+    usable,
+    bearing,
+    rho,
+    sigma_rho,
+    out_row,
+    out_uv,
+    out_warp,
+    out_xyz,
+    out_ray,
+    out_depth,
+):
     """Project the usable points of keyframe slots into a camera.
 
     T_c_m: (4,4). camera: fx, fy, cx, cy, bf. size: width, height px. slots: (s,) int64. T_m_k: (K,4,4). counts: (K,).
-    usable: (K,B) bool. bearing: (K,B,2) x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth and its deviation, 1/m.
-    Out, capacity K*B: out_row slot*B+index, out_uv px, out_warp (2,2) d(px here)/d(px in the keyframe), out_xyz m in the
-    submap frame, out_ray m (one deviation of depth as a vector in m), out_depth m. Returns how many were written.
+    usable: (K,B) bool. bearing: (K,B,2) x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth, its deviation,
+    1/m. Out, capacity K*B: out_row slot*B+index, out_uv px, out_warp (2,2) d(px here)/d(px in the keyframe), out_xyz
+    m in the submap frame, out_ray m (one deviation of depth as a vector), out_depth m. Returns how many were written.
     """
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     births = usable.shape[1]
@@ -101,7 +121,8 @@ def sharpen(T_c_m, camera, rows, inlier, observed, sigma_px, inflate, floor_rho,
     """Scalar Kalman update of inverse depths from where points were seen, the pose held fixed.
 
     rows: (n,) slot*B+index. observed: (n,3) u, v, disparity px (< 0: none). sigma_px: (n,). inflate: factor on the
-    variance of a sighting, for the pose's own error and for errors shared by successive sightings. rho, sigma_rho: in, out.
+    variance of a sighting, for the pose's own error and for errors that successive sightings share. rho, sigma_rho: in,
+    out.
     """
     fx, fy, cx, cy, bf = camera[0], camera[1], camera[2], camera[3], camera[4]
     births = rho.shape[1]

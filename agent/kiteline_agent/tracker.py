@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from kiteline_core import alignment_kernels, pose_kernels, se3, stereo_kernels
-from kiteline_core.features import Pyramid
 from numpy.typing import NDArray
 
 from kiteline_agent import local_map_kernels
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map import Candidates, LocalMap
+from kiteline_core import alignment_kernels, pose_kernels, se3, stereo_kernels
+from kiteline_core.features import Pyramid
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -31,9 +31,9 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """What the tracker measured. T_c_m: (4,4). rows: (n,) of the local map. observed: (n,3) u, v, disparity px (< 0 none).
-    sigma_px: (n,). depth_m: (n,) of the points in the camera. inlier: (n,). information: (6,6) of T_c_m, left perturbation.
-    inliers: how many. rms: whitened error of the inliers. tried: how many points were looked for.
+    """What the tracker measured. T_c_m: (4,4). rows: (n,) of the local map. observed: (n,3) u, v, disparity px (< 0:
+    none). sigma_px: (n,). depth_m: (n,) of the points in the camera. inlier: (n,). information: (6,6) of T_c_m, left
+    perturbation. inliers: how many. rms: whitened error of the inliers. tried: how many points were looked for.
     """
 
     T_c_m: F64
@@ -110,11 +110,17 @@ class Tracker:
             T, candidates.xyz[chosen], candidates.ray[chosen], observed, sigma_px, self._map.intrinsics,
             T_c_m, self._zero_prior, config.pose.rounds, config.pose.iterations, config.pose.chi2, inlier, information,
         )  # fmt: skip
-        if not coarse_only:
-            tried = candidates.rows[chosen] if len(rows) == 0 else rows
-            del tried
         return Track(
-            se3.orthonormalise(T), rows, observed, sigma_px, depth, inlier, information, int(inliers), float(rms), len(found)
+            se3.orthonormalise(T),
+            rows,
+            observed,
+            sigma_px,
+            depth,
+            inlier,
+            information,
+            int(inliers),
+            float(rms),
+            len(found),
         )
 
     def _add_disparities(self, view: View, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64) -> None:

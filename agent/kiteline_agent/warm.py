@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.cameras import CameraModel, CameraRig
-from kiteline_core.frame import Frame
-from kiteline_core.ids import AgentId
-from kiteline_core.se3 import from_rt
 
 from kiteline_agent.agent import Agent, Identity, StepInput
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_core.frame import Frame
+from kiteline_core.ids import AgentId
+from kiteline_core.se3 import from_rt
 
 
 def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> None:

@@ -8,6 +8,7 @@ both drop out of the normal equations. Templates are warped by the affine map th
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 PATCH_RADIUS = 4  # a patch is 9x9 px of the level at which it is compared
@@ -121,7 +122,7 @@ def _prepare(reference, gx, gy, t0):  # type: ignore[no-untyped-def]
 
 @njit
 def _iterate(image, t0, gx, gy, tt, h00, h01, h11, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
-    """Move (x, y) until the patch there looks like t0. Returns (x, y, ncc, converged)."""
+    """Move (x, y) until the patch there looks like t0. Returns (x, y, ncc, whether it stayed inside)."""
     h, w = image.shape
     det = h00 * h11 - h01 * h01
     if det < 1e-3 * (h00 + h11) ** 2 * 0.25 or h00 + h11 < 1.0:
@@ -179,7 +180,7 @@ def _iterate(image, t0, gx, gy, tt, h00, h01, h11, x, y, iterations, max_step): 
         converged = norm < 0.02
         if abs(x - start_x) > max_step or abs(y - start_y) > max_step:
             return x, y, 0.0, False
-    return x, y, ncc, converged or True
+    return x, y, ncc, True
 
 
 @njit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 DESCRIPTOR_RADIUS = 15  # px around a corner that orientation and descriptor look at

@@ -26,7 +26,7 @@ def _pattern() -> NDArray[np.float64]:
         state = state * 48271 % 2147483647
         draws[i] = state / 2147483647
     normal = draws.reshape(256, 4, 12).sum(axis=2) - 6.0  # Irwin-Hall: a Gaussian to 1 %
-    return np.clip(np.round(normal * 6.2), -PATTERN_REACH_PX, PATTERN_REACH_PX)
+    return np.asarray(np.clip(np.round(normal * 6.2), -PATTERN_REACH_PX, PATTERN_REACH_PX))
 
 
 PATTERN = _pattern()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 
@@ -65,11 +66,13 @@ def _solve6(h, g, x):  # type: ignore[no-untyped-def]
 
 
 @njit
-def optimise_pose(T_c_m, points, depth_ray, observed, sigma_px, camera, prior, prior_weight, rounds, iterations, chi2, inlier, h_out):  # type: ignore[no-untyped-def]
+def optimise_pose(  # type: ignore[no-untyped-def]
+    T_c_m, points, depth_ray, observed, sigma_px, camera, prior, prior_weight, rounds, iterations, chi2, inlier, h_out
+):
     """Gauss-Newton with Huber weights; after each round outliers leave (or come back), as in ORB-SLAM2 section V.
 
     T_c_m: (4,4) pose, start in, result out. points: (n,3) m. depth_ray: (n,3) one standard deviation of the point along
-    the ray on which it hangs, in m; zeros for well-known points. observed: (n,3) u, v, disparity px (disparity < 0: none).
+    the ray on which it hangs, in m; zeros for well-known points. observed: (n,3) u, v, disparity px (< 0: none).
     sigma_px: (n,) of one coordinate. camera: fx, fy, cx, cy, bf. prior: (4,4) predicted T_c_m; prior_weight: (6,)
     information of its error [translation 1/m^2, rotation 1/rad^2], zeros for none. chi2: threshold of squared whitened
     error for 2 measurements; 3 measurements use chi2 * 1.3. inlier: (n,) bool, in and out.
@@ -88,8 +91,8 @@ def optimise_pose(T_c_m, points, depth_ray, observed, sigma_px, camera, prior, p
     dt = np.zeros(3)
     count = 0
     total = 0.0
-    for rnd in range(rounds):
-        for it in range(iterations):
+    for _round in range(rounds):
+        for _iteration in range(iterations):
             for a in range(6):
                 g[a] = 0.0
                 for b in range(6):
@@ -97,7 +100,9 @@ def optimise_pose(T_c_m, points, depth_ray, observed, sigma_px, camera, prior, p
             for i in range(n):
                 if not inlier[i]:
                     continue
-                w, ok = _point_terms(T_c_m, points[i], depth_ray[i], observed[i], sigma_px[i], fx, fy, cx, cy, bf, jac, res, v)
+                ok = _point_terms(
+                    T_c_m, points[i], depth_ray[i], observed[i], sigma_px[i], fx, fy, cx, cy, bf, jac, res, v
+                )
                 if not ok:
                     continue
                 rows = 3 if observed[i, 2] >= 0.0 else 2
@@ -167,7 +172,7 @@ def optimise_pose(T_c_m, points, depth_ray, observed, sigma_px, camera, prior, p
         count = 0
         total = 0.0
         for i in range(n):
-            w, ok = _point_terms(T_c_m, points[i], depth_ray[i], observed[i], sigma_px[i], fx, fy, cx, cy, bf, jac, res, v)
+            ok = _point_terms(T_c_m, points[i], depth_ray[i], observed[i], sigma_px[i], fx, fy, cx, cy, bf, jac, res, v)
             if not ok:
                 inlier[i] = False
                 continue
@@ -206,7 +211,7 @@ def _point_terms(T, p, ray, obs, sigma, fx, fy, cx, cy, bf, jac, res, v):  # typ
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z < 0.05:
-        return 0.0, False
+        return False
     iz = 1.0 / z
     u = x * iz
     w = y * iz
@@ -232,4 +237,4 @@ def _point_terms(T, p, ray, obs, sigma, fx, fy, cx, cy, bf, jac, res, v):  # typ
     v[0] = a0 * rx + a2 * rz
     v[1] = b1 * ry + b2 * rz
     v[2] = c2 * rz
-    return 1.0, True
+    return True

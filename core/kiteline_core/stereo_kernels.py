@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_core.jit import njit
 
 RADIUS = 4
@@ -13,7 +14,7 @@ SIDE = 2 * RADIUS + 1
 def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity):  # type: ignore[no-untyped-def]
     """Coarse disparity of pixels by zero-mean SAD over whole rows, at pyramid level max(octave, 1).
 
-    left, right: tuples of uint8 pyramids. uv: (n,2) level-0 px. uniqueness: the second-best cost must be at least this
+    left, right: tuples of uint8 pyramids. uv: (n,2) level-0 px. uniqueness: the second-best cost must exceed this
     factor of the best. disparity: (n,) float64 out, level-0 px, -1 where there is no sure match.
     """
     levels = len(left)
@@ -32,15 +33,13 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
         mean = 0
         for r in range(SIDE):
             for c in range(SIDE):
-                v = np.int32(a[y + r - RADIUS, x + c - RADIUS])
-                patch[r, c] = v
-                mean += v
+                patch[r, c] = a[y + r - RADIUS, x + c - RADIUS]
+                mean += patch[r, c]
         mean = mean // (SIDE * SIDE)
         reach = min(int(max_disparity_px / s) + 1, x - RADIUS)
         best = 1 << 30
         second = 1 << 30
         best_d = -1
-        previous_d = -10
         for d in range(-1, reach + 1):
             xr = x - d
             if xr + RADIUS >= w:
@@ -49,24 +48,21 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
             for r in range(SIDE):
                 row = y + r - RADIUS
                 for c in range(SIDE):
-                    other += np.int32(b[row, xr + c - RADIUS])
+                    other += int(b[row, xr + c - RADIUS])
             shift = mean - other // (SIDE * SIDE)
             cost = 0
             for r in range(SIDE):
                 row = y + r - RADIUS
                 for c in range(SIDE):
-                    cost += abs(patch[r, c] - np.int32(b[row, xr + c - RADIUS]) - shift)
+                    cost += abs(patch[r, c] - int(b[row, xr + c - RADIUS]) - shift)
             if cost < best:
                 if d - best_d > 2:
                     second = best
                 best = cost
-                previous_d = best_d
                 best_d = d
             elif cost < second and d - best_d > 2:
                 second = cost
-        if best_d < 0 and previous_d < 0 and best_d != -1:
-            continue
-        if best < (1 << 30) and second >= uniqueness * best:
+        if best < (1 << 30) and second > uniqueness * best:
             disparity[i] = max(best_d * s, 0.0)
 
 

@@ -1,0 +1,129 @@
+"""The agent on recordings and on bad frames: it follows the truth, survives faults, and stays continuous."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+from kiteline_core import se3
+from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.ids import AgentId
+from kiteline_hw.ports import FrameSource
+from kiteline_hw.sources import open_source
+
+
+def fly(source: FrameSource, frames: Iterable[Frame | ImuBatch], config: AgentConfig | None = None) -> list[Estimate]:
+    agent = Agent(source.rig, source.imu, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    out: list[Estimate] = []
+    imu: ImuBatch | None = None
+    for item in frames:
+        if isinstance(item, ImuBatch):
+            imu = item
+            continue
+        estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
+        assert estimate is not None
+        out.append(estimate)
+        imu = None
+    return out
+
+
+def first_frames(source: FrameSource, n: int) -> list[Frame | ImuBatch]:
+    items: list[Frame | ImuBatch] = []
+    for item in source:
+        items.append(item)
+        n -= isinstance(item, Frame)
+        if n == 0:
+            break
+    return items
+
+
+def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> NDArray[np.float64]:
+    """Error of the motion between frames that have a true pose at their time."""
+    truth = source.ground_truth
+    assert truth is not None
+    at = {int(t): T for t, T in zip(truth.t_ns, truth.T_w_b)}
+    known = [e for e in estimates if e.t_ns in at and e.T_m_b is not None]
+    errors = []
+    for a, b in pairwise(known):
+        assert a.T_m_b is not None and b.T_m_b is not None
+        true = se3.inverse(at[a.t_ns]) @ at[b.t_ns]
+        errors.append(np.linalg.norm((se3.inverse(true) @ se3.inverse(a.T_m_b) @ b.T_m_b)[:3, 3]))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_room_flight_is_followed_to_millimetres(data_dir: Path, with_imu: bool) -> None:
+    source = open_source(str(data_dir / "room_flight.mcap"), imu=with_imu)
+    estimates = fly(source, first_frames(source, 60))
+    assert all(e.tracked for e in estimates)
+    errors = step_errors_m(source, estimates)
+    assert len(errors) > 20
+    assert np.sqrt((errors**2).mean()) < 0.004
+
+
+def test_kitti_is_followed(data_dir: Path) -> None:
+    source = open_source(str(data_dir / "kitti_straight"))
+    estimates = fly(source, first_frames(source, 20))
+    assert all(e.tracked for e in estimates)
+    assert np.sqrt((step_errors_m(source, estimates) ** 2).mean()) < 0.025
+
+
+def test_two_runs_give_the_same_bits(data_dir: Path) -> None:
+    runs = []
+    for _ in range(2):
+        source = open_source(str(data_dir / "room_flight.mcap"))
+        runs.append(fly(source, first_frames(source, 15)))
+    for a, b in zip(*runs):
+        assert a.T_o_b.tobytes() == b.T_o_b.tobytes()
+
+
+def jump_m(estimates: list[Estimate]) -> float:
+    p = np.array([e.T_o_b[:3, 3] for e in estimates])
+    return float(np.linalg.norm(np.diff(p, axis=0), axis=1).max())
+
+
+@pytest.mark.parametrize("fault", ["black", "frozen", "half", "dropped", "exposure", "swapped"])
+def test_faults_on_frames_are_survived(data_dir: Path, fault: str) -> None:
+    source = open_source(str(data_dir / "room_flight.mcap"))
+    frames = [f for f in first_frames(source, 44) if isinstance(f, Frame)]
+    for k in range(20, 23):
+        f = frames[k]
+        assert f.right is not None
+        if fault == "black":
+            frames[k] = replace(f, left=np.zeros_like(f.left), right=np.zeros_like(f.right))
+        elif fault == "frozen":
+            frames[k] = replace(frames[19], t_ns=f.t_ns)
+        elif fault == "half":
+            frames[k] = replace(f, right=None)
+        elif fault == "exposure":
+            frames[k] = replace(f, left=(f.left * 0.55).astype(np.uint8), right=(f.right * 0.55).astype(np.uint8))
+        elif fault == "swapped":
+            frames[k] = replace(f, left=f.right, right=f.left)
+    if fault == "dropped":
+        del frames[20:23]
+    estimates = fly(source, frames)
+    assert all(e.tracked for e in estimates[-18:])
+    assert all(np.isfinite(e.T_o_b).all() for e in estimates)
+    assert jump_m(estimates) < 0.35
+
+
+def test_nothing_to_see_is_no_error() -> None:
+    from kiteline_core.cameras import CameraModel, CameraRig
+
+    camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
+    rig = CameraRig(camera, camera, np.eye(4), se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
+    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    grey = np.full((240, 320), 100, np.uint8)
+    for k in range(6):
+        estimate = agent.step(StepInput(Frame(k * 50_000_000, grey, grey)), k * 50_000_000).estimate
+        assert estimate is not None and not estimate.tracked
+        assert estimate.quality == -1 and estimate.T_m_b is None

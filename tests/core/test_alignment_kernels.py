@@ -1,0 +1,91 @@
+"""Template alignment: it finds known displacements to a fraction of a pixel, whatever brightness does."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_core import alignment_kernels as kernels
+from kiteline_core.features import build_pyramid
+
+
+def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> NDArray[np.float64]:
+    """A smooth random image with detail at many scales, 40..215."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros(shape)
+    for sigma, weight in ((1.2, 1.0), (3.0, 2.0), (8.0, 3.0)):
+        layer = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), sigma)
+        out += weight * layer / layer.std()
+    return 127.0 + 30.0 * out / out.std()
+
+
+def warped(image: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The image as seen when its pixel p moves to matrix @ (p, 1)."""
+    h, w = image.shape
+    moved = cv2.warpAffine(image, matrix, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return np.clip(np.round(moved), 0, 255).astype(np.uint8)
+
+
+def run(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    uv: NDArray[np.float64],
+    warp: NDArray[np.float64],
+    guess: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    n = len(uv)
+    octave = np.zeros(n, np.uint8)
+    templates = np.empty((n, kernels.TEMPLATE_LEVELS, kernels.TEMPLATE, kernels.TEMPLATE), np.uint8)
+    kernels.cut_templates(build_pyramid(first, 4), uv, octave, templates)
+    out, found, ncc = guess.copy(), np.zeros(n, np.bool_), np.zeros(n)
+    warps = np.tile(warp, (n, 1, 1))
+    pyramid = build_pyramid(second, 4)
+    kernels.align(pyramid, templates, np.arange(n), octave, warps, out, 2, 1, 8, 7.0, 0.8, found, ncc)
+    kernels.align(pyramid, templates, np.arange(n), octave, warps, out, 1, 0, 8, 3.0, 0.8, found, ncc)
+    return out, found
+
+
+POINTS = np.array([[x, y] for y in range(60, 190, 26) for x in range(60, 270, 30)], np.float64)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.7, 20.0), (1.15, -12.0)])
+@pytest.mark.parametrize("shift", [(0.4, -0.3), (6.3, 4.8), (-7.2, 5.6)])
+def test_finds_shifts_to_a_tenth_of_a_pixel(shift: tuple[float, float], gain: float, offset: float) -> None:
+    image = texture(1)
+    matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
+    second = np.clip(warped(image, matrix) * gain + offset, 0, 255).astype(np.uint8)
+    out, found = run(warped(image, np.eye(2, 3)), second, POINTS, np.eye(2), POINTS)
+    assert found.mean() > 0.8
+    error = np.linalg.norm(out[found] - POINTS[found] - shift, axis=1)
+    assert np.median(error) < 0.1
+    assert np.percentile(error, 90) < 0.25
+
+
+@pytest.mark.parametrize(("angle_deg", "scale"), [(20.0, 1.0), (-35.0, 1.0), (10.0, 1.3), (0.0, 0.75), (5.0, 1.9)])
+def test_warps_make_turns_and_zooms_alignable(angle_deg: float, scale: float) -> None:
+    image = texture(2)
+    matrix = cv2.getRotationMatrix2D((160.0, 120.0), angle_deg, scale)
+    truth = POINTS @ matrix[:, :2].T + matrix[:, 2]
+    inside = (truth > 25).all(axis=1) & (truth[:, 0] < 295) & (truth[:, 1] < 215)
+    guess = truth + np.array([1.4, -1.1])
+    out, found = run(warped(image, np.eye(2, 3)), warped(image, matrix), POINTS, matrix[:, :2].copy(), guess)
+    good = found & inside
+    assert good.sum() > 0.7 * inside.sum()
+    assert np.median(np.linalg.norm(out[good] - truth[good], axis=1)) < 0.12
+
+
+def test_rejects_what_is_not_there() -> None:
+    _, found = run(warped(texture(3), np.eye(2, 3)), warped(texture(4), np.eye(2, 3)), POINTS, np.eye(2), POINTS)
+    assert found.mean() < 0.1
+
+
+def test_flat_images_give_nothing() -> None:
+    flat = np.full((240, 320), 90, np.uint8)
+    assert not run(flat, flat, POINTS, np.eye(2), POINTS)[1].any()
+
+
+def test_sample_is_bilinear() -> None:
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert kernels.sample(image, 1.25, 0.5) == pytest.approx(1.25 + 2.0)

@@ -1,0 +1,104 @@
+"""Corners and descriptors: spread, repeatable, and the same as written plainly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core import feature_kernels as kernels
+from kiteline_core import features
+from kiteline_core.features import DetectorConfig, build_pyramid, describe, detect
+
+
+def blobs(seed: int, turn_deg: float = 0.0) -> NDArray[np.uint8]:
+    """A grey image with many distinct patches of different shape, perhaps turned about its centre."""
+    rng = np.random.default_rng(seed)
+    image = np.full((400, 400), 120, np.uint8)
+    for _ in range(260):
+        x, y = rng.integers(10, 390, 2)
+        w, h = rng.integers(4, 26, 2)
+        box = cv2.boxPoints(((float(x), float(y)), (float(w), float(h)), float(rng.uniform(0, 90))))
+        cv2.fillConvexPoly(image, box.astype(np.int32), int(rng.integers(20, 235)), cv2.LINE_AA)
+    image = cv2.GaussianBlur(image, (0, 0), 0.8)
+    if turn_deg:
+        image = cv2.warpAffine(image, cv2.getRotationMatrix2D((199.5, 199.5), turn_deg, 1.0), (400, 400))
+    return np.asarray(image, np.uint8)
+
+
+def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int64]:
+    return np.unpackbits(a[:, None] ^ b[None, :], axis=2).sum(axis=2).astype(np.int64)
+
+
+def test_one_corner_a_free_cell_strongest_first() -> None:
+    config = DetectorConfig()
+    pyramid = build_pyramid(blobs(1), 4)
+    corners = detect(pyramid, np.zeros((0, 2)), config)
+    cells = (corners.uv // config.cell_px).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(cells) > 40
+    assert (np.diff(corners.score) <= 0).all()
+    taken = corners.uv[:20]
+    again = detect(pyramid, taken, config)
+    free = {tuple(c) for c in (taken // config.cell_px).astype(int)}
+    assert not free & {tuple(c) for c in (again.uv // config.cell_px).astype(int)}
+
+
+def test_flat_image_has_no_corner() -> None:
+    assert len(detect(build_pyramid(np.full((200, 300), 77, np.uint8), 4), np.zeros((0, 2)), DetectorConfig()).uv) == 0
+
+
+def test_scores_are_the_smaller_eigenvalue() -> None:
+    image = blobs(2)
+    rng = np.random.default_rng(0)
+    xy = rng.integers(8, 390, (50, 2)).astype(np.int32)
+    out = np.empty(50)
+    kernels.corner_scores(image, xy, out)
+    f = image.astype(np.float64)
+    dx, dy = np.zeros_like(f), np.zeros_like(f)
+    dx[:, 1:-1] = 0.5 * (f[:, 2:] - f[:, :-2])
+    dy[1:-1] = 0.5 * (f[2:] - f[:-2])
+    for (x, y), score in zip(xy, out):
+        gx, gy = dx[y - 3 : y + 4, x - 3 : x + 4].ravel(), dy[y - 3 : y + 4, x - 3 : x + 4].ravel()
+        tensor = np.array([[gx @ gx, gx @ gy], [gx @ gy, gy @ gy]]) / 49.0
+        np.testing.assert_allclose(score, np.linalg.eigvalsh(tensor)[0], atol=1e-9)
+
+
+def test_descriptors_survive_a_turn_and_tell_corners_apart() -> None:
+    first, turned = blobs(3), blobs(3, 40.0)
+    pyramid, other = build_pyramid(first, 3), build_pyramid(turned, 3)
+    corners = detect(pyramid, np.zeros((0, 2)), DetectorConfig())
+    matrix = cv2.getRotationMatrix2D((199.5, 199.5), 40.0, 1.0)
+    moved = np.round(corners.uv @ matrix[:, :2].T + matrix[:, 2])
+    keep = ((moved > 80) & (moved < 320)).all(axis=1) & (corners.octave == 0)
+    _, a = describe(pyramid, corners.uv[keep], corners.octave[keep])
+    angle, b = describe(other, moved[keep], corners.octave[keep])
+    d = hamming(a, b)
+    right = np.diag(d)
+    wrong = d[~np.eye(len(d), dtype=bool)]
+    assert len(right) > 4
+    assert right.max() < 35 < np.percentile(wrong, 2)
+    assert angle.dtype == np.uint8
+
+
+def test_describe_is_the_plain_description() -> None:
+    image = blobs(4)
+    xy = np.array([[60, 70], [200, 210], [331, 199]], np.int32)
+    angle = np.array([0.0, 1.1, -2.0])
+    out = np.empty((3, 32), np.uint8)
+    kernels.describe(image, xy, angle, features.PATTERN, out)
+    for k in range(3):
+        c, s = np.cos(angle[k]), np.sin(angle[k])
+        turn = np.array([[c, -s], [s, c]])
+        a = np.floor(features.PATTERN[:, :2] @ turn.T + 0.5).astype(int) + xy[k]
+        b = np.floor(features.PATTERN[:, 2:] @ turn.T + 0.5).astype(int) + xy[k]
+        bits = image[a[:, 1], a[:, 0]] < image[b[:, 1], b[:, 0]]
+        np.testing.assert_array_equal(out[k], np.packbits(bits, bitorder="little"))
+
+
+def test_pattern_stays_as_it_was_frozen() -> None:
+    assert features.PATTERN.shape == (256, 4)
+    assert np.abs(features.PATTERN).max() <= features.PATTERN_REACH_PX
+    weights = np.arange(1, 1025).reshape(256, 4)
+    assert (
+        int((features.PATTERN * weights).sum()) == 70162
+    )  # two builds that differ here cannot match each other's corners

@@ -1,0 +1,81 @@
+"""Stereo along the row: against a plain search, and against known sub-pixel disparities."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core import stereo_kernels
+from kiteline_core.features import build_pyramid
+
+RADIUS = stereo_kernels.RADIUS
+
+
+def pair(
+    seed: int, disparity: float, rows: int = 200, columns: int = 320
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Left and right image of a wall at one disparity, with a little noise."""
+    rng = np.random.default_rng(seed)
+    wide = cv2.GaussianBlur(rng.standard_normal((rows, columns + 80)), (0, 0), 1.5)
+    wide = 120 + 35 * wide / wide.std()
+    # Content at x of the left image lies at x - disparity of the right one; shifted exactly, in the Fourier domain.
+    turn = np.exp(2j * np.pi * np.fft.fftfreq(columns + 80) * disparity)
+    moved = np.real(np.fft.ifft(np.fft.fft(wide, axis=1) * turn, axis=1))
+    crops = (image[:, 40 : 40 + columns] for image in (wide, moved))
+    noisy = [np.clip(i + rng.normal(0, 1.0, i.shape) + 0.5, 0, 255).astype(np.uint8) for i in crops]
+    return noisy[0], noisy[1]
+
+
+UV = np.array([[float(x), float(y)] for y in range(30, 180, 20) for x in range(90, 300, 15)])
+
+
+def test_search_then_refinement_recover_the_disparity() -> None:
+    for disparity in (3.3, 17.62, 41.5):
+        left, right = (build_pyramid(i, 3) for i in pair(5, disparity))
+        octave = (np.arange(len(UV)) % 2).astype(np.uint8)
+        found_px, found = np.empty(len(UV)), np.zeros(len(UV), np.bool_)
+        stereo_kernels.search_rows(left, right, UV, octave, 80.0, 1.15, found_px)
+        assert (found_px >= 0).mean() > 0.9
+        stereo_kernels.refine_rows(left, right, UV, octave, 6, 3.0, 0.85, found_px, found)
+        assert found.mean() > 0.85
+        assert abs(np.median(found_px[found]) - disparity) < 0.04
+        assert np.percentile(np.abs(found_px[found] - disparity), 90) < 0.15
+
+
+def reference_search(left: NDArray[np.uint8], right: NDArray[np.uint8], x: int, y: int, reach: int) -> int:
+    """Best integer disparity by zero-mean SAD, written plainly."""
+    patch = left[y - RADIUS : y + RADIUS + 1, x - RADIUS : x + RADIUS + 1].astype(np.int64)
+    costs = []
+    for d in range(-1, min(reach, x - RADIUS) + 1):
+        other = right[y - RADIUS : y + RADIUS + 1, x - d - RADIUS : x - d + RADIUS + 1].astype(np.int64)
+        shift = patch.sum() // patch.size - other.sum() // other.size
+        costs.append(np.abs(patch - other - shift).sum())
+    return int(np.argmin(costs)) - 1
+
+
+def test_search_is_the_plain_search() -> None:
+    left, right = (build_pyramid(i, 3) for i in pair(6, 21.0))
+    out = np.empty(len(UV))
+    stereo_kernels.search_rows(left, right, UV, np.zeros(len(UV), np.uint8), 80.0, 1.0, out)
+    for (u, v), d in zip(UV, out):
+        if d >= 0:
+            assert d == 2 * max(0, reference_search(left[1], right[1], int(u / 2 + 0.5), int(v / 2 + 0.5), 41))
+
+
+def test_repetition_is_not_trusted() -> None:
+    stripes = np.tile(((np.arange(320) // 8 % 2) * 120 + 60).astype(np.uint8), (200, 1))
+    pyramid = build_pyramid(stripes, 3)
+    out = np.empty(len(UV))
+    stereo_kernels.search_rows(pyramid, pyramid, UV, np.zeros(len(UV), np.uint8), 80.0, 1.15, out)
+    assert (out < 0).all()
+
+
+def test_unrelated_rows_are_not_refined() -> None:
+    left, _ = pair(7, 10.0)
+    _, right = pair(8, 10.0)
+    guess, found = np.full(len(UV), 10.0), np.zeros(len(UV), np.bool_)
+    stereo_kernels.refine_rows(
+        build_pyramid(left, 3), build_pyramid(right, 3), UV, np.zeros(len(UV), np.uint8), 6, 3.0, 0.85, guess, found
+    )
+    assert found.mean() < 0.05
