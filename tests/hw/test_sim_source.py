@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,10 @@ from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.source import START_NS, open_sim
 
-SMALL: dict[str, object] = {"scale": 0.2, "texture_bits": 8, "seconds": 0.5}
+SMALL: dict[str, Any] = {"scale": 0.2, "texture_bits": 8, "seconds": 0.5}
 
 
-def frames(scene: str, workers: int = 1, **options: object) -> list[Frame]:
+def frames(scene: str, workers: int = 1, **options: Any) -> list[Frame]:
     return [item for item in open_sim(scene, workers, **(SMALL | options)) if isinstance(item, Frame)]
 
 
