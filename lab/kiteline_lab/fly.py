@@ -13,6 +13,7 @@ from pathlib import Path
 from kiteline_agent.spec import AgentSpec
 from kiteline_basestation.spec import BaseSpec
 from kiteline_core.frame import Frame
+from kiteline_hw.mcap_mend import mend
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
 from kiteline_hw.sources import open_source
 from kiteline_lab.flight import Flight, Outcome, fly_here, fly_processes
@@ -21,7 +22,7 @@ from kiteline_lab.judge import judge
 
 MODES = ("tracker", "local", "monolith", "distributed")
 PROFILES = {"wifi": (0, 0), "radio": (1000, 500)}  # B/s up and down on the wire; 0: what the link takes
-_FILES = ("log.mcap", "live.tum", "odometry.tum", "stderr.log", "map.ply", "grid.pgm", "grid.yaml")
+_FILES = ("live.tum", "odometry.tum", "stderr.log", "map.ply", "grid.pgm", "grid.yaml")
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +176,7 @@ def _span_ns(source: FrameSource, several: bool) -> tuple[int, int]:
 def clear(out: Path) -> None:
     """Remove what an earlier flight left in the folder, and nothing else."""
     for folder in [out / "base", *out.glob("agent[0-9]*")]:
-        for path in [*(folder / name for name in _FILES), *folder.glob("agent[0-9]*.tum")]:
+        for path in [*(folder / name for name in _FILES), *folder.glob("agent[0-9]*.tum"), *folder.glob("log*.mcap")]:
             path.unlink(missing_ok=True)
     for name in ("report.json", "trajectory.png"):
         (out / name).unlink(missing_ok=True)
@@ -194,8 +195,16 @@ def fly(o: Options, quiet: bool = False) -> tuple[dict[str, object], Outcome]:
             outcome = fly_processes(flight, o.link, o.realtime)
         else:
             outcome = fly_here(flight, made.sources, o.mode)
+        mend_logs(o.out)
         report = judge(o.out, made.sources, made.agents, outcome, align_scale=o.mono)
     return report, outcome
+
+
+def mend_logs(out: Path) -> None:
+    """Finish the logs of processes that were ended in mid-flight, so that every tool opens them."""
+    for log in [*out.glob("agent[0-9]*/*.mcap"), *out.glob("base/*.mcap")]:
+        with contextlib.suppress(SourceError):  # not one byte was written
+            mend(log)
 
 
 def main(argv: list[str]) -> int:

@@ -18,12 +18,14 @@ from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.spec import AgentSpec
 from kiteline_agent.tally import Tally, live_line, odometry_line
+from kiteline_agent.warm import warm as agent_warm
 from kiteline_basestation import flight_log as base_log
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import Job, run_job
 from kiteline_basestation.spec import BaseSpec
 from kiteline_basestation.station import Station
 from kiteline_basestation.store import restore
+from kiteline_basestation.warm import warm as base_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
@@ -213,6 +215,8 @@ def main(argv: list[str]) -> int:
 
         return refly(a.log, a.cpu, a.out, a.virtual)
     cv2.setNumThreads(1)
+    agent_warm()
+    base_warm()
     with LogReader(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
         is_agent = log.metadata.get("role") == "agent"
         done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
