@@ -11,7 +11,7 @@ import pytest
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store import Codes, pack
 from kiteline_codec import messages
-from kiteline_codec.schema import Births, Camera, Head, Record
+from kiteline_codec.schema import Births, Camera, Head, Placement, Record
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
@@ -87,7 +87,9 @@ def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
 
 def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     codes = {messages.key(r): messages.encode(r) for r in records(0)}
-    (tmp_path / STORE_FILE).write_bytes(pack({AgentId(0): Codes(codes, {})}))
+    placed = Placement(submap_id(0, 1, 0), np.eye(4))
+    own = {messages.key(placed): messages.encode(placed)}
+    (tmp_path / STORE_FILE).write_bytes(pack({AgentId(0): Codes(codes, own)}))
     assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")
     found = trajectories.read(str(tmp_path / "new" / "a.tum")).trajectory.T_w_b[:, :3, 3]
