@@ -87,6 +87,7 @@ class PublishConfig:
     pose_rad: float = 0.0002  # a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px of bearing or disparity, the largest of a keyframe's points
     grid_every: int = 3  # keyframes between two grids
+    grid_share: int = 40  # of the map's keyframes at least this share, one in so many: a grid reads the whole map
 
 
 @dataclass(frozen=True, slots=True)

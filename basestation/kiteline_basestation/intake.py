@@ -6,7 +6,7 @@ import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
 from kiteline_codec.schema import Births, Camera, Head, Live, Record, Sightings
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.map_tables import NO_POSE
 from kiteline_core.sparse_map import SparseMap
 
@@ -25,6 +25,7 @@ class Intake:
         self._waiting: dict[KeyframeId, int] = {}  # not used yet -> when the header came
         self._partial: set[KeyframeId] = set()  # used before they were complete
         self.live: dict[AgentId, Live] = {}
+        self.last_of: dict[SubmapId, Live] = {}  # the last that was heard in each submap
         self.last_seen_ns: dict[AgentId, int] = {}
         self.refused = 0  # records that contradict what is known
 
@@ -38,6 +39,7 @@ class Intake:
                 held = self.live.get(record.agent)
                 if held is None or record.t_ns >= held.t_ns:
                     self.live[record.agent] = record
+                    self.last_of[submap_of_keyframe(record.keyframe)] = record
             elif isinstance(record, Head):
                 self._take_head(record, now_ns)
             elif isinstance(record, Births | Sightings):
@@ -68,6 +70,10 @@ class Intake:
         late = [k for k in sorted(self._partial) if k not in out and self._map.complete(k)]
         self._partial.difference_update(late)
         return sorted(out + late)
+
+    def use_all(self) -> None:
+        """Take all that came for used: an earlier base has worked on it."""
+        self._waiting = {k: t for k, t in self._waiting.items() if not self._map.complete(k)}
 
     def _take_head(self, head: Head, now_ns: int) -> None:
         fresh = head.keyframe not in self._map

@@ -18,7 +18,8 @@ from kiteline_basestation.intake import Intake
 from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
-from kiteline_codec.schema import Record
+from kiteline_codec.schema import Placement, Record
+from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import (
     KEYPOINT_BITS,
@@ -92,7 +93,7 @@ class Mapper:
         self._publisher = Publisher(self.map)
         self._next_job = 1
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
-        self._stale: dict[SubmapId, KeyframeId] = {}  # submaps to be adjusted -> their newest keyframe
+        self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
 
@@ -109,7 +110,7 @@ class Mapper:
                 self.map, keyframe, self.config.new_points, self.config.measurement, self._publisher
             )
             self.counts.culled += culling.cull_weak(self.map, keyframe, self.config.cull, self._publisher)
-            self._stale[submap_of_keyframe(keyframe)] = keyframe
+            self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
             self._grid_due += 1
             self.counts.keyframes += 1
         jobs = self._bundle_jobs() + self._grid_jobs()
@@ -118,6 +119,17 @@ class Mapper:
     def adopt(self, record: Record) -> None:
         """Compute on with a published record as the other side will hold it."""
         adopt(self.map, record)
+
+    def restore(
+        self, agent: AgentId, received: tuple[Record, ...], own: tuple[Record, ...], now_ns: int
+    ) -> None:  # fmt: skip
+        """Begin with what an earlier base had received from an agent and had written for it; nothing is done anew."""
+        self._intake.take(agent, received, now_ns)
+        self._intake.use_all()
+        for record in own:
+            if isinstance(record, Placement):
+                self.placements[record.submap] = record.T_w_m
+            self.adopt(record)
 
     @property
     def idle(self) -> bool:
@@ -193,10 +205,22 @@ class Mapper:
     # -- inside ------------------------------------------------------------------------------------------------------
 
     def _place(self, keyframe: KeyframeId) -> None:
+        """The first submap of all is the world. A later one of the same flight begins where the last was left."""
         submap = submap_of_keyframe(keyframe)
+        if submap in self.placements:
+            return
         if not self.placements:
-            self.placements[submap] = np.eye(4)
-            self._publisher.place(submap, np.eye(4))
+            T_w_m = np.eye(4)
+        else:
+            before = SubmapId(submap - 1)
+            live, T_w_before = self._intake.last_of.get(before), self.placements.get(before)
+            begin = self.map.pose(self.map.submaps[submap][0])
+            left = self.map.pose(live.keyframe) if live else None
+            if live is None or T_w_before is None or left is None or begin is None:
+                return
+            T_w_m = se3.orthonormalise(T_w_before @ left @ live.T_k_c @ se3.inverse(begin))
+        self.placements[submap] = T_w_m
+        self._publisher.place(submap, T_w_m)
 
     def _finish(self, done: JobDone) -> None:
         if isinstance(done.result, BundleResult):
@@ -219,7 +243,13 @@ class Mapper:
         busy = {submap for submap, _ in self._windows.values()}
         jobs = []
         for submap in sorted(self._stale.keys() - busy):
-            keyframe = self._stale.pop(submap)
+            # Around the newest keyframe; where many came at once, the oldest first, half a window at a time.
+            waiting, half = self._stale[submap], self.config.window.free // 2
+            taken = len(waiting) if len(waiting) <= 2 * half else half
+            keyframe = waiting[taken - 1]
+            del waiting[:taken]
+            if not waiting:
+                del self._stale[submap]
             part = local_window(self.map, keyframe, self.config.window, self.config.measurement)
             if part is not None:
                 jobs.append(Job(self._next_job, "bundle", BundleInputs(part.problem, self.config.bundle)))
@@ -228,7 +258,8 @@ class Mapper:
         return jobs
 
     def _grid_jobs(self) -> list[Job]:
-        if self._grid_job or self._grid_due < self.config.publish.grid_every:
+        pause = max(self.config.publish.grid_every, len(self.map) // self.config.publish.grid_share)
+        if self._grid_job or self._grid_due < pause:
             return []
         self._grid_due = 0
         view = self.world_view()

@@ -81,9 +81,30 @@ class Publisher:
 
 
 def adopt(sparse_map: SparseMap, record: Record) -> None:
-    """Compute on with a record as the other side holds it: quantisation changes poses and depths only."""
+    """Make a record that the base wrote true in the map: as quantised just now, or as an earlier base left it.
+
+    Records of keyframes that are not here, and what is true already, change nothing.
+    """
+    if not isinstance(record, Pose | Depths | Found | Removed | Culled) or record.keyframe not in sparse_map:
+        return
     if isinstance(record, Pose):
         sparse_map.set_pose(record.keyframe, record.T_m_k)
-    elif isinstance(record, Depths):
-        start = int(sparse_map.keyframes.start[sparse_map.rows[record.keyframe]])
-        sparse_map.set_depths((start + record.index.astype(np.int32)).astype(np.int32), record.inv_depth, record.offset)
+        return
+    row = sparse_map.rows[record.keyframe]
+    known = record.index < sparse_map.keyframes.count[row]
+    slots = (int(sparse_map.keyframes.start[row]) + record.index[known].astype(np.int32)).astype(np.int32)
+    flags = sparse_map.keypoints.flags
+    if isinstance(record, Depths):
+        sparse_map.set_depths(slots, record.inv_depth[known], record.offset[known])
+    elif isinstance(record, Found):
+        roots = sparse_map.find_points(record.point[known])
+        for slot, root in zip(slots.tolist(), roots.tolist()):
+            if root >= 0 and sparse_map.keypoints.root[slot] == slot != root:
+                sparse_map.fuse(slot, int(sparse_map.keypoints.root[root]))
+    else:
+        bit = REMOVED if isinstance(record, Removed) else CULLED
+        fresh = slots[flags[slots] & bit == 0]
+        if len(fresh):
+            sparse_map.set_flags(fresh, bit)
+        if isinstance(record, Culled) and record.keyframe_too:
+            sparse_map.cull_keyframe(record.keyframe)

@@ -11,7 +11,7 @@ from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import KeyframeId
-from kiteline_core.map_tables import BIRTH, CULLED, REMOVED
+from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
@@ -40,7 +40,8 @@ def _poses(
         old = sparse_map.keyframes.T_m_k[row]
         moved = float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
         turned = float(np.linalg.norm(new[:3, :3] - old[:3, :3])) / np.sqrt(2.0)  # chord: the angle when small
-        if moved > publish.pose_m or turned > publish.pose_rad:
+        first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # said once, so that an older base's value goes
+        if first or moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_pose(keyframe, new)
             publisher.touch(Kind.POSE, keyframe)
 

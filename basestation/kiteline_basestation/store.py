@@ -11,10 +11,9 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from kiteline_basestation.mapper import MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec import messages
-from kiteline_codec.schema import Key, Placement, WireError
+from kiteline_codec.schema import Key, WireError
 from kiteline_core.ids import AgentId
 
 _MAGIC = b"KLSTORE1"
@@ -76,13 +75,6 @@ def restore(station: Station, kept: bytes, now_ns: int) -> None:
 
 def _restore(station: Station, agent: AgentId, codes: Codes, now_ns: int) -> None:
     channel = station.join(agent)
-    records = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
-    output = station.mapper.step(MapperInput(((agent, records),)), now_ns)
-    for _, published in output.publish:
-        for record in published:
-            station.mapper.adopt(channel.put(record))
-    for key in sorted(codes.own):  # last, for it rests on more than one look
-        record = messages.decode(key, codes.own[key])
-        if isinstance(record, Placement):
-            station.mapper.placements[record.submap] = record.T_w_m
-        station.mapper.adopt(channel.put(record))
+    received = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
+    own = tuple(channel.put(messages.decode(key, codes.own[key])) for key in sorted(codes.own))
+    station.mapper.restore(agent, received, own, now_ns)
