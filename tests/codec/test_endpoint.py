@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kiteline_codec.packet import parse
 from kiteline_codec.schema import Key, Kind, WireError
 from kiteline_codec.sync import Endpoint, SyncConfig
@@ -135,8 +136,10 @@ def test_the_same_code_again_costs_nothing() -> None:
 def test_order_of_sending() -> None:
     pair = Pair()
     pair.run(50)
-    for kind, id_, part in ((Kind.TILE, 9, 0), (Kind.BIRTHS, 1, 1), (Kind.BIRTHS, 1, 0), (Kind.BIRTHS, 2, 0),
-                            (Kind.SIGHTINGS, 2, 0), (Kind.HEAD, 1, 0), (Kind.POSE, 1, 0), (Kind.LIVE, 0, 0)):  # fmt: skip
+    for kind, id_, part in (
+        (Kind.TILE, 9, 0), (Kind.BIRTHS, 1, 1), (Kind.BIRTHS, 1, 0), (Kind.BIRTHS, 2, 0),
+        (Kind.SIGHTINGS, 2, 0), (Kind.HEAD, 1, 0), (Kind.POSE, 1, 0), (Kind.LIVE, 0, 0),
+    ):  # fmt: skip
         pair.a.put(Key(kind, id_, part), b"x" * 100)
     pair.settle()
     got = [(key.kind, key.id, key.part) for key, _ in pair.updates[1]]

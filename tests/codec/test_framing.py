@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from kiteline_codec.framing import Deframer, frame, framed_bytes
+
+from kiteline_codec.framing import Deframer, StreamFramer, frame, framed_bytes
 
 PACKETS = st.lists(st.one_of(st.binary(max_size=40), st.binary(min_size=250, max_size=600)), max_size=6)
 
@@ -50,3 +51,8 @@ def test_memory_is_bounded() -> None:
         assert len(deframer._pending) <= framed_bytes(100)
     assert deframer.feed(b"\0" + frame(b"next")) == [b"next"]
     assert deframer.damaged == 1
+
+
+def test_one_object_for_both_directions() -> None:
+    framer = StreamFramer()
+    assert framer.feed(framer.encode(b"there and back")) == [b"there and back"]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kiteline_codec import ranges
 from kiteline_codec.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
 from kiteline_codec.schema import WireError
@@ -134,9 +137,10 @@ def test_any_bytes_are_columns_or_an_error(data: bytes, c: int, n: int) -> None:
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 30), st.integers(0, 30)), max_size=20))
 def test_ranges_are_sets(steps: list[tuple[bool, int, int]]) -> None:
-    got, expected = ranges.NONE, set()
+    got = ranges.NONE
+    expected: set[int] = set()
     for add, a, b in steps:
         got = ranges.add(got, a, b) if add else ranges.cut(got, a, b)
         expected = expected | set(range(a, b)) if add else expected - set(range(a, b))
         assert [i for start, stop in got for i in range(start, stop)] == sorted(expected)
-        assert all(x[1] < y[0] for x, y in zip(got, got[1:], strict=False))
+        assert all(x[1] < y[0] for x, y in pairwise(got))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+
 from kiteline_codec import quantise
 from kiteline_core import se3
 

@@ -1,0 +1,70 @@
+"""Records from one end to the other: coded and plain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_codec import messages
+from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
+from kiteline_codec.schema import Key, Kind, Pose, Record, Removed
+from kiteline_codec.sync import SyncConfig
+from kiteline_core import se3
+from kiteline_core.ids import KeyframeId
+
+POSE = Pose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))
+
+
+def cross(a: RecordChannel, b: RecordChannel, ticks: int = 10) -> tuple[list[Record], list[Key]]:
+    """What b learns from a."""
+    records: list[Record] = []
+    for tick in range(ticks):
+        now_ns = tick * 50_000_000
+        records += b.receive(a.poll(now_ns), now_ns)
+        a.receive(b.poll(now_ns), now_ns)
+    return records, b.take_removed()
+
+
+def test_coded_records_arrive_as_the_writer_was_told() -> None:
+    a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
+    kept = a.put(POSE)
+    assert isinstance(kept, Pose)
+    assert np.abs(kept.T_m_k - POSE.T_m_k).max() > 0
+    (got,), removed = cross(a, b)
+    assert isinstance(got, Pose)
+    assert np.array_equal(got.T_m_k, kept.T_m_k)
+    assert removed == []
+    assert a.endpoint.digest_equal
+    again = a.put(kept)
+    assert isinstance(again, Pose)
+    assert np.array_equal(again.T_m_k, kept.T_m_k)
+    assert a.endpoint.digest_equal  # nothing new
+    a.remove(messages.key(POSE))
+    assert cross(a, b) == ([], [messages.key(POSE)])
+    assert a.stats.values == b.stats.values == 0
+
+
+def test_values_of_another_schema_are_counted() -> None:
+    a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
+    a.endpoint.put(Key(50, 1), b"of the future")
+    a.endpoint.put(Key(Kind.POSE, 1), b"damaged")
+    a.put(POSE)
+    records, _ = cross(a, b)
+    assert len(records) == 1
+    assert b.undecodable == 2
+
+
+def test_plain_records_pass_as_they_are() -> None:
+    a, b = plain_pair()
+    removed = Removed(KeyframeId(1), np.array([3], np.uint16))
+    assert a.put(POSE) is POSE
+    b.put(removed)
+    assert a.poll(0) == []
+    (got,) = b.receive([], 0)
+    assert got is POSE
+    (got,) = a.receive([], 0)
+    assert got is removed
+    a.put(POSE)
+    a.remove(messages.key(POSE))
+    assert b.receive([], 0) == []
+    assert b.take_removed() == [messages.key(POSE)]
+    assert b.receive([], 0) == []

@@ -1,0 +1,268 @@
+"""A second reader, written from codec/SPEC.md alone in plain Python, reads what the codec writes."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from hashlib import blake2b
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kiteline_codec import messages
+from kiteline_codec.framing import frame
+from kiteline_codec.packet import PROTOCOL_VERSION
+from kiteline_codec.schema import Births, Key, Kind, Record, Sightings
+from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_core import se3
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+class Source:
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def raw(self, n: int) -> bytes:
+        self.at += n
+        assert self.at <= len(self.data)
+        return self.data[self.at - n : self.at]
+
+    def u8(self) -> int:
+        return self.raw(1)[0]
+
+    def varint(self) -> int:
+        value = shift = 0
+        while True:
+            b = self.u8()
+            value |= (b & 127) << shift
+            shift += 7
+            if b < 128:
+                return value
+
+    def signed(self) -> int:
+        z = self.varint()
+        return -(z + 1) // 2 if z % 2 else z // 2
+
+    def columns(self, c: int, n: int) -> list[list[int]]:
+        if not n:
+            return [[] for _ in range(c)]
+        heads = []
+        for _ in range(c):
+            head = self.u8()
+            mode, width = head >> 6, head & 63
+            heads.append((mode, width, self.signed(), self.signed() if mode else 0))
+        bits = sum(w * (n - m) for m, w, _, _ in heads)
+        stream = int.from_bytes(self.raw((bits + 7) // 8), "little")
+        out = []
+        for mode, width, first, step in heads:
+            column = [first] if mode else []
+            while len(column) < n:
+                number = stream % (1 << width)
+                stream >>= width
+                column.append(column[-1] + step + number if mode else first + number)
+            out.append(column)
+        assert stream == 0
+        return out
+
+    def pose(self) -> list[list[float]]:
+        t = [self.signed() / 10000 for _ in range(3)]
+        s = [self.signed() / 2**19 for _ in range(3)]
+        ss = sum(c * c for c in s)
+        w, x, y, z = (1 - ss) / (1 + ss), *(2 * c / (1 + ss) for c in s)
+        assert abs(sqrt(w * w + x * x + y * y + z * z) - 1) < 1e-12
+        return [[float(v) for v in row] for row in se3.from_quaternion(np.array([w, x, y, z]), np.array(t))]
+
+
+def inverse_depth(code: int) -> float:
+    e, m = divmod(code, 1024)
+    return float(((1 + m / 1024) * 2**e - 1) / 128)
+
+
+def points(s: Source, n: int) -> list[int]:
+    table, last = [], 0
+    for _ in range(s.varint() if n else 0):
+        last += s.varint()
+        table.append(last)
+    place, keypoint = s.columns(2, n)
+    return [(table[p] << 11) + k for p, k in zip(place, keypoint, strict=True)]
+
+
+def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
+    s = Source(data)
+    out: dict[str, Any] = {}
+    if kind == 1:
+        out["size"] = (s.varint(), s.varint())
+        out["floats"] = struct.unpack("<5d", s.raw(40))
+        out["stereo"] = s.u8()
+        out["T_b_c"] = np.reshape(struct.unpack("<12d", s.raw(96)), (3, 4)).tolist()
+    elif kind == 2:
+        out["t_ns"], out["keyframe"], out["T_k_c"], out["quality"] = s.varint(), s.varint() - 1, s.pose(), s.signed()
+    elif kind == 3:
+        out["t_ns"] = s.varint()
+        z = s.varint() - 1
+        out["parent"] = -1 if z < 0 else id_ - (-(z + 1) // 2 if z % 2 else z // 2)
+        out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
+    elif kind in (16, 21):
+        out["T_m_k" if kind == 16 else "T_w_m"] = s.pose()
+    elif kind == 22:
+        out["cell_m"] = struct.unpack("<f", s.raw(4))[0]
+        inflated = zlib.decompress(s.raw(len(data) - 4), -15)
+        codes = [c for byte in inflated for c in (byte & 15, byte >> 4)]
+        out["cells"] = [-1 if c == 0 else (100 * (c - 1) + 7) // 14 for c in codes]
+    else:
+        n = s.varint()
+        names = {
+            4: ("index", "u", "v", "inv_depth", "octave", "angle"),
+            5: ("index", "u", "v", "inv_depth", "octave"),
+            17: ("index", "inv_depth", "du", "dv"),
+        }.get(kind, ("index",))
+        columns = dict(zip(names, s.columns(len(names), n), strict=True))
+        out["index"] = columns["index"]
+        for name in ("octave", "angle"):
+            if name in columns:
+                out[name] = columns[name]
+        if "u" in columns:
+            out["uv"] = [[u / 16 - 64, v / 16 - 64] for u, v in zip(columns["u"], columns["v"], strict=True)]
+        if "du" in columns:
+            out["offset"] = [[u / 32, v / 32] for u, v in zip(columns["du"], columns["dv"], strict=True)]
+        if "inv_depth" in columns:
+            out["inv_depth"] = [inverse_depth(c) for c in columns["inv_depth"]]
+        if kind == 4:
+            out["descriptor"] = np.frombuffer(s.raw(32 * n), np.uint8).reshape(n, 32).tolist()
+        if kind in (5, 18):
+            out["point"] = points(s, n)
+        if kind == 20:
+            out["keyframe_too"] = s.u8()
+    assert s.at == len(data)
+    return out
+
+
+def assert_agree(read: dict[str, Any], record: Record) -> None:
+    for name, value in read.items():
+        if name in ("size", "floats", "stereo", "T_b_c"):
+            c = record.camera  # type: ignore[union-attr]
+            floats = (c.fx, c.fy, c.cx, c.cy, c.baseline_m)
+            ours: Any = {"size": (c.width, c.height), "floats": floats, "stereo": c.stereo, "T_b_c": c.T_b_c[:3]}[name]
+        else:
+            ours = getattr(record, name)
+            ours = ours.reshape(-1) if name == "cells" else ours
+        assert np.allclose(ours, value, rtol=1e-7, atol=1e-12), name
+
+
+def test_records() -> None:
+    entries = json.loads((GOLDEN / "records.json").read_text())
+    assert {entry["key"][0] for entry in entries} == set(Kind)
+    for entry in entries:
+        kind, id_, _ = entry["key"]
+        code = bytes.fromhex(entry["code"])
+        assert_agree(read_code(kind, id_, code), messages.decode(Key(*entry["key"]), code))
+
+
+def exchange() -> list[tuple[str, bytes]]:
+    """A conversation with greeting, values, a long value, a removal, acknowledgements and digests."""
+    config = SyncConfig(packet_bytes=200)
+    ends = {"agent": Endpoint(config, 5), "base": Endpoint(config, 700)}
+    wire: list[tuple[str, bytes]] = []
+    for tick in range(60):
+        now_ns = tick * 30_000_000
+        if tick == 0:
+            for entry in json.loads((GOLDEN / "records.json").read_text()):
+                side = "agent" if entry["key"][0] < 16 else "base"
+                ends[side].put(Key(*entry["key"]), bytes.fromhex(entry["code"]))
+        if tick == 20:
+            ends["base"].remove(next(iter(ends["agent"].peer_values())))
+        for name, other in (("agent", "base"), ("base", "agent")):
+            while (packet := ends[name].poll(now_ns)) is not None:
+                wire.append((name, packet))
+                ends[other].receive(packet, now_ns)
+    assert ends["agent"].digest_equal
+    assert ends["base"].digest_equal
+    return wire
+
+
+def test_packets() -> None:
+    wire = exchange()
+    golden = json.loads((GOLDEN / "packets.json").read_text())
+    assert [[name, packet.hex()] for name, packet in wire] == golden
+    held: dict[str, dict[tuple[int, int, int], tuple[int, bytes]]] = {"agent": {}, "base": {}}
+    parts: dict[tuple[int, int, int, int], dict[int, bytes]] = {}
+    compared = set()
+    for name, packet in wire:
+        assert zlib.crc32(packet[:-4]) == int.from_bytes(packet[-4:], "little")
+        s = Source(packet[:-4])
+        assert s.u8() == PROTOCOL_VERSION == 1
+        flags = s.u8()
+        assert s.varint() == {"agent": 5, "base": 700}[name]
+        assert s.varint() in (0, {"agent": 700, "base": 5}[name])
+        if flags & 1:
+            last, missing = s.varint(), s.varint()
+            assert last > 0 == missing
+        values = held[name]
+        if flags & 2:
+            newest, digest = s.varint(), s.raw(16)
+            total = 0
+            for (kind, id_, part), (version, code) in values.items():
+                head = b"".join(varint(x) for x in (kind, id_, part, version))
+                total += int.from_bytes(blake2b(head + code, digest_size=16).digest(), "little")
+            assert digest == (total % 2**128).to_bytes(16, "little")
+            assert newest >= max((v for v, _ in values.values()), default=0)
+            compared.add(name)
+        for flag in (4, 8, 16):
+            if flags & flag:
+                s.varint()
+        if flags & 32:
+            s.varint()
+            watermark, id_ = s.varint(), 0
+            while s.at < len(s.data):
+                tag = s.u8()
+                id_ += s.signed()
+                key = (tag & 63, id_, s.varint())
+                version = s.varint() + watermark + 1
+                if tag & 128:
+                    del values[key]
+                    continue
+                length = s.varint()
+                offset, total = (s.varint(), s.varint()) if tag & 64 else (0, length)
+                got = parts.setdefault((*key, version), {})
+                got[offset] = s.raw(length)
+                if sum(map(len, got.values())) == total:
+                    values[key] = (version, b"".join(got[o] for o in sorted(got)))
+    assert compared == {"agent", "base"}
+    entries = json.loads((GOLDEN / "records.json").read_text())
+    ours = {tuple(e["key"]): bytes.fromhex(e["code"]) for e in entries}
+    read = {k: code for side in held.values() for k, (_, code) in side.items()}
+    assert len(ours) - len(read) == 1  # the removed one
+    assert all(ours[k] == code for k, code in read.items())
+
+
+def varint(value: int) -> bytes:
+    out = b""
+    while value > 127:
+        out += bytes([value % 128 + 128])
+        value //= 128
+    return out + bytes([value])
+
+
+def test_frames() -> None:
+    packet = bytes(range(7)) * 60
+    coded = frame(packet)
+    assert coded[0] == coded[-1] == 0
+    body, at = b"", 1
+    while at < len(coded) - 1:
+        n = coded[at]
+        body += coded[at + 1 : at + n] + (b"\0" if n < 255 else b"")
+        at += n
+    assert body[:-1] == packet + zlib.crc32(packet).to_bytes(4, "little")
+
+
+def test_the_names_in_the_specification_exist() -> None:
+    text = (Path(__file__).parents[2] / "codec" / "SPEC.md").read_text()
+    for kind in Kind:
+        assert f"| {int(kind)} | {kind.name.capitalize()} |" in text
+    for record in (Births, Sightings):
+        assert record.__name__ in text
+    assert f"The protocol version is **{PROTOCOL_VERSION}**" in text
