@@ -9,6 +9,8 @@ from mcap.writer import CompressionType, Writer
 from kiteline_hw.mcap_file import McapFile
 from kiteline_hw.mcap_log import CHUNK_BYTES
 
+MENDED = "mended"  # metadata key of a log that was finished here; its value says what was wrong
+
 
 def mend(path: Path) -> str | None:
     """Rewrite a cut file in place with all messages before the cut; what was wrong, or None when it was whole.
@@ -23,7 +25,7 @@ def mend(path: Path) -> str | None:
         writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         writer.start("", "kiteline")
         for record in log.metadata:
-            writer.add_metadata(record.name, record.metadata)
+            writer.add_metadata(record.name, {**record.metadata, MENDED: log.cut})
         schemas = {0: 0}
         for number, schema in sorted(log.schemas.items()):
             schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)

@@ -38,6 +38,11 @@ def judge(
         estimates = read_estimates(Path(spec.folder) / "log.mcap")
         part = outcome.agents[k]
         mine: Report = _with_statistics(part) if part is not None else _from_log(source, estimates)
+        if part is None:  # it may have died between a line of its trajectories and its log: the log counts
+            write_tum(
+                out / f"agent{k}" / "live.tum", [(e.t_ns, p) for e in estimates if (p := live_pose(e)) is not None]
+            )
+            write_tum(out / f"agent{k}" / "odometry.tum", [(e.t_ns, e.T_o_b) for e in estimates])
         mine.pop("drain", None)
         truth = source.ground_truth
         live = [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]

@@ -32,6 +32,7 @@ from kiteline_core import config as configuration
 from kiteline_core.frame import EncodedImage, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader, read_frame
+from kiteline_hw.mcap_mend import MENDED
 from kiteline_hw.ports import SourceError
 from kiteline_hw.rig_json import rig_from_json
 from kiteline_lab.progress import Progress
@@ -82,7 +83,7 @@ def steps(log: LogReader) -> Iterator[Step]:
             number += 1
         elif step is not None:
             step.messages.setdefault(message.topic, []).append(message)
-    if step is not None and log.cut is None:
+    if step is not None and log.cut is None and MENDED not in log.metadata:
         yield step
 
 
@@ -220,13 +221,13 @@ def main(argv: list[str]) -> int:
     with LogReader(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
         is_agent = log.metadata.get("role") == "agent"
         done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
-        cut = log.cut
+        cut = log.cut or log.metadata.get(MENDED)
     if a.out is not None and is_agent:
         a.out.mkdir(parents=True, exist_ok=True)
         (a.out / "live.tum").write_text("".join(done.live))
         (a.out / "odometry.tum").write_text("".join(done.odometry))
     if cut is not None:
-        print(f"the log is {cut}; what stands before was replayed")
+        print(f"the log was {cut}; what stands before was replayed")
     if done.difference is not None:
         print(f"differs: {done.difference}")
         return 1 if a.verify else 0
