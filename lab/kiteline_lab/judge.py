@@ -32,20 +32,18 @@ def judge(
 ) -> Report:
     """Write what the processes themselves did not, and report.json; the report."""
     alignment = Alignment.SIM3 if align_scale else Alignment.SE3
-    report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": outcome.notes}
+    report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": sorted(outcome.notes)}
     lines: list[Line] = []
     for k, (source, spec) in enumerate(zip(sources, agents, strict=True)):
         estimates = read_estimates(Path(spec.folder) / "log.mcap")
         part = outcome.agents[k]
         mine: Report = _with_statistics(part) if part is not None else _from_log(source, estimates)
-        if part is None:  # it may have died between a line of its trajectories and its log: the log counts
-            write_tum(
-                out / f"agent{k}" / "live.tum", [(e.t_ns, p) for e in estimates if (p := live_pose(e)) is not None]
-            )
-            write_tum(out / f"agent{k}" / "odometry.tum", [(e.t_ns, e.T_o_b) for e in estimates])
         mine.pop("drain", None)
         truth = source.ground_truth
         live = [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]
+        if part is None:  # it may have died between a line of its trajectories and its log: the log counts
+            write_tum(out / f"agent{k}" / "live.tum", live)
+            write_tum(out / f"agent{k}" / "odometry.tum", [(e.t_ns, e.T_o_b) for e in estimates])
         mine["accuracy"] = {
             "live": _accuracy(live, truth, alignment),
             "odometry": _accuracy([(e.t_ns, e.T_o_b) for e in estimates], truth, alignment),
