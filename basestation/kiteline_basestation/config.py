@@ -14,6 +14,7 @@ class IntakeConfig:
 
     patience_s: float = 2.0  # a keyframe whose sections are still under way is used as it is after this long
     orphan_s: float = 10.0  # a submap whose first keyframes never come is begun at the oldest known one after this long
+    per_step: int = 4  # keyframes taken up in one step, so that a backlog does not hold up the rest
     max_pending: int = 20_000  # sections kept without their header; more are a broken peer
 
 

@@ -54,11 +54,12 @@ class Intake:
     def ready(self, now_ns: int) -> list[KeyframeId]:
         """Keyframes to be used now, in order of id: complete ones, those waited for too long, late completions."""
         self._adopt_orphans(now_ns)
-        out = []
+        out: list[KeyframeId] = []
         patience_ns = round(self._config.patience_s * 1e9)
         for keyframe, since_ns in sorted(self._waiting.items()):
-            row = self._map.rows[keyframe]
-            if self._map.keyframes.pose_source[row] == NO_POSE or agent_of_keyframe(keyframe) not in self._map.cameras:
+            if len(out) == self._config.per_step:
+                break
+            if not self._known(keyframe):
                 continue
             complete = self._map.complete(keyframe)
             if complete or now_ns - since_ns >= patience_ns:
@@ -67,13 +68,23 @@ class Intake:
                     self._partial.add(keyframe)
         for keyframe in out:
             del self._waiting[keyframe]
-        late = [k for k in sorted(self._partial) if k not in out and self._map.complete(k)]
+        late = [k for k in sorted(self._partial) if k not in out and self._map.complete(k)][: self._config.per_step]
         self._partial.difference_update(late)
         return sorted(out + late)
+
+    @property
+    def backlog(self) -> bool:
+        """Whether keyframes are ready that no step has taken up yet."""
+        return any(self._map.complete(k) and self._known(k) for k in self._waiting)
 
     def use_all(self) -> None:
         """Take all that came for used: an earlier base has worked on it."""
         self._waiting = {k: t for k, t in self._waiting.items() if not self._map.complete(k)}
+
+    def _known(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe has a pose and a camera."""
+        placed = self._map.keyframes.pose_source[self._map.rows[keyframe]] != NO_POSE
+        return bool(placed) and agent_of_keyframe(keyframe) in self._map.cameras
 
     def _take_head(self, head: Head, now_ns: int) -> None:
         fresh = head.keyframe not in self._map

@@ -133,8 +133,8 @@ class Mapper:
 
     @property
     def idle(self) -> bool:
-        """Whether no job is open and none is due."""
-        return not self._windows and not self._stale and self._grid_job == 0
+        """Whether no job is open and nothing is left to be done with what came."""
+        return not self._intake.backlog and not self._windows and not self._stale and self._grid_job == 0
 
     def summary(self) -> dict[str, object]:
         """Numbers for people: what the base knows of each agent, and the size of the map."""
@@ -243,14 +243,14 @@ class Mapper:
         busy = {submap for submap, _ in self._windows.values()}
         jobs = []
         for submap in sorted(self._stale.keys() - busy):
-            # Around the newest keyframe; where many came at once, the oldest first, half a window at a time.
-            waiting, half = self._stale[submap], self.config.window.free // 2
-            taken = len(waiting) if len(waiting) <= 2 * half else half
-            keyframe = waiting[taken - 1]
-            del waiting[:taken]
-            if not waiting:
-                del self._stale[submap]
+            # Around the newest keyframe; where many came at once, from the oldest on, half a window at a time.
+            waiting, size = self._stale.pop(submap), self.config.window.free
+            keyframe = waiting[-1] if len(waiting) <= size else waiting[size // 2]
             part = local_window(self.map, keyframe, self.config.window, self.config.measurement)
+            moved = set() if part is None else set(self.map.keyframes.id[part.rows[part.problem.free]].tolist())
+            left = [k for k in waiting if k != keyframe and k not in moved]
+            if left:
+                self._stale[submap] = left
             if part is not None:
                 jobs.append(Job(self._next_job, "bundle", BundleInputs(part.problem, self.config.bundle)))
                 self._windows[self._next_job] = (submap, part)

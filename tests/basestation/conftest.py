@@ -40,7 +40,7 @@ class Flight:
 def fly(
     keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3,
     drift_m: float = 0.004, outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0,
-    missed: float = 0.1, no_depth: float = 0.0,
+    missed: float = 0.1, no_depth: float = 0.0, submap: int = 0,
 ) -> Flight:  # fmt: skip
     """Fly a circle of 1.2 m radius, looking outwards. memory: keyframes after which the tracker forgets a point."""
     rng = np.random.default_rng(seed)
@@ -52,7 +52,7 @@ def fly(
     descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
     size, direction = rng.uniform(-0.4, 1.4, points), rng.integers(0, 256, points)
     flight = Flight(camera, AgentId(agent), world)
-    submap = submap_id(agent, 1, 0)
+    in_submap = submap_id(agent, 1, submap)
     tracked: dict[int, tuple[int, int]] = {}  # row of world -> point id, number of the keyframe that last saw it
     for n in range(keyframes):
         phi = 2 * np.pi * turns * n / keyframes
@@ -68,7 +68,7 @@ def fly(
             step = np.concatenate([rng.normal(0, drift_m, 3), rng.normal(0, drift_m / 3, 3)])
             parent, T_p_k = flight.keyframes[-1], se3.inverse(flight.true_T_m_k[-1]) @ true @ se3.exp(step)
         believed = T_p_k if n == 0 else flight.agent_T_m_k[-1] @ T_p_k
-        keyframe = keyframe_id(submap, n)
+        keyframe = keyframe_id(in_submap, n)
         local = se3.transform(se3.inverse(true), world)
         z = np.maximum(local[:, 2], 0.01)
         uv = np.stack([420 * local[:, 0] / z + 376, 420 * local[:, 1] / z + 240], 1)

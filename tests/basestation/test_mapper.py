@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
 from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec import messages
 from kiteline_codec.schema import Births, Camera, Culled, Depths, Found, Head, Live, Placement, Pose, Record, Removed
 from kiteline_core import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
-from kiteline_core.map_tables import BIRTH, CULLED, REMOVED
+from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -28,7 +29,7 @@ def feed(mapper: Mapper, flight: Any, groups: Sequence[Sequence[Record]]) -> lis
     """Hand in one group of records a step, run every job at once, and collect all that is published."""
     done: tuple[JobDone, ...] = ()
     published: list[Record] = []
-    for n, records in enumerate([[Camera(flight.agent, flight.camera)], *groups, [], []]):
+    for n, records in enumerate([[Camera(flight.agent, flight.camera)], *groups, *[[]] * 12]):
         output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * STEP_NS)
         done = tuple(run_job(job) for job in output.jobs)
         for _, out in output.publish:
@@ -236,7 +237,8 @@ def test_a_base_without_its_store_begins_at_the_oldest_keyframe_it_gets(make_fli
         mapper.step(MapperInput(((flight.agent, (*camera, *part)),)), 0)
         camera = ()
     assert mapper.counts.keyframes == 0
-    mapper.step(MapperInput(()), 20_000_000_000)
+    for _ in range(3):
+        mapper.step(MapperInput(()), 20_000_000_000)
     assert mapper.counts.keyframes == 8
     a, b = mapper.map.pose(flight.keyframes[4]), mapper.map.pose(flight.keyframes[9])
     assert a is not None and b is not None
@@ -262,3 +264,49 @@ def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
     assert np.bincount(view.observations[:, 1]).min() >= 2
     table = mapper.map.keypoints
     assert not (table.flags[mapper.map.find_points(view.point_ids)] & CULLED).any()
+
+
+def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=24, turns=1.2, memory=3)
+    first = Mapper()
+    published = feed(first, flight, flight.records[:20])
+    received = (Camera(flight.agent, flight.camera), *(r for part in flight.records[:20] for r in part))
+    own = {messages.key(r): r for r in published}
+    second = Mapper()
+    second.restore(flight.agent, received, tuple(own[key] for key in sorted(own)), 0)
+    assert second.idle
+    assert not second.step(MapperInput(()), 0).publish
+    assert np.array_equal(first.map.point_ids(first.map.roots()), second.map.point_ids(second.map.roots()))
+    for keyframe in flight.keyframes[:20]:
+        a, b = first.map.pose(keyframe), second.map.pose(keyframe)
+        assert a is not None and b is not None
+        assert np.array_equal(a, b)
+        assert np.array_equal(
+            first.map.point_ids(first.map.points_of(keyframe)), second.map.point_ids(second.map.points_of(keyframe))
+        )
+    assert np.array_equal(first.map.positions(first.map.roots())[0], second.map.positions(second.map.roots())[0])
+    feed(second, flight, flight.records[20:])
+    assert second.counts.bundles > 2
+    assert len(second.map) == 24
+
+
+def test_a_backlog_is_worked_off_from_the_oldest_on(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=24, turns=1.2, memory=3)
+    mapper = Mapper()
+    feed(mapper, flight, [[r for part in flight.records for r in part]])
+    assert mapper.idle
+    assert mapper.counts.bundles >= 4
+    refined = [k for k in flight.keyframes if mapper.map.keyframes.pose_source[mapper.map.rows[k]] == REFINED_POSE]
+    assert refined == flight.keyframes[1:]
+
+
+def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) -> None:
+    flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
+    mapper = Mapper()
+    live = Live(flight.agent, 77, flight.keyframes[2], se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0])), 80)
+    feed(mapper, flight, [*flight.records, [live]])
+    published = feed(mapper, later, later.records)
+    (placement,) = [r for r in published if isinstance(r, Placement)]
+    left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
+    assert left is not None and begin is not None
+    assert np.allclose(placement.T_w_m @ begin, left @ live.T_k_c, atol=1e-9)
