@@ -35,7 +35,6 @@ COMMANDS = (
     Command("replay", "run an agent or a base again from its log, and compare"),
     Command("convert", "turn a data set or a ROS 2 bag into a kiteline log"),
     Command("log", "look into logs and mend them: info, recover, cut, merge"),
-    Command("log", "look into logs and mend them: info, recover, cut, merge"),
     Command("export", "a base's map in the formats of other tools: TUM, PLY, PGM, g2o"),
     Command("doctor", "check this machine, and warm the compiled kernels"),
     Command("bench", "measure, and write docs/results.md"),
