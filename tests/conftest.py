@@ -35,3 +35,38 @@ def data_dir() -> Path:
     if IN_CI:
         pytest.fail(text)
     pytest.skip(text)
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of 1.5 s that agents track in milliseconds: a rectified 320x240 stereo pair at 20 Hz slides past a textured
+    wall 2 m away, with its ground truth. No data needed.
+    """
+    import numpy as np
+
+    from kiteline_core.cameras import CameraModel, CameraRig
+    from kiteline_core.frame import Frame, Trajectory
+    from kiteline_hw.mcap_log import LogWriter
+
+    frames, step_m, depth_m, baseline_m, focal = 30, 0.02, 2.0, 0.1, 200.0
+    random = np.random.default_rng(1)
+    wall = cv2.GaussianBlur(random.integers(0, 256, (260, 480), np.uint8), (0, 0), 1.2)
+    wall = cv2.normalize(wall, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)
+    camera = CameraModel(320, 240, focal, focal, 159.5, 119.5)
+    T_c_r = np.eye(4)
+    T_c_r[0, 3] = baseline_m
+    stamps = 1_000_000_000 + 50_000_000 * np.arange(frames, dtype=np.int64)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = step_m * np.arange(frames)
+
+    def seen_from(x_m: float) -> np.ndarray:
+        shift = np.array([[1.0, 0.0, -focal * x_m / depth_m], [0.0, 1.0, -5.0]])
+        return cv2.warpAffine(wall, shift, (320, 240), flags=cv2.INTER_LINEAR)
+
+    path = tmp_path_factory.mktemp("recording") / "wall.mcap"
+    with LogWriter(path, {"made": "for tests"}) as log:
+        log.rig(int(stamps[0]), CameraRig(camera, camera, np.eye(4), T_c_r, has_body=False), None)
+        for t_ns, pose in zip(stamps, poses):
+            log.frame(Frame(int(t_ns), seen_from(pose[0, 3]), seen_from(pose[0, 3] + baseline_m)))
+        log.ground_truth(Trajectory(stamps, poses))
+    return path

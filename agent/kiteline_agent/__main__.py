@@ -79,7 +79,7 @@ class Onboard:
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(source.rig, config)
-        self.warm_ms = (time.process_time_ns() - begin_ns) / 1e6
+        self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
         self.camera = Camera(source, until_ns, time.process_time_ns)
         self.agent = Agent(source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel)
@@ -219,7 +219,7 @@ class Onboard:
             "timing": {
                 "cpu_ms_per_frame": self.cpu_ms,
                 "decode_ms": self.camera.decode_ms,
-                "warm_ms": round(self.warm_ms, 1),
+                "warm_up_s": round(self.warm_s, 3),
                 "rss_mib": round(self.rss_mib, 1),
             },
         }

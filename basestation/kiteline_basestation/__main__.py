@@ -26,7 +26,7 @@ from kiteline_basestation.jobs import Job, JobDone, run_job
 from kiteline_basestation.outputs import counts, keyframe_poses, map_files
 from kiteline_basestation.spec import BaseSpec, base_config, from_json
 from kiteline_basestation.station import Station, StationOutput
-from kiteline_basestation.store import Codes, pack, restore
+from kiteline_basestation.store import Codes, pack, restore, unpack
 from kiteline_basestation.warm import warm
 from kiteline_basestation.worker import Worker
 from kiteline_codec import warm as codec_warm
@@ -336,8 +336,11 @@ class Keeper:
         self._path = folder / "values.klstore"
         self._ground = ground
         self._kept_ns = now_ns
+        self._before: dict[AgentId, Codes] = {}  # what earlier bases received, and this one may not get again
         if self._path.exists():
-            ground.restore(self._path.read_bytes(), now_ns)
+            kept = self._path.read_bytes()
+            self._before = unpack(kept)
+            ground.restore(kept, now_ns)
 
     def keep_at_times(self, now_ns: int) -> None:
         """Keep, if the last time is long ago."""
@@ -351,7 +354,8 @@ class Keeper:
         for agent, channel in self._ground.station.channels.items():
             if isinstance(channel, CodedChannel):
                 end = channel.endpoint
-                agents[agent] = Codes({**end.legacy_values(), **end.peer_values()}, end.own_values())
+                before = self._before[agent].received if agent in self._before else {}
+                agents[agent] = Codes({**before, **end.legacy_values(), **end.peer_values()}, end.own_values())
         process.write_atomically(self._path, pack(agents))
 
 
