@@ -1,0 +1,286 @@
+"""The inertial half of tracking: start at rest or in motion, predict, fuse with what the images saw, coast when blind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from kiteline_core import imu_alignment, se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.fixed_lag import FixedLagConfig, FixedLagSmoother, InertialState, StartDeviations, VisualPoints
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.imu_preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
+from kiteline_core.time_offset import TimeOffsetEstimator
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class InertialConfig:
+    """How the inertial part starts, and when it gives up."""
+
+    smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
+    gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer's bias takes up
+    max_gap_s: float = 0.05  # a longer hole in the samples makes an interval unknown
+    rest_window_s: float = 0.3  # so long must the vehicle stand to start from rest
+    rest_gyro_rad_s: float = 0.02  # deviation of the gyro below which it stands
+    rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle
+    rest_moved_m: float = 0.005  # most that the images may have moved meanwhile
+    motion_window_s: float = 0.7  # window of the alignment in motion
+    window_frames: int = 30  # most frames that are kept while waiting
+    max_residual_m_s: float = 0.15  # of the alignment: above it the poses do not fit the IMU, wait on
+    max_gravity_error: float = 0.12  # relative, of its length as found without knowing it
+    max_coast_s: float = 5.0  # longer without images, the position means nothing
+    offset_memory_s: float = 20.0  # a time offset drifts slowly
+    offset_start_sigma_s: float = 0.02  # cameras without a trigger line
+    offset_turn_sigma_rad: float = 6e-4  # error of a visual turn between two frames
+    offset_trusted_s: float = 1.5e-3  # deviation below which the estimate is applied
+    offset_rate: float = 0.05  # s/s, how fast the applied offset follows
+    apply_offset: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """T_m_b: (4,4) where the body should be. velocity: (3,) m/s in m. turn_R_b0_b1: (3,3) since the last frame."""
+
+    T_m_b: F64
+    velocity: F64
+    turn_R_b0_b1: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    t_ns: int
+    T_m_b: F64
+    samples: Samples | None  # that lead here from the pose before
+
+
+class InertialTracker:
+    """Once a frame: `predict`, then `update` with what the images saw or `coast` without. Pure; no clocks."""
+
+    def __init__(self, camera: RectifiedCamera, calibration: ImuCalibration, config: InertialConfig) -> None:
+        self._config = config
+        self._calibration = calibration
+        self._p_b_c = camera.T_b_c[:3, 3].copy()
+        self._buffer = SampleBuffer(3.0, config.max_gap_s)
+        self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
+        self._offset = TimeOffsetEstimator(
+            config.offset_memory_s, config.offset_start_sigma_s, config.offset_turn_sigma_rad
+        )
+        self._applied_s = 0.0
+        self._bias = np.zeros(6)
+        self._bias_known = False
+        self._waiting: list[_Pose] = []
+        self._last: _Pose | None = None  # the last pose, however it was come by
+        self._last_visual: tuple[int, F64] | None = None
+        self._ends_ns = 0  # instant of the IMU at which the last interval ended
+        self._blind_s = 0.0
+        self.started: str | None = None  # "rest" or "motion", how the smoother started last
+        self.surprise = 0.0  # squared Mahalanobis distance of the last visual pose from the prediction, 6 dof
+
+    # what is known
+
+    @property
+    def running(self) -> bool:
+        """Whether velocity, gravity and biases are known, so that `coast` can carry the pose."""
+        return self._smoother.running
+
+    @property
+    def state(self) -> InertialState | None:
+        """The newest state; None while waiting for a start."""
+        return self._smoother.state if self._smoother.running else None
+
+    @property
+    def level_R(self) -> F64:
+        """R_level_m (3,3): the turn that would set the map upright, by what is known of gravity now."""
+        tilt = self._smoother.state.tilt if self._smoother.running else np.zeros(2)
+        return se3.so3_exp(np.array([-tilt[0], -tilt[1], 0.0]))
+
+    @property
+    def time_offset_s(self) -> tuple[float, float]:
+        """Camera stamp + offset = time of the IMU, and one standard deviation, s."""
+        return self._offset.offset_s, self._offset.sigma_s
+
+    @property
+    def blind_s(self) -> float:
+        """How long the IMU alone has carried the pose."""
+        return self._blind_s
+
+    # once a frame
+
+    def predict(self, imu: ImuBatch | None, t_ns: int) -> Prediction | None:
+        """Take in samples, and say where the body should be at t_ns. None where samples are missing or nothing is known."""
+        self._buffer.push(imu)
+        if self._last is None:
+            return None
+        samples = self._interval(t_ns)
+        if samples is None:
+            return None
+        if self._smoother.running:
+            T_m_b, velocity = self._smoother.predict(samples)
+            return Prediction(T_m_b, velocity, self._last.T_m_b[:3, :3].T @ T_m_b[:3, :3])
+        motion = preintegrate(samples, self._bias, self._calibration)
+        velocity = self._visual_velocity()
+        T = self._last.T_m_b.copy()
+        T[:3, 3] += velocity * (t_ns - self._last.t_ns) * 1e-9
+        T[:3, :3] = T[:3, :3] @ motion.turn
+        return Prediction(T, velocity, motion.turn)
+
+    def update(self, t_ns: int, T_m_b_visual: F64, points: VisualPoints) -> InertialState | None:
+        """A frame was measured: T_m_b_visual (4,4) by images alone, from `points`. The state that images and IMU together
+        give, or None while waiting for a start or where samples are missing (then the images alone hold).
+        """
+        samples = self._interval(t_ns)
+        if samples is not None:
+            self._watch_offset(t_ns, T_m_b_visual, samples)
+        state = None
+        if self._smoother.running:
+            state = self._advance(samples, points, T_m_b_visual)
+        if state is None:
+            self._wait(_Pose(t_ns, T_m_b_visual.copy(), samples))
+            self._note(t_ns, T_m_b_visual)
+            self._try_start()
+        else:
+            self._note(t_ns, state.T_m_b)
+        self._last_visual = (t_ns, T_m_b_visual.copy())
+        self._blind_s = 0.0
+        return state
+
+    def coast(self, t_ns: int) -> InertialState | None:
+        """A frame without images: the IMU alone carries the state, its covariance grows. None when it cannot."""
+        samples = self._interval(t_ns)
+        self._last_visual = None
+        self._waiting = []
+        if self._last is not None:
+            self._blind_s += (t_ns - self._last.t_ns) * 1e-9
+        state = None
+        if self._smoother.running and self._blind_s <= self._config.max_coast_s:
+            state = self._advance(samples, None, None)
+        if state is None:
+            self._smoother.stop()
+            return None
+        self._note(t_ns, state.T_m_b)
+        return state
+
+    def shift_map(self, T_new_old: F64) -> None:
+        """The map moved under the vehicle between two frames: p_new = T_new_old p_old."""
+        self._smoother.shift_map(T_new_old)
+        self._waiting = [_Pose(p.t_ns, T_new_old @ p.T_m_b, p.samples) for p in self._waiting]
+        if self._last is not None:
+            self._last = _Pose(self._last.t_ns, T_new_old @ self._last.T_m_b, self._last.samples)
+        if self._last_visual is not None:
+            self._last_visual = (self._last_visual[0], T_new_old @ self._last_visual[1])
+
+    def reset(self) -> None:
+        """A new map begins whose place is not known relative to the old one. Biases are kept."""
+        self._smoother.stop()
+        self._waiting = []
+        self._last = self._last_visual = None
+        self._blind_s = 0.0
+
+    def metric_scale(self) -> tuple[float, float] | None:
+        """Metres per unit of a map without scale, and one deviation, from the frames seen while waiting; None if unknown."""
+        poses, motions = self._window(self._config.window_frames)
+        if len(poses) < 8:
+            return None
+        bias = np.concatenate([imu_alignment.gyro_bias(poses, motions), self._bias[3:]])
+        found = imu_alignment.align(
+            poses, self._p_b_c, motions, bias, self._config.gravity_m_s2, with_scale=True
+        )
+        return None if found is None else (found.scale, found.scale_sigma)
+
+    # parts
+
+    def _interval(self, t_ns: int) -> Samples | None:
+        """Samples from the last frame to this one, on the IMU's clock."""
+        if self._last is None:
+            return None
+        begin = self._ends_ns if self._ends_ns else self._last.t_ns + int(self._applied_s * 1e9)
+        return self._buffer.between(begin, t_ns + int(self._applied_s * 1e9))
+
+    def _note(self, t_ns: int, T_m_b: F64) -> None:
+        self._last = _Pose(t_ns, T_m_b.copy(), None)
+        self._ends_ns = t_ns + int(self._applied_s * 1e9)
+
+    def _advance(self, samples: Samples | None, points: VisualPoints | None, T_m_b_visual: F64 | None) -> InertialState | None:
+        if samples is None:
+            self._smoother.stop()
+            return None
+        state = self._smoother.add(samples, points)
+        if state is not None:
+            self._bias, self._bias_known = state.bias, True
+        return state
+
+    def _watch_offset(self, t_ns: int, T_m_b: F64, samples: Samples) -> None:
+        if self._last_visual is None or not (self._smoother.running or self._bias_known):
+            return
+        config = self._config
+        before_ns, before = self._last_visual
+        dt_s = (t_ns - before_ns) * 1e-9
+        if abs(dt_s - samples.duration_s) < 1e-3:
+            motion = preintegrate(samples, self._bias, self._calibration)
+            change = (samples.gyro[-1] - self._bias[:3]) - motion.turn.T @ (samples.gyro[0] - self._bias[:3])
+            error = se3.so3_log(motion.turn.T @ before[:3, :3].T @ T_m_b[:3, :3])
+            self._offset.add(error + change * self._applied_s, change, dt_s)
+        if config.apply_offset and self._offset.sigma_s < config.offset_trusted_s:
+            step = self._offset.offset_s - self._applied_s
+            self._applied_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
+
+    # start
+
+    def _wait(self, pose: _Pose) -> None:
+        if pose.samples is None:
+            self._waiting = []
+        self._waiting = [*self._waiting, pose][-self._config.window_frames :]
+
+    def _visual_velocity(self) -> F64:
+        if len(self._waiting) < 2:
+            return np.zeros(3)
+        a, b = self._waiting[-2], self._waiting[-1]
+        return np.asarray((b.T_m_b[:3, 3] - a.T_m_b[:3, 3]) / ((b.t_ns - a.t_ns) * 1e-9))
+
+    def _window(self, most: int) -> tuple[F64, list[Preintegrated]]:
+        poses = self._waiting[-most:]
+        motions = [preintegrate(p.samples, self._bias, self._calibration) for p in poses[1:] if p.samples is not None]
+        return np.array([p.T_m_b for p in poses]), motions
+
+    def _try_start(self) -> None:
+        if len(self._waiting) < 4:
+            return
+        last = self._waiting[-1]
+        span_s = (last.t_ns - self._waiting[0].t_ns) * 1e-9
+        if span_s >= self._config.rest_window_s and self._start_at_rest(last):
+            self.started = "rest"
+        elif span_s >= self._config.motion_window_s and self._start_in_motion(last):
+            self.started = "motion"
+        else:
+            return
+        self._waiting = []
+
+    def _start_at_rest(self, last: _Pose) -> bool:
+        config = self._config
+        recent = [p for p in self._waiting if (last.t_ns - p.t_ns) * 1e-9 <= config.rest_window_s + 0.1]
+        moved = max(float(np.linalg.norm(p.T_m_b[:3, 3] - last.T_m_b[:3, 3])) for p in recent)
+        mean, spread, n = self._buffer.mean(recent[0].t_ns, last.t_ns)
+        quiet = spread[:3].max() < config.rest_gyro_rad_s and spread[3:].max() < config.rest_accel_m_s2
+        if n < 20 or not quiet or moved > config.rest_moved_m:
+            return False
+        if abs(np.linalg.norm(mean[3:]) - config.gravity_m_s2) > 0.1 * config.gravity_m_s2:
+            return False
+        bias = np.concatenate([mean[:3], self._bias[3:]])
+        gravity = -last.T_m_b[:3, :3] @ (mean[3:] - bias[3:])
+        deviations = StartDeviations(velocity_m_s=0.02, gyro_bias_rad_s=0.002)
+        self._smoother.start(last.T_m_b, np.zeros(3), bias, gravity, deviations)
+        return True
+
+    def _start_in_motion(self, last: _Pose) -> bool:
+        config = self._config
+        poses, motions = self._window(config.window_frames)
+        gyro = imu_alignment.gyro_bias(poses, motions)
+        bias = np.concatenate([gyro, self._bias[3:]])
+        found = imu_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
+        if found is None or found.residual_m_s > config.max_residual_m_s or found.gravity_error > config.max_gravity_error:
+            return False
+        self._smoother.start(last.T_m_b, found.velocities[-1], bias, found.gravity, StartDeviations())
+        return True
