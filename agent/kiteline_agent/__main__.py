@@ -45,6 +45,7 @@ from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, Sour
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
 from kiteline_hw.zenoh_lockstep import LockstepClient
+from kiteline_hw.zenoh_session import exit_on_sigterm
 
 _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
@@ -95,6 +96,7 @@ class Onboard:
                 LogWriter(folder / spec.log_name, _log_metadata(spec, source, config, channel))
             )
             log.rig(self._log_shift_ns, source.rig, source.imu)
+            log.flush()  # an agent that dies at once leaves a log that can be read
             self._log = log
             self._live = self._open(folder / "live.tum")
             self._odometry = self._open(folder / "odometry.tum")
@@ -240,7 +242,7 @@ def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig, cha
     }
 
 
-def fly_lockstep(spec: AgentSpec, parent: process.Parent, stop: process.StopSignal) -> None:
+def fly_lockstep(spec: AgentSpec, parent: process.Parent) -> None:
     """Fly behind the base's barrier; where the base ends, go on alone."""
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
     onboard = Onboard(spec, source, channel_for(spec), whole_process=True)
@@ -248,7 +250,7 @@ def fly_lockstep(spec: AgentSpec, parent: process.Parent, stop: process.StopSign
     line = Barrier(spec.link.removeprefix("lockstep:"), spec.agent, parent)
     try:
         up, now_ns, phase = onboard.hello(), -1, Phase.FLY
-        while phase is not Phase.END and not stop:
+        while phase is not Phase.END:
             down = line.exchange(up)
             if down is None:
                 if onboard.next_ns is None:
@@ -381,9 +383,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """`kiteline agent`, and a child of `kiteline fly` (with --spec); the exit status."""
     p = parser()
     a = p.parse_args(argv)
-    stop = process.StopSignal()
     if a.spec:
-        return run_child(from_json(a.spec), stop)
+        return run_child(from_json(a.spec))
     if not a.source:
         p.error("a SOURCE is needed")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
@@ -394,15 +395,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, cpu_percent=a.cpu,
         mavlink=a.mavlink, axes=a.axes,
     )  # fmt: skip
-    fly_live(spec, None, stop)
+    fly_live(spec, None, process.StopSignal())
     return 0
 
 
-def run_child(spec: AgentSpec, stop: process.StopSignal) -> int:
+def run_child(spec: AgentSpec) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
     parent = process.Parent()
     try:
-        (fly_lockstep if spec.link.startswith("lockstep:") else fly_live)(spec, parent, stop)
+        if spec.link.startswith("lockstep:"):
+            exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
+            fly_lockstep(spec, parent)
+        else:
+            fly_live(spec, parent, process.StopSignal())
     except (SourceError, LinkError, ValueError) as error:
         parent.tell("error", text=str(error))
         return 2

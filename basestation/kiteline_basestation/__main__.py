@@ -45,6 +45,7 @@ from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, LinkHub
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.zenoh_lockstep import LockstepServer
+from kiteline_hw.zenoh_session import exit_on_sigterm
 
 _COLLECT_S = 120.0  # s that an agent may take for one tick of a lock-step flight before it counts as gone
 _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
@@ -127,6 +128,8 @@ class Ground:
         if spec.log_name:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._log = LogWriter(self._folder / spec.log_name, _log_metadata(spec, self.config))
+            self._log.text("/log", spec.start_ns, "info", f"base, session {spec.session}")
+            self._log.flush()  # a base that dies at once leaves a log that can be read
         self._log_shift_ns = spec.start_ns
         self._wires: dict[AgentId, LinkModel] = {}
 
@@ -241,14 +244,14 @@ def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
     return lambda agent: CodedChannel(SyncConfig(budget_bytes=spec.down_bytes_s), spec.session)
 
 
-def fly_lockstep(spec: BaseSpec, parent: process.Parent, stop: process.StopSignal) -> None:
+def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
     """Keep the barrier: step once all agents have handed in their messages. An agent that ends is left out."""
     ground = Ground(spec, coded_channels(spec))
     server = LockstepServer(spec.link.removeprefix("lockstep:"))
     try:
         parent.tell("ready")
         here = set(spec.agents)
-        while ground.phase is not Phase.END and not stop:
+        while ground.phase is not Phase.END:
             ups = _collect(server, here, ground, parent)
             if 0 <= spec.kill_at_s * 1e9 <= ground.now_ns:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -389,9 +392,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """`kiteline base`, and a child of `kiteline fly` (with --spec); the exit status."""
     p = parser()
     a = p.parse_args(argv)
-    stop = process.StopSignal()
     if a.spec:
-        return run_child(from_json(a.spec), stop)
+        return run_child(from_json(a.spec))
     if not a.link:
         p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline" / "base"
@@ -400,15 +402,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         folder=a.log, log_name=f"session{session:05d}.mcap" if a.log else "", session=session, link=a.link,
         config=a.config, down_bytes_s=a.down_bytes, store=a.store, web=a.web,
     )  # fmt: skip
-    fly_live(spec, None, stop)
+    fly_live(spec, None, process.StopSignal())
     return 0
 
 
-def run_child(spec: BaseSpec, stop: process.StopSignal) -> int:
+def run_child(spec: BaseSpec) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
     parent = process.Parent()
     try:
-        (fly_lockstep if spec.link.startswith("lockstep:") else fly_live)(spec, parent, stop)
+        if spec.link.startswith("lockstep:"):
+            exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
+            fly_lockstep(spec, parent)
+        else:
+            fly_live(spec, parent, process.StopSignal())
     except (LinkError, WireError, ValueError) as error:
         parent.tell("error", text=str(error))
         return 2

@@ -1,4 +1,4 @@
-"""Flights in this process: every mode flies the same recording, leaves what the contract says, and does so twice alike."""
+"""Flights in this process: every mode flies the same recording, keeps the contract, and does so twice alike."""
 
 from __future__ import annotations
 

@@ -1,0 +1,124 @@
+"""Logs fly again bit for bit, and a log that was tampered with is found out."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from mcap.writer import CompressionType, Writer
+
+from kiteline_hw.mcap_file import McapFile
+from kiteline_hw.mcap_log import LogReader
+from kiteline_hw.mcap_mend import mend
+from kiteline_hw.ports import SourceError
+from kiteline_lab.fly import Options, fly
+from kiteline_lab.replay import main, replay_agent
+
+
+@pytest.fixture(scope="module")
+def flown(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight with the codec and a bad link."""
+    out = tmp_path_factory.mktemp("flown")
+    fly(Options((str(recording),), out, "local", loss=0.1), quiet=True)
+    return out
+
+
+def rewritten(log: Path, to: Path, topic: str, number: int, change: bytes) -> Path:
+    """A copy of a log in which the last bytes of one message are others."""
+    source = McapFile(log)
+    with to.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start("", "test")
+        for record in source.metadata:
+            writer.add_metadata(record.name, record.metadata)
+        schemas = {k: writer.register_schema(s.name, s.encoding, s.data) for k, s in sorted(source.schemas.items())}
+        channels = {
+            k: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
+            for k, c in sorted(source.channels.items())
+        }
+        seen = 0
+        for m in source.messages(ordered=False):
+            data = m.data
+            if source.channels[m.channel].topic == topic:
+                if seen == number:
+                    data = data[: -len(change)] + change
+                seen += 1
+            writer.add_message(channels[m.channel], m.log_ns, data, m.publish_ns, m.sequence)
+        writer.finish()
+    assert seen > number
+    return to
+
+
+@pytest.mark.parametrize("half", ["agent0", "base"])
+def test_a_flight_replays_bit_for_bit(flown: Path, half: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(flown / half / "log.mcap"), "--verify"]) == 0
+    assert "every output as in the log" in capsys.readouterr().out
+
+
+def test_trajectories_of_a_replay_are_those_of_the_flight(flown: Path, tmp_path: Path) -> None:
+    assert main([str(flown / "agent0" / "log.mcap"), "--out", str(tmp_path)]) == 0
+    for name in ("live.tum", "odometry.tum"):
+        assert (tmp_path / name).read_bytes() == (flown / "agent0" / name).read_bytes()
+
+
+def test_another_packet_in_the_log_is_found(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = rewritten(flown / "agent0" / "log.mcap", tmp_path / "log.mcap", "/packets/out", 5, b"!")
+    assert main([str(log), "--verify"]) == 1
+    assert "/packets/out" in capsys.readouterr().out
+
+
+def test_another_estimate_in_the_log_is_found(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with LogReader(flown / "agent0" / "log.mcap") as reader:
+        fourth = list(reader.messages(["/estimate"]))[4].json()
+    assert fourth["T_w_b"] is not None
+    log = rewritten(flown / "agent0" / "log.mcap", tmp_path / "log.mcap", "/estimate", 4, b"9.0]}")
+    assert main([str(log), "--verify"]) == 1
+    assert "T_w_b" in capsys.readouterr().out
+
+
+def test_a_base_that_heard_something_else_answers_otherwise(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with LogReader(flown / "base" / "log.mcap") as reader:
+        sizes = [len(m.data) for m in reader.messages(["/agent0/packets/in"])]
+    largest = sizes.index(max(sizes))
+    log = rewritten(flown / "base" / "log.mcap", tmp_path / "log.mcap", "/agent0/packets/in", largest, b"!")
+    assert main([str(log), "--verify"]) == 1
+    assert "differs" in capsys.readouterr().out
+
+
+def test_a_cut_log_replays_up_to_the_cut_also_when_mended(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log.mcap"
+    whole = (flown / "agent0" / "log.mcap").read_bytes()
+    log.write_bytes(whole[: len(whole) // 2])
+    assert main([str(log), "--verify"]) == 0
+    assert "cut" in capsys.readouterr().out
+    assert mend(log) is not None
+    assert mend(log) is None
+    with LogReader(log) as reader:
+        assert reader.cut is None
+        assert 5 < replay_agent(reader).steps < 30
+    assert main([str(log), "--verify"]) == 0
+    assert "cut" in capsys.readouterr().out
+
+
+def test_the_virtual_cpu_drops_frames(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(flown / "agent0" / "log.mcap"), "--cpu", "4", "--virtual"]) == 0
+    words = capsys.readouterr().out.split()
+    assert int(words[words.index("dropped,") - 1]) > 5
+    assert main([str(flown / "agent0" / "log.mcap"), "--cpu", "100", "--virtual"]) == 0
+    words = capsys.readouterr().out.split()
+    assert words[words.index("dropped,") - 1] == "0"
+
+
+def test_a_recording_is_no_log_of_ours(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="fly"):
+        main([str(recording), "--verify"])
+    cut = tmp_path / "cut.mcap"
+    shutil.copy(recording, cut)
+    cut.write_bytes(cut.read_bytes()[:100])
+    with pytest.raises(SourceError):
+        main([str(cut), "--verify"])

@@ -1,0 +1,115 @@
+"""Flights of separate processes over a real link: agreement, repetition, deaths, and nobody left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from kiteline_hw.ports import LinkError, SourceError
+from kiteline_lab.flight import free_endpoint
+from kiteline_lab.flight_report import check_contract, without_timing
+from kiteline_lab.fly import Options, fly
+from kiteline_lab.replay import main as replay
+
+
+def children_of(folder: Path) -> list[int]:
+    """Processes whose command line names a folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal() and int(entry.name) != os.getpid():
+            try:
+                line = (entry / "cmdline").read_bytes()
+            except OSError:
+                continue
+            if str(folder).encode() in line and b"--spec" in line:
+                found.append(int(entry.name))
+    return found
+
+
+def test_two_flights_over_a_lossy_link_are_alike_and_agree(recording: Path, tmp_path: Path) -> None:
+    for run in "ab":
+        report, outcome = fly(Options((str(recording),), tmp_path / run, loss=0.2, seed=1), quiet=True)
+        assert not outcome.failed
+        assert report["base"]["digest_equal"] is True
+        assert check_contract(tmp_path / run) == []
+        assert children_of(tmp_path / run) == []
+    for name in ("agent0/live.tum", "agent0/odometry.tum", "base/agent0.tum", "base/map.ply", "agent0/log.mcap"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    a, b = (json.loads((tmp_path / run / "report.json").read_text()) for run in "ab")
+    assert without_timing(a) == without_timing(b)
+    assert replay([str(tmp_path / "a" / "base" / "log.mcap"), "--verify"]) == 0
+
+
+def test_a_base_that_dies_is_missed_by_nobody_and_its_successor_catches_up(recording: Path, tmp_path: Path) -> None:
+    o = Options((str(recording),), tmp_path, kill_base_at_s=0.5, restart_base_at_s=0.9)
+    report, outcome = fly(o, quiet=True)
+    agent = report["agents"][0]
+    assert (agent["frames"], agent["tracked"]) == (30, 30)
+    assert report["base"]["digest_equal"] is True
+    assert report["base"]["keyframes"] == agent["keyframes"]
+    assert any("went on alone" in note for note in report["notes"])
+    assert check_contract(tmp_path) == []
+    assert not outcome.failed
+
+
+def test_without_a_new_base_the_agent_flies_to_the_end(recording: Path, tmp_path: Path) -> None:
+    report, _ = fly(Options((str(recording),), tmp_path, kill_base_at_s=0.5), quiet=True)
+    assert report["agents"][0]["tracked"] == 30
+    assert report["base"] is None
+    assert check_contract(tmp_path) == []
+
+
+def test_an_agent_that_dies_leaves_its_map_to_the_base(recording: Path, tmp_path: Path) -> None:
+    o = Options((str(recording), str(recording)), tmp_path, kill_agent_at_s=0.8)
+    report, outcome = fly(o, quiet=True)
+    assert report["agents"][1]["tracked"] == 30
+    assert 14 <= report["agents"][0]["tracked"] <= 16
+    assert report["base"]["agents_lost"] == [0]
+    assert report["base"]["keyframes"] > report["agents"][1]["keyframes"]
+    assert check_contract(tmp_path) == []
+    assert not outcome.failed
+
+
+def test_a_base_that_cannot_listen_is_told_at_once(recording: Path, tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    from kiteline_hw.zenoh_lockstep import LockstepServer
+
+    with LockstepServer(endpoint), pytest.raises(LinkError, match="listen"):
+        fly(Options((str(recording),), tmp_path, link=f"zenoh:{endpoint}"), quiet=True)
+    assert children_of(tmp_path) == []
+
+
+def test_a_bad_source_is_told_before_anything_starts(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="no such"):
+        fly(Options((str(tmp_path / "nothing"),), tmp_path / "out"), quiet=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_link_that_fly_cannot_use_is_refused(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match="zenoh:tcp"):
+        fly(Options((str(recording),), tmp_path, link="serial:/dev/null:57600"), quiet=True)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_flight_leaves_no_process(recording: Path, tmp_path: Path, how: signal.Signals) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    # Real clocks and a long recording time: it is surely still flying when it is interrupted.
+    command = [sys.executable, "-m", "kiteline_cli", "fly", str(recording), "--out", str(tmp_path), "--realtime"]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as flight:
+        deadline_s = time.monotonic() + 20.0
+        while len(children_of(tmp_path)) < 2:
+            assert time.monotonic() < deadline_s, "the flight did not begin"
+            time.sleep(0.02)
+        flight.send_signal(how)
+        flight.communicate(timeout=10.0)
+    while children_of(tmp_path):
+        assert time.monotonic() < deadline_s, "a child is left"
+        time.sleep(0.02)
+    assert flight.returncode == (130 if how is signal.SIGINT else -9)
