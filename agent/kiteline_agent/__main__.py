@@ -45,7 +45,6 @@ from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, Sour
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
 from kiteline_hw.zenoh_lockstep import LockstepClient
-from kiteline_hw.zenoh_session import exit_on_sigterm
 
 _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
@@ -404,7 +403,7 @@ def run_child(spec: AgentSpec) -> int:
     parent = process.Parent()
     try:
         if spec.link.startswith("lockstep:"):
-            exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
+            process.exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
             fly_lockstep(spec, parent)
         else:
             fly_live(spec, parent, process.StopSignal())

@@ -45,7 +45,6 @@ from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, LinkHub
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.zenoh_lockstep import LockstepServer
-from kiteline_hw.zenoh_session import exit_on_sigterm
 
 _COLLECT_S = 120.0  # s that an agent may take for one tick of a lock-step flight before it counts as gone
 _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
@@ -411,7 +410,7 @@ def run_child(spec: BaseSpec) -> int:
     parent = process.Parent()
     try:
         if spec.link.startswith("lockstep:"):
-            exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
+            process.exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
             fly_lockstep(spec, parent)
         else:
             fly_live(spec, parent, process.StopSignal())

@@ -33,6 +33,15 @@ class StopSignal:
         return self._event.wait(max(0.0, seconds))
 
 
+def exit_on_sigterm() -> None:
+    """Turn SIGTERM into SystemExit in the main thread, so that `with` and `finally` close logs and sessions."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    signal.signal(signal.SIGTERM, leave)
+
+
 def notify(state: str) -> None:
     """Tell systemd, if it started us: READY=1, WATCHDOG=1, STATUS=... (sd_notify(3)). Never raises."""
     address = os.environ.get("NOTIFY_SOCKET")
