@@ -18,7 +18,7 @@ from kiteline_hw.sim.source import SimSource, open_sim
 from kiteline_hw.sim.textures import TexturePool, make_pool
 from kiteline_hw.sim.world import NO_GROUND, World, bilinear
 
-SMALL: dict[str, Any] = {"scale": 0.25, "texture_bits": 8}
+SMALL: dict[str, Any] = {"miscalibration": 0.0, "scale": 0.25, "texture_bits": 8}
 
 
 @pytest.fixture(scope="module")

@@ -28,9 +28,10 @@ class SimConfig:
     lens: str = "radtan"  # or equidistant, none
     baseline: float = 0.11  # m
     scale: float = 1.0  # of image size and focal length
-    exposure_s: float = 0.006  # indoor exposure of a small drone camera
-    read_noise: float = 1.0  # grey values
-    shot_noise: float = 0.012  # variance per grey value
+    exposure_s: float = 0.010  # indoor exposure of a small drone camera
+    read_noise: float = 1.2  # grey values
+    shot_noise: float = 0.02  # variance per grey value
+    miscalibration: float = 0.5  # how far the true cameras are from the stated ones, see lens.imperfect; 0: not at all
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,6 +84,26 @@ def rays(camera: CameraModel) -> F32:
 def fall_off(directions: F32) -> F32:
     """Vignette (h, w) of the inner pixels: cos^2.2 of the angle to the axis, 1 in the middle."""
     return np.ascontiguousarray(directions[1:-1, 1:-1, 2] ** 2.2, np.float32)
+
+
+def imperfect(rig: CameraRig, rng: np.random.Generator, amount: float) -> CameraRig:
+    """The cameras as they truly are where `rig` is what a good calibration says: off by about a tenth of a pixel."""
+
+    def camera(c: CameraModel) -> CameraModel:
+        e = amount * rng.standard_normal(4 + len(c.distortion))
+        centre = 0.1 * c.width / 752  # px
+        k = tuple(value * (1.0 + 1e-3 * error) for value, error in zip(c.distortion, e[4:], strict=True))
+        fx, fy = c.fx * (1.0 + 2e-4 * e[0]), c.fy * (1.0 + 2e-4 * e[1])
+        return replace(c, fx=fx, fy=fy, cx=c.cx + centre * e[2], cy=c.cy + centre * e[3], distortion=k)
+
+    def turn(t: F64, angle_rad: float, shift_m: float) -> F64:
+        e = amount * rng.standard_normal(6)
+        return t @ se3.exp(np.concatenate([shift_m * e[:3], angle_rad * e[3:]]))
+
+    left, t_b_c = camera(rig.left), turn(rig.T_b_c, 4e-4, 5e-4)
+    if rig.right is None or rig.T_c_r is None:
+        return replace(rig, left=left, T_b_c=t_b_c)
+    return replace(rig, left=left, right=camera(rig.right), T_b_c=t_b_c, T_c_r=turn(rig.T_c_r, 1e-4, 1e-5))
 
 
 def make_rig(

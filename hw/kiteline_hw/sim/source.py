@@ -15,7 +15,7 @@ from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sim import imu as inertial
 from kiteline_hw.sim.config import SimConfig, read_config
-from kiteline_hw.sim.lens import make_rig
+from kiteline_hw.sim.lens import imperfect, make_rig
 from kiteline_hw.sim.paths import built_in, course_length_s
 from kiteline_hw.sim.render import Eye
 from kiteline_hw.sim.scenes import build_indoor
@@ -60,6 +60,8 @@ class SimSource:
         self.config = config
         stereo = not (config.mono or config.depth)
         self._rig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale)
+        rng = np.random.default_rng([config.seed * 64 + config.agent, 41])
+        self._true_rig = imperfect(self._rig, rng, config.miscalibration)
         self.path = self._choose_path()
         self.world = world if world is not None else build_world(config, self._rig.T_b_c)
         seconds = self.path.duration_s if not config.seconds else min(config.seconds, self.path.duration_s)
@@ -125,10 +127,11 @@ class SimSource:
 
     def eyes(self) -> list[Eye]:
         """Fresh cameras in the world, left first."""
-        left = [Eye(self.world, self._rig.left, self._rig.T_b_c)]
-        if self._rig.right is None or self._rig.T_c_r is None:
+        rig = self._true_rig
+        left = [Eye(self.world, rig.left, rig.T_b_c)]
+        if rig.right is None or rig.T_c_r is None:
             return left
-        return [*left, Eye(self.world, self._rig.right, self._rig.T_b_c @ self._rig.T_c_r)]
+        return [*left, Eye(self.world, rig.right, rig.T_b_c @ rig.T_c_r)]
 
     def render(self, k: int, eyes: list[Eye]) -> Frame:
         """Frame k of the flight, whatever was rendered before."""
