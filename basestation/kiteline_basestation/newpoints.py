@@ -61,15 +61,16 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointCo
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[keyframe]
     made = 0
+    inverse = sparse_map.inverse_depths(sparse_map.points_of(keyframe))
+    inverse = inverse[inverse > 0]
+    here = _open_births(sparse_map, keyframe)
     for other in covisible_keyframes(sparse_map, keyframe, 1)[: config.keyframes]:
-        here, there = _open_births(sparse_map, keyframe), _open_births(sparse_map, other)
         if len(here) == 0:
-            return made
+            break
+        there = _open_births(sparse_map, other)
         if len(there) == 0:
             continue
         T_m_a, T_m_b = keyframes.T_m_k[row], keyframes.T_m_k[sparse_map.rows[other]]
-        inverse = sparse_map.inverse_depths(sparse_map.points_of(keyframe))
-        inverse = inverse[inverse > 0]
         baseline = float(np.linalg.norm(T_m_a[:3, 3] - T_m_b[:3, 3]))
         if len(inverse) and baseline * float(np.median(inverse)) < config.min_baseline_ratio:
             continue
@@ -90,6 +91,7 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointCo
             if fuse(sparse_map, int(a[i]), int(b[i]), publisher):
                 root = table.root[a[i : i + 1]]
                 made += _set(sparse_map, root, position[i : i + 1], publisher)
+        here = here[table.root[here] == here]
     return made
 
 

@@ -26,10 +26,3 @@ def huber_weight(s: F64, bound: F64) -> F64:
     """Derivative of `huber_cost` by s: the weight that a residual keeps in iterated least squares."""
     outside = s > bound
     return np.where(outside, np.sqrt(bound) / np.sqrt(np.where(outside, s, 1.0)), 1.0)
-
-
-def spread(values: F64) -> float:
-    """Standard deviation of values (n,) by the median absolute deviation; 0 for none."""
-    if len(values) == 0:
-        return 0.0
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_core import se3
-from kiteline_core.robust import spread
 from kiteline_core.triangulation import nearest_point, parallax, project, rays
 
 CAMERA = np.array([400.0, 410.0, 320.0, 240.0])
@@ -34,10 +33,3 @@ def test_parallel_rays_are_said_to_meet_nowhere() -> None:
     direction = np.tile([0.0, 0.0, 1.0], (1, 2, 1))
     _, good = nearest_point(np.array([[[0.0, 0, 0], [1.0, 0, 0]]]), direction)
     assert not good[0]
-
-
-def test_spread_is_that_of_a_normal_distribution_and_ignores_a_few_wild_values() -> None:
-    values = np.random.default_rng(0).normal(5.0, 2.0, 4000)
-    values[:100] = 1e6
-    assert abs(spread(values) - 2.0) < 0.15
-    assert spread(np.zeros(0)) == 0.0
