@@ -1,4 +1,4 @@
-"""Motion from two views: exact on clean scenes flat and deep, sure under noise and outliers, silent where nothing tells."""
+"""Motion from two views: exact on clean scenes, sure under noise and outliers, silent where nothing tells."""
 
 from __future__ import annotations
 
