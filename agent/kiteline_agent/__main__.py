@@ -383,7 +383,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = parser()
     a = p.parse_args(argv)
     if a.spec:
-        return run_child(from_json(a.spec))
+        process.leave(run_child(from_json(a.spec)))
     if not a.source:
         p.error("a SOURCE is needed")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
@@ -395,7 +395,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         mavlink=a.mavlink, axes=a.axes,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
-    return 0
+    process.leave(0)
 
 
 def run_child(spec: AgentSpec) -> int:

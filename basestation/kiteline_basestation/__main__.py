@@ -392,7 +392,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = parser()
     a = p.parse_args(argv)
     if a.spec:
-        return run_child(from_json(a.spec))
+        process.leave(run_child(from_json(a.spec)))
     if not a.link:
         p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline" / "base"
@@ -402,7 +402,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         config=a.config, down_bytes_s=a.down_bytes, store=a.store, web=a.web,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
-    return 0
+    process.leave(0)
 
 
 def run_child(spec: BaseSpec) -> int:

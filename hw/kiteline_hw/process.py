@@ -11,7 +11,7 @@ import sys
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 
 class StopSignal:
@@ -40,6 +40,15 @@ def exit_on_sigterm() -> None:
         sys.exit(128 + number)
 
     signal.signal(signal.SIGTERM, leave)
+
+
+def leave(status: int) -> NoReturn:
+    """End the process now. Logs and sessions must be closed. The interpreter's own end is passed over: it would cancel
+    the threads of native libraries (Zenoh's among them) in mid-call, which now and then aborts the process.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def notify(state: str) -> None:
