@@ -178,6 +178,9 @@ class FixedLagSmoother:
         T_m_b, velocity = motion.propagate(
             se3.from_rt(self._rot[k - 1], self._state[k - 1, :3]), self._state[k - 1, 3:6], bias, self.gravity
         )
+        if not (np.isfinite(T_m_b).all() and np.isfinite(motion.cov).all()):
+            self.stop()
+            return None
         self._put_interval(k - 1, motion)
         self._samples.append(samples)
         self._rot[k] = se3.orthonormalise(T_m_b)[:3, :3]
