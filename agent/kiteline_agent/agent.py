@@ -12,6 +12,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.inertial import GyroPreintegrator, level_rotation
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
+from kiteline_agent.right_eye import RightEye
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
@@ -158,7 +159,7 @@ class Agent:
     def _view(self, frame: Frame) -> View:
         levels = self._config.pyramid.levels
         left = build_pyramid(self._rectifier.left(frame.left), levels)
-        right = None if frame.right is None else build_pyramid(self._rectifier.right(frame.right), levels)
+        right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels)
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
         return View(left, right, depth)
 

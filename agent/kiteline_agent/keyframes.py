@@ -15,6 +15,7 @@ from kiteline_core.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 
+_SEARCH_PX = 2.5  # px of the level: how far sub-pixel stereo may lie from the coarse search, whose step is 2 px
 _COVER_CELL_PX = 96  # about 8 x 5 cells at 752x480: coarse enough that an even track fills nearly all
 
 
@@ -99,12 +100,10 @@ def new_points(view: View, taken: F64, camera: RectifiedCamera, config: AgentCon
         stereo = config.stereo
         widest = min(camera.bf / stereo.min_depth_m, 0.45 * camera.width)
         stereo_kernels.search_rows(
-            view.left, view.right, corners.uv, corners.octave, widest, stereo.uniqueness, disparity
+            view.left, view.right.whole(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
         )
         found = np.zeros(len(disparity), np.bool_)
-        stereo_kernels.refine_rows(
-            view.left, view.right, corners.uv, corners.octave, stereo.iterations, 2.5, stereo.min_ncc, disparity, found
-        )
+        view.right.refine(view.left, corners.uv, corners.octave, found.copy(), stereo, _SEARCH_PX, disparity, found)
         disparity[~found] = -1.0
         disparity[disparity < camera.fx / config.local_map.max_far_ratio] = -1.0
     elif view.depth_m is not None:

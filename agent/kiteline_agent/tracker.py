@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from kiteline_agent import local_map_kernels
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map import Candidates, LocalMap
-from kiteline_core import alignment_kernels, pose_kernels, se3, stereo_kernels
+from kiteline_agent.right_eye import RightEye
+from kiteline_core import alignment_kernels, pose_kernels, se3
 from kiteline_core.features import Pyramid
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+_SURE = 0.4  # px of the octave: below such a deviation of the predicted disparity, no coarser level is needed
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 
 
@@ -25,7 +27,7 @@ class View:
     """The pyramids of one instant. depth_m: (h,w) float32 aligned with left, or None."""
 
     left: Pyramid
-    right: Pyramid | None
+    right: RightEye | None
     depth_m: NDArray[np.float32] | None
 
 
@@ -102,7 +104,7 @@ class Tracker:
         depth = candidates.depth[chosen]
         observed = np.column_stack([uv, np.full(len(uv), -1.0)])
         if not coarse_only:
-            self._add_disparities(view, uv, octave, depth, observed)
+            self._add_disparities(view, rows, uv, octave, depth, observed)
         T = T_c_m.copy()
         inlier = np.ones(len(rows), np.bool_)
         information = np.zeros((6, 6))
@@ -123,16 +125,17 @@ class Tracker:
             len(found),
         )
 
-    def _add_disparities(self, view: View, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64) -> None:
+    def _add_disparities(
+        self, view: View, rows: I64, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64
+    ) -> None:
         """Fill observed[:, 2] from the right image or from the depth image, where they agree to be measurable."""
         bf = self._map.camera.bf
         if view.right is not None:
             stereo = self._config.stereo
             disparity = bf / depth
+            sure = self._map.sigma_rho.reshape(-1)[rows] * bf < _SURE * (1 << octave)
             found = np.zeros(len(uv), np.bool_)
-            stereo_kernels.refine_rows(
-                view.left, view.right, uv, octave, stereo.iterations, stereo.search_px, stereo.min_ncc, disparity, found
-            )
+            view.right.refine(view.left, uv, octave, sure, stereo, stereo.search_px, disparity, found)
             observed[found, 2] = disparity[found]
         elif view.depth_m is not None:
             d = depth_at(view.depth_m, uv)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import se3
+from kiteline_core.stereo_kernels import GRID_STEP
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
@@ -100,6 +101,9 @@ class Rectifier:
         self._size = (left.width, left.height)
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self._depth_map: NDArray[np.int16] | None = None
+        self.right_grid: NDArray[np.float32] | None = (
+            None  # see _grid; None where the right image needs no rectification
+        )
         if rig.right is None:
             if left.lens is not Lens.NONE:
                 self._maps[0] = _undistortion_maps(left, np.eye(3), left.matrix())
@@ -125,6 +129,7 @@ class Rectifier:
         r_left, r_right, new = _stereo_rotations(rig)
         self._maps[0] = _undistortion_maps(left, r_left, new)
         self._maps[1] = _undistortion_maps(rig.right, r_right, new)
+        self.right_grid = _grid(rig.right, r_right, new)
         # A point of the raw left camera is turned by r_left into the rectified one.
         t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
         self.camera = RectifiedCamera(
@@ -163,11 +168,15 @@ class Rectifier:
             self._depth_map = (whole + (rest_xy >= 16)).astype(np.int16)
         return np.asarray(cv2.remap(depth_m, self._depth_map, np.empty(0), cv2.INTER_NEAREST), np.float32)
 
-    def _apply(self, eye: int, image: U8) -> U8:
+    def check_size(self, image: U8) -> None:
+        """Raises CalibrationError when an image has not the calibrated size."""
         if image.shape != (self._size[1], self._size[0]):
             raise CalibrationError(
                 f"image is {image.shape[1]}x{image.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
             )
+
+    def _apply(self, eye: int, image: U8) -> U8:
+        self.check_size(image)
         maps = self._maps[eye]
         if maps is None:
             return image
@@ -193,6 +202,15 @@ def _undistortion_maps(camera: CameraModel, rotation: F64, new: F64) -> tuple[ND
     if camera.lens is Lens.EQUIDISTANT:
         return cv2.fisheye.initUndistortRectifyMap(camera.matrix(), d, rotation, new, size, cv2.CV_16SC2)  # type: ignore[return-value]
     return cv2.initUndistortRectifyMap(camera.matrix(), d, rotation, new, size, cv2.CV_16SC2)  # type: ignore[return-value]
+
+
+def _grid(camera: CameraModel, rotation: F64, new: F64) -> NDArray[np.float32]:
+    """Raw pixels (gh, gw, 2) float32 of every GRID_STEP-th rectified pixel, the far border included."""
+    size = (camera.width + GRID_STEP, camera.height + GRID_STEP)
+    d = np.array(camera.distortion, np.float64)
+    undistort = cv2.fisheye.initUndistortRectifyMap if camera.lens is Lens.EQUIDISTANT else cv2.initUndistortRectifyMap
+    x, y = undistort(camera.matrix(), d, rotation, new, size, cv2.CV_32FC1)
+    return np.ascontiguousarray(np.stack([x, y], axis=-1)[::GRID_STEP, ::GRID_STEP], np.float32)
 
 
 def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:

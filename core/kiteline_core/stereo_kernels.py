@@ -8,6 +8,8 @@ from kiteline_core.jit import njit
 
 RADIUS = 4
 SIDE = 2 * RADIUS + 1
+FINE_STEP_PX = 2.0  # px of the finer level: what the coarser one, or a sure prediction, leaves
+GRID_STEP = 4  # px; between grid points a lens bends by less than 0.01 px
 
 
 @njit
@@ -67,106 +69,192 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
 
 
 @njit
-def refine_rows(left, right, uv, octave, iterations, max_step_px, min_ncc, disparity, found):  # type: ignore[no-untyped-def]
+def _cut(image, x, y, patch, gradient):  # type: ignore[no-untyped-def]
+    """Patch around (x, y) of a level, zero-mean, and its gradient along the row made orthogonal to gain and offset.
+
+    Returns the sums of squares of both. The caller keeps RADIUS + 2 px from the border.
+    """
+    y0 = int(y)
+    fy = y - y0
+    x0 = int(x)
+    fx = x - x0
+    line = np.empty(SIDE + 3)
+    mean = 0.0
+    mg = 0.0
+    for r in range(SIDE):
+        row = y0 + r - RADIUS
+        for c in range(SIDE + 3):
+            col = x0 + c - RADIUS - 1
+            line[c] = (1.0 - fy) * image[row, col] + fy * image[row + 1, col]
+        for c in range(SIDE):
+            v = (1.0 - fx) * line[c + 1] + fx * line[c + 2]
+            gv = 0.5 * ((1.0 - fx) * (line[c + 2] - line[c]) + fx * (line[c + 3] - line[c + 1]))
+            patch[r, c] = v
+            gradient[r, c] = gv
+            mean += v
+            mg += gv
+    mean /= SIDE * SIDE
+    mg /= SIDE * SIDE
+    tt = 1e-9
+    tg = 0.0
+    for r in range(SIDE):
+        for c in range(SIDE):
+            patch[r, c] -= mean
+            gradient[r, c] -= mg
+            tt += patch[r, c] * patch[r, c]
+            tg += patch[r, c] * gradient[r, c]
+    hess = 0.0
+    for r in range(SIDE):
+        for c in range(SIDE):
+            gradient[r, c] -= tg / tt * patch[r, c]
+            hess += gradient[r, c] * gradient[r, c]
+    return tt, hess
+
+
+@njit
+def _strip_of(image, first, columns, y, strip):  # type: ignore[no-untyped-def]
+    """Fill strip (SIDE, >= columns) with rows around y of a level, from column `first` on."""
+    y0 = int(y)
+    fy = y - y0
+    for r in range(SIDE):
+        row = y0 + r - RADIUS
+        for c in range(columns):
+            strip[r, c] = (1.0 - fy) * image[row, first + c] + fy * image[row + 1, first + c]
+
+
+@njit
+def _raw_at(grid, x, y):  # type: ignore[no-untyped-def]
+    """Where pixel (x, y) of the rectified image lies in the raw one. grid: (gh,gw,2) float32, every GRID_STEP px."""
+    gx = min(max(x * (1.0 / GRID_STEP), 0.0), grid.shape[1] - 1.001)
+    gy = min(max(y * (1.0 / GRID_STEP), 0.0), grid.shape[0] - 1.001)
+    x0 = int(gx)
+    y0 = int(gy)
+    fx = gx - x0
+    fy = gy - y0
+    w00 = (1.0 - fx) * (1.0 - fy)
+    w01 = fx * (1.0 - fy)
+    w10 = (1.0 - fx) * fy
+    w11 = fx * fy
+    u = w00 * grid[y0, x0, 0] + w01 * grid[y0, x0 + 1, 0] + w10 * grid[y0 + 1, x0, 0] + w11 * grid[y0 + 1, x0 + 1, 0]
+    v = w00 * grid[y0, x0, 1] + w01 * grid[y0, x0 + 1, 1] + w10 * grid[y0 + 1, x0, 1] + w11 * grid[y0 + 1, x0 + 1, 1]
+    return u, v
+
+
+@njit
+def _raw_strip_of(image, grid, scale, first, columns, y, strip):  # type: ignore[no-untyped-def]
+    """The same strip of the rectified image, from the raw one. Along a row the lens is a parabola through three
+    pixels: over the 140 px of the coarsest level that is exact to 0.02 px of that level. False where the raw image ends.
+    """
+    h, w = image.shape
+    last = columns - 1.0
+    inverse = 1.0 / scale
+    for r in range(SIDE):
+        row = (y + r - RADIUS) * scale
+        u0, v0 = _raw_at(grid, first * scale, row)
+        u1, v1 = _raw_at(grid, (first + 0.5 * last) * scale, row)
+        u2, v2 = _raw_at(grid, (first + last) * scale, row)
+        u0, v0, u1, v1, u2, v2 = u0 * inverse, v0 * inverse, u1 * inverse, v1 * inverse, u2 * inverse, v2 * inverse
+        if min(u0, u2) < 0.0 or max(u0, u2) >= w - 1.5 or min(v0, v1, v2) < 0.5 or max(v0, v1, v2) >= h - 1.5:
+            return False
+        bu, bv = (4.0 * u1 - 3.0 * u0 - u2) / last, (4.0 * v1 - 3.0 * v0 - v2) / last
+        cu, cv = 2.0 * (u0 - 2.0 * u1 + u2) / (last * last), 2.0 * (v0 - 2.0 * v1 + v2) / (last * last)
+        for c in range(columns):
+            px = u0 + c * (bu + c * cu)
+            py = v0 + c * (bv + c * cv)
+            x0 = int(px)
+            y0 = int(py)
+            fx = px - x0
+            fy = py - y0
+            a = float(image[y0, x0])
+            b = float(image[y0 + 1, x0])
+            top = a + fx * (float(image[y0, x0 + 1]) - a)
+            bottom = b + fx * (float(image[y0 + 1, x0 + 1]) - b)
+            strip[r, c] = top + fy * (bottom - top)
+    return True
+
+
+@njit
+def _slide(strip, first, patch, gradient, tt, hess, begin, width, iterations, max_step_px):  # type: ignore[no-untyped-def]
+    """Slide along a strip until it looks like the patch. Returns where (px of the level), and the correlation."""
+    xr = begin
+    ncc = 0.0
+    converged = False
+    for k in range(iterations + 1):
+        if xr < RADIUS or xr >= width - RADIUS - 1 or abs(xr - begin) > max_step_px:
+            return xr, -1.0
+        c0 = int(xr)
+        fr = xr - c0
+        base = c0 - RADIUS - first
+        si = 0.0
+        sii = 0.0
+        st = 0.0
+        sg = 0.0
+        for r in range(SIDE):
+            for c in range(SIDE):
+                v1 = strip[r, base + c]
+                v = v1 + fr * (strip[r, base + c + 1] - v1)
+                si += v
+                sii += v * v
+                st += v * patch[r, c]
+                sg += v * gradient[r, c]
+        ncc = st / np.sqrt(tt * max(sii - si * si / (SIDE * SIDE), 1e-9))
+        gain = st / tt
+        if gain < 0.1:
+            return xr, -1.0
+        if converged or k == iterations:
+            break
+        move = min(max(-sg / (hess * gain), -1.5), 1.5)
+        xr += move
+        converged = abs(move) < 0.01
+    return xr, ncc
+
+
+@njit
+def refine_rows(left, right, grid, uv, octave, sure, iterations, max_step_px, min_ncc, disparity, found):  # type: ignore[no-untyped-def]
     """Sub-pixel disparity by 1-D Lucas-Kanade, invariant to gain and offset, at level `octave` (and one coarser first).
 
+    grid: (0,0,2) where `right` is rectified; else `right` is the raw image's pyramid, and grid (gh,gw,2) float32 says
+    where every GRID_STEP-th rectified pixel lies in it: only what is looked at is rectified.
+    sure: (n,) bool, the prediction is good to a pixel of its octave: the coarser level is left out.
     disparity: (n,) float64 px at level 0: prediction in (negative: skip), result out. found: (n,) bool out.
     max_step_px: how far the match may lie from the prediction, in px of the level.
     """
     levels = len(left)
-    t0 = np.empty((SIDE, SIDE))
-    g = np.empty((SIDE, SIDE))
+    patch = np.empty((SIDE, SIDE))
+    gradient = np.empty((SIDE, SIDE))
+    strip = np.empty((SIDE, SIDE + 2 * int(np.ceil(max(max_step_px, FINE_STEP_PX))) + 4))
+    raw = grid.shape[0] > 0
     for i in range(uv.shape[0]):
         found[i] = False
         if disparity[i] < 0.0:
             continue
-        start = disparity[i]
-        d = start
+        d = disparity[i]
         ok = False
-        for step in range(2):
+        for step in range(1 if sure[i] else 0, 2):
+            reach_px = max_step_px if step == 0 else min(max_step_px, FINE_STEP_PX)
+            reach = int(np.ceil(reach_px)) + 1
             level = min(int(octave[i]) + 1 - step, levels - 1)
-            a = left[level]
-            b = right[level]
-            h, w = a.shape
+            h, w = left[level].shape
             s = float(1 << level)
             x = uv[i, 0] / s
             y = uv[i, 1] / s
             ok = False
             if x < RADIUS + 1 or y < RADIUS or x >= w - RADIUS - 2 or y >= h - RADIUS - 1:
                 continue
-            y0 = int(y)
-            fy = y - y0
-            x0 = int(x)
-            fx = x - x0
-            mean = 0.0
-            mg = 0.0
-            for r in range(SIDE):
-                ra = y0 + r - RADIUS
-                for c in range(SIDE):
-                    ca = x0 + c - RADIUS
-                    l1 = (1.0 - fy) * a[ra, ca - 1] + fy * a[ra + 1, ca - 1]
-                    l2 = (1.0 - fy) * a[ra, ca] + fy * a[ra + 1, ca]
-                    l3 = (1.0 - fy) * a[ra, ca + 1] + fy * a[ra + 1, ca + 1]
-                    l4 = (1.0 - fy) * a[ra, ca + 2] + fy * a[ra + 1, ca + 2]
-                    v = (1.0 - fx) * l2 + fx * l3
-                    gv = 0.5 * ((1.0 - fx) * (l3 - l1) + fx * (l4 - l2))
-                    t0[r, c] = v
-                    g[r, c] = gv
-                    mean += v
-                    mg += gv
-            mean /= SIDE * SIDE
-            mg /= SIDE * SIDE
-            tt = 1e-9
-            tg = 0.0
-            for r in range(SIDE):
-                for c in range(SIDE):
-                    t0[r, c] -= mean
-                    g[r, c] -= mg
-                    tt += t0[r, c] * t0[r, c]
-                    tg += t0[r, c] * g[r, c]
-            hess = 0.0
-            for r in range(SIDE):
-                for c in range(SIDE):
-                    g[r, c] -= tg / tt * t0[r, c]
-                    hess += g[r, c] * g[r, c]
+            begin = x - d / s
+            if begin < RADIUS or begin >= w - RADIUS - 1:
+                continue
+            tt, hess = _cut(left[level], x, y, patch, gradient)
             if hess < 30.0:
                 continue
-            xr = x - d / s
-            begin = xr
-            ncc = 0.0
-            converged = False
-            for k in range(iterations + 1):
-                if xr < RADIUS or xr >= w - RADIUS - 1 or abs(xr - begin) > max_step_px:
-                    ncc = -1.0
-                    break
-                c0 = int(xr)
-                fr = xr - c0
-                si = 0.0
-                sii = 0.0
-                st = 0.0
-                sg = 0.0
-                for r in range(SIDE):
-                    ra = y0 + r - RADIUS
-                    for c in range(SIDE):
-                        ca = c0 + c - RADIUS
-                        v1 = (1.0 - fy) * b[ra, ca] + fy * b[ra + 1, ca]
-                        v2 = (1.0 - fy) * b[ra, ca + 1] + fy * b[ra + 1, ca + 1]
-                        v = v1 + fr * (v2 - v1)
-                        si += v
-                        sii += v * v
-                        st += v * t0[r, c]
-                        sg += v * g[r, c]
-                ncc = st / np.sqrt(tt * max(sii - si * si / (SIDE * SIDE), 1e-9))
-                gain = st / tt
-                if gain < 0.1:
-                    ncc = -1.0
-                    break
-                if converged or k == iterations:
-                    break
-                move = -sg / (hess * gain)
-                move = min(max(move, -1.5), 1.5)
-                xr += move
-                converged = abs(move) < 0.01
+            first = max(int(begin) - RADIUS - reach, 0)
+            columns = min(int(begin) + RADIUS + reach + 2, w) - first
+            if raw:
+                if not _raw_strip_of(right[level], grid, s, first, columns, y, strip):
+                    continue
+            else:
+                _strip_of(right[level], first, columns, y, strip)
+            xr, ncc = _slide(strip, first, patch, gradient, tt, hess, begin, w, iterations, reach_px)
             if ncc >= min_ncc or (step == 0 and ncc > 0.6):
                 d = (x - xr) * s
                 ok = step == 1

@@ -7,9 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import stereo_kernels
+from kiteline_core.cameras import CameraModel, CameraRig, Lens, Rectifier
 from kiteline_core.features import build_pyramid
+from kiteline_core.se3 import from_rt, so3_exp
 
 RADIUS = stereo_kernels.RADIUS
+RECTIFIED = np.zeros((0, 0, 2), np.float32)
 
 
 def pair(
@@ -28,6 +31,7 @@ def pair(
 
 
 UV = np.array([[float(x), float(y)] for y in range(30, 180, 20) for x in range(90, 300, 15)])
+SURE = np.zeros(len(UV), np.bool_)
 
 
 def test_search_then_refinement_recover_the_disparity() -> None:
@@ -37,7 +41,7 @@ def test_search_then_refinement_recover_the_disparity() -> None:
         found_px, found = np.empty(len(UV)), np.zeros(len(UV), np.bool_)
         stereo_kernels.search_rows(left, right, UV, octave, 80.0, 1.15, found_px)
         assert (found_px >= 0).mean() > 0.9
-        stereo_kernels.refine_rows(left, right, UV, octave, 6, 3.0, 0.85, found_px, found)
+        stereo_kernels.refine_rows(left, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.85, found_px, found)
         assert found.mean() > 0.85
         assert abs(np.median(found_px[found]) - disparity) < 0.04
         assert np.percentile(np.abs(found_px[found] - disparity), 90) < 0.15
@@ -76,6 +80,30 @@ def test_unrelated_rows_are_not_refined() -> None:
     _, right = pair(8, 10.0)
     guess, found = np.full(len(UV), 10.0), np.zeros(len(UV), np.bool_)
     stereo_kernels.refine_rows(
-        build_pyramid(left, 3), build_pyramid(right, 3), UV, np.zeros(len(UV), np.uint8), 6, 3.0, 0.85, guess, found
-    )
+        build_pyramid(left, 3), build_pyramid(right, 3), RECTIFIED, UV, np.zeros(len(UV), np.uint8), SURE, 6, 3.0, 0.85,
+        guess, found,
+    )  # fmt: skip
     assert found.mean() < 0.05
+
+
+def test_strips_of_the_raw_image_say_what_the_rectified_one_says() -> None:
+    model = CameraModel(320, 200, 220.0, 221.0, 158.0, 101.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
+    rig = CameraRig(model, model, np.eye(4), from_rt(so3_exp(np.array([0.004, -0.006, 0.003])), np.array([0.1, 0, 0])))
+    rectifier = Rectifier(rig)
+    assert rectifier.right_grid is not None
+    raw_left, raw_right = pair(9, 12.4)
+    left = build_pyramid(rectifier.left(raw_left), 3)
+    octave = (np.arange(len(UV)) % 2).astype(np.uint8)
+    results = []
+    for right, grid in (
+        (build_pyramid(rectifier.right(raw_right), 3), RECTIFIED),
+        (build_pyramid(raw_right, 3), rectifier.right_grid),
+    ):
+        guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
+        stereo_kernels.refine_rows(left, right, grid, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
+        results.append((guess, found))
+    (whole, whole_found), (strips, strips_found) = results
+    both = whole_found & strips_found
+    assert whole_found.sum() > 0.5 * len(UV) and both.sum() > 0.9 * whole_found.sum()
+    assert np.median(np.abs(whole[both] - strips[both])) < 0.04
+    assert np.percentile(np.abs(whole[both] - strips[both]), 90) < 0.12

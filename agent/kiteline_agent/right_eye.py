@@ -1,0 +1,50 @@
+"""The right image of a pair, rectified only where somebody looks: whole at keyframes, in small strips elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import StereoConfig
+from kiteline_core import stereo_kernels
+from kiteline_core.cameras import Rectifier
+from kiteline_core.features import Pyramid, build_pyramid
+
+U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
+
+_RECTIFIED = np.zeros((0, 0, 2), np.float32)  # no way back to a raw image is needed
+
+
+class RightEye:
+    """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's."""
+
+    def __init__(self, image: U8, rectifier: Rectifier, levels: int) -> None:
+        rectifier.check_size(image)
+        self._image = image
+        self._rectifier = rectifier
+        self._levels = levels
+        self._raw: Pyramid | None = None
+        self._whole: Pyramid | None = None
+
+    def whole(self) -> Pyramid:
+        """The pyramid of the rectified image."""
+        if self._whole is None:
+            self._whole = build_pyramid(self._rectifier.right(self._image), self._levels)
+        return self._whole
+
+    def refine(
+        self, left: Pyramid, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig, search_px: float,
+        disparity: F64, found: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """stereo_kernels.refine_rows, on the whole rectified image where there is one already."""
+        grid = self._rectifier.right_grid
+        if self._whole is not None or grid is None:
+            right, grid = self.whole(), _RECTIFIED
+        else:
+            if self._raw is None:
+                self._raw = build_pyramid(self._image, self._levels)
+            right = self._raw
+        stereo_kernels.refine_rows(
+            left, right, grid, uv, octave, sure, config.iterations, search_px, config.min_ncc, disparity, found
+        )
