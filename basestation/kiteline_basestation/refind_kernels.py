@@ -6,30 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.jit import njit
+from kiteline_core.matching_kernels import hamming
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
-
-_M1 = np.uint64(0x5555555555555555)
-_M2 = np.uint64(0x3333333333333333)
-_M4 = np.uint64(0x0F0F0F0F0F0F0F0F)
-_H = np.uint64(0x0101010101010101)
-_S1, _S2, _S4, _S56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
-
-
-@njit
-def hamming(a: U64, i: int, b: U64, j: int) -> int:
-    """Bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
-    total = 0
-    for k in range(4):
-        x = a[i, k] ^ b[j, k]
-        x = x - ((x >> _S1) & _M1)
-        x = (x & _M2) + ((x >> _S2) & _M2)
-        x = (x + (x >> _S4)) & _M4
-        total += int((x * _H) >> _S56)
-    return total
 
 
 @njit

@@ -1,0 +1,169 @@
+"""Kernels that match 256-bit descriptors by their Hamming distance."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.jit import njit
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
+
+_M1 = np.uint64(0x5555555555555555)
+_M2 = np.uint64(0x3333333333333333)
+_M4 = np.uint64(0x0F0F0F0F0F0F0F0F)
+_H = np.uint64(0x0101010101010101)
+_S1, _S2, _S4, _S56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
+_FAR = 1 << 20  # more bits than any two descriptors differ in
+
+
+@njit
+def hamming(a: U64, i: int, b: U64, j: int) -> int:
+    """Bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
+    total = 0
+    for k in range(4):
+        x = a[i, k] ^ b[j, k]
+        x = x - ((x >> _S1) & _M1)
+        x = (x & _M2) + ((x >> _S2) & _M2)
+        x = (x + (x >> _S4)) & _M4
+        total += int((x * _H) >> _S56)
+    return total
+
+
+@njit
+def match_all(a: U64, b: U64, max_hamming: int, ratio: float, best: I32, distance: I32) -> int:
+    """For each of a (n,4) the nearest of b (m,4), where it is near, distinct, and prefers nobody else.
+
+    best: (n,) index in b or -1, out. distance: (n,) bits, out. Returns how many matched.
+    """
+    n, m = a.shape[0], b.shape[0]
+    owner = np.full(m, -1, np.int32)
+    owner_distance = np.full(m, _FAR, np.int32)
+    for i in range(n):
+        best[i] = -1
+        distance[i] = _FAR
+        first, second, chosen = _FAR, _FAR, -1
+        for j in range(m):
+            d = hamming(a, i, b, j)
+            if d < first:
+                first, second, chosen = d, first, j
+            elif d < second:
+                second = d
+        if chosen < 0 or first > max_hamming or first > ratio * second or first >= owner_distance[chosen]:
+            continue
+        if owner[chosen] >= 0:
+            best[owner[chosen]] = -1
+        owner[chosen], owner_distance[chosen] = i, first
+        best[i], distance[i] = chosen, first
+    return _count(best)
+
+
+@njit
+def fill_cells(uv: F64, cell_px: float, start: I32, item: I32) -> None:
+    """Sort pixels (m,2) into square cells. start: (rows, columns + 1) out; item: (m,) indices in order of cell, out.
+
+    Those of cell (r, c) are item[start[r, c]:start[r, c + 1]]. Pixels outside count for the nearest cell.
+    """
+    rows, columns = start.shape[0], start.shape[1] - 1
+    m = uv.shape[0]
+    cell = np.empty(m, np.int64)
+    count = np.zeros(rows * columns + 1, np.int64)
+    for j in range(m):
+        r = min(max(int(uv[j, 1] / cell_px), 0), rows - 1)
+        c = min(max(int(uv[j, 0] / cell_px), 0), columns - 1)
+        cell[j] = r * columns + c
+        count[cell[j] + 1] += 1
+    for k in range(rows * columns):
+        count[k + 1] += count[k]
+    for r in range(rows):
+        for c in range(columns + 1):
+            start[r, c] = count[r * columns + c]
+    for j in range(m):
+        item[count[cell[j]]] = j
+        count[cell[j]] += 1
+
+
+@njit
+def match_cells(
+    uv: F64, radius_px: F64, octave: F64, a: U64,
+    uv2: F64, octave2: U8, b: U64, cell_px: float, start: I32, item: I32,
+    octave_gap: float, max_hamming: int, ratio: float, best: I32, distance: I32,
+) -> int:  # fmt: skip
+    """Like match_all, but each of a looks only within radius_px (n,) of its foreseen pixel uv (n,2), by cells.
+
+    octave: (n,) foreseen pyramid level, octave2: (m,) measured. start, item: of uv2 (m,2) by fill_cells.
+    """
+    n, m = uv.shape[0], uv2.shape[0]
+    rows, columns = start.shape[0], start.shape[1] - 1
+    owner = np.full(m, -1, np.int32)
+    owner_distance = np.full(m, _FAR, np.int32)
+    for i in range(n):
+        best[i] = -1
+        distance[i] = _FAR
+        first, second, chosen = _FAR, _FAR, -1
+        reach = radius_px[i]
+        top = min(max(int(np.floor((uv[i, 1] - reach) / cell_px)), 0), rows - 1)
+        bottom = min(max(int(np.floor((uv[i, 1] + reach) / cell_px)), 0), rows - 1)
+        left = min(max(int(np.floor((uv[i, 0] - reach) / cell_px)), 0), columns - 1)
+        right = min(max(int(np.floor((uv[i, 0] + reach) / cell_px)), 0), columns - 1)
+        for r in range(top, bottom + 1):
+            for s in range(start[r, left], start[r, right + 1]):
+                j = item[s]
+                du, dv = uv2[j, 0] - uv[i, 0], uv2[j, 1] - uv[i, 1]
+                if du * du + dv * dv > reach * reach or abs(octave2[j] - octave[i]) > octave_gap:
+                    continue
+                d = hamming(a, i, b, j)
+                if d < first:
+                    first, second, chosen = d, first, int(j)
+                elif d < second:
+                    second = d
+        if chosen < 0 or first > max_hamming or first > ratio * second or first >= owner_distance[chosen]:
+            continue
+        if owner[chosen] >= 0:
+            best[owner[chosen]] = -1
+        owner[chosen], owner_distance[chosen] = i, first
+        best[i], distance[i] = chosen, first
+    return _count(best)
+
+
+@njit
+def agree_in_turn(best: I32, angle: U8, angle2: U8, bins: int, kept: int) -> int:
+    """Drop matches whose turn of the image is not one of the most frequent (ORB-SLAM's orientation histogram).
+
+    best: (n,) in and out. angle (n,), angle2 (m,): 1/256 turns. kept: how many of `bins` bins, with their two
+    neighbours counted in, stay. Returns how many matches are left.
+    """
+    count = np.zeros(bins, np.int64)
+    for i in range(best.shape[0]):
+        if best[i] >= 0:
+            turn = (int(angle2[best[i]]) - int(angle[i])) & 255
+            count[turn * bins >> 8] += 1
+    stays = np.zeros(bins, np.bool_)
+    for _ in range(kept):
+        top, most = -1, 0
+        for k in range(bins):
+            if stays[k]:
+                continue
+            around = count[k] * 2 + count[(k + 1) % bins] + count[(k + bins - 1) % bins]
+            if around > most:
+                top, most = k, around
+        if top >= 0:
+            stays[top] = True
+    for i in range(best.shape[0]):
+        if best[i] >= 0:
+            turn = (int(angle2[best[i]]) - int(angle[i])) & 255
+            if not stays[turn * bins >> 8]:
+                best[i] = -1
+    return _count(best)
+
+
+@njit
+def _count(best: I32) -> int:
+    n = 0
+    for i in range(best.shape[0]):
+        if best[i] >= 0:
+            n += 1
+    return n
