@@ -20,6 +20,7 @@ def njit(
     nogil: bool = ...,
     inline: str = ...,
     forceinline: bool = ...,
+    _nrt: bool = ...,
     boundscheck: bool = ...,
     error_model: str = ...,
     locals: dict[str, Any] = ...,

@@ -4,6 +4,9 @@ Boxes are culled against the pyramid of each screen tile, so a pixel tests only 
 first. Textures are mip pyramids; a pixel reads the level of its footprint on the surface, with a few probes along the
 long axis of a grazing footprint. Pixels on the outline of a solid are cast again with four sub-pixel rays.
 
+What is called for every ray is inlined and compiled without reference counting (`_nrt=False`): counting each array
+argument up and down atomically takes longer than the ray.
+
 Arrays shared by the kernels (see world.py for their meaning):
 boxes (n, 8) float64: centre x y z, half-extent x y z, cos yaw, sin yaw. faces (6 n, 8) float64: texels per metre
 along u and v (signed), offset u and v in texels, brightness, contrast, texture, 1 where u and v are swapped.
@@ -95,7 +98,7 @@ def tile_lists(boxes: F64, items: I32, count: int, o: F64, rot: F64, rays: F32, 
         lengths[tile] = n
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def box_hit(boxes: F64, i: int, o: F64, dx: float, dy: float, dz: float, from_inside: bool) -> tuple[float, int]:
     """Distance and face at which a ray enters box i (leaves it, `from_inside`), or (inf, 0).
 
@@ -127,7 +130,7 @@ def box_hit(boxes: F64, i: int, o: F64, dx: float, dy: float, dz: float, from_in
     return low, 4 if iz > 0.0 else 5
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _ground(field: F32, frame: F64, x: float, y: float, channel: int) -> float:
     """Bilinear height (channel 0) or distance to the path (channel 1). frame: x0, y0, cell, largest slope, top."""
     u = min(max((x - frame[0]) / frame[2], 0.0), field.shape[2] - 1.001)
@@ -139,7 +142,7 @@ def _ground(field: F32, frame: F64, x: float, y: float, channel: int) -> float:
     return float(a * (1.0 - fv) + b * fv)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def ground_hit(field: F32, frame: F64, o: F64, dx: float, dy: float, dz: float, limit: float) -> float:
     """Distance at which a ray meets the height field, or inf beyond `limit`.
 
@@ -164,7 +167,7 @@ def ground_hit(field: F32, frame: F64, o: F64, dx: float, dy: float, dz: float, 
     return t
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _cast(
     boxes: F64, shell: int, field: F32, frame: F64, near: F64, items: I32, lists: I32, tile: int, length: int,
     o: F64, dx: float, dy: float, dz: float, far: float,
@@ -188,7 +191,7 @@ def _cast(
     return best, hit
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _bilinear(atlas: U8, base: int, bits: int, u: float, v: float) -> float:
     u += _WRAP - 0.5
     v += _WRAP - 0.5
@@ -204,7 +207,7 @@ def _bilinear(atlas: U8, base: int, bits: int, u: float, v: float) -> float:
     return low + fv * (high - low)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def texture_value(atlas: U8, table: NDArray[np.int64], k: int, u: float, v: float, lod: float) -> float:
     """Value, 0..255, of texture k at texel (u, v) of its finest level. table (n, 1 + levels): log2 of side, offsets.
 
@@ -226,7 +229,7 @@ def texture_value(atlas: U8, table: NDArray[np.int64], k: int, u: float, v: floa
     return a + (b - a) * fraction
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _surface(
     atlas: U8, table: NDArray[np.int64], faces: F64, n: int, u: float, v: float, eu: float, ev: float,
     across: float, along: float, detail_m: float,
@@ -250,7 +253,7 @@ def _surface(
     return float(faces[n, 4] * value)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _shade(
     boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: NDArray[np.int64],
     detail_m: float, o: F64, dx: float, dy: float, dz: float, t: float, hit: int, pixel: float,

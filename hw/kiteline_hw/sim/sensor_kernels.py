@@ -26,15 +26,15 @@ def motion_blur(
     height, width = radiance.shape
     for y in range(height):
         for x in range(width):
-            d, right, down = rays[y + 1, x + 1], rays[y + 1, x + 2], rays[y + 2, x + 1]
+            d0, d1, d2 = rays[y + 1, x + 1, 0], rays[y + 1, x + 1, 1], rays[y + 1, x + 1, 2]
             inverse = 1.0 / distance[y, x]
-            fx = -(linear[0] * inverse + angular[1] * d[2] - angular[2] * d[1])
-            fy = -(linear[1] * inverse + angular[2] * d[0] - angular[0] * d[2])
-            fz = -(linear[2] * inverse + angular[0] * d[1] - angular[1] * d[0])
-            along = fx * d[0] + fy * d[1] + fz * d[2]
-            fx, fy, fz = fx - along * d[0], fy - along * d[1], fz - along * d[2]
-            ax, ay, az = right[0] - d[0], right[1] - d[1], right[2] - d[2]
-            bx, by, bz = down[0] - d[0], down[1] - d[1], down[2] - d[2]
+            fx = -(linear[0] * inverse + angular[1] * d2 - angular[2] * d1)
+            fy = -(linear[1] * inverse + angular[2] * d0 - angular[0] * d2)
+            fz = -(linear[2] * inverse + angular[0] * d1 - angular[1] * d0)
+            along = fx * d0 + fy * d1 + fz * d2
+            fx, fy, fz = fx - along * d0, fy - along * d1, fz - along * d2
+            ax, ay, az = rays[y + 1, x + 2, 0] - d0, rays[y + 1, x + 2, 1] - d1, rays[y + 1, x + 2, 2] - d2
+            bx, by, bz = rays[y + 2, x + 1, 0] - d0, rays[y + 2, x + 1, 1] - d1, rays[y + 2, x + 1, 2] - d2
             aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
             fa, fb = fx * ax + fy * ay + fz * az, fx * bx + fy * by + fz * bz
             determinant = aa * bb - ab * ab
