@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from kiteline_agent import keyframes
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.depth_from_motion import DepthFromMotion
 from kiteline_agent.inertial import GyroPreintegrator, level_rotation
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
+from kiteline_agent.recovery import Recovered, Recovery
+from kiteline_agent.mono_start import MonoStart, Opening
 from kiteline_agent.right_eye import RightEye
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
@@ -20,12 +23,21 @@ from kiteline_core import se3
 from kiteline_core.cameras import CameraRig, Rectifier
 from kiteline_core.features import build_pyramid
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
+from kiteline_core.ids import (
+    MAX_SUBMAPS,
+    NO_KEYFRAME,
+    AgentId,
+    KeyframeId,
+    SubmapId,
+    keyframe_id,
+    submap_id,
+)
+from kiteline_core.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 
 _SHARPEN_INFLATION = 6.0  # successive sightings share the template's error: six of them count as one
-_FAILURES_BEFORE_SUBMAP = 2  # tries to find the old map before a new one opens
+_FAILURES_BEFORE_SUBMAP = 2  # tries, with texture in view, to find the old map before a new one opens
 _MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
 
 
@@ -88,7 +100,9 @@ class Agent:
         config: AgentConfig,
         identity: Identity,
         channel: RecordChannel,
+        words: Vocabulary | None = None,
     ) -> None:
+        """words: those by which places are recognised; without them only the reference keyframe is found again."""
         self._config = config
         self._identity = identity
         self._channel = channel
@@ -100,11 +114,16 @@ class Agent:
         self.map = LocalMap(self._camera, config.local_map, config.depth_filter)
         self._tracker = Tracker(self.map, config)
         self._maker = KeyframeMaker(self.map, self._camera, config, channel)
+        self._motion_depth = DepthFromMotion(self.map, config)
+        one_eye = rig.right is None and not rig.has_depth
+        self._mono = MonoStart(self._camera, config) if one_eye else None
+        self._recovery = Recovery(self.map, self._tracker, config, words)
         self._events: list[str] = []
         self._frame_number = 0
         self._last_t_ns: int | None = None
         self._submap_number = -1
-        self._sequence = 0
+        self._submaps = 0  # how many have been opened
+        self._sequence: dict[SubmapId, int] = {}  # how many keyframes after the first each submap has
         self._failures = 0
         self._T_m_c = np.eye(4)
         self._T_o_m = np.eye(4)
@@ -143,14 +162,18 @@ class Agent:
             track = self._tracker.track(view, se3.inverse(predicted), self._frame_number)
         if track is not None and track.inliers >= self._config.pose.min_inliers:
             self._accept(track, turn, dt_s)
-            # 4. Make a keyframe where the policy asks for one.
+            # 4. Look for the depth of what was born without one.
+            self._motion_depth.update(view, track)
+            # 5. Make a keyframe where the policy asks for one.
             self._keyframe_if_due(view, track, frame.t_ns)
+            self._join_if_found(view, track, frame.t_ns)
             tracked = True
         else:
-            self._failures += 1
+            # 5. Lost: search the old map; with texture in view and two failed tries, open a new submap.
             self._T_m_c = predicted
             self._refresh_relative()
-            tracked = self._begin_submap(view, frame.t_ns, imu)
+            track = self._recover(view, frame.t_ns)
+            tracked = track is not None or self._begin_submap(view, frame.t_ns, imu)
         inliers = track.inliers if track is not None else 0
         self._last_t_ns = frame.t_ns
         self._gyro.remember(imu)
@@ -193,6 +216,8 @@ class Agent:
                 R_b_c = self._camera.T_b_c[:3, :3]
                 self._gyro.correct(R_b_c @ self._step_T[:3, :3] @ R_b_c.T, turn_R_b0_b1, dt_s)
         self._failures = 0
+        if self._mono is not None:
+            self._mono.tracked(track.depth_m[track.inlier])
         self.map.note_tracking(track.rows, track.inlier, self._frame_number)
         self.map.sharpen(track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, _SHARPEN_INFLATION)
         self._refresh_relative()
@@ -217,15 +242,17 @@ class Agent:
         if why is None:
             return
         self._events.append(f"keyframe: {why}")
-        self._sequence += 1
         self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
 
     def _add_keyframe(self, view: View, track: Track | None, t_ns: int, parent: KeyframeId, T_p_k: F64) -> None:
-        keyframe = keyframe_id(self.submap, self._sequence)
+        sequence = 0 if parent == NO_KEYFRAME else self._sequence[self.submap] + 1
+        self._sequence[self.submap] = sequence
+        keyframe = keyframe_id(self.submap, sequence)
         T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
         # The keyframe's pose is its code's value: move with it by the rounding, and let odometry absorb it.
         self._reference, self._T_k_c = keyframe, np.eye(4)
         self._keyframe_t_ns, self._keyframe_frame = t_ns, self._frame_number
+        self._recovery.remember(keyframe)
         self._move_map_pose(T_m_k)
 
     def _begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
@@ -233,22 +260,92 @@ class Agent:
         first = self._submap_number < 0
         if not first and self._failures < _FAILURES_BEFORE_SUBMAP:
             return False
-        if not self._maker.enough(view, _MIN_FIRST_POINTS):
+        opening = None
+        if self._mono is not None:
+            if self._last_t_ns is None:
+                self._T_m_c = self._first_pose(imu)  # the camera moves from here on
+            opening = self._mono.step(view, t_ns)
+            if opening is None:
+                return False
+        elif not self._maker.enough(view, _MIN_FIRST_POINTS):
             return False
-        if first:
+        if first and opening is None:
             self._T_m_c = self._first_pose(imu)
-        else:
+        elif not first:
             self._T_m_c = self._T_o_m @ self._T_m_c  # the new submap's axes are those of the odometry frame
             self._T_o_m = np.eye(4)
+            self._recovery.search_beside(self._frame_number)
         self._events.append("submap: opened")
-        self._submap_number += 1
-        self._sequence = 0
+        self._submap_number = self._submaps
+        self._submaps += 1
         self._failures = 0
         self._step_T = np.eye(4)
         self._velocity_m = np.zeros(3)
-        self.map.clear()
+        self.map.activate(self.submap)
+        if opening is not None:
+            return self._open_from_two_views(view, t_ns, opening)
         self._add_keyframe(view, None, t_ns, NO_KEYFRAME, self._T_m_c)
         return True
+
+    def _open_from_two_views(self, view: View, t_ns: int, opening: Opening) -> bool:
+        """The first two keyframes of one eye's map. Where the camera is now stays where it was thought to be."""
+        self._events.append(f"mono: scale by convention, median depth {opening.median_depth_m:.3g} m")
+        self._maker.begin_with(opening.points)
+        T_m_a = self._T_m_c @ se3.inverse(opening.T_a_b)
+        self._add_keyframe(opening.view, None, opening.t_ns, NO_KEYFRAME, T_m_a)
+        opening.sharpen(self.map, self._reference, self._config.align.sigma_px)
+        self._move_map_pose(self._T_m_c @ opening.T_a_b)
+        track = self._tracker.track(view, se3.inverse(self._T_m_c), self._frame_number)
+        if track.inliers < self._config.pose.min_inliers:
+            return False
+        self._accept(track, None, 0.0)
+        self._step_T = se3.exp(se3.log(opening.T_a_b) / opening.frames)
+        dt_s = (t_ns - opening.t_ns) * 1e-9
+        self._velocity_m = (self._T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
+        self._sequence += 1
+        self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
+        return True
+
+    # the old map found again
+
+    def _recover(self, view: View, t_ns: int) -> Track | None:
+        """Look for a lost frame in all that is remembered."""
+        if self._submap_number < 0:
+            return None
+        found = self._recovery.attempt(view, self._frame_number, self._reference)
+        if found is None:
+            self._failures += self._recovery.textured
+            return None
+        self._events.append("recovered")
+        self._return_to(found)
+        # Nothing is known of the motion since: the next frame is looked for where this one was.
+        self._step_T, self._velocity_m = np.eye(4), np.zeros(3)
+        self._keyframe_if_due(view, found.track, t_ns)
+        return found.track
+
+    def _join_if_found(self, view: View, track: Track, t_ns: int) -> None:
+        """Beside a young submap, look for the old ones; where one is found, a keyframe in each says how they lie."""
+        found = self._recovery.beside(view, self._frame_number, self._T_m_c)
+        if found is None:
+            return
+        self._events.append("submap: joined to an older one")
+        self.map.note_tracking(found.track.rows, found.track.inlier, self._frame_number)
+        if self._keyframe_frame != self._frame_number:
+            self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
+        self._return_to(found)
+        self._add_keyframe(view, found.track, t_ns, found.keyframe, self._T_k_c)
+
+    def _return_to(self, found: Recovered) -> None:
+        """Go on in the submap and from the keyframe where the old map was found; the odometry frame stays still."""
+        self._submap_number = found.submap % MAX_SUBMAPS
+        self.map.activate(found.submap)
+        self._reference = found.keyframe
+        self._move_map_pose(se3.inverse(found.T_c_m))
+        self._refresh_relative()
+        self._failures = 0
+        self._reference_inliers = found.track.inliers
+        self.map.last_seen[self.map.slot_of(found.keyframe)] = self._frame_number
+        self.map.note_tracking(found.track.rows, found.track.inlier, self._frame_number)
 
     def _first_pose(self, imu: ImuBatch | None) -> F64:
         """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""

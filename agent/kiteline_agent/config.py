@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from kiteline_core.features import DetectorConfig
+from kiteline_core.matching import MatchConfig
+from kiteline_core.pnp import RansacConfig
+from kiteline_core.two_view import TwoViewConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,59 @@ class DepthFilterConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MonoStartConfig:
+    """How one eye begins a map."""
+
+    median_depth_m: float = 4.0  # of the first points: the convention that sets the scale; that of a room
+    corners: int = 400  # followed from the first frame; half of them are lost or have no parallax
+    cell_px: int = 22  # one corner a cell
+    window_px: int = 15  # px of the flow's window: the cheapest that holds on to corners
+    min_flow: float = 0.02  # of the focal length, median: below it two views are hardly two
+    min_share: float = 0.4  # of the first corners; with fewer left a new first frame is taken
+    max_frames: int = 40  # after which a new first frame is taken: the view has changed too much
+    two_view: TwoViewConfig = field(default_factory=TwoViewConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionDepthConfig:
+    """How bearings get their depth from motion."""
+
+    per_frame: int = 150  # bearings looked for in a frame; each costs about 10 us
+    nearer: float = 2.0  # how much nearer than the nearest twentieth of the points a bearing may be
+    reach: float = 2.5  # deviations of inverse depth that are searched
+    step_px: float = 0.7  # px of the level between two tries: half of what correlation bears
+    max_steps: int = 40  # tries on a segment; longer ones are searched on a smaller image
+    min_search_ncc: float = 0.7  # correlation at a try, up to half a step from the peak
+    distinct: float = 0.93  # share of the best correlation that nothing else on the segment may reach
+    off_line_px: float = 1.5  # px at octave 0 that alignment may leave the segment's line
+    gate: float = 3.0  # deviations between what is measured and what is held
+    sigma_px: float = 0.5  # one deviation of an aligned pixel, with the pose's own error
+    inflation: float = 2.0  # successive frames share the template's error: so many count as one
+    known: float = 0.12  # deviation over inverse depth at which a bearing becomes a point
+    far_share: float = 0.4  # of the typical inverse depth: a farther point needs only be known as well as one there
+    min_hits: int = 3  # frames that agree
+    max_misses: int = 6  # frames in which nothing alike is there: it moved, or was the edge of something
+    max_tries: int = 60  # frames in view without a depth: there is none to be had
+
+
+@dataclass(frozen=True, slots=True)
+class RecoveryConfig:
+    """Finding the old map again."""
+
+    cell_px: int = 16  # one corner a cell; four times as many as a keyframe bears, so that its own are among them
+    max_corners: int = 600  # 0.5 ms of descriptors
+    min_corners: int = 60  # fewer: there is no texture in view, and a try would prove nothing
+    candidates: int = 3  # places tried in a frame; each costs about 1 ms
+    beyond_px: float = 150.0  # px beyond a keyframe's border of which points are matched too: a fifth of the image
+    min_pnp_inliers: int = 12  # of P3P; chance matches reach 8
+    min_inliers: int = 30  # of the tracker from that pose
+    min_share: float = 0.4  # of the points that the tracker looked for: a place that only resembles has fewer
+    beside_frames: int = 20  # how long the search goes on beside a young submap: 1 s
+    agree_ratio: float = 0.05  # of the depth: two results beside a young submap may differ by so much
+    agree_rad: float = 0.035  # 2 degrees, the same for the turn
+
+
+@dataclass(frozen=True, slots=True)
 class AgentConfig:
     """All sections."""
 
@@ -93,3 +149,8 @@ class AgentConfig:
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
+    motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)
+    mono_start: MonoStartConfig = field(default_factory=MonoStartConfig)
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    matching: MatchConfig = field(default_factory=MatchConfig)
+    ransac: RansacConfig = field(default_factory=RansacConfig)

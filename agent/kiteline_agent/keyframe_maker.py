@@ -36,6 +36,10 @@ class KeyframeMaker:
         self._fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
         return int(np.count_nonzero(self._fresh.disparity > 0.0)) >= points
 
+    def begin_with(self, points: NewPoints) -> None:
+        """What is born in the keyframe that follows at once."""
+        self._fresh = points
+
     def make(
         self, view: View, track: Track | None, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
         frame_number: int,
@@ -68,7 +72,7 @@ class KeyframeMaker:
         for section in split_sightings(sightings, 1.0 / (1.0 + sightings.octave.astype(np.float64))):
             self._channel.put(section)
         T_m_k = self._placed(shared_head)
-        self._remember(view, shared_head, T_m_k, uv, rho, births.octave, frame_number)
+        self._remember(view, shared_head, T_m_k, uv, rho, births, frame_number)
         return T_m_k
 
     def _births(self, keyframe: KeyframeId, fresh: NewPoints, order: NDArray[np.int64]) -> tuple[Births, F64]:
@@ -103,8 +107,9 @@ class KeyframeMaker:
         return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(head.parent)] @ head.T_p_k)
 
     def _remember(
-        self, view: View, head: Head, T_m_k: F64, uv: F64, rho: F64, octave: NDArray[np.uint8], frame_number: int
+        self, view: View, head: Head, T_m_k: F64, uv: F64, rho: F64, births: Births, frame_number: int
     ) -> None:
+        octave = births.octave
         templates = np.empty(
             (len(uv), alignment_kernels.TEMPLATE_LEVELS, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE),
             np.uint8,
@@ -113,7 +118,9 @@ class KeyframeMaker:
         sigma = self._config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
         if view.depth_m is not None and not self._camera.stereo:
             sigma = np.maximum(sigma, _depth_camera_sigma(rho))
-        self._map.add(head, T_m_k, uv, rho, sigma, octave, templates, frame_number)
+        self._map.add(
+            head, T_m_k, uv, rho, sigma, octave, births.angle, births.descriptor, templates, frame_number
+        )  # fmt: skip
 
 
 def _depth_camera_sigma(rho: F64) -> F64:

@@ -1,7 +1,8 @@
 """What the agent remembers: a bounded number of keyframes, and the points born in them with their templates.
 
 Structure of arrays with fixed capacity: slot k holds a keyframe, row k * births + i the point born at its keypoint i.
-A point is a bearing in its keyframe and an inverse depth, so a corrected keyframe carries its points along.
+A point is a bearing in its keyframe and an inverse depth, so a corrected keyframe carries its points along. Keyframes
+of several submaps are remembered side by side; only those of the active one are tracked.
 """
 
 from __future__ import annotations
@@ -17,7 +18,15 @@ from kiteline_codec.schema import Culled, Depths, Found, Head, Pose, Removed
 from kiteline_core import se3
 from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, PointId, point_id
+from kiteline_core.ids import (
+    KEYPOINT_BITS,
+    NO_KEYFRAME,
+    SEQUENCE_BITS,
+    KeyframeId,
+    PointId,
+    SubmapId,
+    point_id,
+)
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -57,15 +66,20 @@ class LocalMap:
         self.last_seen = np.zeros(k, np.int64)  # number of the frame that last tracked a point of the slot
         self.counts = np.zeros(k, np.int64)
         self.usable = np.zeros((k, b), np.bool_)
+        self.seed = np.zeros((k, b), np.bool_)  # a bearing that waits for a depth from motion
         self.bearing = np.zeros((k, b, 2))
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
         self.sigma_rho = np.zeros((k, b))
         self.octave = np.zeros(k * b, np.uint8)
+        self.angle = np.zeros(k * b, np.uint8)  # in 1/256 turns
+        self.descriptor = np.zeros((k * b, 32), np.uint8)
         self.templates = np.zeros((k * b, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
         self.tried = np.zeros(k * b, np.int32)
         self.hits = np.zeros(k * b, np.int32)
+        self.misses = np.zeros(k * b, np.int32)  # of a bearing: how often it was looked for in vain
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the point
+        self.active = SubmapId(0)  # the submap whose points are tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
         self._uv = np.zeros((capacity, 2))
@@ -79,11 +93,9 @@ class LocalMap:
         """Rows a slot."""
         return self._config.births
 
-    def clear(self) -> None:
-        """Forget everything: a new submap begins."""
-        self.keyframe[:] = NO_KEYFRAME
-        self.counts[:] = 0
-        self.usable[:] = False
+    def activate(self, submap: SubmapId) -> None:
+        """Track the points of this submap from now on; those of the others stay remembered while there is room."""
+        self.active = submap
 
     def slot_of(self, keyframe: int) -> int:
         """The slot of a keyframe, -1 when it is not remembered."""
@@ -96,12 +108,12 @@ class LocalMap:
 
     def add(
         self, head: Head, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
-        templates: NDArray[np.uint8], frame_number: int,
+        angle: NDArray[np.uint8], descriptor: NDArray[np.uint8], templates: NDArray[np.uint8], frame_number: int,
     ) -> int:  # fmt: skip
         """Remember a keyframe with its births; the slot that it got. The slot seen least recently makes room.
 
-        uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: depth unknown, the point waits for the base.
-        templates: (n,3,21,21).
+        uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: depth unknown, the point waits for motion or the base.
+        angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21).
         """
         slot = self._free_slot(head.parent)
         n = min(len(uv), self.births)
@@ -116,10 +128,13 @@ class LocalMap:
         self.uv[slot, :n] = uv[:n]
         self.bearing[slot, :n] = self._bearings(uv[:n])
         self.rho[slot, :n] = np.where(rho[:n] > 0.0, rho[:n], 1.0 / _SEED_DEPTH_M)
-        self.sigma_rho[slot, :n] = sigma_rho[:n]
+        self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, sigma_rho[:n], 0.0)  # 0: not planted
+        self.seed[slot] = False
+        self.seed[slot, :n] = rho[:n] <= 0.0
         self.octave[rows] = octave[:n]
+        self.angle[rows], self.descriptor[rows] = angle[:n], descriptor[:n]
         self.templates[rows] = templates[:n]
-        self.tried[rows], self.hits[rows] = 0, 0
+        self.tried[rows], self.hits[rows], self.misses[rows] = 0, 0, 0
         self.last_hit[rows] = frame_number
         return slot
 
@@ -134,11 +149,18 @@ class LocalMap:
         age = np.where(self.keyframe == parent, np.iinfo(np.int64).max, self.last_seen)
         return int(np.argmin(age))
 
-    def candidates(self, T_c_m: F64, margin_px: float, max_scale: float) -> Candidates:
-        """The usable points that should be in view of a camera at T_c_m (4,4). Views into buffers: use them at once."""
-        slots = np.flatnonzero(self.keyframe != NO_KEYFRAME)
+    def candidates(
+        self, T_c_m: F64, margin_px: float, max_scale: float, *, seeds: bool = False, submap: SubmapId | None = None
+    ) -> Candidates:
+        """The usable points (or bearings) that should be in view of a camera at T_c_m (4,4).
+
+        submap: None for the active one. Views into buffers: use them at once.
+        """
+        wanted = self.active if submap is None else submap
+        slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == wanted)
         n = kernels.project(
-            T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.counts, self.usable,
+            T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.counts,
+            self.seed if seeds else self.usable,
             self.bearing, self.rho, self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip
         return Candidates(self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n])
@@ -163,6 +185,26 @@ class LocalMap:
         hopeless = rows[(self.tried[rows] >= 12) & (self.hits[rows] * 5 < self.tried[rows])]
         self.usable.reshape(-1)[hopeless] = False
 
+    # bearings without depth
+
+    def plant(self, rho: float, sigma_rho: float) -> None:
+        """Give bearings that are new a rough inverse depth in 1/m, to look around."""
+        new = self.seed & (self.sigma_rho == 0.0)
+        self.rho[new], self.sigma_rho[new] = rho, sigma_rho
+
+    def ripen(self, rows: I64) -> None:
+        """Bearings (n,) that have a depth now become points."""
+        self.seed.reshape(-1)[rows] = False
+        self.usable.reshape(-1)[rows] = True
+        self.tried[rows], self.hits[rows] = 0, 0
+
+    def rescale(self, factor: float) -> None:
+        """Change the unit of length: all lengths grow by `factor`."""
+        self.T_m_k[:, :3, 3] *= factor
+        self.T_p_k[:, :3, 3] *= factor
+        self.rho /= factor
+        self.sigma_rho /= factor
+
     # what the base made of it
 
     def apply(self, record: Pose | Depths | Found | Removed | Culled) -> bool:
@@ -180,22 +222,25 @@ class LocalMap:
         else:  # removed births and culled points are no longer looked for
             index = record.index.astype(np.int64)
             self.usable[slot, index[index < self.counts[slot]]] = False
+            self.seed[slot, index[index < self.counts[slot]]] = False
         return True
 
     def _apply_depths(self, slot: int, record: Depths) -> None:
         keep = (record.index < self.counts[slot]) & (record.inv_depth > 0.0)
         index = record.index[keep].astype(np.int64)
-        fresh = ~self.usable[slot, index] & (self.tried[slot * self.births + index] == 0)
+        never = ~self.usable[slot, index] & (self.tried[slot * self.births + index] == 0)
+        fresh = never | self.seed[slot, index]
         self.rho[slot, index] = record.inv_depth[keep]
         self.sigma_rho[slot, index] = self._filtering.refined_sigma_px / self.camera.bf
         self.bearing[slot, index] = self._bearings(self.uv[slot, index] + record.offset[keep])
-        self.usable[slot, index[fresh]] = True  # a point that only the base could place
+        self.ripen(slot * self.births + index[fresh])  # points that only the base could place
 
     def _apply_found(self, slot: int, record: Found) -> None:
         """A birth that shows an older point leaves, where the older one is remembered."""
         for index, point in zip(record.index.tolist(), record.point.tolist()):
             if index < self.counts[slot] and self.slot_of(point >> KEYPOINT_BITS) >= 0:
                 self.usable[slot, index] = point == point_id(KeyframeId(int(self.keyframe[slot])), index)
+                self.seed[slot, index] &= self.usable[slot, index]
 
     def settle(self) -> None:
         """Compose keyframes that the base has not placed from their parents, oldest first."""

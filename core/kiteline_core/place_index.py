@@ -52,8 +52,8 @@ def nodes(branching: int, levels: int) -> int:
 def pack(vocabulary: Vocabulary) -> bytes:
     """A vocabulary as the bytes that `unpack` reads; weights are rounded to 1/24."""
     weight = np.clip(np.rint(vocabulary.weight / _IDF_STEP), 0, 255).astype(np.uint8)
-    head = _HEADER.pack(_MAGIC, vocabulary.branching, vocabulary.levels)
-    return head + vocabulary.centres.astype("<u8").tobytes() + weight.tobytes()
+    head: bytes = _HEADER.pack(_MAGIC, vocabulary.branching, vocabulary.levels)
+    return b"".join((head, vocabulary.centres.astype("<u8").tobytes(), weight.tobytes()))
 
 
 def unpack(data: bytes) -> Vocabulary:

@@ -1,4 +1,4 @@
-"""Kernels of absolute pose: P3P and three-point alignment, each inside its own RANSAC with draws seeded by the caller."""
+"""Kernels of absolute pose: P3P and three-point alignment, each in its own RANSAC with draws seeded by the caller."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _real_cubic_root(b: float, c: float, d: float) -> float:
         r -= step
         if abs(step) < 1e-14 * (1.0 + abs(r)):
             break
-    return r
+    return float(r)
 
 
 @njit

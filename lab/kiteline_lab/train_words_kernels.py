@@ -34,7 +34,7 @@ def spread_centres(descriptor: U64, member: I64, start: int, centre: U64) -> int
             for rest in range(c + 1, k):
                 centre[rest] = centre[c]
             return c + 1
-    return k
+    return int(k)
 
 
 @njit
