@@ -1,0 +1,63 @@
+"""The results file: sections are replaced, bars tell whether they are met."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from kiteline_hw.ports import SourceError
+from kiteline_lab import benchmark
+from kiteline_lab.benchmark import Bench, at_most, data_folder, is_true, main, replace_section, section
+
+
+def test_bars_are_met_up_to_their_limit() -> None:
+    assert at_most("x", 2.0, 2.0, "ms").met
+    assert not at_most("x", 2.001, 2.0, "ms").met
+    assert not at_most("x", float("nan"), 2.0, "ms").met
+    assert is_true("x", "all", False).measured == "no"
+
+
+def test_a_section_replaces_its_older_self_only() -> None:
+    one = section("a", "One", [at_most("x", 1.0, 2.0, "m")])
+    two = section("b", "Two", [at_most("y", 3.0, 2.0, "m")])
+    text = replace_section(replace_section("", "One", one), "Two", two)
+    assert text.startswith("# Results")
+    assert "**no**" in text
+    newer = section("a", "One", [at_most("x", 1.5, 2.0, "m")])
+    text = replace_section(text, "One", newer)
+    assert text.count("## ") == 2
+    assert "1.500 m" in text and "1.000 m" not in text
+    assert text.index("## One") < text.index("## Two")
+
+
+def test_the_command_writes_what_it_measured_and_tells_of_a_bar_that_is_not_met(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("KITELINE_DATA", str(tmp_path))
+    monkeypatch.setattr(benchmark, "BENCHMARKS", {"fake": __name__})
+    monkeypatch.setattr(
+        benchmark.importlib, "import_module", lambda name: FakeBench if name == __name__ else __import__(name)
+    )
+    results = tmp_path / "docs" / "results.md"
+    assert main(["fake", "--results", str(results)]) == 1
+    assert "| speed | <= 1 ms | 2.000 ms | **no** |" in results.read_text()
+    assert "`kiteline bench fake`" in results.read_text()
+    with pytest.raises(SystemExit):
+        main(["nothing"])
+
+
+class FakeBench:
+    TITLE = "Fake"
+
+    @staticmethod
+    def run(bench: Bench) -> list[benchmark.Bar]:
+        with pytest.raises(SourceError, match="KITELINE_DATA"):
+            bench.source("missing.mcap")
+        return [at_most("speed", 2.0, 1.0, "ms")]
+
+
+def test_without_recordings_it_says_where_to_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KITELINE_DATA", str(tmp_path / "nowhere"))
+    with pytest.raises(SourceError, match="KITELINE_DATA"):
+        data_folder()

@@ -1,0 +1,91 @@
+"""What a command line becomes: options, flight time 0 of several sources, a cleared folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_core.frame import Frame
+from kiteline_hw.ports import LinkError, SourceError, SourceReport
+from kiteline_lab.fly import Options, clear, flight_starts, fly, link_bytes, options
+
+
+class Stamps:
+    """A source of nothing but stamps."""
+
+    def __init__(self, first_ns: int, frames: int, period_ns: int = 50) -> None:
+        self.name = "stamps"
+        camera = CameraModel(4, 4, 1.0, 1.0, 0.0, 0.0)
+        self.rig = CameraRig(camera, None, np.eye(4), None)
+        self.imu = self.ground_truth = None
+        self.report = SourceReport()
+        self.frame_count = frames
+        self._stamps = [first_ns + i * period_ns for i in range(frames)]
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (Frame(t_ns, np.zeros((4, 4), np.uint8)) for t_ns in self._stamps)
+
+    def close(self) -> None: ...
+
+
+def test_sources_that_overlap_share_a_clock() -> None:
+    assert flight_starts([Stamps(1000, 10), Stamps(1200, 10)]) == [1000, 1000]
+
+
+def test_sources_of_other_times_start_together() -> None:
+    assert flight_starts([Stamps(1000, 10), Stamps(9000, 10)]) == [1000, 9000]
+
+
+def test_one_source_starts_at_its_first_frame() -> None:
+    assert flight_starts([Stamps(1000, 10)]) == [1000]
+
+
+def test_a_source_without_frames_cannot_be_flown() -> None:
+    with pytest.raises(SourceError, match="frame"):
+        flight_starts([Stamps(1000, 0)])
+
+
+@pytest.mark.parametrize(("text", "wanted"), [("1000", (1000, 1000)), ("1000,500", (1000, 500)), ("0,0", (0, 0))])
+def test_bytes_of_the_link(text: str, wanted: tuple[int, int]) -> None:
+    assert link_bytes(text) == wanted
+
+
+@pytest.mark.parametrize("text", ["", "fast", "1,2,3", "-5", "1e3"])
+def test_bytes_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match="UP"):
+        link_bytes(text)
+
+
+def test_profiles_and_overrides() -> None:
+    radio = options(["a.mcap", "--out", "o", "--profile", "radio"])
+    assert (radio.up_bytes_s, radio.down_bytes_s) == (1000, 500)
+    own = options(["a.mcap", "--out", "o", "--profile", "radio", "--link-bytes", "700"])
+    assert (own.up_bytes_s, own.down_bytes_s) == (700, 700)
+    assert options(["a.mcap", "--out", "o"]) == Options(("a.mcap",), Path("o"))
+
+
+@pytest.mark.parametrize("words", [["--link-loss", "1.0"], ["--cpu", "-1"], ["--mode", "none"], ["--link-bytes", "x"]])
+def test_a_wrong_word_ends_with_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        options(["a.mcap", "--out", "o", *words])
+    assert end.value.code == 2
+    assert "usage" in capsys.readouterr().err
+
+
+def test_clearing_takes_only_what_a_flight_leaves(tmp_path: Path) -> None:
+    for name in ("agent0/live.tum", "agent1/log.mcap", "base/agent0.tum", "base/map.ply", "report.json", "notes.txt",
+                 "agent0/mine.txt", "base/mine.ply"):  # fmt: skip
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    clear(tmp_path)
+    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    assert left == ["agent0/mine.txt", "base/mine.ply", "notes.txt"]
+
+
+def test_realtime_needs_processes(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match="mode"):
+        fly(Options(("x",), tmp_path, "local", realtime=True), quiet=True)
