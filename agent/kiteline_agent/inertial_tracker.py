@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
+_SCALE_FRAMES = 20  # fewer cannot tell acceleration from scale
+
 
 @dataclass(frozen=True, slots=True)
 class InertialConfig:
@@ -28,14 +30,15 @@ class InertialConfig:
     rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle
     rest_moved_m: float = 0.005  # most that the images may have moved meanwhile
     motion_window_s: float = 0.7  # window of the alignment in motion
-    window_frames: int = 30  # most frames that are kept while waiting
-    max_residual_m_s: float = 0.15  # of the alignment: above it the poses do not fit the IMU, wait on
+    window_frames: int = 60  # most frames that are kept while waiting; a scale needs some seconds
+    max_residual_m: float = 0.02  # of the alignment: above it the poses do not fit the IMU, wait on
     max_gravity_error: float = 0.12  # relative, of its length as found without knowing it
     max_coast_s: float = 5.0  # longer without images, the position means nothing
-    offset_memory_s: float = 20.0  # a time offset drifts slowly
+    offset_memory_s: float = 60.0  # a time offset drifts slowly
     offset_start_sigma_s: float = 0.02  # cameras without a trigger line
     offset_turn_sigma_rad: float = 6e-4  # error of a visual turn between two frames
-    offset_trusted_s: float = 1.5e-3  # deviation below which the estimate is applied
+    offset_trusted_s: float = 3e-3  # deviation below which the estimate is applied
+    offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
     offset_rate: float = 0.05  # s/s, how fast the applied offset follows
     apply_offset: bool = True
 
@@ -59,7 +62,9 @@ class _Pose:
 class InertialTracker:
     """Once a frame: `predict`, then `update` with what the images saw or `coast` without. Pure; no clocks."""
 
-    def __init__(self, camera: RectifiedCamera, calibration: ImuCalibration, config: InertialConfig) -> None:
+    def __init__(
+        self, camera: RectifiedCamera, calibration: ImuCalibration, config: InertialConfig, *, metric: bool = True
+    ) -> None:
         self._config = config
         self._calibration = calibration
         self._p_b_c = camera.T_b_c[:3, 3].copy()
@@ -70,14 +75,13 @@ class InertialTracker:
         )
         self._applied_s = 0.0
         self._bias = np.zeros(6)
-        self._bias_known = False
         self._waiting: list[_Pose] = []
         self._last: _Pose | None = None  # the last pose, however it was come by
         self._last_visual: tuple[int, F64] | None = None
         self._ends_ns = 0  # instant of the IMU at which the last interval ended
         self._blind_s = 0.0
         self.started: str | None = None  # "rest" or "motion", how the smoother started last
-        self.surprise = 0.0  # squared Mahalanobis distance of the last visual pose from the prediction, 6 dof
+        self.metric = metric  # False: the map's unit is unknown, nothing but `metric_scale` is sought
 
     # what is known
 
@@ -136,7 +140,7 @@ class InertialTracker:
             self._watch_offset(t_ns, T_m_b_visual, samples)
         state = None
         if self._smoother.running:
-            state = self._advance(samples, points, T_m_b_visual)
+            state = self._advance(samples, points)
         if state is None:
             self._wait(_Pose(t_ns, T_m_b_visual.copy(), samples))
             self._note(t_ns, T_m_b_visual)
@@ -156,7 +160,7 @@ class InertialTracker:
             self._blind_s += (t_ns - self._last.t_ns) * 1e-9
         state = None
         if self._smoother.running and self._blind_s <= self._config.max_coast_s:
-            state = self._advance(samples, None, None)
+            state = self._advance(samples, None)
         if state is None:
             self._smoother.stop()
             return None
@@ -182,13 +186,24 @@ class InertialTracker:
     def metric_scale(self) -> tuple[float, float] | None:
         """Metres per unit of a map without scale, and one deviation, from the frames seen while waiting; None if unknown."""
         poses, motions = self._window(self._config.window_frames)
-        if len(poses) < 8:
+        if len(poses) < _SCALE_FRAMES or len(motions) < len(poses) - 1:
             return None
         bias = np.concatenate([imu_alignment.gyro_bias(poses, motions), self._bias[3:]])
-        found = imu_alignment.align(
-            poses, self._p_b_c, motions, bias, self._config.gravity_m_s2, with_scale=True
-        )
+        found = imu_alignment.align(poses, self._p_b_c, motions, bias, self._config.gravity_m_s2, with_scale=True)
         return None if found is None else (found.scale, found.scale_sigma)
+
+    def rescale(self, scale: float) -> None:
+        """The map was multiplied by `scale` and is metric from now on: the smoother may start."""
+
+        def scaled(p: _Pose) -> _Pose:
+            T = p.T_m_b.copy()
+            offset = T[:3, :3] @ self._p_b_c
+            T[:3, 3] = scale * (T[:3, 3] + offset) - offset
+            return _Pose(p.t_ns, T, p.samples)
+
+        self.metric = True
+        self._waiting = [scaled(p) for p in self._waiting]
+        self._last = None if self._last is None else scaled(self._last)
 
     # parts
 
@@ -203,28 +218,33 @@ class InertialTracker:
         self._last = _Pose(t_ns, T_m_b.copy(), None)
         self._ends_ns = t_ns + int(self._applied_s * 1e9)
 
-    def _advance(self, samples: Samples | None, points: VisualPoints | None, T_m_b_visual: F64 | None) -> InertialState | None:
+    def _advance(self, samples: Samples | None, points: VisualPoints | None) -> InertialState | None:
         if samples is None:
             self._smoother.stop()
             return None
         state = self._smoother.add(samples, points)
         if state is not None:
-            self._bias, self._bias_known = state.bias, True
+            self._bias = state.bias
         return state
 
     def _watch_offset(self, t_ns: int, T_m_b: F64, samples: Samples) -> None:
-        if self._last_visual is None or not (self._smoother.running or self._bias_known):
+        if self._last_visual is None:
             return
         config = self._config
         before_ns, before = self._last_visual
         dt_s = (t_ns - before_ns) * 1e-9
-        if abs(dt_s - samples.duration_s) < 1e-3:
-            motion = preintegrate(samples, self._bias, self._calibration)
-            change = (samples.gyro[-1] - self._bias[:3]) - motion.turn.T @ (samples.gyro[0] - self._bias[:3])
-            error = se3.so3_log(motion.turn.T @ before[:3, :3].T @ T_m_b[:3, :3])
+        if abs(dt_s - samples.duration_s) < 2e-3:
+            # the bias is left in, since the smoother's would itself follow a wrong offset
+            turn = preintegrate(samples, np.zeros(6), self._calibration).turn
+            change = samples.gyro[-1] - turn.T @ samples.gyro[0]
+            error = se3.so3_log(turn.T @ before[:3, :3].T @ T_m_b[:3, :3])
             self._offset.add(error + change * self._applied_s, change, dt_s)
-        if config.apply_offset and self._offset.sigma_s < config.offset_trusted_s:
-            step = self._offset.offset_s - self._applied_s
+        if not config.apply_offset:
+            return
+        offset_s, sigma_s = self.time_offset_s
+        significant = abs(offset_s - self._applied_s) > config.offset_significance * sigma_s
+        if sigma_s < config.offset_trusted_s and significant:
+            step = offset_s - self._applied_s
             self._applied_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
 
     # start
@@ -246,7 +266,7 @@ class InertialTracker:
         return np.array([p.T_m_b for p in poses]), motions
 
     def _try_start(self) -> None:
-        if len(self._waiting) < 4:
+        if len(self._waiting) < 5 or not self.metric:
             return
         last = self._waiting[-1]
         span_s = (last.t_ns - self._waiting[0].t_ns) * 1e-9
@@ -276,11 +296,13 @@ class InertialTracker:
 
     def _start_in_motion(self, last: _Pose) -> bool:
         config = self._config
-        poses, motions = self._window(config.window_frames)
+        recent = sum((last.t_ns - p.t_ns) * 1e-9 <= config.motion_window_s + 0.3 for p in self._waiting)
+        poses, motions = self._window(recent)
         gyro = imu_alignment.gyro_bias(poses, motions)
         bias = np.concatenate([gyro, self._bias[3:]])
         found = imu_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
-        if found is None or found.residual_m_s > config.max_residual_m_s or found.gravity_error > config.max_gravity_error:
+        if found is None or found.residual_m > config.max_residual_m or found.gravity_error > config.max_gravity_error:
             return False
+        bias[3:] = found.accel_bias
         self._smoother.start(last.T_m_b, found.velocities[-1], bias, found.gravity, StartDeviations())
         return True

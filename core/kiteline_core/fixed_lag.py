@@ -26,13 +26,13 @@ Bools = NDArray[np.bool_]
 class FixedLagConfig:
     """The window, and what is believed of the measurements."""
 
-    states: int = 4  # frames in the window; more cost time and gain little, points being fixed
+    states: int = 3  # frames in the window; points being fixed, 2 to 6 measure the same and more cost time
     fresh: int = 1  # newest frames whose points are linearised anew; older ones are condensed to 6x6
     iterations: int = 3  # Gauss-Newton steps; the prediction is near
     points: int = 320  # most points of a frame
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
-    visual_inflation: float = 12.0  # of variance: successive frames share errors of templates and points
-    imu_inflation: float = 1.5  # of noise densities: vibration, scale and axes are not calibrated
+    visual_inflation: float = 16.0  # of variance: successive frames share errors of templates and points
+    imu_inflation: float = 3.0  # of noise densities: vibration, scale and axes are not calibrated, and the map bends
     turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
     velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
     position_floor_m: float = 2e-5  # the same of position

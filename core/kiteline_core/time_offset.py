@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
+_BIAS_RAD_S = 0.1  # deviation of a gyro bias before anything is known
+
 
 class TimeOffsetEstimator:
     """Recursive least squares with forgetting over [offset s, gyro bias rad/s].
@@ -19,7 +21,7 @@ class TimeOffsetEstimator:
         """memory_s: time constant of forgetting. turn_sigma_rad: error of a visual turn between two frames."""
         self._memory_s = memory_s
         self._weight = turn_sigma_rad**-2.0
-        self._prior = np.diag([start_sigma_s**-2.0, 1e4, 1e4, 1e4])
+        self._prior = np.diag([start_sigma_s**-2.0, *3 * [_BIAS_RAD_S**-2.0]])
         self._h, self._g = self._prior.copy(), np.zeros(4)
 
     def add(self, error: F64, rate_change: F64, dt_s: float) -> None:

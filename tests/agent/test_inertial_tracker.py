@@ -1,0 +1,226 @@
+"""The inertial tracker on simulated flights: starts, fuses, coasts, finds a wrong level, a time offset and a scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from kiteline_agent.inertial_tracker import InertialConfig, InertialTracker
+from kiteline_core import se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.fixed_lag import InertialState, VisualPoints
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_hw.sim import imu as sim_imu
+from kiteline_hw.sim.paths import built_in
+from kiteline_hw.sim.trajectory import Path
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+CALIBRATION = ImuCalibration()
+T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
+CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 375.5, 239.5, 0.11, True, T_B_C)
+FRAME_NS = 50_000_000
+NOISE_PX = 0.3
+HASTE = 0.4  # the course in so much of its time
+
+
+@dataclass
+class Step:
+    """One frame as the tracker gets it, and the truth."""
+
+    t_ns: int
+    imu: ImuBatch
+    visual: F64
+    points: VisualPoints
+    truth: F64
+
+
+def flight(frames: int, seed: int = 0, rest_s: float = 0.0, late_ns: int = 0, T_m_w: F64 | None = None) -> list[Step]:
+    """A lively flight along the room's course. late_ns: so much later than its stamp was each image taken. T_m_w: the map."""
+    T_m_w = np.eye(4) if T_m_w is None else T_m_w
+    rng = np.random.default_rng([seed, 2])
+    path = built_in("room", (frames * 0.05 + 3.0) / HASTE, T_B_C, 0)
+    path = Path(path.coefficients, path.knot_s * HASTE, path.length_s * HASTE, 0.7, rest_s)
+    stamps = np.arange(frames, dtype=np.int64) * FRAME_NS + 100_000_000
+    imu_t = np.arange(0, int(stamps[-1]) + 1, 5_000_000, dtype=np.int64)
+    samples = sim_imu.measure(path, imu_t, 0, CALIBRATION, seed)
+    truth = path.motion((stamps + late_ns) * 1e-9).T_w_b
+    cloud = truth[:, :3, 3].mean(axis=0) + rng.uniform(-6.0, 6.0, (3000, 3))
+    steps, done = [], 0
+    for k in range(frames):
+        end = int(np.searchsorted(imu_t, stamps[k], "right"))
+        batch = ImuBatch(imu_t[done:end], samples.gyro[done:end], samples.accel[done:end])
+        done = end
+        error = np.concatenate([0.0006 * rng.normal(size=3), 0.0003 * rng.normal(size=3)])
+        T = T_m_w @ truth[k]
+        steps.append(Step(int(stamps[k]), batch, T @ se3.exp(error), see(truth[k], cloud, rng, T_m_w), T))
+    return steps
+
+
+def see(T_w_b: F64, cloud: F64, rng: np.random.Generator, T_m_w: F64) -> VisualPoints:
+    c = CAMERA
+    p = se3.transform(se3.inverse(T_w_b @ T_B_C), cloud)
+    z = np.maximum(p[:, 2], 1e-3)
+    uvd = np.column_stack([c.fx * p[:, 0] / z + c.cx, c.fy * p[:, 1] / z + c.cy, c.bf / z])
+    good = (p[:, 2] > 0.5) & (uvd[:, 0] > 0) & (uvd[:, 0] < c.width) & (uvd[:, 1] > 0) & (uvd[:, 1] < c.height)
+    chosen = np.flatnonzero(good)[:60]
+    n = len(chosen)
+    observed = uvd[chosen] + NOISE_PX * rng.normal(size=(n, 3))
+    xyz = se3.transform(T_m_w, cloud[chosen])
+    return VisualPoints(xyz, np.zeros((n, 3)), observed, np.full(n, NOISE_PX), np.ones(n, np.bool_))
+
+
+def run(
+    steps: list[Step], blind: range = range(0), config: InertialConfig | None = None
+) -> tuple[InertialTracker, list[InertialState | None]]:
+    tracker = InertialTracker(CAMERA, CALIBRATION, config or InertialConfig())
+    states: list[InertialState | None] = []
+    for k, step in enumerate(steps):
+        tracker.predict(step.imu, step.t_ns)
+        states.append(tracker.coast(step.t_ns) if k in blind else tracker.update(step.t_ns, step.visual, step.points))
+    return tracker, states
+
+
+def apart_m(state: InertialState | None, T: F64) -> float:
+    assert state is not None
+    return float(np.linalg.norm(state.T_m_b[:3, 3] - T[:3, 3]))
+
+
+def test_starts_at_rest_and_smooths() -> None:
+    steps = flight(70, rest_s=1.0)
+    tracker, states = run(steps)
+    assert tracker.started == "rest"
+    assert states[12] is not None
+    fused = [apart_m(s, step.truth) for s, step in zip(states[30:], steps[30:])]
+    assert np.sqrt(np.mean(np.square(fused))) < 0.002
+    # from frame to frame it moves as the vehicle moves, better than the images alone say
+    jitter = [
+        np.linalg.norm((b.T_m_b - a.T_m_b)[:3, 3] - (t1.truth - t0.truth)[:3, 3])
+        for a, b, t0, t1 in zip(states[30:], states[31:], steps[30:], steps[31:])
+        if a is not None and b is not None
+    ]
+    rough = [
+        np.linalg.norm((b.visual - a.visual)[:3, 3] - (b.truth - a.truth)[:3, 3]) for a, b in zip(steps[30:], steps[31:])
+    ]
+    assert np.mean(jitter) < 0.3 * np.mean(rough)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_starts_in_motion_in_a_map_that_is_not_level(seed: int) -> None:
+    lean = se3.from_rt(se3.so3_exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 0.0, 2.0]))
+    steps = flight(60, seed, T_m_w=lean)
+    tracker, states = run(steps)
+    assert tracker.started == "motion"
+    assert next(k for k, s in enumerate(states) if s is not None) < 25
+    upright = tracker.level_R @ lean[:3, :3]
+    assert upright[2, 2] > np.cos(np.radians(1.0))
+    assert apart_m(states[-1], steps[-1].truth) < 0.004
+
+
+def test_prediction_is_near_what_comes() -> None:
+    steps = flight(60, 3)
+    tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig())
+    assert tracker.predict(steps[0].imu, steps[0].t_ns) is None
+    for k, step in enumerate(steps):
+        ahead = tracker.predict(step.imu if k else None, step.t_ns)
+        if k >= 30:
+            assert ahead is not None
+            assert np.linalg.norm(ahead.T_m_b[:3, 3] - step.truth[:3, 3]) < 0.006
+            assert np.linalg.norm(se3.so3_log(ahead.T_m_b[:3, :3].T @ step.truth[:3, :3])) < 0.003
+        tracker.update(step.t_ns, step.visual, step.points)
+
+
+def test_two_seconds_blind() -> None:
+    steps = flight(110, 4)
+    tracker, states = run(steps, range(60, 100))
+    end = states[99]
+    assert apart_m(end, steps[99].truth) < 0.12
+    assert end is not None and states[59] is not None
+    error = end.T_m_b[:3, 3] - steps[99].truth[:3, 3]
+    assert error @ np.linalg.solve(end.pose_cov[:3, :3], error) < 16.3  # 99.9 % of 3 degrees of freedom
+    assert np.trace(end.pose_cov[:3, :3]) > 10.0 * np.trace(states[59].pose_cov[:3, :3])
+    assert apart_m(states[-1], steps[-1].truth) < 0.004
+    assert tracker.blind_s == 0.0
+
+
+def test_blind_for_too_long_says_so() -> None:
+    steps = flight(60, 4)
+    config = InertialConfig(max_coast_s=0.5)
+    tracker, states = run(steps, range(40, 60), config)
+    assert states[49] is not None and states[51] is None
+    assert not tracker.running
+
+
+def test_a_hole_in_the_samples_is_survived() -> None:
+    steps = flight(90, 5)
+    tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig())
+    running = []
+    for k, step in enumerate(steps):
+        tracker.predict(None if 40 <= k < 44 else step.imu, step.t_ns)
+        tracker.update(step.t_ns, step.visual, step.points)
+        running.append(tracker.running)
+    assert running[39] and not running[44] and running[-1]
+
+
+@pytest.mark.parametrize("late_ns", [12_000_000, -8_000_000])
+def test_time_offset_is_found_and_applied(late_ns: int) -> None:
+    steps = flight(160, 6, late_ns=late_ns)
+    tracker, states = run(steps)
+    offset_s, sigma_s = tracker.time_offset_s
+    assert offset_s == pytest.approx(late_ns * 1e-9, abs=1.5e-3)
+    assert sigma_s < 1e-3
+    assert apart_m(states[-1], steps[-1].truth) < 0.004
+
+
+def test_scale_of_a_map_without_one() -> None:
+    """Camera positions in a unit of 2.5 m: the scale is found, and after `rescale` the smoother starts."""
+    steps, unit = flight(90, 7), 2.5
+    tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig(), metric=False)
+    scaled = False
+    for k, step in enumerate(steps):
+        tracker.predict(step.imu, step.t_ns)
+        visual = step.visual.copy()
+        if not scaled:
+            offset = visual[:3, :3] @ T_B_C[:3, 3]
+            visual[:3, 3] = (visual[:3, 3] + offset) / unit - offset
+        tracker.update(step.t_ns, visual, step.points)
+        if k == 60:
+            assert not tracker.running
+            found = tracker.metric_scale()
+            assert found is not None
+            assert found[0] == pytest.approx(unit, rel=0.04)
+            tracker.rescale(unit)
+            scaled = True
+    assert tracker.running and tracker.state is not None
+    assert apart_m(tracker.state, steps[-1].truth) < 0.004
+
+
+def test_a_moved_map_and_a_new_one() -> None:
+    steps = flight(90, 8)
+    shift = se3.exp(np.array([0.2, 0.1, -0.1, 0.01, 0.02, 0.1]))
+    tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig())
+    for k, step in enumerate(steps):
+        if k == 40:
+            tracker.shift_map(shift)
+        if k == 60:
+            tracker.reset()
+            assert not tracker.running
+        T = shift if k >= 40 else np.eye(4)
+        points = VisualPoints(
+            se3.transform(T, step.points.xyz), step.points.ray, step.points.observed, step.points.sigma_px,
+            step.points.inlier,
+        )  # fmt: skip
+        ahead = tracker.predict(step.imu, step.t_ns)
+        if 40 <= k < 60 and ahead is not None:
+            assert np.linalg.norm(ahead.T_m_b[:3, 3] - (T @ step.truth)[:3, 3]) < 0.006
+        tracker.update(step.t_ns, T @ step.visual, points)
+    assert tracker.running and tracker.state is not None
+    assert apart_m(tracker.state, shift @ steps[-1].truth) < 0.004
+
+
+def test_the_same_input_gives_the_same_output() -> None:
+    steps = flight(40, 9)
+    a, b = run(steps)[1][-1], run(steps)[1][-1]
+    assert a is not None and b is not None
+    assert np.array_equal(a.T_m_b, b.T_m_b) and np.array_equal(a.cov, b.cov)
