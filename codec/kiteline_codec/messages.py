@@ -22,6 +22,7 @@ from kiteline_codec.schema import (
     Head,
     Key,
     Kind,
+    Level,
     Live,
     Placement,
     Pose,
@@ -254,6 +255,11 @@ _TABLE = (
     _Coder(Kind.HEAD, Head, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_head, _read_head),
     _Coder(Kind.BIRTHS, Births, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_births, _read_births),
     _Coder(Kind.SIGHTINGS, Sightings, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_sightings, _read_sightings),
+    _Coder(
+        Kind.LEVEL, Level, (1 << 32) - 1, 1, lambda r: (int(r.submap),),
+        lambda out, r: _write_pose(out, r.T_l_m),
+        lambda source, key: Level(SubmapId(key.id), _read_pose(source)),
+    ),
     _Coder(
         Kind.POSE, Pose, MAX_KEYFRAME_ID, 1, _of_keyframe,
         lambda out, r: _write_pose(out, r.T_m_k),

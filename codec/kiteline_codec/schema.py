@@ -35,6 +35,7 @@ class Kind(IntEnum):
     HEAD = 3
     BIRTHS = 4
     SIGHTINGS = 5
+    LEVEL = 6
     POSE = 16
     DEPTHS = 17
     FOUND = 18
@@ -107,6 +108,14 @@ class Sightings:
 
 
 @dataclass(frozen=True, slots=True)
+class Level:
+    """A submap that began in motion lies askew until its agent knows which way is up. T_l_m: (4,4) sets it upright."""
+
+    submap: SubmapId
+    T_l_m: F64
+
+
+@dataclass(frozen=True, slots=True)
 class Pose:
     """The base's pose of a keyframe. T_m_k: (4,4) camera in the submap frame."""
 
@@ -174,7 +183,7 @@ class Tile:
     cells: NDArray[np.int8]
 
 
-Record = Camera | Live | Head | Births | Sightings | Pose | Depths | Found | Removed | Culled | Placement | Tile
+Record = Camera | Live | Head | Births | Sightings | Level | Pose | Depths | Found | Removed | Culled | Placement | Tile
 
 
 @dataclass(frozen=True, slots=True, order=True)

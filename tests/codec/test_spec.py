@@ -106,8 +106,8 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         z = s.varint() - 1
         out["parent"] = -1 if z < 0 else id_ - (-(z + 1) // 2 if z % 2 else z // 2)
         out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
-    elif kind in (16, 21):
-        out["T_m_k" if kind == 16 else "T_w_m"] = s.pose()
+    elif kind in (6, 16, 21):
+        out[{6: "T_l_m", 16: "T_m_k", 21: "T_w_m"}[kind]] = s.pose()
     elif kind == 22:
         out["cell_m"] = struct.unpack("<f", s.raw(4))[0]
         inflated = zlib.decompress(s.raw(len(data) - 4), -15)
