@@ -57,7 +57,7 @@ def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-de
 
 
 @njit
-def _warp_template(template, w00, w01, w10, w11, reference, gx, gy):  # type: ignore[no-untyped-def]
+def warp_template(template, w00, w01, w10, w11, reference, gx, gy):  # type: ignore[no-untyped-def]
     """Sample the warped template and its gradients. Returns False where the warp leaves the template."""
     n = PATCH + 2
     reach = (PATCH_RADIUS + 1.0) * (abs(w00) + abs(w01))
@@ -214,7 +214,7 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
             cut = min(octave[i] + j, levels - 1)
             level = min(max(cut + shift, 0), levels - 1)
             ratio = float(1 << level) / float(1 << cut) / det
-            inside = _warp_template(
+            inside = warp_template(
                 templates[rows[i], j],
                 warp[i, 1, 1] * ratio,
                 -warp[i, 0, 1] * ratio,

@@ -93,8 +93,9 @@ def _fit_fundamentals(a: F64, b: F64) -> F64:
 def _judge_homographies(models: F64, a: F64, b: F64, sigma_px: float) -> tuple[F64, Bool]:
     """Scores (s,) of H (s,3,3), and which matches each explains (s,n)."""
     regular = np.abs(np.linalg.det(models)) > 1e-15
-    models = np.asarray(np.where(regular[:, None, None], models, np.eye(3)), np.float64)
-    forth, back = _squared_transfer(models, a, b), _squared_transfer(np.linalg.inv(models), b, a)
+    models = np.where(regular[:, None, None], models, np.eye(3))
+    inverses: F64 = np.asarray(np.linalg.inv(models), np.float64)
+    forth, back = _squared_transfer(models, a, b), _squared_transfer(inverses, b, a)
     scores, inside = _score(forth / sigma_px**2, back / sigma_px**2, _CHI2_POINT)
     return np.where(regular, scores, 0.0), inside
 

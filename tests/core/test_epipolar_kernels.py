@@ -1,0 +1,100 @@
+"""Templates are found on segments: where they are, at every level, and not where two places look alike."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core import alignment_kernels
+from kiteline_core.epipolar_kernels import search_segments
+from kiteline_core.features import Pyramid, build_pyramid
+
+F64 = NDArray[np.float64]
+
+
+def picture(seed: int = 0, blur_px: float = 2.0) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).integers(0, 256, (240, 320), np.uint8)
+    return np.asarray(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), blur_px), None, 10, 245, cv2.NORM_MINMAX), np.uint8)
+
+
+def search(
+    pyramid: Pyramid, other: Pyramid, uv: F64, start: F64, end: F64, warp: F64 | None = None, octave: int = 0
+) -> tuple[F64, NDArray[np.int8]]:
+    n = len(uv)
+    octaves = np.full(n, octave, np.uint8)
+    templates = np.empty((n, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
+    alignment_kernels.cut_templates(pyramid, uv, octaves, templates)
+    out, found = np.zeros((n, 2)), np.zeros(n, np.int8)
+    warps = np.tile(np.eye(2) if warp is None else warp, (n, 1, 1))
+    search_segments(
+        other, templates, np.arange(n), octaves, warps, start, end, 0.7, 40, 0.8, 0.9, out, found
+    )  # fmt: skip
+    return out, found
+
+
+def grid() -> F64:
+    return np.stack(np.meshgrid(np.arange(80.0, 250.0, 24.0), np.arange(60.0, 190.0, 24.0)), -1).reshape(-1, 2)
+
+
+def test_a_shift_is_found_on_short_and_long_segments() -> None:
+    image = picture()
+    shift = np.array([9.0, -4.0])
+    moved = cv2.warpAffine(image, np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]]), (320, 240))
+    a, b = build_pyramid(image, 4), build_pyramid(np.asarray(moved, np.uint8), 4)
+    uv = grid()
+    for reach, tolerance in ((1.0, 0.8), (4.0, 2.5)):
+        out, found = search(a, b, uv, uv - 0.4 * reach * shift, uv + (1.0 + 0.3 * reach) * shift)
+        assert (found == 1).mean() > 0.9
+        assert np.linalg.norm(out - uv - shift, axis=1)[found == 1].max() < tolerance
+
+
+def test_a_warped_template_is_found() -> None:
+    image = picture(1)
+    turn = np.array([[1.25, -0.35], [0.35, 1.25]])
+    centre = np.array([160.0, 120.0])
+    moved = cv2.warpAffine(image, np.column_stack([turn, centre - turn @ centre]), (320, 240))
+    uv = centre + np.array([[-30.0, 10.0], [20.0, 25.0], [5.0, -30.0]])
+    true = centre + (uv - centre) @ turn.T
+    along = np.array([12.0, 5.0])
+    a, b = build_pyramid(image, 4), build_pyramid(np.asarray(moved, np.uint8), 4)
+    out, found = search(a, b, uv, true - along, true + 0.5 * along, turn)
+    assert (found == 1).all()
+    assert np.linalg.norm(out - true, axis=1).max() < 1.0
+    _, unwarped = search(a, b, uv, true - along, true + 0.5 * along)
+    assert not (unwarped == 1).all()
+
+
+def test_what_is_not_there_is_told_from_what_is_there_twice() -> None:
+    image = picture(2, 1.0)
+    uv = np.array([[100.0, 100.0], [200.0, 120.0]])
+    pyramid = build_pyramid(image, 4)
+    _, found = search(pyramid, build_pyramid(picture(3, 1.0), 4), uv, uv - [8.0, 0.0], uv + [8.0, 0.0])
+    assert (found == 0).all()
+    twice = np.tile(image[:, :20], (1, 16))
+    again = build_pyramid(twice, 4)
+    _, found = search(again, again, uv, uv - [24.0, 0.0], uv + [24.0, 0.0])
+    assert (found == -1).all()
+    _, found = search(pyramid, pyramid, uv, uv + [400.0, 0.0], uv + [410.0, 0.0])
+    assert (found == -1).all()
+
+
+def test_scores_are_those_of_plain_numpy() -> None:
+    a, b = picture(4), picture(5)
+    b[90:150, 70:190] = a[90:150, 70:190]
+    uv = np.array([[100.0, 110.0], [150.0, 130.0]])
+    start, end = uv - [7.0, 0.0], uv + [7.0, 0.0]
+    out, found = search((a,), (b,), uv, start, end)
+    assert (found == 1).all()
+    for i in range(len(uv)):
+        x0, y0 = uv[i].astype(int)
+        patch = a[y0 - 4 : y0 + 5, x0 - 4 : x0 + 5].astype(np.float64)
+        best, where = -1.0, 0.0
+        for x in np.linspace(start[i, 0], end[i, 0], 21):
+            left, part = int(x), x - int(x)
+            rows = b[y0 - 4 : y0 + 5].astype(np.float64)
+            there = (1.0 - part) * rows[:, left - 4 : left + 5] + part * rows[:, left - 3 : left + 6]
+            score = np.corrcoef(patch.ravel(), there.ravel())[0, 1]
+            if score > best:
+                best, where = score, x
+        np.testing.assert_allclose(out[i], [where, y0])
