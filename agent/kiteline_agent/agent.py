@@ -302,7 +302,6 @@ class Agent:
         self._step_T = se3.exp(se3.log(opening.T_a_b) / opening.frames)
         dt_s = (t_ns - opening.t_ns) * 1e-9
         self._velocity_m = (self._T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
-        self._sequence += 1
         self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
         return True
 

@@ -199,11 +199,12 @@ class LocalMap:
         self.tried[rows], self.hits[rows] = 0, 0
 
     def rescale(self, factor: float) -> None:
-        """Change the unit of length: all lengths grow by `factor`."""
-        self.T_m_k[:, :3, 3] *= factor
-        self.T_p_k[:, :3, 3] *= factor
-        self.rho /= factor
-        self.sigma_rho /= factor
+        """Change the unit of length of the active submap: all its lengths grow by `factor`."""
+        slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == self.active)
+        self.T_m_k[slots, :3, 3] *= factor
+        self.T_p_k[slots, :3, 3] *= factor
+        self.rho[slots] /= factor
+        self.sigma_rho[slots] /= factor
 
     # what the base made of it
 
