@@ -22,7 +22,8 @@ import cv2
 from kiteline_agent.agent import Agent, Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.camera import Camera
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.cost import VirtualCpu, frame_ops
+from kiteline_agent.cost import VirtualCpu
+from kiteline_agent.cost_model import cost_ns
 from kiteline_agent.flight_log import StepLog, write_step
 from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json
 from kiteline_agent.tally import Tally, live_line, odometry_line
@@ -75,7 +76,7 @@ class Onboard:
         self.flown: dict[str, int | float] | None = None  # the tally when the last frame had been flown
         self.cpu_ms: list[float] = []
         self.rss_mib = 0.0
-        config = agent_config(spec.config)
+        config = agent_config(spec.config, spec.cpu_percent)
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(source.rig, config)
@@ -172,7 +173,7 @@ class Onboard:
         if frame is not None:
             self._record(output)
             if not self._live_clock:
-                ops = frame_ops(frame, output)
+                ops = cost_ns(self.agent.work)
                 self._core.spend(ops, now_ns)
                 self._told_cpu_ns = ops
         for packet in output.packets:

@@ -8,13 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent import keyframes
+from kiteline_agent.camera import joined
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
+from kiteline_agent.governor import LADDER, Governor, governed
 from kiteline_agent.inertial import GyroPreintegrator, level_rotation
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
-from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.mono_start import MonoStart, Opening
+from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.right_eye import RightEye
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
@@ -38,6 +41,7 @@ F64 = NDArray[np.float64]
 
 _SHARPEN_INFLATION = 6.0  # successive sightings share the template's error: six of them count as one
 _FAILURES_BEFORE_SUBMAP = 2  # tries, with texture in view, to find the old map before a new one opens
+_UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
 _MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
 
 
@@ -112,8 +116,12 @@ class Agent:
         self._has_imu = imu is not None
         self._gyro = GyroPreintegrator()
         self.map = LocalMap(self._camera, config.local_map, config.depth_filter)
-        self._tracker = Tracker(self.map, config)
-        self._maker = KeyframeMaker(self.map, self._camera, config, channel)
+        self.work = Work()  # of the last step
+        self._tracker = Tracker(self.map, config, self.work)
+        self._maker = KeyframeMaker(self.map, self._camera, config, channel, self.work)
+        self._full_config = config  # before the governor saves on it
+        self._governor = Governor(config.governor)
+        self._held_imu: list[ImuBatch] = []  # of frames that were skipped
         self._motion_depth = DepthFromMotion(self.map, config)
         one_eye = rig.right is None and not rig.has_depth
         self._mono = MonoStart(self._camera, config) if one_eye else None
@@ -128,6 +136,7 @@ class Agent:
         self._T_m_c = np.eye(4)
         self._T_o_m = np.eye(4)
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame: the motion model
+        self._step_s = 0.0  # s that the last motion took
         self._velocity_m: F64 = np.zeros(3)  # m/s in the submap frame
         self._reference: KeyframeId = NO_KEYFRAME
         self._T_k_c = np.eye(4)
@@ -145,8 +154,11 @@ class Agent:
         self._events = []
         self._take_corrections(self._channel.receive(step_input.packets, now_ns))
         estimate = None
-        if step_input.frame is not None:
-            estimate = self._process(step_input.frame, step_input.imu)
+        self.work.clear()
+        self.work.steps = 1
+        if step_input.frame is not None and self._governed(step_input.frame.t_ns, step_input):
+            imu, self._held_imu = joined(self._held_imu), []
+            estimate = self._process(step_input.frame, imu)
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(self._events))
 
     def _process(self, frame: Frame, imu: ImuBatch | None) -> Estimate:
@@ -179,11 +191,29 @@ class Agent:
         self._gyro.remember(imu)
         return self._estimate(frame.t_ns, inliers, tracked=tracked)
 
+    def _governed(self, t_ns: int, step_input: StepInput) -> bool:
+        """Whether the frame is tracked, at the effort on which the governor decides; its samples are kept anyhow."""
+        if step_input.imu is not None:
+            self._held_imu.append(step_input.imu)
+        decision = self._governor.frame(t_ns, step_input.cpu_ns)
+        self._events.extend(decision.events)
+        if decision.changed:
+            points = self._config.align.points
+            self._config = governed(self._full_config, LADDER[decision.level])
+            self._tracker.configure(self._config)
+            self._maker.configure(self._config)
+            self.map.searched = self._config.local_map.searched
+            self._reference_inliers = self._reference_inliers * self._config.align.points // points
+        return decision.track
+
     def _view(self, frame: Frame) -> View:
         levels = self._config.pyramid.levels
         left = build_pyramid(self._rectifier.left(frame.left), levels)
         right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels)
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
+        self.work.frames = 1
+        self.work.rectified_px += frame.left.size if self._rectifier.bends else 0
+        self.work.pyramid_px += frame.left.size * (1 if right is None else 2)
         return View(left, right, depth)
 
     # motion model
@@ -198,7 +228,10 @@ class Agent:
     def _predict(self, turn_R_b0_b1: F64 | None, dt_s: float) -> F64:
         """T_m_c of this frame from the last pose: constant velocity, turned by the gyro where there is one."""
         if turn_R_b0_b1 is None:
-            return se3.orthonormalise(self._T_m_c @ self._step_T)
+            step = self._step_T
+            if self._step_s > 0.0 and abs(dt_s / self._step_s - 1.0) > _UNEVEN:  # frames are missing in between
+                step = se3.exp(dt_s / self._step_s * se3.log(step))
+            return se3.orthonormalise(self._T_m_c @ step)
         R_b_c = self._camera.T_b_c[:3, :3]
         T = self._T_m_c.copy()
         T[:3, :3] = T[:3, :3] @ (R_b_c.T @ turn_R_b0_b1 @ R_b_c)
@@ -210,6 +243,7 @@ class Agent:
         before = self._T_m_c
         self._T_m_c = se3.inverse(track.T_c_m)
         self._step_T = se3.orthonormalise(se3.inverse(before) @ self._T_m_c)
+        self._step_s = dt_s
         if dt_s > 0.0:
             self._velocity_m = (self._T_m_c[:3, 3] - before[:3, 3]) / dt_s
             if turn_R_b0_b1 is not None and self._failures == 0:
@@ -241,6 +275,9 @@ class Agent:
         why = keyframes.why_keyframe(what, self._config.keyframe)
         if why is None:
             return
+        if not self._governor.may_keyframe(track.inliers, self._config.pose.min_inliers):
+            self._events.append("governor: keyframe put off")
+            return
         self._events.append(f"keyframe: {why}")
         self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
 
@@ -248,6 +285,8 @@ class Agent:
         sequence = 0 if parent == NO_KEYFRAME else self._sequence[self.submap] + 1
         self._sequence[self.submap] = sequence
         keyframe = keyframe_id(self.submap, sequence)
+        self._governor.note_keyframe()
+        self.work.rectified_px += view.left[0].size if view.right is not None and self._rectifier.bends else 0
         T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
         # The keyframe's pose is its code's value: move with it by the rounding, and let odometry absorb it.
         self._reference, self._T_k_c = keyframe, np.eye(4)

@@ -26,6 +26,7 @@ class StereoConfig:
     min_ncc: float = 0.85  # correlation of the two patches; lower ones are occlusions and edges of depth
     search_px: float = 3.0  # px of the level: how far stereo may lie from the predicted disparity
     iterations: int = 6  # Gauss-Newton steps; it converges in 3
+    points: int = 240  # of a frame, spread over those that were found
     sigma_px: float = 0.25  # one standard deviation of a disparity at octave 0
 
 
@@ -37,6 +38,7 @@ class AlignConfig:
     points: int = 240  # points of the fine pass; more cost time and gain little
     cell_px: int = 32  # one candidate at a time is taken from each cell
     iterations: int = 8  # Gauss-Newton steps a level
+    fine_from: int = 1  # template level at which the fine pass begins; 0 is cheaper and forgives less
     coarse_step_px: float = 7.0  # px of the coarse level: half a template
     fine_step_px: float = 3.0  # px of the fine level: what the coarse pass leaves
     min_ncc: float = 0.80  # correlation of template and patch
@@ -73,6 +75,7 @@ class LocalMapConfig:
 
     keyframes: int = 48  # slots; older and farther keyframes are forgotten (the base has them)
     births: int = 200  # points a keyframe can bear
+    searched: int = 48  # keyframes whose points are looked for: those seen last
     max_far_ratio: float = 400.0  # depth over baseline beyond which stereo says nothing
 
 
@@ -138,6 +141,23 @@ class RecoveryConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GovernorConfig:
+    """How CPU time is held under a budget."""
+
+    cpu_percent: float = 0.0  # of one core, over any window; 0: no budget
+    window_s: float = 1.0  # s in which the budget has to hold
+    margin: float = 0.94  # share of the budget that is planned with: the rest is for what was not foreseen
+    tight: float = 0.92  # share of the budget above which effort falls
+    comfort: float = 0.82  # share below which the next better effort would have to stay, so that effort rises
+    down_s: float = 0.25  # s between two falls: a window needs time to show the first one
+    up_s: float = 1.5  # s of comfort before a rise
+    burst: float = 0.3  # of a window that may be saved up by skipping
+    max_skips: int = 6  # frames in a row; after more, a track is hard to find again
+    doubt: float = 0.15  # how much dearer than expected a frame may be
+    learning: float = 0.15  # gain of the expectations
+
+
+@dataclass(frozen=True, slots=True)
 class AgentConfig:
     """All sections."""
 
@@ -149,6 +169,7 @@ class AgentConfig:
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
+    governor: GovernorConfig = field(default_factory=GovernorConfig)
     motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)
     mono_start: MonoStartConfig = field(default_factory=MonoStartConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)

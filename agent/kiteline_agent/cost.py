@@ -1,27 +1,6 @@
-"""The virtual CPU: what a frame costs in counted operations, and when a limited core is free again. Pure."""
+"""The virtual CPU: when a limited core is free again. Pure; cost_model.py says what work costs."""
 
 from __future__ import annotations
-
-from kiteline_agent.agent import StepOutput
-from kiteline_core.frame import Frame
-
-# Operations, at one a nanosecond on the modelled core; measured on x86 and rounded up.
-_PER_PIXEL = 4  # rectification and pyramids
-_PER_INLIER = 15_000  # alignment and pose, for a point that was used
-_KEYFRAME_PER_PIXEL = 8  # detection over the whole left image
-_KEYFRAME = 3_000_000  # descriptors, row stereo, coding
-_STEP = 300_000  # endpoint and log
-
-
-def frame_ops(frame: Frame, output: StepOutput) -> int:
-    """Operations that a frame cost."""
-    pixels = frame.left.size * (1 if frame.right is None else 2)
-    ops = _STEP + _PER_PIXEL * pixels
-    if output.estimate is not None:
-        ops += _PER_INLIER * output.estimate.inliers
-    if any(event.startswith(("keyframe", "submap")) for event in output.events):
-        ops += _KEYFRAME + _KEYFRAME_PER_PIXEL * frame.left.size
-    return ops
 
 
 class VirtualCpu:

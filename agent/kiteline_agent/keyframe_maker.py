@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.cost_model import Work
 from kiteline_agent.keyframes import NewPoints, new_points
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.tracker import Track, View
@@ -23,13 +24,18 @@ class KeyframeMaker:
     """Turns a tracked frame into records for the base and into a slot of the local map."""
 
     def __init__(
-        self, local_map: LocalMap, camera: RectifiedCamera, config: AgentConfig, channel: RecordChannel
+        self, local_map: LocalMap, camera: RectifiedCamera, config: AgentConfig, channel: RecordChannel, work: Work
     ) -> None:
         self._map = local_map
         self._camera = camera
         self._config = config
         self._channel = channel
+        self._work = work
         self._fresh: NewPoints | None = None  # found by `enough`, for the keyframe that follows at once
+
+    def configure(self, config: AgentConfig) -> None:
+        """From now on so much effort."""
+        self._config = config
 
     def enough(self, view: View, points: int) -> bool:
         """Whether a view by itself gives at least so many points with depth."""
@@ -61,6 +67,10 @@ class KeyframeMaker:
         births, strength = self._births(keyframe, fresh, order)
         sightings = self._sightings(keyframe, rows, seen, len(births.index))
         head = Head(keyframe, t_ns, parent, T_p_k, len(births.index) + len(sightings.index))
+        self._work.keyframes += 1
+        self._work.detected_px += view.left[0].size
+        self._work.births += len(births.index)
+        self._work.sightings += len(sightings.index)
         shared_head = self._channel.put(head)
         assert isinstance(shared_head, Head)
         held = births

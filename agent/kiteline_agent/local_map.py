@@ -57,6 +57,7 @@ class LocalMap:
         self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
         self._config = config
+        self.searched = config.searched
         self._filtering = filtering
         self.keyframe = np.full(k, NO_KEYFRAME, np.int64)
         self.parent = np.full(k, NO_KEYFRAME, np.int64)
@@ -157,13 +158,20 @@ class LocalMap:
         submap: None for the active one. Views into buffers: use them at once.
         """
         wanted = self.active if submap is None else submap
-        slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == wanted)
+        slots = self._searched(np.flatnonzero(self.keyframe >> SEQUENCE_BITS == wanted))
         n = kernels.project(
             T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.counts,
             self.seed if seeds else self.usable,
             self.bearing, self.rho, self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip
         return Candidates(self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n])
+
+    def _searched(self, slots: I64) -> I64:
+        """Of some slots those seen last, as many as are searched."""
+        if len(slots) <= self.searched:
+            return slots
+        order = np.argsort(-self.last_seen[slots], kind="stable")[: self.searched]
+        return np.asarray(np.sort(slots[order]))
 
     def sharpen(
         self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float

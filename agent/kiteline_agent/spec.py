@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +50,18 @@ def from_json(text: str) -> AgentSpec:
     return AgentSpec(**values)
 
 
-def agent_config(path: str) -> AgentConfig:
-    """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError."""
-    if not path:
-        return AgentConfig()
+def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
+    """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError.
+
+    cpu_percent: of one core, overrides the governor's budget; 0: what the file says.
+    """
+    config = _config_of(path) if path else AgentConfig()
+    if cpu_percent <= 0.0:
+        return config
+    return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
+
+
+def _config_of(path: str) -> AgentConfig:
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from kiteline_core import tum
-from kiteline_core.ids import KeyframeId, SubmapId
 from numpy import float64
 from numpy.typing import NDArray
+
+from kiteline_core import tum
+from kiteline_core.ids import KeyframeId, SubmapId
 
 F64 = NDArray[float64]
 
@@ -53,8 +54,10 @@ class Tally:
         return self.tracked + self.lost + self.dropped
 
     def count(self, estimate: FlownFrame | None) -> None:
-        """Count one frame that was given to the tracker; None when no estimate came of it."""
-        if estimate is None or live_pose(estimate) is None:
+        """Count one frame that was given to the agent; None when it was passed over to save CPU time."""
+        if estimate is None:
+            self.dropped += 1
+        elif live_pose(estimate) is None:
             self.lost += 1
         else:
             self.tracked += 1

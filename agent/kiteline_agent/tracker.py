@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent import local_map_kernels
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.cost_model import Work
 from kiteline_agent.local_map import Candidates, LocalMap
 from kiteline_agent.right_eye import RightEye
 from kiteline_core import alignment_kernels, pose_kernels, se3
@@ -53,10 +54,15 @@ class Track:
 class Tracker:
     """Stateless but for its buffers: the local map and the prediction are handed in."""
 
-    def __init__(self, local_map: LocalMap, config: AgentConfig) -> None:
+    def __init__(self, local_map: LocalMap, config: AgentConfig, work: Work) -> None:
         self._map = local_map
         self._config = config
+        self._work = work
         self._zero_prior = np.zeros(6)
+
+    def configure(self, config: AgentConfig) -> None:
+        """From now on so much effort."""
+        self._config = config
 
     def track(self, view: View, predicted_T_c_m: F64, frame_number: int) -> Track:
         """One frame: a coarse pass over few points mends the prediction, a fine pass over many measures the pose."""
@@ -94,10 +100,15 @@ class Tracker:
         ncc = np.zeros(len(rows))
         last = 1 if coarse_only else 0
         step = config.align.coarse_step_px if coarse_only else config.align.fine_step_px
+        first = 2 if coarse_only else config.align.fine_from
         alignment_kernels.align(
-            view.left, self._map.templates, rows, octave, candidates.warp[chosen], uv, 2 if coarse_only else 1, last,
+            view.left, self._map.templates, rows, octave, candidates.warp[chosen], uv, first, last,
             config.align.iterations, step, config.align.min_ncc, found, ncc,
         )  # fmt: skip
+        self._work.projected += len(candidates.rows)
+        self._work.coarse_points += len(rows) if coarse_only else 0
+        self._work.fine_points += 0 if coarse_only else len(rows)
+        self._work.posed_points += int(np.count_nonzero(found))
         rows, uv, octave, chosen = rows[found], uv[found], octave[found], chosen[found]
         scale = (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
         sigma_px = config.align.sigma_px * scale
@@ -134,6 +145,12 @@ class Tracker:
             stereo = self._config.stereo
             disparity = bf / depth
             sure = self._map.sigma_rho.reshape(-1)[rows] * bf < _SURE * (1 << octave)
+            if len(uv) > stereo.points:
+                picked = np.linspace(0, len(uv) - 1, stereo.points).astype(np.int64)
+                skipped = np.ones(len(uv), np.bool_)
+                skipped[picked] = False
+                disparity[skipped] = -1.0
+            self._work.stereo_points += min(len(uv), stereo.points)
             found = np.zeros(len(uv), np.bool_)
             view.right.refine(view.left, uv, octave, sure, stereo, stereo.search_px, disparity, found)
             observed[found, 2] = disparity[found]

@@ -144,6 +144,11 @@ class Rectifier:
             t_b_c,
         )
 
+    @property
+    def bends(self) -> bool:
+        """Whether images have to be remapped at all."""
+        return self._maps[0] is not None
+
     def left(self, image: U8) -> U8:
         """Rectify a left image (h, w) uint8. Raises CalibrationError when its size is not the calibrated one."""
         return self._apply(0, image)

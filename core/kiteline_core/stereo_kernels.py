@@ -143,7 +143,7 @@ def _raw_at(grid, x, y):  # type: ignore[no-untyped-def]
 @njit
 def _raw_strip_of(image, grid, scale, first, columns, y, strip):  # type: ignore[no-untyped-def]
     """The same strip of the rectified image, from the raw one. Along a row the lens is a parabola through three
-    pixels: over the 140 px of the coarsest level that is exact to 0.02 px of that level. False where the raw image ends.
+    pixels: over the 140 px of the coarsest level that is exact to 0.02 px of it. False where the raw image ends.
     """
     h, w = image.shape
     last = columns - 1.0

@@ -1,0 +1,217 @@
+"""The CPU governor: holds the agent's CPU time under a share of one core, at the least loss of accuracy.
+
+A closed loop on the CPU time that is handed in with each frame. Two things are steered: an effort, one row of LADDER
+(how many points, how much stereo, how many keyframes), and, on the last row only, which frames are tracked at all.
+Before quality there is a soft target with hysteresis; before frames there is a bucket that fills at the allowed rate;
+and over both a sum over the last second that is never overdrawn but to keep the vehicle from being lost.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+from kiteline_agent.config import AgentConfig, GovernorConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much work a frame may be. Factors on the configuration's own numbers, except fine_from."""
+
+    points: float  # of the fine and the coarse pass, and of the inliers that are wanted
+    corners: float  # a keyframe's births
+    stereo: float  # points whose disparity is measured
+    fine_from: int  # template level at which the fine pass begins
+    keyframes: float  # motion until the next keyframe
+    slots: float  # keyframes whose points are looked for
+    cost: float  # of a frame relative to the first row: a start, until it was measured
+
+
+LADDER = (
+    Effort(1.00, 1.00, 1.00, 1, 1.0, 1.00, 1.00),
+    Effort(0.80, 0.80, 0.80, 1, 1.1, 1.00, 0.88),
+    Effort(0.65, 0.65, 0.60, 0, 1.2, 1.00, 0.74),
+    Effort(0.50, 0.55, 0.45, 0, 1.4, 0.75, 0.66),
+    Effort(0.38, 0.45, 0.30, 0, 1.6, 0.50, 0.59),
+    Effort(0.30, 0.40, 0.20, 0, 1.8, 0.35, 0.54),
+)  # from the best to the cheapest
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What to do with a frame. track: whether it is tracked at all. level: row of LADDER. changed: level is new.
+    events: what was decided, in words for the log.
+    """
+
+    track: bool
+    level: int
+    changed: bool
+    events: tuple[str, ...]
+
+
+def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
+    """The configuration at an effort. Fewer points lie in larger cells, and fewer inliers are enough."""
+    align, keyframe = config.align, config.keyframe
+    points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
+    return replace(
+        config,
+        align=replace(
+            align,
+            points=points,
+            coarse_points=max(round(align.coarse_points * effort.points), 2 * config.pose.min_inliers),
+            cell_px=round(align.cell_px / effort.points**0.5),
+            fine_from=min(align.fine_from, effort.fine_from),
+        ),
+        stereo=replace(config.stereo, points=round(config.stereo.points * effort.stereo)),
+        detector=replace(config.detector, max_corners=round(config.detector.max_corners * effort.corners)),
+        keyframe=replace(
+            keyframe,
+            min_inliers=max(round(keyframe.min_inliers * effort.points), config.pose.min_inliers + 10),
+            min_cover=keyframe.min_cover * (0.5 + 0.5 * effort.points),
+            baseline_ratio=keyframe.baseline_ratio * effort.keyframes,
+            rotation_rad=keyframe.rotation_rad * min(effort.keyframes, 1.4),
+        ),
+        local_map=replace(config.local_map, searched=max(round(config.local_map.searched * effort.slots), 8)),
+    )
+
+
+class Governor:
+    """Asked once before each frame, and told of each keyframe. Without a budget it never says no."""
+
+    def __init__(self, config: GovernorConfig) -> None:
+        self._config = config
+        self.level = 0
+        self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # a window
+        self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
+        self._window_ns = 0
+        self._bucket_ns = 0.0
+        self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
+        self._keyframe_ns = 0.0  # what a keyframe adds
+        self._last_t_ns: int | None = None
+        self._last_tracked = False
+        self._last_keyframe = False
+        self._calm_since_ns = 0
+        self._level_since_ns = 0
+        self._skipped = 0  # frames in a row
+        self._saving = False  # a keyframe waits until there is CPU time for it
+        self.window_peak_ns = 0
+
+    @property
+    def on(self) -> bool:
+        """Whether there is a budget."""
+        return self._budget_ns > 0.0
+
+    def frame(self, t_ns: int, last_cpu_ns: int) -> Decision:
+        """Decide about the frame at t_ns. last_cpu_ns: what the frame before cost, whether it was tracked or not."""
+        if not self.on:
+            return Decision(True, 0, False, ())
+        self._learn(last_cpu_ns)
+        self._advance(t_ns)
+        before = self.level
+        events: list[str] = []
+        self._steer(t_ns)
+        track = self._affordable()
+        if not track and self.level < len(LADDER) - 1:
+            self._set_level(t_ns, len(LADDER) - 1)  # quality before frames
+            track = self._affordable()
+        if not track and self._skipped >= self._config.max_skips:
+            track = True  # frames before tracking
+            events.append("governor: over budget, or the track would be lost")
+        if self.level != before:
+            share = self._window_ns / self._budget_ns
+            events.insert(0, f"governor: effort {before} -> {self.level} at {100.0 * share:.0f} % of the budget")
+        if track:
+            self._skipped = 0
+        else:
+            self._skipped += 1
+            events.append("governor: frame skipped")
+        self._last_t_ns, self._last_tracked, self._last_keyframe = t_ns, track, False
+        return Decision(track, self.level, self.level != before, tuple(events))
+
+    def may_keyframe(self, inliers: int, min_inliers: int) -> bool:
+        """Whether there is CPU time for a keyframe now; always when the track hangs by a thread."""
+        if not self.on or inliers < 2 * min_inliers:
+            return True
+        need = self._keyframe_ns + self._frame_ns
+        if self._window_ns + need <= self._config.margin * self._budget_ns:
+            return True
+        self._saving = True
+        return False
+
+    def note_keyframe(self) -> None:
+        """A keyframe was made of the frame that was asked about last."""
+        self._last_keyframe = True
+        self._saving = False
+
+    def _learn(self, cpu_ns: int) -> None:
+        """Book what the last frame cost, and sharpen what frames and keyframes are expected to cost."""
+        if self._last_t_ns is None:
+            return
+        self._spent.append((self._last_t_ns, cpu_ns))
+        self._window_ns += cpu_ns
+        self._window_peak(cpu_ns)
+        if not self._last_tracked:
+            return
+        gain = self._config.learning
+        if self._last_keyframe:
+            extra = max(cpu_ns - self._frame_ns, 0.0) if self._frame_ns else 0.7 * cpu_ns
+            self._keyframe_ns += (extra - self._keyframe_ns) * (gain if self._keyframe_ns else 1.0)
+        elif self._frame_ns:
+            # Quicker to believe that frames are dear than that they are cheap.
+            up = 2.0 * gain if cpu_ns > self._frame_ns else gain
+            self._frame_ns += (cpu_ns - self._frame_ns) * min(up, 1.0)
+        else:
+            self._frame_ns = float(cpu_ns)
+
+    def _window_peak(self, cpu_ns: int) -> None:
+        self._bucket_ns -= cpu_ns
+        self.window_peak_ns = max(self.window_peak_ns, self._window_ns)
+
+    def _advance(self, t_ns: int) -> None:
+        """Move the window and the bucket to a new time."""
+        window_ns = round(self._config.window_s * 1e9)
+        while self._spent and self._spent[0][0] <= t_ns - window_ns:
+            self._window_ns -= self._spent.popleft()[1]
+        if self._last_t_ns is None:
+            self._level_since_ns = self._calm_since_ns = t_ns
+            self._bucket_ns = self._burst_ns()
+            return
+        passed = (t_ns - self._last_t_ns) / window_ns
+        self._bucket_ns = min(self._bucket_ns + passed * self._config.margin * self._budget_ns, self._burst_ns())
+
+    def _burst_ns(self) -> float:
+        """How much may be saved up: a share of a window, and at least a keyframe with its frame."""
+        return max(self._config.burst * self._budget_ns, self._frame_ns + self._keyframe_ns)
+
+    def _affordable(self) -> bool:
+        """Whether the frame fits the window and, on the last row, the even pace of the bucket."""
+        cost = self._frame_ns * (1.0 + self._config.doubt)
+        if self._window_ns + cost > self._config.margin * self._budget_ns:
+            return False
+        if self.level < len(LADDER) - 1:
+            return True
+        return self._bucket_ns >= cost + (self._keyframe_ns if self._saving else 0.0)
+
+    def _steer(self, t_ns: int) -> None:
+        """Hysteresis on the load of the last window: down at once, up only after a calm while and one row a time."""
+        config = self._config
+        load = self._window_ns / self._budget_ns
+        settled = t_ns - self._level_since_ns
+        if load > config.tight and self.level < len(LADDER) - 1 and settled >= config.down_s * 1e9:
+            wish = load * 1.0
+            level = self.level
+            while level < len(LADDER) - 1 and wish > config.tight:
+                wish *= LADDER[level + 1].cost / LADDER[level].cost
+                level += 1
+            self._set_level(t_ns, level)
+        better = max(self.level - 1, 0)
+        if load * LADDER[better].cost / LADDER[self.level].cost > config.comfort or self._skipped:
+            self._calm_since_ns = t_ns
+        elif self.level > 0 and min(settled, t_ns - self._calm_since_ns) >= config.up_s * 1e9:
+            self._set_level(t_ns, better)
+
+    def _set_level(self, t_ns: int, level: int) -> None:
+        self._frame_ns *= LADDER[level].cost / LADDER[self.level].cost
+        self._keyframe_ns *= LADDER[level].corners / LADDER[self.level].corners
+        self.level = level
+        self._level_since_ns = self._calm_since_ns = t_ns
