@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
-from kiteline_codec.schema import Births, Camera, Head, Live, Record, Sightings
+from kiteline_codec.schema import Births, Camera, Head, Level, Live, Record, Sightings
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.map_tables import NO_POSE
 from kiteline_core.sparse_map import SparseMap
@@ -26,6 +26,7 @@ class Intake:
         self._partial: set[KeyframeId] = set()  # used before they were complete
         self.live: dict[AgentId, Live] = {}
         self.last_of: dict[SubmapId, Live] = {}  # the last that was heard in each submap
+        self.levels: dict[SubmapId, Level] = {}  # what agents say of which way is up
         self.last_seen_ns: dict[AgentId, int] = {}
         self.refused = 0  # records that contradict what is known
 
@@ -42,6 +43,8 @@ class Intake:
                     self.last_of[submap_of_keyframe(record.keyframe)] = record
             elif isinstance(record, Head):
                 self._take_head(record, now_ns)
+            elif isinstance(record, Level):
+                self.levels[record.submap] = record
             elif isinstance(record, Births | Sightings):
                 if record.keyframe in self._map:
                     self._take_section(record)

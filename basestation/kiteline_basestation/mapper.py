@@ -101,6 +101,7 @@ class Mapper:
         """Take in what came, and say what is to be published and worked on."""
         for agent, records in given.arrivals:
             self._intake.take(agent, records, now_ns)  # sections -> map, whatever their order
+        self._set_upright()  # where an agent has learnt which way is up
         for done in given.done:
             self._finish(done)  # refined poses and points, outliers, grid
         for keyframe in self._intake.ready(now_ns):
@@ -204,13 +205,27 @@ class Mapper:
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
+    def _set_upright(self) -> None:
+        """Turn the world when the agent of its first submap says which way is up; all that is placed moves along."""
+        first = next(iter(self.placements), None)
+        level = None if first is None else self._intake.levels.get(first)
+        if first is None or level is None or np.array_equal(level.T_l_m, self.placements[first]):
+            return
+        T_new_old = level.T_l_m @ se3.inverse(self.placements[first])
+        for submap, T_w_m in self.placements.items():
+            upright = level.T_l_m if submap == first else se3.orthonormalise(T_new_old @ T_w_m)
+            self.placements[submap] = upright
+            self._publisher.place(submap, upright)
+        self._grid_due = max(self._grid_due, len(self.map.rows))  # the grid is made anew
+
     def _place(self, keyframe: KeyframeId) -> None:
         """The first submap of all is the world. A later one of the same flight begins where the last was left."""
         submap = submap_of_keyframe(keyframe)
         if submap in self.placements:
             return
         if not self.placements:
-            T_w_m = np.eye(4)
+            level = self._intake.levels.get(submap)
+            T_w_m = np.eye(4) if level is None else level.T_l_m
         else:
             before = SubmapId(submap - 1)
             live, T_w_before = self._intake.last_of.get(before), self.placements.get(before)
