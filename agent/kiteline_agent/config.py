@@ -106,6 +106,7 @@ class MotionDepthConfig:
     """How bearings get their depth from motion."""
 
     per_frame: int = 150  # bearings looked for in a frame; each costs about 10 us
+    per_frame_stereo: int = 24  # the same beside stereo, which leaves only far and doubtful points
     nearer: float = 2.0  # how much nearer than the nearest twentieth of the points a bearing may be
     reach: float = 2.5  # deviations of inverse depth that are searched
     step_px: float = 0.7  # px of the level between two tries: half of what correlation bears
