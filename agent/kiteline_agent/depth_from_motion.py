@@ -60,7 +60,7 @@ class DepthFromMotion:
 
     def _choose(self, seeds: Candidates) -> I64:
         """Bearings of this frame: those nearest to a depth first, then the newest."""
-        limit = self._config.motion.per_frame
+        limit = self._config.motion.per_frame_stereo if self._map.camera.stereo else self._config.motion.per_frame
         order = np.lexsort((-seeds.rows, self._map.tried[seeds.rows], -self._map.hits[seeds.rows]))
         return np.sort(order[:limit])
 

@@ -26,9 +26,10 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """The first keyframe of a map, seen from the second. view, t_ns: of the first frame. frames: from there to the second.
-    T_a_b: (4,4) the second camera in the first. points: what is born in the first frame. median_depth_m: theirs, a convention. flat: the
-    scene was taken for a plane.
+    """The first keyframe of a map, seen from the second.
+
+    view, t_ns: of the first frame. frames: from there to the second. T_a_b: (4,4) the second camera in the first.
+    points: what is born in the first frame. median_depth_m: theirs. flat: the scene was taken for a plane.
     """
 
     view: View
@@ -46,7 +47,7 @@ class Opening:
         octave = local_map.octave[slot * local_map.births : slot * local_map.births + n]
         local_map.sigma_rho[slot, :n] = sigma_of_meeting(
             local_map.bearing[slot, :n], local_map.rho[slot, :n], se3.inverse(self.T_a_b),
-            local_map.camera.fx, sigma_px * (1 << octave),
+            local_map.camera.fx, sigma_px * np.exp2(octave.astype(np.float64)),
         )  # fmt: skip
 
 
@@ -69,6 +70,7 @@ class MonoStart:
         self._octave = np.zeros(0, np.uint8)
         self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
         self._uv = np.zeros((0, 2))
+        self._index = np.zeros(0, np.int64)  # template of each corner that is still followed
 
     def tracked(self, depth_m: F64) -> None:
         """A map is being tracked, at these depths (n,): a later start takes on their scale, and begins anew."""
@@ -105,7 +107,7 @@ class MonoStart:
         self._last = view.left[0]
         self._uv0, self._uv, self._octave = corners.uv, corners.uv.copy(), corners.octave
         self._templates = np.empty((len(corners.uv), *self._templates.shape[1:]), np.uint8)
-        self._index = np.arange(len(corners.uv))  # of those still followed
+        self._index = np.arange(len(corners.uv))
         alignment_kernels.cut_templates(view.left, corners.uv, corners.octave, self._templates)
 
     def _follow(self, view: View) -> None:
