@@ -132,7 +132,8 @@ class Agent:
         self._submap_number = -1
         self._submaps = 0  # how many have been opened
         self._sequence: dict[SubmapId, int] = {}  # how many keyframes after the first each submap has
-        self._failures = 0
+        self._failures = 0  # tries since the old map was lost that had texture in view
+        self._lost = False  # the last frame had no pose
         self._T_m_c = np.eye(4)
         self._T_o_m = np.eye(4)
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame: the motion model
@@ -187,6 +188,7 @@ class Agent:
             track = self._recover(view, frame.t_ns)
             tracked = track is not None or self._begin_submap(view, frame.t_ns, imu)
         inliers = track.inliers if track is not None else 0
+        self._lost = not tracked
         self._last_t_ns = frame.t_ns
         self._gyro.remember(imu)
         return self._estimate(frame.t_ns, inliers, tracked=tracked)
@@ -246,7 +248,7 @@ class Agent:
         self._step_s = dt_s
         if dt_s > 0.0:
             self._velocity_m = (self._T_m_c[:3, 3] - before[:3, 3]) / dt_s
-            if turn_R_b0_b1 is not None and self._failures == 0:
+            if turn_R_b0_b1 is not None and not self._lost:
                 R_b_c = self._camera.T_b_c[:3, :3]
                 self._gyro.correct(R_b_c @ self._step_T[:3, :3] @ R_b_c.T, turn_R_b0_b1, dt_s)
         self._failures = 0
