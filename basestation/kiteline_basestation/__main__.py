@@ -51,7 +51,7 @@ _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the las
 _DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is still not quiet is given up
 _LIVE_WAIT_S = 0.005  # s between two looks at the links of a live base: small beside the camera's period
 _LIVE_STEP_NS = 50_000_000  # ns between two steps without news: keeps acknowledgements and heartbeats moving
-_KEEP_NS = 5_000_000_000  # ns between two copies of the shared values on disk
+_KEEP_NS = 2_000_000_000  # ns between two copies of the shared values on disk
 _PAGE_NS = 400_000_000  # ns between two snapshots for the status page
 _MEMORY_STEPS = 10  # steps between two looks at the memory
 

@@ -143,8 +143,6 @@ def fly_processes(flight: Flight, link: str, realtime: bool) -> Outcome:
         crew = stack.enter_context(Crew())
         progress = stack.enter_context(Progress("flying", flight.frames, "frames")) if not flight.quiet else None
         crew.start("base", "kiteline_basestation", asdict(base), Path(base.folder))
-        for spec in agents:
-            crew.start(f"agent{spec.agent}", "kiteline_agent", asdict(spec), Path(spec.folder))
         supervisor = _Supervisor(crew, base, agents, progress)
         supervisor.run()
         return supervisor.outcome
@@ -169,6 +167,8 @@ class _Supervisor:
 
     def run(self) -> None:
         """Until every child has ended, or none says anything any more."""
+        if not self._live:  # agents wait for the base at the barrier
+            self._start_agents()
         while self._flying or self._base_up:
             event = self._crew.next_event(_SILENCE_S if self._flying else _AGENT_END_S)
             if event is None:
@@ -177,9 +177,15 @@ class _Supervisor:
                 return
             self._take(event)
 
+    def _start_agents(self) -> None:
+        for spec in self._agents:
+            self._crew.start(f"agent{spec.agent}", "kiteline_agent", asdict(spec), Path(spec.folder))
+
     def _take(self, event: Event) -> None:
         agent = int(event.child.removeprefix("agent")) if event.child.startswith("agent") else None
         match event.kind:
+            case "ready" if agent is None and self._live:
+                self._start_agents()
             case "progress" if agent is not None:
                 self._show(agent, event.values["frames"])
             case "result" if agent is not None:

@@ -1,0 +1,194 @@
+"""Agent and base as a user starts them: real clocks, watched over, told to stop, killed and started again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+from kiteline_basestation.store import unpack
+from kiteline_codec.schema import Kind
+from kiteline_hw.mcap_log import LogReader
+from kiteline_lab.flight import free_endpoint
+from kiteline_lab.flight_report import check_contract
+from kiteline_lab.fly import Options, fly
+from kiteline_lab.replay import main as replay
+
+STOP_S = 2.0  # s in which a program told to stop has to be gone
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Starts `kiteline …`; whatever still runs at the end is killed."""
+    running: list[subprocess.Popen[str]] = []
+
+    def begin(*words: object, **variables: str) -> subprocess.Popen[str]:
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+            "XDG_STATE_HOME": str(tmp_path),
+            **variables,
+        }
+        program = subprocess.Popen(
+            [sys.executable, "-m", "kiteline_cli", *map(str, words)],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        running.append(program)
+        return program
+
+    yield begin
+    for program in running:
+        if program.poll() is None:
+            program.kill()
+        program.communicate()
+
+
+def wait_for(what: str, ready: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not ready():
+        assert time.monotonic() < deadline_s, f"waited in vain for {what}"
+        time.sleep(0.02)
+
+
+def stop(program: subprocess.Popen[str], how: signal.Signals = signal.SIGTERM) -> str:
+    """Ask a program to stop; it ends well and soon. Returns what it wrote to stderr."""
+    program.send_signal(how)
+    begin_s = time.monotonic()
+    _, errors = program.communicate(timeout=10.0)
+    assert time.monotonic() - begin_s < STOP_S
+    assert program.returncode == 0, errors
+    assert "Traceback" not in errors
+    return errors
+
+
+def test_flying_in_real_time(recording: Path, tmp_path: Path) -> None:
+    begin_s = time.monotonic()
+    report, outcome = fly(Options((str(recording),), tmp_path, realtime=True), quiet=True)
+    assert time.monotonic() - begin_s > 1.45  # frames are paced by their stamps
+    agent = report["agents"][0]
+    assert agent["tracked"] + agent["dropped"] == 30
+    assert agent["tracked"] >= 20
+    assert report["base"]["digest_equal"] is True
+    assert report["base"]["keyframes"] == agent["keyframes"]
+    assert check_contract(tmp_path) == []
+    assert not outcome.failed
+    for half in ("agent0", "base"):
+        assert replay([str(tmp_path / half / "log.mcap"), "--verify"]) == 0
+
+
+def test_agent_and_base_meet_and_a_killed_base_resumes(recording: Path, tmp_path: Path, start: Start) -> None:
+    endpoint, port = free_endpoint(), free_endpoint().rpartition(":")[2]
+    words = ("--link", f"zenoh:{endpoint}", "--store", tmp_path / "store", "--web", f"127.0.0.1:{port}")
+    base = start("base", *words, "--log", tmp_path / "log")
+
+    def seen() -> dict[str, int]:
+        try:
+            with urlopen(f"http://127.0.0.1:{port}/status.json", timeout=1.0) as page:
+                agents = json.load(page)["agents"]
+        except OSError:
+            return {}
+        return dict(agents[0]) if agents else {}
+
+    agent = start("agent", recording, "--link", f"zenoh:{endpoint}", "--log", tmp_path / "log")
+    assert agent.wait(30.0) == 0  # a recording ends by itself, once the base has it all
+    wait_for("the page to show the agent", lambda: seen().get("keyframes", 0) >= 3)
+    keyframes = seen()["keyframes"]
+    store = tmp_path / "store" / "values.klstore"
+    wait_for("the store", lambda: store.exists() and heads(store) == keyframes)
+    base.kill()
+    base.wait()
+    again = start("base", *words, "--log", tmp_path / "log")
+    wait_for("the next base to show what the last one knew", lambda: seen().get("keyframes", 0) == keyframes)
+    stop(again)
+    assert sorted(path.name for path in (tmp_path / "log").glob("session*.mcap")) == [
+        "session00001.mcap", "session00002.mcap",
+    ]  # fmt: skip
+    for number in (1, 2):
+        assert replay([str(tmp_path / "log" / f"session0000{number}.mcap"), "--verify"]) == 0
+    assert heads(store) == keyframes  # a base that heard nothing forgets nothing
+
+
+def heads(store: Path) -> int:
+    """How many keyframes a store holds."""
+    return sum(key.kind == Kind.HEAD for codes in unpack(store.read_bytes()).values() for key in codes.received)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_a_base_alone_stops_when_told(tmp_path: Path, start: Start, how: signal.Signals) -> None:
+    base = start("base", "--link", f"zenoh:{free_endpoint()}", "--web", "127.0.0.1:0")
+    assert base.stderr is not None
+    assert "http://127.0.0.1" in base.stderr.readline()
+    stop(base, how)
+
+
+def test_systemd_hears_from_the_tracking_loop_and_boots_are_counted(
+    recording: Path, tmp_path: Path, start: Start
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(20.0)
+        for boot in (1, 2):
+            agent = start("agent", recording, "--log", tmp_path / "log", NOTIFY_SOCKET=str(tmp_path / "notify"))
+            assert systemd.recv(64) == b"READY=1"
+            assert systemd.recv(64) == b"WATCHDOG=1"
+            assert stop(agent) == ""
+            drain(systemd)
+            with LogReader(tmp_path / "log" / "agent0" / f"boot0000{boot}.mcap") as log:
+                assert json.loads(log.metadata["spec"])["boot"] == boot
+                assert log.cut is None
+
+
+def drain(s: socket.socket) -> None:
+    """Throw away what has come in."""
+    s.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            s.recv(64)
+    s.settimeout(20.0)
+
+
+def test_poses_go_to_a_flight_controller(recording: Path, start: Start) -> None:
+    from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
+
+    model = FlightController("ardupilot")
+    with UdpFlightController(model) as controller:
+        agent = start("agent", recording, "--mavlink", f"udp:127.0.0.1:{controller.port}")
+        assert agent.wait(30.0) == 0
+    assert len(model.accepted) >= 10
+    assert not model.dropped
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("agent", "nowhere.mcap"), "no such file"),
+        (("agent", "RECORDING", "--link", "pigeon:1"), "unknown link"),
+        (("agent", "RECORDING", "--mavlink", "udp:nowhere"), "flight controller"),
+        (("agent", "RECORDING", "--config", "CONFIG"), "unknown key"),
+        (("base", "--link", "zenoh:tcp/256.0.0.1:1"), "listen"),
+        (("base", "--link", "none", "--web", "here"), "address"),
+    ],
+)
+def test_a_mistake_ends_in_one_line(
+    recording: Path, tmp_path: Path, start: Start, words: tuple[str, ...], told: str
+) -> None:
+    (tmp_path / "config.toml").write_text("[agent]\nspeed = 3\n")
+    real = {"RECORDING": str(recording), "CONFIG": str(tmp_path / "config.toml")}
+    program = start(*(real.get(word, word) for word in words))
+    _, errors = program.communicate(timeout=30.0)
+    assert program.returncode == 2
+    assert re.fullmatch(r"kiteline: error: [^\n]+\n", errors), errors
+    assert told in errors
