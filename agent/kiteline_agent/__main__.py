@@ -45,6 +45,7 @@ from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, SourceError
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
+from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_lockstep import LockstepClient
 
 _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
@@ -83,7 +84,9 @@ class Onboard:
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
         self.camera = Camera(source, until_ns, time.process_time_ns)
-        self.agent = Agent(source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel)
+        self.agent = Agent(
+            source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel, shipped_words()
+        )
         self._files = ExitStack()
         self._log_shift_ns = spec.start_ns  # log time minus the time handed to the agent: logs stand in source time
         self._log: StepLog | None = None

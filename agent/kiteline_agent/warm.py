@@ -1,4 +1,4 @@
-"""Compile all kernels of the onboard half before the first frame, by flying two frames of noise."""
+"""Compile all kernels of the onboard half before the first frame, by flying a few frames of noise."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
+from kiteline_core.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.se3 import from_rt
 
 
@@ -23,6 +24,13 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
     camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
     small = CameraRig(camera, camera, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
     right = np.ascontiguousarray(np.roll(image, -8, axis=1))
-    agent = Agent(small, None, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
-    for k in range(4):
-        agent.step(StepInput(Frame(k * 50_000_000, image, right)), k * 50_000_000)
+    centres = pixels[: 32 * nodes(4, 2)].view(np.uint64).reshape(-1, 4)
+    words = Vocabulary(4, 2, centres, np.ones(16, np.float32))
+    agent = Agent(small, None, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+    for k in range(6):
+        # At last the picture jumps by a quarter of its width: lost, and found again by its descriptors.
+        eyes = (image, right) if k < 5 else (np.roll(image, -80, axis=1), np.roll(right, -80, axis=1))
+        agent.step(StepInput(Frame(k * 50_000_000, *(np.ascontiguousarray(eye) for eye in eyes))), k * 50_000_000)
+    places = PlaceIndex(words)  # forgets, which so short a flight does not
+    places.add(0, pixels[:320].reshape(10, 32))
+    places.remove(0)

@@ -35,6 +35,7 @@ from kiteline_hw.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader,
 from kiteline_hw.mcap_mend import MENDED
 from kiteline_hw.ports import SourceError
 from kiteline_hw.rig_json import rig_from_json
+from kiteline_hw.words import shipped_words
 from kiteline_lab.progress import Progress
 
 
@@ -101,7 +102,7 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
     channel: RecordChannel = AloneChannel()
     if kind == "CodedChannel":
         channel = CodedChannel(SyncConfig(budget_bytes=spec["up_bytes_s"]), spec["boot"] + 1)
-    agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel)
+    agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_words())
     out = Replayed()
     for step in steps(log):
         frame = batch = None

@@ -1,0 +1,224 @@
+"""Forced losses: turned into a wall and out again, black for seconds, the old place seen again, and places alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig, LocalMapConfig
+from kiteline_codec.schema import Head, Record
+from kiteline_core import se3
+from kiteline_core.cameras import CameraRig
+from kiteline_core.frame import Frame
+from kiteline_core.ids import MAX_SUBMAPS, NO_KEYFRAME, AgentId, submap_of_keyframe
+from kiteline_core.place_index import Vocabulary
+from kiteline_hw.sim.source import open_sim
+from kiteline_hw.sources import open_source
+from kiteline_hw.words import shipped_words
+
+PERIOD_NS = 50_000_000
+
+
+class Listening(AloneChannel):
+    """Keeps the heads of the keyframes that were shared."""
+
+    def __init__(self) -> None:
+        self.heads: list[Head] = []
+
+    def put(self, record: Record) -> Record:
+        if isinstance(record, Head):
+            self.heads.append(record)
+        return record
+
+
+@dataclass
+class Flown:
+    """What came of a flight, frame by frame."""
+
+    agent: Agent
+    estimates: list[Estimate]
+    events: list[tuple[str, ...]]
+    heads: list[Head]
+
+    @property
+    def submaps(self) -> list[int]:
+        return [e.submap % MAX_SUBMAPS for e in self.estimates]
+
+    def said(self, word: str) -> list[int]:
+        """Frames in which an event begins with a word."""
+        return [k for k, events in enumerate(self.events) if any(e.startswith(word) for e in events)]
+
+
+def fly(rig: CameraRig, frames: Iterable[Frame], words: Vocabulary | None, config: AgentConfig | None = None) -> Flown:
+    channel = Listening()
+    agent = Agent(rig, None, config or AgentConfig(), Identity(AgentId(0), 0), channel, words)
+    estimates, events = [], []
+    for k, frame in enumerate(frames):
+        output = agent.step(StepInput(replace(frame, t_ns=k * PERIOD_NS)), k * PERIOD_NS)
+        assert output.estimate is not None
+        estimates.append(output.estimate)
+        events.append(output.events)
+    heads = channel.heads
+    assert len({h.keyframe for h in heads}) == len(heads), "a keyframe's id was used twice"
+    steps = [np.linalg.norm(b.T_o_b[:3, 3] - a.T_o_b[:3, 3]) for a, b in pairwise(estimates)]
+    assert max(steps) < 0.15, "odometry jumped"
+    return Flown(agent, estimates, events, heads)
+
+
+def wall(like: Frame, level: float, frames: int) -> list[Frame]:
+    """A blank wall of some brightness, with sensor noise."""
+    rng = np.random.default_rng(0)
+    image = np.clip(rng.normal(level, 1.2, like.left.shape), 0, 255).astype(np.uint8)
+    return [Frame(0, image, image)] * frames
+
+
+@pytest.fixture(scope="module")
+def words() -> Vocabulary:
+    return shipped_words()
+
+
+@dataclass
+class Recording:
+    """Frames of a rendered flight and where the body truly was at each."""
+
+    rig: CameraRig
+    frames: list[Frame]
+    truth: list[np.ndarray]
+
+    def error_m(self, flown: Flown, shown: Sequence[int | None], submap: int) -> float:
+        """Largest error of a submap's poses relative to its first, over the frames shown."""
+        known = [
+            (e.T_m_b, self.truth[k])
+            for e, k in zip(flown.estimates, shown)
+            if k is not None and e.T_m_b is not None and e.submap % MAX_SUBMAPS == submap
+        ]
+        first, true_first = known[0]
+        return max(
+            float(np.linalg.norm((se3.inverse(se3.inverse(true_first) @ true) @ se3.inverse(first) @ T)[:3, 3]))
+            for T, true in known
+        )
+
+    def show(self, shown: Sequence[int | None], blank: float) -> list[Frame]:
+        """The frames of some numbers; None shows a wall."""
+        nothing = wall(self.frames[0], blank, 1)[0]
+        return [nothing if k is None else self.frames[k] for k in shown]
+
+
+@pytest.fixture(scope="module")
+def room(data_dir: Path) -> Recording:
+    source = open_source(str(data_dir / "room_flight.mcap"), imu=False)
+    frames = []
+    for item in source:
+        if isinstance(item, Frame):
+            frames.append(item)
+        if len(frames) == 226:
+            break
+    truth = source.ground_truth
+    assert truth is not None
+    nearest = [int(np.argmin(np.abs(truth.t_ns - f.t_ns))) for f in frames]
+    return Recording(source.rig, frames, [truth.T_w_b[k] for k in nearest])
+
+
+BEFORE = range(30, 61)
+WALL = [None] * 10
+
+
+def back_after(flown: Flown, back: int) -> int:
+    """How many frames after texture came back a pose came back."""
+    return next(k for k, e in enumerate(flown.estimates[back:]) if e.tracked)
+
+
+@pytest.mark.parametrize("resume", [61, 75, 200], ids=["same place", "a little further", "seen before"])
+def test_out_of_the_wall_at_a_known_place(room: Recording, words: Vocabulary, resume: int) -> None:
+    shown = [*BEFORE, *WALL, *range(resume, resume + 12)]
+    flown = fly(room.rig, room.show(shown, 120.0), words)
+    assert back_after(flown, 41) <= 2 and all(e.tracked for e in flown.estimates[43:])
+    assert set(flown.submaps) == {0}
+    assert not any(e.tracked or e.quality > 0 for e in flown.estimates[31:41])
+    assert room.error_m(flown, shown, 0) < 0.04
+
+
+@pytest.mark.parametrize("resume", [110, 150])
+def test_out_of_the_wall_at_another_place(room: Recording, words: Vocabulary, resume: int) -> None:
+    shown = [*BEFORE, *WALL, *range(resume, resume + 24)]
+    flown = fly(room.rig, room.show(shown, 120.0), words)
+    assert back_after(flown, 41) <= 2 and all(e.tracked for e in flown.estimates[43:])
+    assert flown.submaps[-1] == 1 and flown.submaps[30] == 0
+    assert flown.said("submap: joined") == []
+    assert room.error_m(flown, shown, 1) < 0.04
+    opened = next(h for h in flown.heads if h.keyframe >> 20 == flown.estimates[-1].submap)
+    assert opened.parent == NO_KEYFRAME
+
+
+def test_two_seconds_of_black(room: Recording, words: Vocabulary) -> None:
+    shown = [*BEFORE, *[None] * 40, *range(101, 113)]
+    flown = fly(room.rig, room.show(shown, 0.0), words)
+    assert back_after(flown, 71) <= 2 and all(e.tracked for e in flown.estimates[73:])
+    assert all(e.quality == -1 and e.T_m_b is None for e in flown.estimates[31:71])
+
+
+def test_a_young_submap_is_joined_where_the_old_place_comes_back(room: Recording, words: Vocabulary) -> None:
+    shown = [*BEFORE, *WALL, *range(90, 60, -1), *range(61, 71)]
+    flown = fly(room.rig, room.show(shown, 120.0), words)
+    joined = flown.said("submap: joined")
+    assert len(joined) == 1
+    assert set(flown.submaps[43 : joined[0]]) == {1} and set(flown.submaps[joined[0] :]) == {0}
+    assert all(e.tracked for e in flown.estimates[43:])
+    assert room.error_m(flown, shown, 0) < 0.04
+    # Two keyframes of one instant tell how the submaps lie.
+    twins = [h for h in flown.heads if h.t_ns == joined[0] * PERIOD_NS]
+    assert sorted(submap_of_keyframe(h.keyframe) % MAX_SUBMAPS for h in twins) == [0, 1]
+    T_m_k = {submap_of_keyframe(h.keyframe) % MAX_SUBMAPS: pose_of(flown.agent, h) for h in twins}
+    T_0_1 = T_m_k[0] @ se3.inverse(T_m_k[1])
+    young = next(k for k in range(43, joined[0]) if shown[k] is not None)
+    T_1_b = flown.estimates[young].T_m_b
+    start = flown.estimates[0].T_m_b
+    assert T_1_b is not None and start is not None
+    expected = start @ se3.inverse(room.truth[30]) @ room.truth[shown[young] or 0]
+    assert np.linalg.norm((T_0_1 @ T_1_b)[:3, 3] - expected[:3, 3]) < 0.05
+
+
+def pose_of(agent: Agent, head: Head) -> np.ndarray:
+    slot = agent.map.slot_of(head.keyframe)
+    assert slot >= 0
+    return agent.map.T_m_k[slot]
+
+
+def test_without_words_the_reference_keyframe_is_still_found(room: Recording) -> None:
+    shown = [*BEFORE, *WALL, *range(62, 68)]
+    flown = fly(room.rig, room.show(shown, 120.0), None)
+    assert all(e.tracked for e in flown.estimates[43:]) and set(flown.submaps) == {0}
+
+
+def test_a_full_map_gives_up_old_submaps_first_and_still_flies(room: Recording, words: Vocabulary) -> None:
+    config = AgentConfig(local_map=LocalMapConfig(keyframes=6))
+    shown = [*BEFORE, *WALL, *range(110, 150), *WALL, *range(58, 63)]
+    flown = fly(room.rig, room.show(shown, 120.0), words, config)
+    held = {int(k) >> 20 for k in flown.agent.map.keyframe if k != NO_KEYFRAME}
+    assert np.count_nonzero(flown.agent.map.keyframe != NO_KEYFRAME) <= 6
+    assert flown.submaps[-1] in (0, 1, 2) and flown.estimates[-1].submap in held
+    assert all(e.tracked for e in flown.estimates[-3:])
+
+
+def simulated(scene: str, seed: int, start: float = 0.0) -> tuple[CameraRig, list[Frame]]:
+    source = open_sim(f"{scene}?seed={seed}&start={start}&seconds=3&scale=0.5&rest=0", imu=False, texture_bits=9)
+    eyes = source.eyes()
+    return source.rig, [source.render(k, eyes) for k in range(0, 50, 2)]
+
+
+def test_rooms_of_the_same_textures_are_kept_apart(words: Vocabulary) -> None:
+    rig, here = simulated("room", 3)
+    _, there = simulated("hall", 3)
+    gap = wall(here[0], 110.0, 6)
+    flown = fly(rig, [*here[:16], *gap, *there], words)
+    assert back_after(flown, 22) <= 2 and all(e.tracked for e in flown.estimates[24:])
+    assert flown.said("submap: joined") == [] and set(flown.submaps[24:]) == {1}
+    again = fly(rig, [*here[:16], *gap, *here[12:20]], words)
+    assert back_after(again, 22) <= 2 and set(again.submaps) == {0}
