@@ -1,17 +1,20 @@
-"""The inertial half of tracking: start at rest or in motion, predict, fuse with what the images saw, coast when blind."""
+"""The inertial half of tracking: start at rest or in motion, predict, fuse with what the images saw, coast when
+blind.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import imu_alignment, se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.fixed_lag import FixedLagConfig, FixedLagSmoother, InertialState, StartDeviations, VisualPoints
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.imu_preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
 from kiteline_core.time_offset import TimeOffsetEstimator
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
@@ -114,7 +117,9 @@ class InertialTracker:
     # once a frame
 
     def predict(self, imu: ImuBatch | None, t_ns: int) -> Prediction | None:
-        """Take in samples, and say where the body should be at t_ns. None where samples are missing or nothing is known."""
+        """Take in samples, and say where the body should be at t_ns. None where samples are missing or nothing is
+        known.
+        """
         self._buffer.push(imu)
         if self._last is None:
             return None
@@ -132,8 +137,8 @@ class InertialTracker:
         return Prediction(T, velocity, motion.turn)
 
     def update(self, t_ns: int, T_m_b_visual: F64, points: VisualPoints) -> InertialState | None:
-        """A frame was measured: T_m_b_visual (4,4) by images alone, from `points`. The state that images and IMU together
-        give, or None while waiting for a start or where samples are missing (then the images alone hold).
+        """A frame was measured: T_m_b_visual (4,4) by images alone, from `points`. The state that images and IMU
+        together give, or None while waiting for a start or where samples are missing (then the images alone hold).
         """
         samples = self._interval(t_ns)
         if samples is not None:
@@ -184,7 +189,9 @@ class InertialTracker:
         self._blind_s = 0.0
 
     def metric_scale(self) -> tuple[float, float] | None:
-        """Metres per unit of a map without scale, and one deviation, from the frames seen while waiting; None if unknown."""
+        """Metres per unit of a map without scale, and one deviation, from the frames seen while waiting; None if
+        unknown.
+        """
         poses, motions = self._window(self._config.window_frames)
         if len(poses) < _SCALE_FRAMES or len(motions) < len(poses) - 1:
             return None

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import fixed_lag_kernels as kernels
-from kiteline_core import se3
+from kiteline_core import inertial_kernels, se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.imu_preintegration import Preintegrated, Samples, preintegrate
@@ -68,8 +68,9 @@ class VisualPoints:
 
 @dataclass(frozen=True, slots=True)
 class InertialState:
-    """T_m_b: (4,4). velocity: (3,) m/s in m. bias: (6,) gyro rad/s, accel m/s^2. tilt: (2,) rad, turn of true up against
-    z of m about its x and y. cov: (17,17) of [rotation (right), position, velocity, gyro bias, accel bias, tilt].
+    """T_m_b: (4,4). velocity: (3,) m/s in m. bias: (6,) gyro rad/s, accel m/s^2. tilt: (2,) rad, turn of true up
+    against z of m about its x and y. cov: (17,17) of [rotation (right), position, velocity, gyro bias, accel bias,
+    tilt].
     """
 
     T_m_b: F64
@@ -122,7 +123,7 @@ class FixedLagSmoother:
     def gravity(self) -> F64:
         """Gravity (3,) in m, m/s^2."""
         down, jac = np.empty(3), np.empty((3, 2))
-        kernels.down_of_tilt(self._tilt, down, jac)
+        inertial_kernels.down_of_tilt(self._tilt, down, jac)
         return self._gravity * down
 
     @property
@@ -273,9 +274,10 @@ class FixedLagSmoother:
             self._prior_h, self._prior_b, self._prior_r, self._prior_s, self._prior_tilt,
         )  # fmt: skip
         n = self._n
-        arrays = [
+        arrays: list[NDArray[np.generic]] = [
             self._rot, self._state, self._imu_dt, self._imu_turn, self._imu_vp, self._imu_jac, self._imu_bias,
-            self._imu_info, self._imu_walk, self._counts, self._scale, self._vis_h, self._vis_b, self._vis_r, self._vis_p,
+            self._imu_info, self._imu_walk, self._counts, self._scale, self._vis_h, self._vis_b, self._vis_r,
+            self._vis_p,
         ]  # fmt: skip
         if self._config.fresh > 1:  # else nobody looks at the points of older frames again
             arrays += [self._xyz, self._ray, self._observed, self._sigma, self._use]
@@ -297,6 +299,6 @@ def tilt_of(gravity: F64) -> F64:
 def _tilt_jacobian(r: F64, tilt: F64) -> F64:
     """Change (2,2) of the tilt of a turned map by the tilt before."""
     down, jac, down_new, jac_new = np.empty(3), np.empty((3, 2)), np.empty(3), np.empty((3, 2))
-    kernels.down_of_tilt(tilt, down, jac)
-    kernels.down_of_tilt(tilt_of(r @ down), down_new, jac_new)
+    inertial_kernels.down_of_tilt(tilt, down, jac)
+    inertial_kernels.down_of_tilt(tilt_of(r @ down), down_new, jac_new)
     return np.asarray(np.linalg.lstsq(jac_new, r @ jac, rcond=None)[0])

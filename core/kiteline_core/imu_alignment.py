@@ -1,8 +1,9 @@
 """Start in motion: gyro bias, velocity, gravity and, without stereo, the scale of a map from poses and IMU.
 
-The IMU hardly errs over a second, so a window has few unknowns: place and velocity at its begin, gravity, accelerometer bias
-and scale, all linear (A. Martinelli, "Closed-form solution of visual-inertial structure from motion", 2014). The gyro bias
-and the refinement that imposes the length of gravity are those of T. Qin et al., "VINS-Mono", 2018, section V-B.
+The IMU hardly errs over a second, so a window has few unknowns: place and velocity at its begin, gravity,
+accelerometer bias and scale, all linear (A. Martinelli, "Closed-form solution of visual-inertial structure from
+motion", 2014). The gyro bias and the refinement that imposes the length of gravity are those of T. Qin et al.,
+"VINS-Mono", 2018, section V-B.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """velocities: (n,3) m/s in m of every pose. gravity: (3,) m/s^2 in m. accel_bias: (3,) m/s^2. scale: metres per unit of
-    the map, scale_sigma: one deviation of it, 0 when it was not asked for. residual_m: rms of what the positions disagree.
-    gravity_error: relative difference of the length of gravity, before it was imposed, from the true one.
+    """velocities: (n,3) m/s in m of every pose. gravity: (3,) m/s^2 in m. accel_bias: (3,) m/s^2. scale: metres per
+    unit of the map, scale_sigma: one deviation of it, 0 when it was not asked for. residual_m: rms of what the
+    positions disagree. gravity_error: relative difference of the length of gravity, before it was imposed, from the
+    true one.
     """
 
     velocities: F64
@@ -35,7 +37,9 @@ class Alignment:
 
 
 def gyro_bias(T_m_b: F64, motions: list[Preintegrated]) -> F64:
-    """Bias (3,) rad/s that makes the gyro agree with turns of the poses T_m_b (n,4,4) between which motions (n-1) lead."""
+    """Bias (3,) rad/s that makes the gyro agree with turns of the poses T_m_b (n,4,4) between which motions (n-1)
+    lead.
+    """
     bias = motions[0].bias[:3].copy()
     for _ in range(2):
         h, g = np.zeros((3, 3)), np.zeros(3)
@@ -62,9 +66,9 @@ def align(
 ) -> Alignment | None:
     """Velocities, gravity, accelerometer bias and scale from n >= 5 poses by least squares; None when it is degenerate.
 
-    T_m_b: (n,4,4) poses of which the *camera* lies at s p_c, p_c = p_b + R p_b_c, with p_b_c (3,) in metres, so the body lies
-    at s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess. position_sigma_m: of a visual position.
-    accel_bias_sigma: m/s^2, of the guess.
+    T_m_b: (n,4,4) poses of which the *camera* lies at s p_c, p_c = p_b + R p_b_c, with p_b_c (3,) in metres, so the
+    body lies at s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess. position_sigma_m: of a
+    visual position. accel_bias_sigma: m/s^2, of the guess.
     """
     n = len(T_m_b)
     if n < 5:
@@ -96,7 +100,9 @@ def align(
     ratio = position_sigma_m / accel_bias_sigma
     unit, length = -v[-1] / float(np.linalg.norm(v[-1])), gravity_m_s2
     if not with_scale:
-        x = np.linalg.lstsq(np.concatenate([free, ratio * guess]), np.append(camera - felt, np.zeros(3)), rcond=1e-10)[0]
+        x = np.linalg.lstsq(np.concatenate([free, ratio * guess]), np.append(camera - felt, np.zeros(3)), rcond=1e-10)[
+            0
+        ]
         length = float(np.linalg.norm(x[9:]))
         if not 0.3 * gravity_m_s2 < length < 3.0 * gravity_m_s2:
             return None

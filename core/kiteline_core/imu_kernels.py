@@ -108,9 +108,9 @@ def preintegrate(
 ) -> None:
     """Motion between the first and the last sample, in the body frame of the first and without gravity.
 
-    t_s: (n,) s, increasing. gyro, accel: (n,3). bias: (6,) gyro, accel, taken off. density: (2,) noise of gyro and accel
-    per square root of Hz. Out: turn (3,3); vp (6,) change of velocity, change of position; cov (9,9) of [rotation,
-    velocity, position]; jac (9,6) of the same by the biases.
+    t_s: (n,) s, increasing. gyro, accel: (n,3). bias: (6,) gyro, accel, taken off. density: (2,) noise of gyro and
+    accel per square root of Hz. Out: turn (3,3); vp (6,) change of velocity, change of position; cov (9,9) of
+    [rotation, velocity, position]; jac (9,6) of the same by the biases.
     """
     n = t_s.shape[0]
     w, a0, a1, aa = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)

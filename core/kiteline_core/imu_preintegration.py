@@ -16,7 +16,9 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Inertial samples that begin and end exactly at the two instants. t_s: (n,) s from the first. gyro, accel: (n,3)."""
+    """Inertial samples that begin and end exactly at the two instants. t_s: (n,) s from the first. gyro, accel:
+    (n,3).
+    """
 
     t_s: F64
     gyro: F64
@@ -58,7 +60,9 @@ class Preintegrated:
 
 
 def preintegrate(samples: Samples, bias: F64, calibration: ImuCalibration, inflation: float = 1.0) -> Preintegrated:
-    """Integrate samples with a bias (6,) [gyro rad/s, accel m/s^2] taken off. inflation: factor on the noise densities."""
+    """Integrate samples with a bias (6,) [gyro rad/s, accel m/s^2] taken off. inflation: factor on the noise
+    densities.
+    """
     turn, vp, cov, jac = np.empty((3, 3)), np.empty(6), np.empty((9, 9)), np.empty((9, 6))
     density = np.array([calibration.gyro_noise, calibration.accel_noise]) * inflation
     imu_kernels.preintegrate(samples.t_s, samples.gyro, samples.accel, bias, density, turn, vp, cov, jac)
@@ -98,7 +102,9 @@ class SampleBuffer:
         return int(self._t[-1]) if len(self._t) else None
 
     def between(self, from_ns: int, to_ns: int) -> Samples | None:
-        """Samples from one instant to another, the ends interpolated (held beyond the newest sample); None with a hole."""
+        """Samples from one instant to another, the ends interpolated (held beyond the newest sample); None with a
+        hole.
+        """
         t = self._t
         if len(t) < 2 or to_ns <= from_ns:
             return None

@@ -13,8 +13,9 @@ _BIAS_RAD_S = 0.1  # deviation of a gyro bias before anything is known
 class TimeOffsetEstimator:
     """Recursive least squares with forgetting over [offset s, gyro bias rad/s].
 
-    Moving an interval by d turns the gyro's rotation by d (rate at its end - turned rate at its begin), so every frame gives
-    three equations (after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems", 2014).
+    Moving an interval by d turns the gyro's rotation by d (rate at its end - turned rate at its begin), so every
+    frame gives three equations (after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems",
+    2014).
     """
 
     def __init__(self, memory_s: float, start_sigma_s: float, turn_sigma_rad: float) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+
 from kiteline_agent.inertial_tracker import InertialConfig, InertialTracker
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
@@ -14,7 +17,6 @@ from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_hw.sim import imu as sim_imu
 from kiteline_hw.sim.paths import built_in
 from kiteline_hw.sim.trajectory import Path
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
@@ -37,7 +39,7 @@ class Step:
 
 
 def flight(frames: int, seed: int = 0, rest_s: float = 0.0, late_ns: int = 0, T_m_w: F64 | None = None) -> list[Step]:
-    """A lively flight along the room's course. late_ns: so much later than its stamp was each image taken. T_m_w: the map."""
+    """A lively flight along the room's course. late_ns: images are so much later than stamped. T_m_w: map."""
     T_m_w = np.eye(4) if T_m_w is None else T_m_w
     rng = np.random.default_rng([seed, 2])
     path = built_in("room", (frames * 0.05 + 3.0) / HASTE, T_B_C, 0)
@@ -100,9 +102,7 @@ def test_starts_at_rest_and_smooths() -> None:
         for a, b, t0, t1 in zip(states[30:], states[31:], steps[30:], steps[31:])
         if a is not None and b is not None
     ]
-    rough = [
-        np.linalg.norm((b.visual - a.visual)[:3, 3] - (b.truth - a.truth)[:3, 3]) for a, b in zip(steps[30:], steps[31:])
-    ]
+    rough = [np.linalg.norm((b.visual - a.visual)[:3, 3] - (b.truth - a.truth)[:3, 3]) for a, b in pairwise(steps[30:])]
     assert np.mean(jitter) < 0.3 * np.mean(rough)
 
 

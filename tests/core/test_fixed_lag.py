@@ -8,13 +8,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+
 from kiteline_core import fixed_lag_kernels as kernels
-from kiteline_core import se3
+from kiteline_core import inertial_kernels, se3
 from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.fixed_lag import FixedLagConfig, FixedLagSmoother, InertialState, StartDeviations, VisualPoints, tilt_of
+from kiteline_core.fixed_lag import (
+    FixedLagConfig,
+    FixedLagSmoother,
+    InertialState,
+    StartDeviations,
+    VisualPoints,
+    tilt_of,
+)
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.imu_preintegration import Samples, preintegrate
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 SEEDS = st.integers(0, 2**31)
@@ -130,13 +138,13 @@ def test_tilt_is_a_chart_of_directions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     tilt = rng.uniform(-1.0, 1.0, 2)
     down, jac, moved, unused = np.empty(3), np.empty((3, 2)), np.empty(3), np.empty((3, 2))
-    kernels.down_of_tilt(tilt, down, jac)
+    inertial_kernels.down_of_tilt(tilt, down, jac)
     np.testing.assert_allclose(down, -se3.so3_exp(np.array([tilt[0], tilt[1], 0.0]))[:, 2], atol=1e-12)
     np.testing.assert_allclose(tilt_of(9.81 * down), tilt, atol=1e-9)
     for a in range(2):
         step = np.zeros(2)
         step[a] = 1e-6
-        kernels.down_of_tilt(tilt + step, moved, unused)
+        inertial_kernels.down_of_tilt(tilt + step, moved, unused)
         np.testing.assert_allclose(jac[:, a], (moved - down) / 1e-6, atol=2e-6)
 
 
@@ -158,7 +166,7 @@ def test_imu_jacobian_agrees_with_differences(seed: int) -> None:
         a, sa = moved_by(ri, si, x[:15])
         b, sb = moved_by(rj, sj, x[15:30])
         res, jac = np.empty(9), np.empty((9, 32))
-        kernels.imu_terms(
+        inertial_kernels.imu_terms(
             a, sa, b, sb, tilt + x[30:], 9.81, motion.dt_s, motion.turn, motion.vp, motion.jac, motion.bias, res, jac
         )
         return res, jac
@@ -205,9 +213,10 @@ def test_visual_terms_agree_with_a_plain_reference(seed: int) -> None:
         h += weight * jac.T @ info @ jac
         b -= weight * jac.T @ info @ res
     got_h, got_b = np.empty((6, 6)), np.empty(6)
-    kernels.visual_terms(
+    inertial_kernels.visual_terms(
         r, p, np.ascontiguousarray(T_c_b[:3, :3]), T_c_b[:3, 3].copy(), np.array([c.fx, c.fy, c.cx, c.cy, c.bf]),
-        len(points.xyz), points.xyz, points.ray, points.observed, points.sigma_px, points.inlier, 9.21, 0.5, got_h, got_b,
+        len(points.xyz), points.xyz, points.ray, points.observed, points.sigma_px, points.inlier, 9.21,
+        0.5, got_h, got_b,
     )  # fmt: skip
     np.testing.assert_allclose(got_h, h, rtol=1e-5, atol=1e-5 * np.abs(h).max())
     np.testing.assert_allclose(got_b, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
@@ -288,7 +297,9 @@ def test_biases_and_a_wrong_level_are_found() -> None:
 
 
 def test_blind_the_imu_carries_and_the_covariance_grows() -> None:
-    flight, states, _ = fly(8, 80, FixedLagConfig(), bias=np.array([0.01, 0.0, 0.0, 0.05, 0.0, 0.0]), blind=range(41, 81))
+    flight, states, _ = fly(
+        8, 80, FixedLagConfig(), bias=np.array([0.01, 0.0, 0.0, 0.05, 0.0, 0.0]), blind=range(41, 81)
+    )
     before, after = states[39], states[-1]
     e = error_of(after, flight.pose(80))
     assert np.linalg.norm(e[3:]) < 0.15

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+
 from kiteline_core import imu_alignment, se3
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.imu_preintegration import Preintegrated, Samples, preintegrate
 from kiteline_core.time_offset import TimeOffsetEstimator
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
@@ -118,7 +119,9 @@ def test_time_offset_is_found(offset_steps: int) -> None:
         first, after = k * FRAME_STEPS, (k + 1) * FRAME_STEPS
         rates = gyro[first : after + 1] + bias
         turn = preintegrate(Samples(t, rates, np.zeros_like(rates)), np.zeros(6), CALIBRATION).turn
-        seen = T[first + offset_steps, :3, :3].T @ T[after + offset_steps, :3, :3] @ se3.so3_exp(6e-4 * rng.normal(size=3))
+        seen = (
+            T[first + offset_steps, :3, :3].T @ T[after + offset_steps, :3, :3] @ se3.so3_exp(6e-4 * rng.normal(size=3))
+        )
         estimator.add(se3.so3_log(turn.T @ seen), rates[-1] - turn.T @ rates[0], 0.05)
     assert estimator.sigma_s < 5e-4
     assert estimator.offset_s == pytest.approx(offset_steps * STEP_S, abs=5e-4)

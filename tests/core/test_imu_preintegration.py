@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+
 from kiteline_core import imu_kernels, se3
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.imu_preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
