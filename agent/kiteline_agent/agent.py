@@ -299,7 +299,7 @@ class Agent:
     def _begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
         first = self._submap_number < 0
-        if not first and self._failures < _FAILURES_BEFORE_SUBMAP:
+        if not first and (self._failures < _FAILURES_BEFORE_SUBMAP or self._submaps == MAX_SUBMAPS):
             return False
         opening = None
         if self._mono is not None:
