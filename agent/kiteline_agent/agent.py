@@ -18,13 +18,12 @@ from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.mono_start import MonoStart, Opening
 from kiteline_agent.recovery import Recovered, Recovery
-from kiteline_agent.right_eye import RightEye
+from kiteline_agent.right_eye import RightEye, rectified
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
 from kiteline_core import se3
 from kiteline_core.cameras import CameraRig, Rectifier
-from kiteline_core.features import build_pyramid
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import (
     MAX_SUBMAPS,
@@ -159,6 +158,7 @@ class Agent:
         self.work.steps = 1
         if step_input.frame is not None and self._governed(step_input.frame.t_ns, step_input):
             imu, self._held_imu = joined(self._held_imu), []
+            self.work.inertial_samples = 0 if imu is None else len(imu.t_ns)
             estimate = self._process(step_input.frame, imu)
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(self._events))
 
@@ -210,13 +210,16 @@ class Agent:
 
     def _view(self, frame: Frame) -> View:
         levels = self._config.pyramid.levels
-        left = build_pyramid(self._rectifier.left(frame.left), levels)
-        right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels)
+        # Coarse images are for a track that holds: what is lost or begins needs all there is.
+        first = self._config.pyramid.first if self._submap_number >= 0 and self._failures == 0 else 0
+        left = rectified(frame.left, self._rectifier, 0, levels, first)
+        right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels, first)
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
         self.work.frames = 1
-        self.work.rectified_px += frame.left.size if self._rectifier.bends else 0
+        share = 4 if first else 1
+        self.work.rectified_px += frame.left.size // share if self._rectifier.bends else 0
         self.work.pyramid_px += frame.left.size * (1 if right is None else 2)
-        return View(left, right, depth)
+        return View(left, right, depth, first if self._rectifier.bends else 0)
 
     # motion model
 
@@ -288,7 +291,8 @@ class Agent:
         self._sequence[self.submap] = sequence
         keyframe = keyframe_id(self.submap, sequence)
         self._governor.note_keyframe()
-        self.work.rectified_px += view.left[0].size if view.right is not None and self._rectifier.bends else 0
+        if view.right is not None and self._rectifier.bends:
+            self.work.rectified_px += view.left[view.first].size
         T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
         # The keyframe's pose is its code's value: move with it by the rounding, and let odometry absorb it.
         self._reference, self._T_k_c = keyframe, np.eye(4)
@@ -352,6 +356,7 @@ class Agent:
         """Look for a lost frame in all that is remembered."""
         if self._submap_number < 0:
             return None
+        self.work.searches += 1
         found = self._recovery.attempt(view, self._frame_number, self._reference)
         if found is None:
             self._failures += self._recovery.textured

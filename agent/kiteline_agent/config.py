@@ -15,6 +15,7 @@ class PyramidConfig:
     """Image pyramids."""
 
     levels: int = 4  # each halves the size; three detected octaves and one above for convergence
+    first: int = 0  # finest level that is made; 1: a third of the work, twice the error
 
 
 @dataclass(frozen=True, slots=True)

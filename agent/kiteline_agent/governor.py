@@ -16,24 +16,26 @@ from kiteline_agent.config import AgentConfig, GovernorConfig
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much work a frame may be. Factors on the configuration's own numbers, except fine_from."""
+    """How much work a frame may be. Factors on the configuration's own numbers, except levels."""
 
     points: float  # of the fine and the coarse pass, and of the inliers that are wanted
     corners: float  # a keyframe's births
     stereo: float  # points whose disparity is measured
     fine_from: int  # template level at which the fine pass begins
+    first: int  # finest pyramid level that is made
     keyframes: float  # motion until the next keyframe
     slots: float  # keyframes whose points are looked for
     cost: float  # of a frame relative to the first row: a start, until it was measured
 
 
 LADDER = (
-    Effort(1.00, 1.00, 1.00, 1, 1.0, 1.00, 1.00),
-    Effort(0.80, 0.80, 0.80, 1, 1.1, 1.00, 0.88),
-    Effort(0.65, 0.65, 0.60, 0, 1.2, 1.00, 0.74),
-    Effort(0.50, 0.55, 0.45, 0, 1.4, 0.75, 0.66),
-    Effort(0.38, 0.45, 0.30, 0, 1.6, 0.50, 0.59),
-    Effort(0.30, 0.40, 0.20, 0, 1.8, 0.35, 0.54),
+    Effort(1.00, 1.00, 1.00, 1, 0, 1.0, 1.00, 1.00),
+    Effort(0.80, 0.80, 0.80, 1, 0, 1.1, 1.00, 0.90),
+    Effort(0.65, 0.65, 0.60, 0, 0, 1.2, 1.00, 0.73),
+    Effort(0.80, 0.70, 0.60, 1, 1, 1.2, 1.00, 0.60),
+    Effort(0.60, 0.60, 0.50, 1, 1, 1.4, 0.75, 0.51),
+    Effort(0.45, 0.45, 0.35, 0, 1, 1.5, 0.50, 0.41),
+    Effort(0.33, 0.40, 0.30, 0, 1, 1.6, 0.50, 0.37),
 )  # from the best to the cheapest
 
 
@@ -55,6 +57,7 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
     points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
     return replace(
         config,
+        pyramid=replace(config.pyramid, first=effort.first),
         align=replace(
             align,
             points=points,
@@ -63,7 +66,9 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
             fine_from=min(align.fine_from, effort.fine_from),
         ),
         stereo=replace(config.stereo, points=round(config.stereo.points * effort.stereo)),
-        detector=replace(config.detector, max_corners=round(config.detector.max_corners * effort.corners)),
+        detector=replace(
+            config.detector, max_corners=round(config.detector.max_corners * effort.corners), first=effort.first
+        ),
         keyframe=replace(
             keyframe,
             min_inliers=max(round(keyframe.min_inliers * effort.points), config.pose.min_inliers + 10),
@@ -186,11 +191,13 @@ class Governor:
     def _affordable(self) -> bool:
         """Whether the frame fits the window and, on the last row, the even pace of the bucket."""
         cost = self._frame_ns * (1.0 + self._config.doubt)
+        if self._saving:
+            cost += self._keyframe_ns
         if self._window_ns + cost > self._config.margin * self._budget_ns:
             return False
         if self.level < len(LADDER) - 1:
             return True
-        return self._bucket_ns >= cost + (self._keyframe_ns if self._saving else 0.0)
+        return self._bucket_ns >= cost
 
     def _steer(self, t_ns: int) -> None:
         """Hysteresis on the load of the last window: down at once, up only after a calm while and one row a time."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,10 @@ class NewPoints:
 
 def new_points(view: View, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:
     """Corners where no point is tracked, with depth where the row or the depth image gives one."""
-    corners = features.detect(view.left, taken, config.detector)
+    detector = config.detector
+    if view.first > detector.first:
+        detector = replace(detector, first=view.first)
+    corners = features.detect(view.left, taken, detector)
     disparity = np.full(len(corners.uv), -1.0)
     if view.right is not None:
         stereo = config.stereo

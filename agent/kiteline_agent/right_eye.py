@@ -1,4 +1,4 @@
-"""The right image of a pair, rectified only where somebody looks: whole at keyframes, in small strips elsewhere."""
+"""What is rectified of a pair: the left image, the right where somebody looks; at half size if need be."""
 
 from __future__ import annotations
 
@@ -16,21 +16,31 @@ F64 = NDArray[np.float64]
 _RECTIFIED = np.zeros((0, 0, 2), np.float32)  # no way back to a raw image is needed
 
 
+def rectified(image: U8, rectifier: Rectifier, eye: int, levels: int, first: int) -> Pyramid:
+    """The pyramid of the rectified image of an eye (0 left, 1 right). first: its finest level, 0 or 1.
+
+    With 1 the work is a third; level 0 is then blank, so that nothing is found on it.
+    """
+    if first == 0 or not rectifier.bends:
+        return build_pyramid(rectifier.rectify(eye, image), levels)
+    return (rectifier.blank, *build_pyramid(rectifier.half(eye, image), levels - 1))
+
+
 class RightEye:
     """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's."""
 
-    def __init__(self, image: U8, rectifier: Rectifier, levels: int) -> None:
+    def __init__(self, image: U8, rectifier: Rectifier, levels: int, first: int) -> None:
         rectifier.check_size(image)
         self._image = image
         self._rectifier = rectifier
-        self._levels = levels
+        self._levels, self._first = levels, first
         self._raw: Pyramid | None = None
         self._whole: Pyramid | None = None
 
     def whole(self) -> Pyramid:
         """The pyramid of the rectified image."""
         if self._whole is None:
-            self._whole = build_pyramid(self._rectifier.right(self._image), self._levels)
+            self._whole = rectified(self._image, self._rectifier, 1, self._levels, self._first)
         return self._whole
 
     def refine(

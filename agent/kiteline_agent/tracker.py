@@ -25,11 +25,12 @@ _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The pyramids of one instant. depth_m: (h,w) float32 aligned with left, or None."""
+    """The pyramids of one instant. depth_m: (h,w) float32 aligned with left, or None. first: finest level not blank."""
 
     left: Pyramid
     right: RightEye | None
     depth_m: NDArray[np.float32] | None
+    first: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +98,22 @@ class Tracker:
         uv = candidates.uv[chosen]
         octave = self._map.octave[rows]
         found = np.zeros(len(rows), np.bool_)
-        ncc = np.zeros(len(rows))
         last = 1 if coarse_only else 0
         step = config.align.coarse_step_px if coarse_only else config.align.fine_step_px
         first = 2 if coarse_only else config.align.fine_from
-        alignment_kernels.align(
-            view.left, self._map.templates, rows, octave, candidates.warp[chosen], uv, first, last,
-            config.align.iterations, step, config.align.min_ncc, found, ncc,
-        )  # fmt: skip
+        fine = np.maximum(octave, 0 if coarse_only else view.first) - octave  # cut finer than anything that is seen now
+        for finest in (last, last + 1) if fine.any() else (last,):
+            some = np.flatnonzero(fine == finest - last)
+            place, seen, score = uv[some], np.zeros(len(some), np.bool_), np.zeros(len(some))
+            alignment_kernels.align(
+                view.left, self._map.templates, rows[some], octave[some], candidates.warp[chosen[some]], place,
+                max(first, finest), finest, config.align.iterations, step, config.align.min_ncc, seen, score,
+            )  # fmt: skip
+            uv[some], found[some] = place, seen
         self._work.projected += len(candidates.rows)
-        self._work.coarse_points += len(rows) if coarse_only else 0
-        self._work.fine_points += 0 if coarse_only else len(rows)
+        self._work.alignments += len(rows) * (first - last + 1)
         self._work.posed_points += int(np.count_nonzero(found))
-        rows, uv, octave, chosen = rows[found], uv[found], octave[found], chosen[found]
+        rows, uv, octave, chosen = rows[found], uv[found], (octave + fine)[found], chosen[found]
         scale = (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
         sigma_px = config.align.sigma_px * scale
         depth = candidates.depth[chosen]

@@ -101,6 +101,8 @@ class Rectifier:
         self._size = (left.width, left.height)
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self._depth_map: NDArray[np.int16] | None = None
+        self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self.blank = np.zeros((left.height, left.width), np.uint8)
         self.right_grid: NDArray[np.float32] | None = (
             None  # see _grid; None where the right image needs no rectification
         )
@@ -148,6 +150,24 @@ class Rectifier:
     def bends(self) -> bool:
         """Whether images have to be remapped at all."""
         return self._maps[0] is not None
+
+    def rectify(self, eye: int, image: U8) -> U8:
+        """Rectify the image of an eye (0 left, 1 right). Raises CalibrationError as `left` does."""
+        return self._apply(eye, image)
+
+    def half(self, eye: int, image: U8) -> U8:
+        """Level 1 of the rectified image's pyramid ((h+1)//2, (w+1)//2), from level 1 of the raw one's."""
+        self.check_size(image)
+        maps = self._maps[eye]
+        small = np.asarray(cv2.pyrDown(image), np.uint8)
+        if maps is None:
+            return small
+        halves = self._halves[eye]
+        if halves is None:
+            x, y = cv2.convertMaps(maps[0][::2, ::2], maps[1][::2, ::2], cv2.CV_32FC1)
+            fixed = cv2.convertMaps(0.5 * x, 0.5 * y, cv2.CV_16SC2)
+            halves = self._halves[eye] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
+        return np.asarray(cv2.remap(small, halves[0], halves[1], cv2.INTER_LINEAR), np.uint8)
 
     def left(self, image: U8) -> U8:
         """Rectify a left image (h, w) uint8. Raises CalibrationError when its size is not the calibrated one."""

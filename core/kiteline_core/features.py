@@ -37,6 +37,7 @@ class DetectorConfig:
     """Where new corners come from."""
 
     levels: int = 3  # pyramid levels searched; each halves the size
+    first: int = 0  # finest of them
     cell_px: int = 32  # one new corner a cell keeps features spread; 32 px gives about 350 cells at 752x480
     fast_threshold: int = 12  # grey levels; low, since the cell keeps only its best corner
     min_score: float = 12.0  # (grey levels / px)^2; below it, sensor noise is as strong as the corner
@@ -70,7 +71,7 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
     best_score = np.zeros((rows, columns))
     best_xy = np.zeros((rows, columns, 2), np.int32)
     best_level = np.zeros((rows, columns), np.uint8)
-    for level in range(min(config.levels, len(pyramid))):
+    for level in range(config.first, min(config.levels, len(pyramid))):
         image = pyramid[level]
         fast = cv2.FastFeatureDetector.create(config.fast_threshold, True)
         found = fast.detect(image)
