@@ -20,6 +20,7 @@ from kiteline_agent.mono_start import MonoStart, Opening
 from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.right_eye import RightEye, rectified
 from kiteline_agent.tracker import Track, Tracker, View
+from kiteline_agent.units import UnitChannel, longer
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
 from kiteline_core import se3
@@ -108,7 +109,7 @@ class Agent:
         """words: those by which places are recognised; without them only the reference keyframe is found again."""
         self._config = config
         self._identity = identity
-        self._channel = channel
+        self._channel = channel = UnitChannel(channel)
         self._rectifier = Rectifier(rig)
         self._camera = self._rectifier.camera
         self._T_c_b = se3.inverse(self._camera.T_b_c)
@@ -349,6 +350,20 @@ class Agent:
         self._velocity_m = (self._T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
         self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
         return True
+
+    def rescale(self, factor: float) -> None:
+        """Measure the active submap in another unit: all its lengths grow by `factor`; the odometry frame stays still.
+
+        For one eye, once something else knows the scale. The base goes on in the unit in which the submap began.
+        """
+        T_o_c = self._T_o_m @ self._T_m_c
+        self.map.rescale(factor)
+        self._channel.rescale(self.submap, factor)
+        if self._mono is not None:
+            self._mono.rescale(factor)
+        self._T_m_c, self._T_k_c = longer(self._T_m_c, factor), longer(self._T_k_c, factor)
+        self._step_T, self._velocity_m = longer(self._step_T, factor), factor * self._velocity_m
+        self._T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self._T_m_c))
 
     # the old map found again
 

@@ -40,7 +40,7 @@ class DepthFromMotion:
         ceiling = float(steepest) * config.nearer
         self._map.plant(float(typical), float(ceiling))
         seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, self._config.align.max_scale, seeds=True)
-        chosen = self._choose(seeds)
+        chosen = self._choose(seeds, view.first)
         if len(chosen) == 0:
             return 0
         rows, warp = seeds.rows[chosen], seeds.warp[chosen]
@@ -58,10 +58,11 @@ class DepthFromMotion:
         self._note(rows, hit, failed=(found == 0) | ((found == 1) & ~hit))
         return self._fuse(rows[hit], measured[hit], variance[hit], float(typical))
 
-    def _choose(self, seeds: Candidates) -> I64:
-        """Bearings of this frame: those nearest to a depth first, then the newest."""
+    def _choose(self, seeds: Candidates, first: int) -> I64:
+        """Bearings of this frame: those nearest to a depth first, then the newest. first: finest level there is."""
         limit = self._config.motion.per_frame_stereo if self._map.camera.stereo else self._config.motion.per_frame
         order = np.lexsort((-seeds.rows, self._map.tried[seeds.rows], -self._map.hits[seeds.rows]))
+        order = order[self._map.octave[seeds.rows[order]] >= first]
         return np.sort(order[:limit])
 
     def _state(self, rows: I64) -> tuple[F64, F64, F64]:
