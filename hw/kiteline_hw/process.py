@@ -96,12 +96,14 @@ class Parent:
 
 def next_number(path: Path) -> int:
     """A number one higher than at the last call with this file, which is made when missing; first 1. It survives a
-    crash at any moment. Raises OSError when the folder cannot be written.
+    crash at any moment. Raises OSError when the folder cannot be written, ValueError when the file holds no number.
     """
     try:
         last = int(path.read_text())
-    except (FileNotFoundError, ValueError):
+    except FileNotFoundError:
         last = 0
+    except ValueError as error:
+        raise ValueError(f"{path} holds no number: write one there that is higher than any used before") from error
     write_atomically(path, f"{last + 1}\n".encode())
     return last + 1
 

@@ -1,0 +1,150 @@
+"""The source read ahead, the tally, the virtual core, and estimates that pass through a log unchanged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kiteline_agent.agent import Estimate
+from kiteline_agent.camera import Camera, joined
+from kiteline_agent.cost import VirtualCpu
+from kiteline_agent.flight_log import estimate_from_json, estimate_to_json
+from kiteline_agent.spec import AgentSpec, agent_config, from_json
+from kiteline_agent.tally import Tally, live_line, odometry_line
+from kiteline_core import se3
+from kiteline_core.config import ConfigError
+from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.ids import KeyframeId, SubmapId
+
+IMAGE = np.zeros((4, 4), np.uint8)
+
+
+def imu(*t_ns: int) -> ImuBatch:
+    n = len(t_ns)
+    return ImuBatch(np.array(t_ns, np.int64), np.ones((n, 3)), np.full((n, 3), 9.8))
+
+
+def source() -> Iterator[Frame | ImuBatch]:
+    for t_ns in (100, 200, 300, 400):
+        yield imu(t_ns - 50, t_ns)
+        yield Frame(t_ns, IMAGE)
+
+
+def no_clock() -> int:
+    return 0
+
+
+def test_frames_come_with_the_samples_before_them() -> None:
+    camera = Camera(source(), None, no_clock)
+    assert camera.next_ns == 100
+    frame, batch = camera.take()
+    assert frame.t_ns == 100
+    assert batch is not None
+    assert batch.t_ns.tolist() == [50, 100]
+    assert camera.period_ns == 100
+
+
+def test_samples_of_a_dropped_frame_go_with_the_next() -> None:
+    camera = Camera(source(), None, no_clock)
+    camera.drop()
+    frame, batch = camera.take()
+    assert frame.t_ns == 200
+    assert batch is not None
+    assert batch.t_ns.tolist() == [50, 100, 150, 200]
+    assert batch.gyro.shape == (4, 3)
+
+
+def test_frames_beyond_the_end_are_left_out() -> None:
+    camera = Camera(source(), 250, no_clock)
+    assert [camera.take()[0].t_ns, camera.take()[0].t_ns] == [100, 200]
+    assert camera.next_ns is None
+
+
+def test_decoding_is_measured_apart() -> None:
+    ticks = iter(range(0, 10**9, 3_000_000))
+    camera = Camera(source(), None, lambda: next(ticks))
+    camera.take()
+    assert camera.decode_ms == [3.0, 3.0]
+    assert camera.decode_ns == 6_000_000
+
+
+def test_nothing_joined_is_nothing() -> None:
+    assert joined([]) is None
+    one = imu(1)
+    assert joined([one]) is one
+
+
+def estimate(tracked: bool = True, placed: bool = False, keyframe: int = 3) -> Estimate:
+    pose = se3.exp(np.array([0.1, -0.2, 1 / 3, 0.3, 1e-9, -2.0]))
+    return Estimate(
+        1_000_000_007, tracked, False, pose if tracked else None, pose, KeyframeId(keyframe), np.eye(4), SubmapId(0),
+        120, 80, np.eye(4) if placed and tracked else None,
+    )  # fmt: skip
+
+
+def test_frames_are_tracked_lost_or_dropped() -> None:
+    tally = Tally(dropped=2, bytes_up=700)
+    for e in (estimate(), estimate(keyframe=4), replace(estimate(), bridged=True), estimate(tracked=False), None):
+        tally.count(e)
+    assert tally.as_report() == {
+        "frames": 7, "tracked": 3, "bridged": 1, "lost": 1, "dropped": 3, "submaps": 1, "keyframes": 2, "bytes_up": 700,
+        "bytes_down": 0, "bytes_per_keyframe": 350.0,
+    }  # fmt: skip
+
+
+def test_a_lost_frame_has_odometry_but_no_live_line() -> None:
+    assert live_line(estimate(tracked=False)) == ""
+    assert odometry_line(estimate(tracked=False)).startswith("1.000000007 ")
+    assert live_line(estimate(placed=True)).split()[1:4] == ["0.000000000"] * 3  # in w where w is known
+    assert live_line(estimate()).split()[1] == "0.100000000" or live_line(estimate()) == odometry_line(estimate())
+
+
+@pytest.mark.parametrize("e", [estimate(), estimate(placed=True), estimate(tracked=False)])
+def test_estimates_pass_through_json_to_the_last_bit(e: Estimate) -> None:
+    back = estimate_from_json(json.loads(json.dumps(estimate_to_json(e))))
+    for name in Estimate.__slots__:
+        a, b = getattr(e, name), getattr(back, name)
+        if isinstance(a, np.ndarray):
+            assert a.tobytes() == b.tobytes()
+        else:
+            assert a == b
+
+
+def test_an_estimate_of_another_version_is_refused() -> None:
+    with pytest.raises(ValueError, match="fields"):
+        estimate_from_json({"t_ns": 1})
+
+
+def test_a_limited_core_is_busy_for_longer_than_a_whole_one() -> None:
+    cpu = VirtualCpu(25.0)
+    cpu.spend(10_000_000, 1_000)
+    assert cpu.free_ns == 40_001_000
+    assert cpu.newest_wins(5_000, 30_000_000)
+    assert not cpu.newest_wins(20_000_000, 30_000_000)
+    assert not cpu.newest_wins(5_000, 0)  # no period is known yet: a frame is not passed over
+    free = VirtualCpu(0.0)
+    free.spend(10**12, 0)
+    assert not free.newest_wins(0, 1)
+
+
+def test_a_spec_travels_as_json() -> None:
+    spec = AgentSpec(source="a", folder="b", seconds=2.5)
+    assert from_json(json.dumps({name: getattr(spec, name) for name in AgentSpec.__slots__})) == spec
+    with pytest.raises(ValueError, match="speed"):
+        from_json('{"source": "a", "folder": "b", "speed": 1}')
+
+
+def test_configuration_files_name_their_mistakes(tmp_path: object) -> None:
+    from pathlib import Path
+
+    path = Path(str(tmp_path)) / "c.toml"
+    path.write_text("[agent.pose]\nmin_inliers = 20\n")
+    assert agent_config(str(path)).pose.min_inliers == 20
+    for text, word in (("[agents]\n", "agents"), ("[agent\n", "c.toml"), ("agent = 3\n", "section")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=word):
+            agent_config(str(path))

@@ -1,0 +1,88 @@
+"""Numbers and files that survive a crash, and signals that become flags."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kiteline_hw import process
+
+
+def test_numbers_only_grow(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "boot"
+    assert [process.next_number(path) for _ in range(3)] == [1, 2, 3]
+
+
+def test_a_number_that_cannot_be_read_is_not_guessed(tmp_path: Path) -> None:
+    path = tmp_path / "boot"
+    path.write_text("rubbish")
+    with pytest.raises(ValueError, match="boot"):
+        process.next_number(path)
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "values"
+    process.write_atomically(path, b"old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        process.write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+
+
+def test_systemd_hears_or_nobody_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    process.notify("READY=1")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
+    process.notify("READY=1")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s:
+        s.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        process.notify("WATCHDOG=1")
+        assert s.recv(64) == b"WATCHDOG=1"
+
+
+def run(code: str, **options: object) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.Popen(
+        [sys.executable, "-c", "from kiteline_hw import process\n" + code],
+        env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def test_a_signal_is_a_flag_and_ends_a_wait() -> None:
+    with run("s = process.StopSignal(); print(bool(s), flush=True); print(s.wait(20), bool(s), flush=True)") as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"False\n"
+        child.send_signal(signal.SIGTERM)
+        assert child.stdout.readline() == b"True True\n"
+
+
+def test_a_child_ends_with_its_parent_and_hears_it_before() -> None:
+    code = (
+        "import time\np = process.Parent(); p.tell('ready', n=1)\n"
+        "while (word := p.said()) is None: time.sleep(0.01)\np.tell('heard', word=word); time.sleep(60)"
+    )
+    with run(code) as child:
+        assert child.stdin is not None and child.stdout is not None
+        assert child.stdout.readline() == b'{"event": "ready", "n": 1}\n'
+        child.stdin.write(b"frames_over\n")
+        child.stdin.flush()
+        assert child.stdout.readline() == b'{"event": "heard", "word": "frames_over"}\n'
+        child.stdin.close()
+        assert child.wait(10.0) == 3
+
+
+def test_leaving_says_its_last_words() -> None:
+    with run("print('last'); process.leave(7)") as child:
+        assert child.communicate()[0] == b"last\n"
+        assert child.returncode == 7
