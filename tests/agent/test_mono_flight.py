@@ -1,0 +1,244 @@
+"""One eye: it begins when two views give depth, follows at its own scale, and its bearings find their true depth."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.depth_from_motion import sigma_of_meeting
+from kiteline_agent.mono_start import MonoStart
+from kiteline_agent.tracker import View
+from kiteline_agent.units import UnitChannel, record_in
+from kiteline_codec.channel import RecordChannel, plain_pair
+from kiteline_codec.schema import Births, Depths, Head, Live, Pose, Sightings
+from kiteline_core import se3
+from kiteline_core.cameras import CameraModel, CameraRig, Rectifier
+from kiteline_core.features import build_pyramid
+from kiteline_core.frame import Frame
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
+from kiteline_hw.sources import open_source
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+W, H, FOCAL = 320, 240, 220.0
+CAMERA = CameraModel(W, H, FOCAL, FOCAL, 159.5, 119.5)
+RIG = CameraRig(CAMERA, None, np.eye(4), None, has_body=False)
+# A room in camera axes: planes n . x = d, each with the two axes of its texture.
+PLANES = (
+    (np.array([0.0, 0.0, 1.0]), 5.0, 0, 1),
+    (np.array([0.0, 1.0, 0.0]), 1.2, 0, 2),
+    (np.array([0.0, -1.0, 0.0]), 1.8, 0, 2),
+    (np.array([-1.0, 0.0, 0.0]), 2.2, 2, 1),
+    (np.array([1.0, 0.0, 0.0]), 2.6, 2, 1),
+)
+
+
+@cache
+def texture(seed: int) -> U8:
+    noise = np.random.default_rng(seed).integers(0, 256, (512, 512), np.uint8)
+    return np.asarray(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.6), None, 5, 250, cv2.NORM_MINMAX), np.uint8)
+
+
+def room(T_w_c: F64) -> tuple[U8, F64]:
+    """What a camera sees of the room, (h,w) grey, and the depths (h,w)."""
+    u, v = np.meshgrid(np.arange(float(W)), np.arange(float(H)))
+    ray = np.stack([(u - CAMERA.cx) / FOCAL, (v - CAMERA.cy) / FOCAL, np.ones_like(u)], -1) @ T_w_c[:3, :3].T
+    best, image = np.full((H, W), np.inf), np.zeros((H, W), np.uint8)
+    for seed, (normal, d, a, b) in enumerate(PLANES):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (d - normal @ T_w_c[:3, 3]) / (ray @ normal)
+        depth = np.where(depth > 1e-6, depth, np.inf)
+        hit = T_w_c[:3, 3] + ray * np.where(np.isfinite(depth), depth, 0.0)[..., None]
+        place = (hit * 60.0).astype(np.float32)
+        seen = cv2.remap(texture(seed), place[..., a] % 510, place[..., b] % 510, cv2.INTER_LINEAR)
+        image = np.where(depth < best, seen, image)
+        best = np.minimum(depth, best)
+    return np.asarray(image, np.uint8), best
+
+
+def path(k: int) -> F64:
+    """A sideways and forward sweep with turns; at rest for the first frames."""
+    s = max(k - 3, 0) * 0.05
+    turn = se3.so3_exp(np.array([0.06 * np.sin(1.3 * s), 0.16 * np.sin(0.9 * s), 0.05 * np.sin(s)]))
+    return se3.from_rt(turn, np.array([0.7 * np.sin(0.8 * s), 0.15 * np.sin(1.1 * s), 0.35 * s]))
+
+
+@cache
+def frame(k: int) -> Frame:
+    return Frame(k * 50_000_000, room(path(k))[0])
+
+
+def agent(channel: RecordChannel | None = None) -> Agent:
+    return Agent(RIG, None, AgentConfig(), Identity(AgentId(0), 0), channel or AloneChannel())
+
+
+def step(one: Agent, f: Frame) -> Estimate:
+    estimate = one.step(StepInput(f), f.t_ns).estimate
+    assert estimate is not None
+    return estimate
+
+
+def similar(p: F64, q: F64) -> tuple[float, float]:
+    """Scale that brings points p (n,3) onto q (n,3), and the rms distance that is left (S. Umeyama, 1991)."""
+    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    d = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    scale = float((s * d).sum() / (a**2).sum())
+    return scale, float(np.sqrt(((b - scale * a @ (u @ np.diag(d) @ vt).T) ** 2).sum(axis=1).mean()))
+
+
+def test_a_room_is_followed_at_a_scale_of_its_own() -> None:
+    one = agent()
+    estimates = [step(one, frame(k)) for k in range(60)]
+    first = next(i for i, e in enumerate(estimates) if e.tracked)
+    assert 4 <= first <= 15
+    assert all(e.tracked for e in estimates[first:])
+    assert not any(e.T_m_b is not None or e.quality >= 0 for e in estimates[:first])
+    assert {e.submap for e in estimates} == {estimates[0].submap}
+    found = np.array([e.T_m_b[:3, 3] for e in estimates if e.T_m_b is not None])
+    true = np.array([path(k)[:3, 3] for k in range(first, 60)])
+    scale, error_m = similar(found, true)
+    assert error_m < 0.01
+    typical_m = float(np.median(room(path(first))[1]))
+    assert scale == pytest.approx(typical_m / AgentConfig().mono_start.median_depth_m, rel=0.25)
+    # What flies must not jump when the map begins.
+    moves = np.diff([e.T_o_b[:3, 3] for e in estimates], axis=0)
+    assert np.linalg.norm(moves, axis=1).max() < 0.15 / scale
+
+
+def test_bearings_find_their_true_depth() -> None:
+    one = agent()
+    made: dict[int, int] = {}  # the frame of which each keyframe was made
+    for k in range(60):
+        made.setdefault(int(step(one, frame(k)).keyframe), k)
+    ratios = []
+    for slot in np.flatnonzero(one.map.keyframe != NO_KEYFRAME):
+        if int(one.map.keyframe[slot]) in made:  # all but the first, whose points two views gave
+            depth = room(path(made[int(one.map.keyframe[slot])]))[1]
+            known = one.map.usable[slot]
+            uv = one.map.uv[slot][known].astype(int)
+            ratios.append(1.0 / one.map.rho[slot][known] / depth[uv[:, 1], uv[:, 0]])
+    ratio = np.concatenate(ratios)
+    assert len(ratios) >= 4 and len(ratio) > 80
+    assert np.mean(np.abs(ratio / np.median(ratio) - 1.0) < 0.05) > 0.9
+
+
+def test_standing_and_turning_begin_nothing() -> None:
+    for turns in (False, True):
+        start = MonoStart(Rectifier(RIG).camera, AgentConfig())
+        for k in range(14):
+            turn = se3.so3_exp(np.array([0.0, 0.015 * k if turns else 0.0, 0.0]))
+            view = View(build_pyramid(room(se3.from_rt(turn, np.zeros(3)))[0], 4), None, None)
+            assert start.step(view, k) is None
+
+
+def test_a_second_start_takes_on_the_scale_of_the_first() -> None:
+    start = MonoStart(Rectifier(RIG).camera, AgentConfig())
+    start.tracked(np.array([6.0, 7.0, 9.0]))
+    start.rescale(2.0)
+    opening = None
+    for k in range(3, 20):
+        opening = opening or start.step(View(build_pyramid(frame(k).left, 4), None, None), k)
+    assert opening is not None and opening.median_depth_m == 14.0
+    depths = Rectifier(RIG).camera.bf / opening.points.disparity
+    assert np.median(depths) == pytest.approx(14.0, rel=0.1)
+    assert opening.t_ns == 3
+
+
+def test_another_unit_of_length_changes_nothing_else() -> None:
+    (plain_near, plain_far), (near, far) = plain_pair(), plain_pair()
+    plain, other = agent(plain_near), agent(near)
+    for k in range(45):
+        if k == 30:
+            before = step(other, frame(k - 1)).T_o_b[:3, 3]
+            step(plain, frame(k - 1))
+            other.rescale(2.5)
+        a, b = step(plain, frame(k)), step(other, frame(k))
+        assert (a.T_m_b is None) == (b.T_m_b is None)
+        if k < 30 or a.T_m_b is None or b.T_m_b is None:
+            continue
+        np.testing.assert_allclose(b.T_m_b[:3, 3], 2.5 * a.T_m_b[:3, 3], atol=0.01)
+        if k == 30:
+            assert np.linalg.norm(b.T_o_b[:3, 3] - before) < 0.3
+    # The base still gets everything in the unit in which the submap began.
+    expected, found = ([r for r in end.receive((), 0) if isinstance(r, Head)] for end in (plain_far, far))
+    assert [h.keyframe for h in found] == [h.keyframe for h in expected] and len(found) >= 4
+    for h, e in zip(found, expected, strict=True):
+        np.testing.assert_allclose(h.T_p_k, e.T_p_k, atol=0.005)
+
+
+def test_records_change_their_unit_and_back() -> None:
+    random = np.random.default_rng(0)
+    k: KeyframeId = keyframe_id(submap_id(0, 0, 1), 4)
+    n = np.arange(5, dtype=np.uint16)
+    uv, rho = random.random((5, 2)).astype(np.float32), random.random(5).astype(np.float32)
+    small, T = np.zeros(5, np.uint8), se3.exp(random.normal(0.0, 1.0, 6))
+    records = (
+        Head(k, 1, NO_KEYFRAME, T, 5),
+        Live(AgentId(0), 1, k, T, 50),
+        Pose(k, T),
+        Births(k, 0, n, uv, rho, small, small, np.zeros((5, 32), np.uint8)),
+        Sightings(k, 0, n, uv, rho, small, n.astype(np.int64)),
+        Depths(k, n, rho, uv),
+    )
+    for record in records:
+        longer = record_in(record, 4.0)
+        for name in ("T_p_k", "T_k_c", "T_m_k"):
+            if hasattr(record, name):
+                np.testing.assert_array_equal(getattr(longer, name)[:3, 3], 4.0 * T[:3, 3])
+                np.testing.assert_array_equal(getattr(longer, name)[:3, :3], T[:3, :3])
+        if isinstance(longer, Births | Sightings | Depths):
+            np.testing.assert_array_equal(longer.inv_depth, rho / np.float32(4.0))
+    near, far = plain_pair()
+    door = UnitChannel(near)
+    door.rescale(submap_id(0, 0, 1), 4.0)
+    shared = door.put(records[0])
+    assert isinstance(shared, Head)
+    np.testing.assert_allclose(shared.T_p_k, T, atol=1e-12)
+    (sent,) = far.receive((), 0)
+    assert isinstance(sent, Head)
+    np.testing.assert_allclose(sent.T_p_k[:3, 3], T[:3, 3] / 4.0, atol=1e-12)
+    far.put(records[2])
+    (got,) = door.receive((), 0)
+    assert isinstance(got, Pose)
+    np.testing.assert_allclose(got.T_m_k[:3, 3], 4.0 * T[:3, 3])
+
+
+def test_deviation_of_a_meeting_is_that_of_moved_pixels() -> None:
+    bearing, rho = np.array([[0.1, -0.2], [-0.3, 0.05]]), np.array([0.3, 0.7])
+    T_c_k = se3.exp(np.array([0.3, -0.1, 0.2, 0.02, 0.05, -0.03]))
+
+    def pixel(r: F64) -> F64:
+        p = np.column_stack([bearing, np.ones(2)]) @ T_c_k[:3, :3].T + T_c_k[:3, 3] * r[:, None]
+        return np.asarray(FOCAL * p[:, :2] / p[:, 2:])
+
+    slope = np.linalg.norm(pixel(rho + 1e-6) - pixel(rho - 1e-6), axis=1) / 2e-6
+    np.testing.assert_allclose(sigma_of_meeting(bearing, rho, T_c_k, FOCAL, np.array([0.5, 1.0])), [0.5, 1.0] / slope)
+
+
+def test_a_street_is_followed_with_one_eye(data_dir: Path) -> None:
+    source = open_source(str(data_dir / "kitti07_mono"))
+    one = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    estimates: list[Estimate] = []
+    for item in source:
+        if isinstance(item, Frame):
+            estimates.append(step(one, item))
+        if len(estimates) == 45:
+            break
+    first = next(i for i, e in enumerate(estimates) if e.tracked)
+    assert first < 15
+    assert all(e.tracked for e in estimates[first:])
+    steps = [se3.inverse(a.T_o_b) @ b.T_o_b for a, b in pairwise(estimates[first:])]
+    speed = np.array([np.linalg.norm(T[:3, 3]) for T in steps])
+    assert min(T[2, 3] for T in steps) > 0.0, "the car drives on"
+    assert np.abs(np.diff(speed) / speed[1:]).max() < 0.4, "and changes its speed smoothly"
