@@ -29,8 +29,9 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
     agent = Agent(small, None, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
     for k in range(6):
         # At last the picture jumps by a quarter of its width: lost, and found again by its descriptors.
-        eyes = (image, right) if k < 5 else (np.roll(image, -80, axis=1), np.roll(right, -80, axis=1))
-        agent.step(StepInput(Frame(k * 50_000_000, *(np.ascontiguousarray(eye) for eye in eyes))), k * 50_000_000)
+        shift = 0 if k < 5 else -80
+        eyes = [np.ascontiguousarray(np.roll(eye, shift, axis=1)) for eye in (image, right)]
+        agent.step(StepInput(Frame(k * 50_000_000, eyes[0], eyes[1])), k * 50_000_000)
     places = PlaceIndex(words)  # forgets, which so short a flight does not
     places.add(0, pixels[:320].reshape(10, 32))
     places.remove(0)
