@@ -181,6 +181,20 @@ class InertialTracker:
         if self._last_visual is not None:
             self._last_visual = (self._last_visual[0], T_new_old @ self._last_visual[1])
 
+    def begin_map(self, t_ns: int, T_m_b: F64) -> None:
+        """A new map begins at this frame, where the body is at T_m_b (4,4) by definition. What is known of velocity,
+        gravity and biases goes along when the smoother runs (tracking or coasting up to now); else it waits for a
+        start.
+        """
+        if self._smoother.running:
+            self._smoother.begin_map(T_m_b)
+        self._waiting = []
+        self._note(t_ns, T_m_b)
+        self._last_visual = (t_ns, T_m_b.copy())
+        self._blind_s = 0.0
+        if not self._smoother.running:
+            self._wait(_Pose(t_ns, T_m_b.copy(), None))
+
     def reset(self) -> None:
         """A new map begins whose place is not known relative to the old one. Biases are kept."""
         self._smoother.stop()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from kiteline_core import se3
 from kiteline_core.ids import KeyframeId
-from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -15,9 +16,9 @@ class MapDrift:
     """Covariance of each keyframe relative to the submap's origin, as a perturbation on the left of T_m_k.
 
     A keyframe's pose errs as the keyframes at whose points it was measured, and on top as that measurement, whose noise
-    is not independent from point to point (templates, stereo of one pair), hence an inflation. A vehicle that comes back
-    to old points is as certain as they are.
-    Bounded: the keyframes that were added first are forgotten first, and a forgotten one counts as the oldest known.
+    is not independent from point to point (templates, stereo of one pair), hence an inflation. A vehicle that comes
+    back to old points is as certain as they are. Bounded: the keyframes that were added first are forgotten first,
+    and a forgotten one counts as the oldest known.
     """
 
     def __init__(self, inflation: float, keep: int) -> None:
@@ -48,10 +49,13 @@ class MapDrift:
     def pose_cov(self, seen: I64, T_m_b: F64, local: F64) -> F64:
         """(6,6) of a body pose in the submap, [translation in m, rotation about the body's axes].
 
-        seen: (n,) keyframes that bore the points of which the pose is measured. local: (6,6) of the pose relative to the map.
+        seen: (n,) keyframes that bore the points of which the pose is measured. local: (6,6) of the pose relative to
+        the map.
         """
         r, t = T_m_b[:3, :3], T_m_b[:3, 3]
-        j = np.zeros((6, 6))  # of [translation, body rotation] by a perturbation [translation, rotation] of the whole map
+        j = np.zeros(
+            (6, 6)
+        )  # of [translation, body rotation] by a perturbation [translation, rotation] of the whole map
         j[:3, :3], j[:3, 3:], j[3:, 3:] = np.eye(3), -se3.skew(t), r.T
         return np.asarray(local + j @ self._of(seen) @ j.T)
 

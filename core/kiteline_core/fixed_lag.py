@@ -202,6 +202,27 @@ class FixedLagSmoother:
             return None
         return self.state
 
+    def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
+        """A new map begins in which the newest body pose is T_m_b (4,4) by definition. Velocity, biases and the
+        direction of gravity are taken along, with what the old map's pose lacked in certainty.
+        """
+        old = self.state
+        r, gravity = old.T_m_b[:3, :3], self.gravity
+        down, jac = np.empty(3), np.empty((3, 2))
+        inertial_kernels.down_of_tilt(self._tilt, down, jac)
+        # the error of the old attitude becomes one of what is known in the map's axes
+        carry = np.eye(17)[6:]
+        carry[:3, :3] = se3.skew(old.velocity) @ r
+        carry[9:, :3] = np.linalg.pinv(self._gravity * jac) @ se3.skew(gravity) @ r
+        cov = np.zeros((17, 17))
+        cov[:3, :3], cov[3:6, 3:6] = turn_sigma_rad**2 * np.eye(3), position_sigma_m**2 * np.eye(3)
+        cov[6:, 6:] = carry @ old.cov @ carry.T
+        T_new_old = T_m_b @ se3.inverse(old.T_m_b)
+        self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations())
+        self._cov = 0.5 * (cov + cov.T)
+        self._prior_h[:] = np.linalg.inv(self._cov)
+        self.shift_map(T_new_old)
+
     def shift_map(self, T_new_old: F64) -> None:
         """The map moved: express everything in the new place, `p_new = T_new_old p_old`."""
         if self._n == 0:

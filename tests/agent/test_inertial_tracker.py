@@ -219,6 +219,30 @@ def test_a_moved_map_and_a_new_one() -> None:
     assert apart_m(tracker.state, shift @ steps[-1].truth) < 0.004
 
 
+def test_a_new_map_after_a_blackout_needs_no_new_start() -> None:
+    steps = flight(80, 4)
+    tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig())
+    shift = np.eye(4)
+    for k, step in enumerate(steps):
+        tracker.predict(step.imu, step.t_ns)
+        if 30 <= k <= 50:
+            state = tracker.coast(step.t_ns)
+        if k == 50:  # texture again, but nothing that is known
+            assert state is not None
+            shift = state.T_m_b @ se3.inverse(step.truth)
+            tracker.begin_map(step.t_ns, state.T_m_b)
+            assert tracker.blind_s == 0.0
+        if not 30 <= k <= 50:
+            points = VisualPoints(
+                se3.transform(shift, step.points.xyz), step.points.ray, step.points.observed, step.points.sigma_px,
+                step.points.inlier,
+            )  # fmt: skip
+            state = tracker.update(step.t_ns, shift @ step.visual, points)
+            if k > 50:
+                assert apart_m(state, shift @ step.truth) < 0.01
+    assert tracker.running and tracker.started == "motion"
+
+
 def test_the_same_input_gives_the_same_output() -> None:
     steps = flight(40, 9)
     a, b = run(steps)[1][-1], run(steps)[1][-1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from kiteline_agent.map_drift import MapDrift
 from kiteline_core import se3
 from kiteline_core.ids import KeyframeId

@@ -359,3 +359,22 @@ def test_nonsense_stops_it() -> None:
     samples = flight.samples(0)
     assert smoother.add(Samples(samples.t_s, samples.gyro * np.nan, samples.accel), None) is None
     assert not smoother.running
+
+
+def test_a_new_map_takes_along_what_is_known() -> None:
+    """After 1.5 s blind a map begins: the pose is exact in it, velocity and gravity err as their covariance says."""
+    nees = []
+    at = se3.from_rt(se3.so3_exp(np.array([0.1, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
+    for seed in range(16):
+        rng = np.random.default_rng([seed, 9])
+        bias = np.concatenate([0.01 * rng.normal(size=3), 0.1 * rng.normal(size=3)])
+        flight, _, smoother = fly(seed, 40, EXACT, bias=bias, blind=range(11, 41))
+        smoother.begin_map(at)
+        s = smoother.state
+        np.testing.assert_allclose(s.T_m_b, at, atol=1e-9)
+        turn = at[:3, :3] @ flight.pose(40)[:3, :3].T  # the new map as the truth sees it
+        tilt = tilt_of(turn @ GRAVITY)
+        e = np.concatenate([turn @ flight.velocity[400] - s.velocity, bias - s.bias, tilt - s.tilt])
+        nees.append(e @ np.linalg.solve(s.cov[6:, 6:], e))
+        assert smoother.add(flight.samples(38), None) is not None
+    assert 8.0 < np.mean(nees) < 15.0  # 11 degrees of freedom, 99.9 % of the mean of 16
