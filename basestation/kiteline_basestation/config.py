@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from kiteline_basestation.grid import GridConfig
 from kiteline_core.bundle import BundleConfig
+from kiteline_core.matching import MatchConfig
+from kiteline_core.pnp import RansacConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,67 @@ class NewPointConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LoopConfig:
+    """What proves that a place was seen before. A wrong proof is worse than a missed one."""
+
+    share: str = "all"  # agents whose maps may become one: "all", "none", or groups such as "0 1, 1 2"
+    enabled: bool = True
+    candidates: int = 3  # most alike keyframes that are looked at
+    min_gap: int = 12  # keyframes of the same submap between two that may close a loop
+    max_shared: int = 15  # points that two keyframes share already: more are no news
+    min_likeness: float = 0.02  # of the bags of words: below it two places have little in common
+    min_of_neighbours: float = 0.35  # share of the likeness that a keyframe has to the one before it
+    match: MatchConfig = field(default_factory=MatchConfig)
+    ransac: RansacConfig = field(default_factory=RansacConfig)
+    sigma_disparity_px: float = 0.4  # one deviation of the disparities from which points hang on their rays
+    neighbours: int = 8  # covisible keyframes whose points are looked for as well
+    radius_px: float = 10.0  # px at octave 0 around where a point is foreseen, halved at the second look
+    octave_gap: float = 1.5  # octaves between the size foreseen and the size found
+    min_inliers: int = 20  # points that agree between the two keyframes alone
+    min_inliers_all: int = 35  # the same with the neighbours' points: to join maps
+    min_inliers_loop: int = 40  # the same, within one map
+    min_share: float = 0.25  # of what both maps should see here: less is a thing that stands in two places
+    columns: int = 6  # parts of the image: a poster that hangs twice fills few of them
+    rows: int = 4
+    cell_points: int = 2  # inliers that fill a part
+    min_cells: int = 8  # of the 24 parts
+    votes: int = 3  # keyframes that say the same
+    memory: int = 24  # keyframes of a submap among which votes are counted
+    against: int = 3  # votes for, for each vote against
+    agree_m: float = 0.10  # between two votes, and
+    agree_depth: float = 0.04  # of the median depth, and
+    agree_path: float = 0.02  # of the way between the two keyframes
+    agree_rad: float = 0.05  # between two votes
+    drift_m: float = 0.3  # correction of a loop that drift explains: this, and
+    drift_path: float = 0.02  # this share of the way flown since
+    drift_rad: float = 0.1  # this turn, and
+    drift_rad_m: float = 0.002  # this turn for each metre
+    small_m: float = 0.02  # correction that needs no pose graph: fusing points is enough
+    small_rad: float = 0.005
+    twin_m: float = 1.0  # places of one map that look the same and lie further apart than this are twins
+
+
+@dataclass(frozen=True, slots=True)
+class GraphConfig:
+    """Corrections of whole maps: the pose graph and the bundle after it."""
+
+    min_shared: int = 100  # points that make two covisible keyframes an edge
+    sigma_m: float = 0.005  # of an edge between neighbours, and
+    sigma_path: float = 0.01  # this share of its length
+    sigma_rad: float = 0.003
+    loop_sigma_depth: float = 0.005  # of a loop's edge: this share of the median depth
+    loop_sigma_rad: float = 0.003
+    huber: float = 3.0  # deviations beyond which an edge counts less
+    iterations: int = 8
+    stop: float = 1e-4  # relative gain below which more iterations change nothing
+    max_full: int = 250  # keyframes whose poses a full bundle moves; of a larger map, those around the loop
+    robust_trials: int = 6  # of the full bundle before the outlier test
+    final_trials: int = 6  # after it
+    revisits: int = 2  # keyframes a step that look again for what joined maps know
+    min_kept: float = 0.5  # share of the points fused by a merge that the bundle must keep, else it was wrong
+
+
+@dataclass(frozen=True, slots=True)
 class CullConfig:
     """Points and observations that are dropped."""
 
@@ -102,5 +165,7 @@ class BaseConfig:
     refind: RefindConfig = field(default_factory=RefindConfig)
     new_points: NewPointConfig = field(default_factory=NewPointConfig)
     cull: CullConfig = field(default_factory=CullConfig)
+    loops: LoopConfig = field(default_factory=LoopConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     grid: GridConfig = field(default_factory=GridConfig)

@@ -29,13 +29,12 @@ class Window:
 
 
 def covisible_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, min_shared: int) -> list[KeyframeId]:
-    """Keyframes of the same submap that share at least min_shared points, most first, newer first among equals."""
+    """Keyframes of the same map that share at least min_shared points, most first, newer first among equals."""
     shared = sparse_map.covisible(sparse_map.points_of(keyframe))
     rows = np.flatnonzero(shared >= max(min_shared, 1))
     ids = sparse_map.keyframes.id[rows]
-    mine = submap_of_keyframe(keyframe)
     order = np.lexsort((-ids, -shared[rows]))
-    return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe and submap_of_keyframe(k) == mine]
+    return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe]
 
 
 def local_window(
@@ -47,11 +46,15 @@ def local_window(
 
 
 def window(
-    sparse_map: SparseMap, free: list[KeyframeId], config: WindowConfig, measurement: MeasurementConfig
-) -> Window | None:
-    """The bundle problem that moves the keyframes `free`, all of one submap, but never the submap's first one."""
+    sparse_map: SparseMap, free: list[KeyframeId], config: WindowConfig, measurement: MeasurementConfig,
+    held: set[KeyframeId] | None = None,
+) -> Window | None:  # fmt: skip
+    """The bundle problem that moves the keyframes `free`, all of one map, but none of `held`, which is the first one
+    of each submap unless it is said.
+    """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
-    submap = submap_of_keyframe(free[0])
+    submaps = sparse_map.island(submap_of_keyframe(free[0]))
+    held = {sparse_map.submaps[s][0] for s in submaps} if held is None else held
     points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in free]))
     _, known = sparse_map.positions(points)
     points = points[known]
@@ -61,8 +64,7 @@ def window(
     # Keep the free keyframes, and of the others those that see most.
     free_rows = np.array([sparse_map.rows[k] for k in free], np.int32)
     counts = np.bincount(table.row[slots], minlength=len(sparse_map))
-    inside = np.array(sparse_map.submaps[submap], np.int64)
-    rows_inside = np.array([sparse_map.rows[KeyframeId(k)] for k in inside.tolist()], np.int32)
+    rows_inside = np.array([sparse_map.rows[k] for s in submaps for k in sparse_map.submaps[s]], np.int32)
     mask = np.zeros(len(sparse_map), bool)
     mask[rows_inside] = True
     mask &= keyframes.pose_source[: len(sparse_map)] != NO_POSE
@@ -86,7 +88,7 @@ def window(
     slots = slots[keep]
     starts = np.concatenate([[0], np.cumsum(seen[seen >= 2])]).astype(np.int32)
 
-    moves = np.isin(rows, free_rows) & (keyframes.id[rows] != sparse_map.submaps[submap][0])
+    moves = np.isin(rows, free_rows) & ~np.isin(keyframes.id[rows], np.array(sorted(held), np.int64))
     if moves.all():
         moves[0] = False
     if not moves.any():
@@ -94,7 +96,7 @@ def window(
     positions, _ = sparse_map.positions(points)
     measured, sigma = measurements(sparse_map, slots, measurement)
     problem = BundleProblem(
-        _inverted(keyframes.T_m_k[rows]), keyframes.camera[rows], moves, positions, starts,
+        _inverted(keyframes.T_w_k[rows]), keyframes.camera[rows], moves, positions, starts,
         number[table.row[slots]], measured, sigma,
     )  # fmt: skip
     return Window(rows, points, slots, problem)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.essential_graph import GraphInputs, GraphResult, optimise
 from kiteline_basestation.grid import GridConfig, GridMap, build
 from kiteline_core.bundle import BundleConfig, BundleProblem, BundleResult, bundle
 
@@ -34,11 +35,11 @@ class GridInputs:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Work to be done elsewhere. kind: "bundle", "grid"."""
+    """Work to be done elsewhere. kind: "bundle", "full" (a bundle of a whole map), "graph", "grid"."""
 
     id: int
     kind: str
-    inputs: BundleInputs | GridInputs
+    inputs: BundleInputs | GraphInputs | GridInputs
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,7 @@ class JobDone:
     """What a job gave. cost_ops: arithmetic operations, at one a nanosecond on the modelled core."""
 
     id: int
-    result: BundleResult | GridMap
+    result: BundleResult | GraphResult | GridMap
     cost_ops: int
 
 
@@ -56,6 +57,9 @@ def run_job(job: Job) -> JobDone:
     if isinstance(inputs, BundleInputs):
         result = bundle(inputs.problem, inputs.config)
         return JobDone(job.id, result, result.cost_ops)
+    if isinstance(inputs, GraphInputs):
+        moved = optimise(inputs)
+        return JobDone(job.id, moved, moved.cost_ops)
     grid = build(inputs.config, inputs.positions, inputs.points, inputs.observations)
     rays = 60 * len(inputs.observations)  # a ray crosses some 60 cells
     return JobDone(job.id, grid, 300_000 + 10 * rays + 200 * len(inputs.points))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation import culling, newpoints, refind
+from kiteline_basestation.atlas import Atlas
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.covisibility import Window, local_window
 from kiteline_basestation.grid import Grid, GridMap
@@ -30,6 +31,7 @@ from kiteline_core.ids import (
     agent_of_keyframe,
     submap_of_keyframe,
 )
+from kiteline_core.place_index import Vocabulary
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
@@ -76,14 +78,13 @@ class MapperCounts:
     culled: int = 0
     bundles: int = 0
     grids: int = 0
-    loops: int = 0
-    merges: int = 0
 
 
 class Mapper:
     """A state machine without clock, threads or links: the same inputs give the same outputs."""
 
-    def __init__(self, config: BaseConfig | None = None) -> None:
+    def __init__(self, config: BaseConfig | None = None, words: Vocabulary | None = None) -> None:
+        """words: by which places are recognised; without them no loops are closed and no maps joined."""
         self.config = config or BaseConfig()
         self.map = SparseMap()
         self.grid = Grid(self.config.grid)
@@ -91,11 +92,15 @@ class Mapper:
         self.counts = MapperCounts()
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map)
-        self._next_job = 1
+        self._last_job = 0
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
+        self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
+        self.atlas: Atlas | None = None
+        if words is not None and self.config.loops.enabled:
+            self.atlas = Atlas(self.config, self.map, self._publisher, words, self._next_job)
 
     def step(self, given: MapperInput, now_ns: int) -> MapperOutput:
         """Take in what came, and say what is to be published and worked on."""
@@ -112,9 +117,14 @@ class Mapper:
             )
             self.counts.culled += culling.cull_weak(self.map, keyframe, self.config.cull, self._publisher)
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
+            if self.atlas is not None:
+                self.atlas.consider(keyframe)  # seen before, here or by others?
             self._grid_due += 1
             self.counts.keyframes += 1
+        self._go_on_with_atlas()
         jobs = self._bundle_jobs() + self._grid_jobs()
+        if self.atlas is not None:
+            jobs += self.atlas.jobs()
         return MapperOutput(self._publisher.collect(), tuple(jobs))
 
     def adopt(self, record: Record) -> None:
@@ -135,7 +145,8 @@ class Mapper:
     @property
     def idle(self) -> bool:
         """Whether no job is open and nothing is left to be done with what came."""
-        return not self._intake.backlog and not self._windows and not self._stale and self._grid_job == 0
+        settled = self.atlas is None or self.atlas.idle
+        return settled and not (self._intake.backlog or self._windows or self._stale or self._grid_job)
 
     def summary(self) -> dict[str, object]:
         """Numbers for people: what the base knows of each agent, and the size of the map."""
@@ -163,9 +174,11 @@ class Mapper:
             "culled": self.counts.culled,
             "bundles": self.counts.bundles,
             "grids": self.counts.grids,
-            "loops": self.counts.loops,
-            "merges": self.counts.merges,
-            "jobs_open": len(self._windows) + (self._grid_job != 0),
+            "loops": self.atlas.loops if self.atlas else 0,
+            "merges": len(self.atlas.merges) if self.atlas else 0,
+            "merges_undone": self.atlas.undone if self.atlas else 0,
+            "maps": len({self.map.island_of(s) for s in self.map.submaps}),
+            "jobs_open": len(self._windows) + (self._grid_job != 0) + (self.atlas.jobs_open if self.atlas else 0),
         }
 
     def world_view(self) -> GridView:
@@ -193,7 +206,7 @@ class Mapper:
         points, xyz = points[seen >= 2], xyz[seen >= 2]
         for submap in sorted(self.placements):
             inside = self.map.point_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
-            T = self.placements[submap]
+            T = self.placements[submap] @ se3.inverse(self.map.frame(submap))
             xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
         return GridView(
             self.map.keyframes.id[rows].copy(),
@@ -238,6 +251,8 @@ class Mapper:
         self._publisher.place(submap, T_w_m)
 
     def _finish(self, done: JobDone) -> None:
+        if self.atlas is not None and self.atlas.finish(done):
+            return
         if isinstance(done.result, BundleResult):
             opened = self._windows.pop(done.id, None)
             if opened is not None:  # else superseded
@@ -253,11 +268,47 @@ class Mapper:
                 for tile in tiles:
                     self._publisher.send(agent, tile)
 
+    def _go_on_with_atlas(self) -> None:
+        """Joined maps look around in each other; where a map moved as a whole, windows are void and places change."""
+        if self.atlas is None:
+            return
+        for keyframe in self.atlas.revisit():
+            self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
+        for island in sorted(self.atlas.moved):
+            for job, (submap, _) in list(self._windows.items()):
+                if self.map.island_of(submap) == island:
+                    del self._windows[job]
+                    waiting = self._stale.setdefault(submap, [])
+                    waiting.append(self.map.submaps[submap][-1])
+            self._place_island(island)
+            self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
+        self.atlas.moved.clear()
+
+    def _place_island(self, island: SubmapId) -> None:
+        """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place."""
+        submaps = self.map.island(island)
+        anchor = next((s for s in [self.map.island_of(island), *submaps] if s in self.placements), None)
+        if anchor is None:
+            return
+        T_w_i = self.placements[anchor] @ se3.inverse(self.map.frame(anchor))
+        for submap in submaps:
+            T_w_m = se3.orthonormalise(T_w_i @ self.map.frame(submap))
+            held = self.placements.get(submap)
+            if submap != anchor and (held is None or not np.allclose(held, T_w_m, rtol=0.0, atol=1e-5)):
+                self.placements[submap] = T_w_m
+                self._publisher.place(submap, T_w_m)
+
+    def _next_job(self) -> int:
+        self._last_job += 1
+        return self._last_job
+
     def _bundle_jobs(self) -> list[Job]:
-        """One bundle at a time for each submap, around its newest keyframe."""
-        busy = {submap for submap, _ in self._windows.values()}
+        """One bundle at a time for each map, around the newest keyframe of a submap; submaps take turns."""
+        busy = {self.map.island_of(submap) for submap, _ in self._windows.values()}
         jobs = []
-        for submap in sorted(self._stale.keys() - busy):
+        for submap in sorted(self._stale, key=lambda s: (self._served.get(s, 0), s)):
+            if self.map.island_of(submap) in busy:
+                continue
             # Around the newest keyframe; where many came at once, from the oldest on, half a window at a time.
             waiting, size = self._stale.pop(submap), self.config.window.free
             keyframe = waiting[-1] if len(waiting) <= size else waiting[size // 2]
@@ -267,9 +318,11 @@ class Mapper:
             if left:
                 self._stale[submap] = left
             if part is not None:
-                jobs.append(Job(self._next_job, "bundle", BundleInputs(part.problem, self.config.bundle)))
-                self._windows[self._next_job] = (submap, part)
-                self._next_job += 1
+                job = Job(self._next_job(), "bundle", BundleInputs(part.problem, self.config.bundle))
+                jobs.append(job)
+                self._windows[job.id] = (submap, part)
+                self._served[submap] = job.id
+                busy.add(self.map.island_of(submap))
         return jobs
 
     def _grid_jobs(self) -> list[Job]:
@@ -278,8 +331,7 @@ class Mapper:
             return []
         self._grid_due = 0
         view = self.world_view()
-        self._grid_job = self._next_job
-        self._next_job += 1
+        self._grid_job = self._next_job()
         return [
             Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.observations))
         ]

@@ -70,7 +70,7 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointCo
         there = _open_births(sparse_map, other)
         if len(there) == 0:
             continue
-        T_m_a, T_m_b = keyframes.T_m_k[row], keyframes.T_m_k[sparse_map.rows[other]]
+        T_m_a, T_m_b = keyframes.T_w_k[row], keyframes.T_w_k[sparse_map.rows[other]]
         baseline = float(np.linalg.norm(T_m_a[:3, 3] - T_m_b[:3, 3]))
         if len(inverse) and baseline * float(np.median(inverse)) < config.min_baseline_ratio:
             continue
@@ -123,7 +123,7 @@ def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: NewPointConfig) ->
     views = []
     for slots in (a, b):
         rows = table.row[slots]
-        views.append((table.uv[slots].astype(np.float64), keyframes.camera[rows, :4], keyframes.T_m_k[rows]))
+        views.append((table.uv[slots].astype(np.float64), keyframes.camera[rows, :4], keyframes.T_w_k[rows]))
     lines = [rays(*view) for view in views]
     position, good = nearest_point(
         np.stack([lines[0][0], lines[1][0]], 1), np.stack([lines[0][1], lines[1][1]], 1)

@@ -50,11 +50,11 @@ def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig
     if len(inverse) == 0:
         return covisible
     reach = config.near_ratio / float(np.median(inverse))
-    same = sparse_map.submaps[submap_of_keyframe(keyframe)]
+    same = [k for s in sparse_map.island(submap_of_keyframe(keyframe)) for k in sparse_map.submaps[s]]
     rows = np.array([sparse_map.rows[k] for k in same], np.int32)
-    poses = table.T_m_k[rows]
-    distance = np.linalg.norm(poses[:, :3, 3] - table.T_m_k[row, :3, 3], axis=1)
-    cosine = poses[:, :3, 2] @ table.T_m_k[row, :3, 2]
+    poses = table.T_w_k[rows]
+    distance = np.linalg.norm(poses[:, :3, 3] - table.T_w_k[row, :3, 3], axis=1)
+    cosine = poses[:, :3, 2] @ table.T_w_k[row, :3, 2]
     near = (distance < reach) & (cosine > config.near_cosine) & (table.pose_source[rows] != NO_POSE)
     near &= (rows != row) & (table.culled[rows] == 0)
     order = np.argsort(distance[near], kind="stable")
@@ -92,13 +92,18 @@ def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: Refi
     return found
 
 
-def foresee(sparse_map: SparseMap, points: I32, target: KeyframeId) -> tuple[I32, F64, F64, NDArray[np.uint8], F64]:
-    """How a keyframe would see points (n,): those inside its image, with pixel, octave, angle and disparity."""
+def foresee(
+    sparse_map: SparseMap, points: I32, target: KeyframeId, T_w_k: F64 | None = None
+) -> tuple[I32, F64, F64, NDArray[np.uint8], F64]:  # fmt: skip
+    """How a keyframe would see points (n,): those inside its image, with pixel, octave, angle and disparity.
+
+    T_w_k: (4,4) where the keyframe is thought to be, if not where the map has it.
+    """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[target]
     xyz, known = sparse_map.positions(points)
     points, xyz = points[known], xyz[known]
-    T = keyframes.T_m_k[row]
+    T = keyframes.T_w_k[row] if T_w_k is None else T_w_k
     local = (xyz - T[:3, 3]) @ T[:3, :3]
     fx, fy, cx, cy, bf = keyframes.camera[row]
     z = np.maximum(local[:, 2], 1e-3)
@@ -106,7 +111,7 @@ def foresee(sparse_map: SparseMap, points: I32, target: KeyframeId) -> tuple[I32
     camera = sparse_map.cameras[agent_of_keyframe(target)]
     inside = (local[:, 2] > 0.1) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
     points, uv, z, xyz = points[inside], uv[inside], z[inside], xyz[inside]
-    anchors = keyframes.T_m_k[table.row[points]]
+    anchors = keyframes.T_w_k[table.row[points]]
     depth = np.einsum("ni,ni->n", anchors[:, :3, 2], xyz - anchors[:, :3, 3])
     octave = table.octave[points] + np.log2(np.maximum(depth, 1e-3) / z)
     turn = np.einsum("ji,njk->nik", T[:3, :3], anchors[:, :3, :3])  # R_target_anchor

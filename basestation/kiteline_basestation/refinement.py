@@ -37,12 +37,12 @@ def _poses(
         row = int(window.rows[i])
         keyframe = KeyframeId(int(sparse_map.keyframes.id[row]))
         new = np.linalg.inv(result.T_c_m[i])
-        old = sparse_map.keyframes.T_m_k[row]
+        old = sparse_map.keyframes.T_w_k[row]
         moved = float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
         turned = float(np.linalg.norm(new[:3, :3] - old[:3, :3])) / np.sqrt(2.0)  # chord: the angle when small
         first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # said once, so that an older base's value goes
         if first or moved > publish.pose_m or turned > publish.pose_rad:
-            sparse_map.set_pose(keyframe, new)
+            sparse_map.set_world_pose(keyframe, new)
             publisher.touch(Kind.POSE, keyframe)
 
 

@@ -10,6 +10,7 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.channel import RecordChannel
 from kiteline_core.ids import AgentId
+from kiteline_core.place_index import Vocabulary
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +24,10 @@ class StationOutput:
 class Station:
     """The base as a state machine over packets. `open_channel` makes our end of the channel to an agent."""
 
-    def __init__(self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel]) -> None:
-        self.mapper = Mapper(config)
+    def __init__(
+        self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], words: Vocabulary | None = None
+    ) -> None:  # fmt: skip
+        self.mapper = Mapper(config, words)
         self.channels: dict[AgentId, RecordChannel] = {}
         self._open_channel = open_channel
 

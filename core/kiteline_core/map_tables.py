@@ -28,6 +28,7 @@ class KeyframeTable:
     parent: I64  # keyframe id, NO_KEYFRAME for the first of a submap
     T_p_k: F64  # (n,4,4) in the parent, as the agent wrote it
     T_m_k: F64  # (n,4,4) in the submap: the base's value, else composed from the parent's
+    T_w_k: F64  # (n,4,4) in the frame in which all submaps lie: T_w_m of its submap times T_m_k
     pose_source: U8
     start: I32  # first slot of its keypoints
     count: I32  # number of keypoints
@@ -71,7 +72,7 @@ def empty_keyframes() -> KeyframeTable:
     """A table without rows."""
     i64, u8, i32 = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int32)
     t = np.zeros((0, 4, 4))
-    return KeyframeTable(i64, i64, i64, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)))
+    return KeyframeTable(i64, i64, i64, t, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)))
 
 
 def empty_keypoints() -> KeypointTable:

@@ -14,6 +14,7 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core import se3
 from kiteline_core import sparse_map_kernels as kernels
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -61,6 +62,8 @@ class SparseMap:
         self.slots = 0
         self.rows: dict[KeyframeId, int] = {}
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes of each submap in order of id
+        self.frames: dict[SubmapId, F64] = {}  # T_w_m of each submap that does not lie as it was begun
+        self.islands: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
         self._children: dict[KeyframeId, list[int]] = {}
@@ -171,10 +174,23 @@ class SparseMap:
         row = self.rows[keyframe]
         had = self.keyframes.pose_source[row]
         self.keyframes.T_m_k[row] = T_m_k
+        self._follow(row)
         self.keyframes.pose_source[row] = REFINED_POSE
         if had == NO_POSE:
             self._refresh_usable(row)
         self._compose_children(keyframe)
+
+    def set_world_pose(self, keyframe: KeyframeId, T_w_k: F64) -> None:
+        """The base's pose of a keyframe, said in w; its submap stays where it is."""
+        frame = self.frames.get(submap_of_keyframe(keyframe))
+        self.set_pose(keyframe, T_w_k if frame is None else se3.orthonormalise(se3.inverse(frame) @ T_w_k))
+
+    def move_submap(self, submap: SubmapId, T_w_m: F64) -> None:
+        """Lay a submap, with all that hangs on it, at T_w_m (4,4)."""
+        if submap in self.frames or not np.array_equal(T_w_m, np.eye(4)):
+            self.frames[submap] = np.array(T_w_m)
+        for keyframe in self.submaps.get(submap, []):
+            self._follow(self.rows[keyframe])
 
     def set_depths(self, slots: I32, inv_depth: F32, offset: F32) -> None:
         """The base's positions of the points born at `slots` (n,): inv_depth (n,) 1/m, offset (n,2) px."""
@@ -206,6 +222,13 @@ class SparseMap:
         births = moved[table.kind[moved] == BIRTH]
         rows = np.union1d(table.row[births], table.row[one])
         return [KeyframeId(k) for k in np.sort(self.keyframes.id[rows]).tolist()]
+
+    def part(self, births: I32) -> None:
+        """The opposite of `fuse` for births at slots (n,): each is a point of its own again, seen where it is named."""
+        table = self.keypoints
+        kernels.link(births, births, table.root, table.first, table.next)
+        slots = np.flatnonzero((table.kind[: self.slots] == SIGHTING) & (table.root[: self.slots] >= 0)).astype(np.int32)
+        self._link_sightings(slots[np.isin(self.find_points(table.point[slots]), births)])
 
     # -- questions ---------------------------------------------------------------------------------------------------
 
@@ -289,7 +312,7 @@ class SparseMap:
         return np.where(refined, table.refined[points], table.inv_depth[points]).astype(np.float64)
 
     def positions(self, points: I32) -> tuple[F64, Bool]:
-        """Positions (n,3) in m of the anchors' submaps, and whether each is known."""
+        """Positions (n,3) in m in the frame w in which the submaps lie, and whether each is known."""
         table = self.keypoints
         rows = table.row[points]
         inv = self.inverse_depths(points)
@@ -300,13 +323,13 @@ class SparseMap:
         local = np.stack(
             [(uv[:, 0] - cx) / np.where(fx > 0, fx, 1.0) * z, (uv[:, 1] - cy) / np.where(fy > 0, fy, 1.0) * z, z], 1
         )
-        pose = self.keyframes.T_m_k[rows]
+        pose = self.keyframes.T_w_k[rows]
         return np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3], valid & (fx > 0)
 
     def bearing_of(self, points: I32, positions: F64) -> tuple[F32, F32, Bool]:
         """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, whether each lies before its anchor."""
         rows = self.keypoints.row[points]
-        pose = self.keyframes.T_m_k[rows]
+        pose = self.keyframes.T_w_k[rows]
         local = np.einsum("nji,nj->ni", pose[:, :3, :3], positions - pose[:, :3, 3])
         ahead = local[:, 2] > 1e-3
         inv = 1.0 / np.where(ahead, local[:, 2], 1.0)
@@ -321,6 +344,27 @@ class SparseMap:
         if row is None or self.keyframes.pose_source[row] == NO_POSE:
             return None
         return np.asarray(self.keyframes.T_m_k[row]).copy()
+
+    def world_pose(self, keyframe: KeyframeId) -> F64 | None:
+        """T_w_k (4,4) of a keyframe, or None as with `pose`."""
+        row = self.rows.get(keyframe)
+        if row is None or self.keyframes.pose_source[row] == NO_POSE:
+            return None
+        return np.asarray(self.keyframes.T_w_k[row]).copy()
+
+    def frame(self, submap: SubmapId) -> F64:
+        """T_w_m (4,4) of a submap."""
+        held = self.frames.get(submap)
+        return np.eye(4) if held is None else held.copy()
+
+    def island_of(self, submap: SubmapId) -> SubmapId:
+        """The eldest of the submaps that are one map with this one."""
+        return self.islands.get(submap, submap)
+
+    def island(self, submap: SubmapId) -> list[SubmapId]:
+        """All submaps that are one map with this one, in order of id."""
+        eldest = self.island_of(submap)
+        return sorted({eldest} | {s for s, root in self.islands.items() if root == eldest})
 
     def complete(self, keyframe: KeyframeId) -> bool:
         """Whether all keypoints that the header announced have arrived."""
@@ -406,9 +450,16 @@ class SparseMap:
             if above is None or table.pose_source[above] == NO_POSE:
                 return
             table.T_m_k[row] = table.T_m_k[above] @ table.T_p_k[row]
+        self._follow(row)
         table.pose_source[row] = COMPOSED
         self._refresh_usable(row)
         self._compose_children(KeyframeId(int(table.id[row])))
+
+    def _follow(self, row: int) -> None:
+        """Where a keyframe lies in w, from its place in m."""
+        table = self.keyframes
+        frame = self.frames.get(submap_of_keyframe(KeyframeId(int(table.id[row]))))
+        table.T_w_k[row] = table.T_m_k[row] if frame is None else frame @ table.T_m_k[row]
 
     def _compose_children(self, keyframe: KeyframeId) -> None:
         table = self.keyframes
@@ -419,6 +470,7 @@ class SparseMap:
                 if table.pose_source[row] == REFINED_POSE:
                     continue
                 table.T_m_k[row] = table.T_m_k[self.rows[above]] @ table.T_p_k[row]
+                self._follow(row)
                 if table.pose_source[row] == NO_POSE:
                     table.pose_source[row] = COMPOSED
                     self._refresh_usable(row)

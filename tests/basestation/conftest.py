@@ -26,6 +26,7 @@ class Flight:
     world: F64
     keyframes: list[KeyframeId] = field(default_factory=list)
     true_T_m_k: list[F64] = field(default_factory=list)
+    true_T_w_k: list[F64] = field(default_factory=list)
     agent_T_m_k: list[F64] = field(default_factory=list)
     records: list[list[Record]] = field(default_factory=list)
     sightings: set[tuple[KeyframeId, int]] = field(default_factory=set)  # keyframe and keypoint
@@ -37,31 +38,69 @@ class Flight:
         return [Camera(self.agent, self.camera), *(r for part in self.records for r in part)]
 
 
-def fly(
-    keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3,
-    drift_m: float = 0.004, outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0,
-    missed: float = 0.1, no_depth: float = 0.0, submap: int = 0,
-) -> Flight:  # fmt: skip
-    """Fly a circle of 1.2 m radius, looking outwards. memory: keyframes after which the tracker forgets a point."""
-    rng = np.random.default_rng(seed)
-    camera = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, stereo, np.eye(4))
+@dataclass
+class Scene:
+    """Points (n,3) with descriptors (n,32), sizes and directions (n,), and the way through them: turns -> T_w_k."""
+
+    world: F64
+    descriptors: NDArray[np.uint8]
+    size: F64
+    direction: NDArray[np.int64]
+    path: Callable[[float], F64]
+
+
+def look(position: F64, forward: F64) -> F64:
+    """T_w_k (4,4) of a camera at position (3,) that looks along forward (3,) with a level horizon."""
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return se3.from_rt(np.stack([right, np.cross(forward, right), forward], 1), position)
+
+
+def circle(turns: float) -> F64:
+    """Around a circle of 1.2 m radius, looking outwards."""
+    phi = 2 * np.pi * turns
+    forward = np.array([np.cos(phi), np.sin(phi), 0.05 * np.sin(3 * phi)])
+    return look(np.array([1.2 * np.cos(phi), 1.2 * np.sin(phi), 0.2 * np.sin(2 * phi)]), forward)
+
+
+def room(rng: np.random.Generator, points: int) -> Scene:
+    """Points on the walls of a room of 8 x 7 x 3 m."""
     half = np.array([4.0, 3.5, 1.5])
     world = rng.uniform(-1, 1, (points, 3)) * half
     wall = rng.integers(0, 2, points)
     world[np.arange(points), wall] = np.sign(world[np.arange(points), wall]) * half[wall]
     descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
     size, direction = rng.uniform(-0.4, 1.4, points), rng.integers(0, 256, points)
+    return Scene(world, descriptors, size, direction, circle)
+
+
+def fly(
+    keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3,
+    drift_m: float = 0.004, outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0,
+    missed: float = 0.1, no_depth: float = 0.0, submap: int = 0, start: float = 0.0, variant: int = 0,
+    T_w_m: F64 | None = None, scene: Scene | None = None,
+) -> Flight:  # fmt: skip
+    """Fly a circle of 1.2 m radius, looking outwards. memory: keyframes after which the tracker forgets a point.
+
+    start: where on the circle, in turns. variant: of the noise, in the same world. T_w_m: where the agent's m lies in
+    the world. scene: another world than the room that the seed makes.
+    """
+    rng = np.random.default_rng(seed)
+    camera = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, stereo, np.eye(4))
+    if scene is None:
+        scene = room(rng, points)
+    world, descriptors, size, direction, path = scene.world, scene.descriptors, scene.size, scene.direction, scene.path
+    points = len(world)
+    if variant:
+        rng = np.random.default_rng([seed, variant])
+    T_m_w = np.eye(4) if T_w_m is None else se3.inverse(T_w_m)
     flight = Flight(camera, AgentId(agent), world)
     in_submap = submap_id(agent, 1, submap)
     tracked: dict[int, tuple[int, int]] = {}  # row of world -> point id, number of the keyframe that last saw it
     for n in range(keyframes):
-        phi = 2 * np.pi * turns * n / keyframes
-        forward = np.array([np.cos(phi), np.sin(phi), 0.05 * np.sin(3 * phi)])
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward], 1)
-        true = se3.from_rt(rotation, np.array([1.2 * np.cos(phi), 1.2 * np.sin(phi), 0.2 * np.sin(2 * phi)]))
+        in_world = path(start + turns * n / keyframes)
+        true = T_m_w @ in_world
         if n == 0:
             parent, T_p_k = NO_KEYFRAME, true
         else:
@@ -69,7 +108,7 @@ def fly(
             parent, T_p_k = flight.keyframes[-1], se3.inverse(flight.true_T_m_k[-1]) @ true @ se3.exp(step)
         believed = T_p_k if n == 0 else flight.agent_T_m_k[-1] @ T_p_k
         keyframe = keyframe_id(in_submap, n)
-        local = se3.transform(se3.inverse(true), world)
+        local = se3.transform(se3.inverse(in_world), world)
         z = np.maximum(local[:, 2], 0.01)
         uv = np.stack([420 * local[:, 0] / z + 376, 420 * local[:, 1] / z + 240], 1)
         seen = (local[:, 2] > 0.3) & (uv > 8).all(1) & (uv < [744, 472]).all(1) & (rng.random(points) > missed)
@@ -117,6 +156,7 @@ def fly(
                 flight.point_of[tracked[r][0]] = r
         flight.keyframes.append(keyframe)
         flight.true_T_m_k.append(true)
+        flight.true_T_w_k.append(in_world)
         flight.agent_T_m_k.append(believed)
         flight.records.append(made)
     return flight

@@ -1,0 +1,287 @@
+"""What becomes of a place seen again: maps are joined or bent, their points fused, and all of it is bundled anew.
+
+Finding (loops) -> [merge: lay the newer map into the older] -> pose graph (job) -> fuse points -> full bundle (job).
+A newer finding in the same map makes the jobs under way void. A merge that the bundle or later places contradict is
+undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation import refind
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.correction import graph_of, keyframes_of, move_keyframes
+from kiteline_basestation.covisibility import Window, covisible_keyframes, window
+from kiteline_basestation.essential_graph import GraphResult
+from kiteline_basestation.jobs import BundleInputs, Job, JobDone
+from kiteline_basestation.loops import Finding, LoopFinder
+from kiteline_basestation.overlap import Overlap
+from kiteline_basestation.publisher import Publisher
+from kiteline_basestation.refinement import apply_bundle
+from kiteline_codec.schema import Kind
+from kiteline_core import se3
+from kiteline_core.bundle import BundleResult
+from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH
+from kiteline_core.place_index import Vocabulary
+from kiteline_core.sparse_map import SparseMap
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Merge:
+    """A map that was laid into another. moved: its submaps and where they lay before (T_w_m). votes: the evidence."""
+
+    eldest: SubmapId
+    into: SubmapId
+    moved: dict[SubmapId, F64]
+    votes: tuple[Overlap, ...]
+    fused: list[tuple[int, int]] = field(default_factory=list)  # slots of points that became one at the merge
+
+
+class Atlas:
+    """Findings and their consequences. The mapper calls; nothing here waits."""
+
+    def __init__(
+        self, config: BaseConfig, sparse_map: SparseMap, publisher: Publisher, words: Vocabulary,
+        next_job: Callable[[], int],
+    ) -> None:  # fmt: skip
+        self._config = config
+        self._map = sparse_map
+        self._publisher = publisher
+        self._next_job = next_job
+        self.finder = LoopFinder(config.loops, sparse_map, words)
+        self.loops = 0
+        self.merges: list[Merge] = []
+        self.undone = 0
+        self.moved: set[SubmapId] = set()  # maps (eldest submap) that moved as a whole since the mapper last asked
+        self._edges: list[Overlap] = []  # proved loops, edges of the pose graph
+        self._fresh: dict[SubmapId, list[Overlap]] = {}  # of each map, those whose points are not fused yet
+        self._graph_due: set[SubmapId] = set()
+        self._full_due: set[SubmapId] = set()
+        self._graphs: dict[int, SubmapId] = {}  # open jobs
+        self._fulls: dict[int, tuple[SubmapId, Window]] = {}
+        self._revisit: list[KeyframeId] = []  # keyframes of merged maps that have not looked around in the other yet
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is under way."""
+        return not (self._graph_due or self._full_due or self._graphs or self._fulls or self._revisit)
+
+    @property
+    def jobs_open(self) -> int:
+        """How many jobs are under way."""
+        return len(self._graphs) + len(self._fulls)
+
+    def consider(self, keyframe: KeyframeId) -> None:
+        """Ask whether a new keyframe's place is known, and remember it."""
+        self.finder.add(keyframe)
+        self._ask(keyframe)
+
+    def revisit(self) -> list[KeyframeId]:
+        """A few keyframes of merged maps look for what the other map knows. Returns them: bundles are due there."""
+        now, self._revisit = self._revisit[: self._config.graph.revisits], self._revisit[self._config.graph.revisits :]
+        for keyframe in now:
+            refind.refind(self._map, keyframe, self._config.refind, self._publisher)
+            self._ask(keyframe)
+        return now
+
+    def jobs(self) -> list[Job]:
+        """Pose graphs first, then full bundles of maps whose graph is settled."""
+        out: list[Job] = []
+        for island in sorted(self._graph_due):
+            inputs = graph_of(self._map, island, tuple(self._edges), self._config.graph)
+            if inputs is not None:
+                job = Job(self._next_job(), "graph", inputs)
+                self._graphs[job.id] = island
+                out.append(job)
+        self._graph_due.clear()
+        for island in sorted(self._full_due - set(self._graphs.values())):
+            part = self._whole(island)
+            if part is not None:
+                problem = BundleInputs(part.problem, self._full_config())
+                job = Job(self._next_job(), "full", problem)
+                self._fulls[job.id] = (island, part)
+                out.append(job)
+            self._full_due.discard(island)
+        return out
+
+    def finish(self, done: JobDone) -> bool:
+        """Take in a finished job; False when it is none of ours. One that was made void changes nothing."""
+        if isinstance(done.result, GraphResult):
+            island = self._graphs.pop(done.id, None)
+            if island is not None:
+                self._bend(island, done.result)
+            return True
+        if isinstance(done.result, BundleResult) and done.id in self._fulls:
+            island, part = self._fulls.pop(done.id)
+            self._settle(island, part, done.result)
+            return True
+        return False
+
+    # -- findings ----------------------------------------------------------------------------------------------------
+
+    def _ask(self, keyframe: KeyframeId) -> None:
+        finding = self.finder.consider(keyframe)
+        if finding is None:
+            return
+        if finding.loop:
+            self.loops += 1
+        else:
+            self._join(finding)
+        self._edges.extend(finding.votes)
+        self._fresh.setdefault(finding.older, []).extend(finding.votes)
+        self._void(finding.older)
+        if self._needs_graph(finding):
+            self._graph_due.add(finding.older)
+        else:
+            self._fuse_fresh(finding.older)
+            self._full_due.add(finding.older)
+
+    def _void(self, island: SubmapId) -> None:
+        """What is under way in a map is out of date."""
+        self._graphs = {job: i for job, i in self._graphs.items() if i != island}
+        self._fulls = {job: (i, part) for job, (i, part) in self._fulls.items() if i != island}
+
+    def _needs_graph(self, finding: Finding) -> bool:
+        """Whether fusing points and bundling would not do: the correction reaches further than they look."""
+        for vote in finding.votes:
+            T_w_old, T_w_new = self._map.world_pose(vote.old), self._map.world_pose(vote.new)
+            assert T_w_old is not None and T_w_new is not None
+            error = se3.inverse(T_w_new) @ T_w_old @ vote.T_old_new
+            if np.linalg.norm(error[:3, 3]) > self._config.loops.small_m:
+                return True
+            if np.linalg.norm(se3.so3_log(se3.orthonormalise(error)[:3, :3])) > self._config.loops.small_rad:
+                return True
+        return False
+
+    def _join(self, finding: Finding) -> None:
+        """Lay the newer map into the older; where it is then bent, its submaps keep their own m."""
+        sparse_map = self._map
+        submaps = sparse_map.island(finding.newer)
+        self._void(finding.newer)
+        for waiting in (self._graph_due, self._full_due):
+            waiting.discard(finding.newer)
+        self._fresh.setdefault(finding.older, []).extend(self._fresh.pop(finding.newer, []))
+        merge = Merge(finding.newer, finding.older, {s: sparse_map.frame(s) for s in submaps}, finding.votes)
+        for submap in submaps:
+            sparse_map.move_submap(submap, se3.orthonormalise(finding.T_older_newer @ merge.moved[submap]))
+            sparse_map.islands[submap] = finding.older
+        self.merges.append(merge)
+        self.moved |= {finding.older, finding.newer}
+        self._revisit.extend(k for s in submaps for k in sparse_map.submaps[s] if k not in self._revisit)
+
+    # -- corrections -------------------------------------------------------------------------------------------------
+
+    def _bend(self, island: SubmapId, result: GraphResult) -> None:
+        targets = {KeyframeId(k): T for k, T in zip(result.keyframes.tolist(), result.T_w_k)}
+        move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
+        self.moved.add(island)
+        self._fuse_fresh(island)
+        self._full_due.add(island)
+
+    def _fuse_fresh(self, island: SubmapId) -> None:
+        """Points that votes proved to be one, then what the neighbours on both sides see of each other."""
+        table = self._map.keypoints
+        votes = self._fresh.pop(island, [])
+        merge = self.merges[-1] if self.merges and self.merges[-1].into == island else None
+        for vote in votes:
+            for a, b in zip(vote.mine.tolist(), vote.theirs.tolist()):
+                a, b = int(table.root[a]), int(table.root[b])
+                if a != b and refind.fuse(self._map, a, b, self._publisher) and merge is not None:
+                    merge.fused.append((a, b))
+        seen: set[KeyframeId] = set()
+        for vote in votes:
+            around = covisible_keyframes(self._map, vote.new, self._config.window.min_shared)
+            for keyframe in [vote.new, *around[: self._config.loops.neighbours]]:
+                if keyframe not in seen:
+                    seen.add(keyframe)
+                    refind.refind(self._map, keyframe, self._config.refind, self._publisher)
+
+    def _whole(self, island: SubmapId) -> Window | None:
+        """The problem of a whole map, or of the part around its newest loop when it is too large."""
+        config = self._config.graph
+        keyframes = [k for k in keyframes_of(self._map, island) if not self._map.keyframes.culled[self._map.rows[k]]]
+        first = self._map.submaps[self._map.island_of(island)][0]
+        if len(keyframes) > config.max_full:
+            newest = next((v for v in reversed(self._edges) if v.new in keyframes), None)
+            spots = [newest.new, newest.old] if newest is not None else keyframes[-1:]
+            near = self._map.keyframes.T_w_k[[self._map.rows[k] for k in keyframes], :3, 3]
+            centres = np.stack([self._map.keyframes.T_w_k[self._map.rows[k], :3, 3] for k in spots])
+            distance = np.linalg.norm(near[:, None] - centres, axis=2).min(axis=1)
+            keep = np.sort(np.argsort(distance, kind="stable")[: config.max_full])
+            keyframes = [keyframes[i] for i in keep.tolist()]
+        if len(keyframes) < 2:
+            return None
+        wide = replace(self._config.window, fixed=config.max_full // 2)
+        return window(self._map, keyframes, wide, self._config.measurement, {first})
+
+    def _full_config(self):  # type: ignore[no-untyped-def]
+        config = self._config.graph
+        return replace(self._config.bundle, robust_trials=config.robust_trials, final_trials=config.final_trials)
+
+    def _settle(self, island: SubmapId, part: Window, result: BundleResult) -> None:
+        """Take a full bundle in; what came meanwhile moves along the spanning tree."""
+        if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
+            return
+        if self._contradicted(island, part, result):
+            return
+        rows = part.rows[part.problem.free]
+        poses = np.linalg.inv(result.T_c_m[part.problem.free])
+        keyframes = self._map.keyframes.id[rows].tolist()
+        targets = {KeyframeId(k): pose for k, pose in zip(keyframes, poses)}
+        held = self._map.keyframes.id[part.rows[~part.problem.free]].tolist()
+        for keyframe in map(KeyframeId, held):
+            pose = self._map.world_pose(keyframe)
+            assert pose is not None
+            targets[keyframe] = pose
+        move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
+        apply_bundle(self._map, part, result, self._publisher, self._config.cull, self._config.publish)
+        self.moved.add(island)
+
+    # -- second thoughts ---------------------------------------------------------------------------------------------
+
+    def _contradicted(self, island: SubmapId, part: Window, result: BundleResult) -> bool:
+        """Undo the last merge into a map when the bundle rejects most of what it fused. Returns whether it did."""
+        merge = next((m for m in reversed(self.merges) if m.into == island), None)
+        if merge is None or not merge.fused:
+            return False
+        table = self._map.keypoints
+        roots = np.unique(table.root[np.array(merge.fused, np.int64).ravel()])
+        which = np.repeat(part.points, np.diff(part.problem.starts))
+        submap = self._map.keyframes.id[table.row[part.slots]] >> 20
+        mine = np.isin(submap, sorted(merge.moved)) & np.isin(which, roots)
+        if int(np.count_nonzero(mine)) < self._config.loops.min_inliers:
+            return False
+        if float(np.mean(result.inlier[mine])) >= self._config.graph.min_kept:
+            return False
+        self.undo(merge)
+        return True
+
+    def undo(self, merge: Merge) -> None:
+        """Take a merged map out again: it lies where it lay, and none of its points is a point of the other."""
+        sparse_map, table = self._map, self._map.keypoints
+        self.merges.remove(merge)
+        self.undone += 1
+        self._void(merge.into)
+        mine = set(merge.moved)
+        self._edges = [v for v in self._edges if (submap_of_keyframe(v.new) in mine) == (submap_of_keyframe(v.old) in mine)]
+        self._fresh.pop(merge.into, None)
+        self._revisit = [k for k in self._revisit if submap_of_keyframe(k) not in mine]
+        inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> 20, sorted(mine))
+        roots = table.root[: sparse_map.slots]
+        crossing = np.flatnonzero((roots >= 0) & (inside != inside[np.maximum(roots, 0)])).astype(np.int32)
+        sparse_map.part(crossing[table.kind[crossing] == BIRTH])
+        self._publisher.touch_slots(Kind.FOUND, crossing[table.kind[crossing] == BIRTH])
+        for submap, frame in merge.moved.items():
+            sparse_map.islands.pop(submap, None)
+            if submap != merge.eldest:
+                sparse_map.islands[submap] = merge.eldest
+            sparse_map.move_submap(submap, frame)
+        self.moved |= {merge.into, merge.eldest}

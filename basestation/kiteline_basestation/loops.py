@@ -1,0 +1,242 @@
+"""Finds places that were seen before, in any map of any agent, and says when the evidence is enough.
+
+Every keyframe asks the place index; what looks alike is proved by geometry (`overlap`), and each proof is a vote for
+how two maps lie to each other, or for how far one has drifted. A few keyframes must say the same, none the contrary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.overlap import Overlap, find_overlap, view_of
+from kiteline_core import se3
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.place_index import PlaceIndex, Vocabulary
+from kiteline_core.sparse_map import SparseMap
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Enough votes. newer, older: islands (the same one: a loop). T_older_newer: (4,4) how the newer has to move.
+
+    votes: those that agree.
+    """
+
+    newer: SubmapId
+    older: SubmapId
+    T_older_newer: F64
+    votes: tuple[Overlap, ...]
+
+    @property
+    def loop(self) -> bool:
+        """Whether both are one map already."""
+        return self.newer == self.older
+
+
+class Shares:
+    """Whose maps may become one. Raises ValueError on words that are no groups of agents."""
+
+    def __init__(self, text: str) -> None:
+        self._all = text.strip() == "all"
+        self._groups: list[set[int]] = []
+        if not self._all and text.strip() not in ("", "none"):
+            try:
+                self._groups = [{int(a) for a in group.split()} for group in text.split(",")]
+            except ValueError as error:
+                raise ValueError(f'share {text!r}: expected "all", "none", or groups such as "0 1, 1 2"') from error
+
+    def together(self, a: AgentId, b: AgentId) -> bool:
+        """Whether two agents share."""
+        return a == b or self._all or any(a in group and b in group for group in self._groups)
+
+
+class LoopFinder:
+    """The place index over all keyframes, and the votes that are open."""
+
+    def __init__(self, config: LoopConfig, sparse_map: SparseMap, words: Vocabulary) -> None:
+        self._config = config
+        self._map = sparse_map
+        self._index = PlaceIndex(words)
+        self._shares = Shares(config.share)
+        self._votes: dict[tuple[SubmapId, SubmapId], list[Overlap]] = {}  # by the submaps of old and new
+        self._born: dict[SubmapId, int] = {}  # when the base first heard of a submap
+        self.proofs = 0  # overlaps that geometry proved
+        self.refused = 0  # findings that were no drift, or of places that have twins
+
+    def add(self, keyframe: KeyframeId) -> None:
+        """Remember what a keyframe sees."""
+        self._born.setdefault(submap_of_keyframe(keyframe), len(self._born))
+        self._index.add(keyframe, view_of(self._map, keyframe).descriptor)
+
+    def forget(self, keyframe: KeyframeId) -> None:
+        """A keyframe is no place any more."""
+        self._index.remove(keyframe)
+
+    def eldest(self, submaps: Sequence[SubmapId]) -> SubmapId:
+        """The submap that the base heard of first."""
+        return min(submaps, key=lambda s: (self._born.get(s, len(self._born)), s))
+
+    def consider(self, keyframe: KeyframeId) -> Finding | None:
+        """Ask where else this place was seen. A finding is told once: its votes are used up."""
+        finding: Finding | None = None
+        for old in self._candidates(keyframe):
+            overlap = find_overlap(self._map, keyframe, old, self._config)
+            if overlap is None:
+                continue
+            self.proofs += 1
+            finding = finding or self._count(overlap)
+        return finding
+
+    # -- inside ------------------------------------------------------------------------------------------------------
+
+    def _candidates(self, keyframe: KeyframeId) -> list[KeyframeId]:
+        """The places most alike, at most one of each neighbourhood, and never what is known to be one with this."""
+        sparse_map, config = self._map, self._config
+        view = view_of(sparse_map, keyframe)
+        if len(view.slots) < config.min_inliers:
+            return []
+        shared = sparse_map.covisible(sparse_map.points_of(keyframe))
+        known = set(sparse_map.keyframes.id[np.flatnonzero(shared > config.max_shared)].tolist())
+        same = sparse_map.submaps[submap_of_keyframe(keyframe)]
+        at = same.index(keyframe)
+        near = same[max(0, at - config.min_gap) : at + config.min_gap + 1]
+        before = [k for k in near if k < keyframe][-1:]
+        enough = config.min_likeness
+        if before and keyframe in self._index and before[0] in self._index:
+            enough = max(enough, config.min_of_neighbours * float(self._index.likeness(keyframe, before)[0]))
+        places = self._index.query(view.descriptor, known | set(near) | {keyframe}, 8 * config.candidates)
+        out: list[KeyframeId] = []
+        taken: set[int] = set()
+        for key, score in zip(places.keys.tolist(), places.score.tolist()):
+            old = KeyframeId(key)
+            if score < enough or len(out) == config.candidates:
+                break
+            if key in taken or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old)):
+                continue
+            out.append(old)
+            around = sparse_map.covisible(sparse_map.points_of(old))
+            taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > config.max_shared)].tolist())
+        return out
+
+    def _count(self, vote: Overlap) -> Finding | None:
+        """Whether this vote and earlier ones are enough."""
+        config = self._config
+        new, old = submap_of_keyframe(vote.new), submap_of_keyframe(vote.old)
+        key = (min(new, old), max(new, old))
+        votes = [v for v in self._votes.get(key, []) if self._recent(v, vote)]
+        votes.append(vote)
+        self._votes[key] = votes
+        same_map = self._map.island_of(new) == self._map.island_of(old)
+        if same_map and (vote.inliers < config.min_inliers_loop or not self._drift_explains(vote)):
+            return None
+        chosen = [v for v in votes if self._agree(v, vote)]
+        supporters = {v.new for v in chosen}
+        against = {v.new for v in votes} - supporters
+        if len(supporters) < config.votes + config.against * len(against):
+            return None
+        if not same_map and any(self._has_twin(v) for v in chosen[-config.votes :]):
+            self.refused += 1
+            return None
+        self._votes[key] = []
+        islands = (self._map.island_of(new), self._map.island_of(old))
+        older = self.eldest(islands)
+        newer = islands[1] if older == islands[0] else islands[0]
+        best = max(chosen, key=lambda v: (v.inliers, v.new))
+        X = self._motion(best)  # island of old from island of new
+        if older != islands[1]:
+            X = se3.inverse(X)
+        return Finding(newer, older, X, tuple(chosen))
+
+    def _recent(self, vote: Overlap, newest: Overlap) -> bool:
+        if vote.new not in self._map or vote.old not in self._map:
+            return False
+        if submap_of_keyframe(vote.new) != submap_of_keyframe(newest.new):
+            return True
+        same = self._map.submaps[submap_of_keyframe(vote.new)]
+        return abs(same.index(vote.new) - same.index(newest.new)) <= self._config.memory
+
+    def _motion(self, vote: Overlap) -> F64:
+        """How the island of the new keyframe would have to lie in that of the old: T_old_new by this vote."""
+        T_w_old, T_w_new = self._map.world_pose(vote.old), self._map.world_pose(vote.new)
+        assert T_w_old is not None and T_w_new is not None
+        return se3.orthonormalise(T_w_old @ vote.T_old_new @ se3.inverse(T_w_new))
+
+    def _agree(self, a: Overlap, b: Overlap) -> bool:
+        """Whether two votes say the same of how two maps lie, as far as drift between them allows."""
+        config = self._config
+        Xa, Xb = self._motion(a), self._motion(b)
+        if submap_of_keyframe(a.new) != submap_of_keyframe(b.new):
+            Xa = se3.inverse(Xa)
+        at_a, at_b = self._map.world_pose(a.new), self._map.world_pose(b.new)
+        assert at_a is not None and at_b is not None
+        spot = at_b[:3, 3]
+        apart = float(np.linalg.norm(se3.transform(Xa, spot[None])[0] - se3.transform(Xb, spot[None])[0]))
+        turned = float(np.linalg.norm(se3.so3_log(Xa[:3, :3].T @ Xb[:3, :3])))
+        way = float(np.linalg.norm(at_a[:3, 3] - spot)) if submap_of_keyframe(a.new) == submap_of_keyframe(b.new) else 0
+        limit = config.agree_m + config.agree_depth * max(a.depth_m, b.depth_m) + config.agree_path * way
+        return apart <= limit and turned <= config.agree_rad
+
+    def _drift_explains(self, vote: Overlap) -> bool:
+        """Whether a loop's correction is what flying that far may have added up to."""
+        config = self._config
+        X = self._motion(vote)
+        pose = self._map.world_pose(vote.new)
+        assert pose is not None
+        moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
+        turned = float(np.linalg.norm(se3.so3_log(X[:3, :3])))
+        way = self._way_m(vote.old, vote.new)
+        limit_m = config.drift_m + config.drift_path * way
+        explained = moved <= limit_m and turned <= config.drift_rad + config.drift_rad_m * way
+        self.refused += not explained
+        return explained
+
+    def _way_m(self, a: KeyframeId, b: KeyframeId) -> float:
+        """Length of the way flown between two keyframes of one map."""
+        total = 0.0
+        same = submap_of_keyframe(a) == submap_of_keyframe(b)
+        for submap in sorted({submap_of_keyframe(a), submap_of_keyframe(b)}):
+            keyframes = self._map.submaps[submap]
+            if same:
+                keyframes = [k for k in keyframes if min(a, b) <= k <= max(a, b)]
+            rows = [self._map.rows[k] for k in keyframes]
+            places = self._map.keyframes.T_w_k[rows, :3, 3]
+            total += float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        return total
+
+    def _has_twin(self, vote: Overlap) -> bool:
+        """Whether one of the two maps shows the same place somewhere else too: then nobody knows which of them it is."""
+        return any(self._twin_of(k) for k in (vote.old, vote.new))
+
+    def _twin_of(self, keyframe: KeyframeId) -> bool:
+        sparse_map, config = self._map, self._config
+        T = sparse_map.world_pose(keyframe)
+        assert T is not None
+        view = view_of(sparse_map, keyframe)
+        island = sparse_map.island_of(submap_of_keyframe(keyframe))
+        looked = 0
+        for key in self._index.query(view.descriptor, {keyframe}, 12 * config.candidates).keys.tolist():
+            other = KeyframeId(key)
+            T_other = sparse_map.world_pose(other)
+            if sparse_map.island_of(submap_of_keyframe(other)) != island or T_other is None:
+                continue
+            way = self._way_m(other, keyframe)
+            limit = config.twin_m + config.drift_path * way
+            if float(np.linalg.norm(T_other[:3, 3] - T[:3, 3])) <= limit and (T_other[:3, 2] @ T[:3, 2]) > 0.5:
+                continue  # the same place seen from near by
+            looked += 1
+            if looked > config.candidates:
+                return False
+            overlap = find_overlap(sparse_map, keyframe, other, config)
+            if overlap is None:
+                continue
+            X = self._motion(overlap)
+            if float(np.linalg.norm(se3.transform(X, T[None, :3, 3])[0] - T[:3, 3])) > limit:
+                return True
+        return False

@@ -1,0 +1,189 @@
+"""Proves that a keyframe looks at what older keyframes saw: by the points that both see, and by where they lie.
+
+Guided matching, absolute pose by RANSAC, then the neighbours' points, as in ORB-SLAM2 section III-E; what looks alike
+must also fill the image, stand in several depths, and be found where it is foreseen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.covisibility import covisible_keyframes
+from kiteline_basestation.refind import foresee
+from kiteline_core import matching, pnp, se3
+from kiteline_core.ids import KeyframeId, agent_of_keyframe
+from kiteline_core.map_tables import BIRTH
+from kiteline_core.pose_kernels import optimise_pose
+from kiteline_core.sparse_map import SparseMap
+
+Bools = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a keyframe sees, one row an observation.
+
+    slots, points: (n,) observations and roots. uv: (n,2) px. disparity: (n,) px, -1 none. octave, angle: (n,).
+    descriptor: (n,32). xyz: (n,3) m in w. known: (n,) whether xyz means something.
+    """
+
+    slots: I32
+    points: I32
+    uv: F64
+    disparity: F64
+    octave: U8
+    angle: U8
+    descriptor: U8
+    xyz: F64
+    known: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """A keyframe `new` that proved to see what `old` saw. T_old_new: (4,4) m. inliers: points that agree.
+
+    mine, theirs: (k,) slots of points of the new and of the old that are one. depth_m: median depth of them.
+    """
+
+    new: KeyframeId
+    old: KeyframeId
+    T_old_new: F64
+    inliers: int
+    mine: I32
+    theirs: I32
+    depth_m: float
+
+
+def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
+    """All that a keyframe sees; what was born elsewhere is described by its birth, turned as the keyframe sees it."""
+    table = sparse_map.keypoints
+    row = sparse_map.rows[keyframe]
+    slots = sparse_map.observed(keyframe)
+    points = table.root[slots]
+    from_birth = np.where(table.kind[slots] == BIRTH, slots, points)
+    T = sparse_map.keyframes.T_w_k
+    turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[from_birth], :3, :3])
+    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    angle = (table.angle[from_birth].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
+    xyz, known = sparse_map.positions(points)
+    bf = sparse_map.keyframes.camera[row, 4]
+    measured = np.where((table.inv_depth[slots] > 0) & (bf > 0), bf * table.inv_depth[slots].astype(np.float64), -1.0)
+    return View(
+        slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle.astype(np.uint8),
+        table.descriptor[from_birth], xyz, known,
+    )  # fmt: skip
+
+
+def find_overlap(sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig) -> Overlap | None:
+    """Whether `new` sees what `old` and its neighbours saw, and how the two then lie; None without proof.
+
+    The poses of both are taken from their own maps; how these lie to each other is not used.
+    """
+    mine, theirs = view_of(sparse_map, new), view_of(sparse_map, old)
+    pairs = matching.match(mine.descriptor, mine.angle, theirs.descriptor, theirs.angle, config.match)
+    a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
+    if len(a) < config.min_inliers:
+        return None
+    camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
+    observed = np.column_stack([mine.uv, mine.disparity])
+    rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
+    seed = int(new) ^ (int(old) << 1)
+    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, seed, config.ransac)
+    if fit is None or fit.inliers < config.min_inliers:
+        return None
+    found = _with_neighbours(sparse_map, new, old, mine, observed, camera, fit.T_c_m, config)
+    if found is None:
+        return None
+    T_c_w, which, points, share = found
+    if len(which) < config.min_inliers_all or share < config.min_share:
+        return None
+    if not spread_out(sparse_map, new, mine.uv[which], config):
+        return None
+    T_old_new = se3.orthonormalise(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[old]]) @ se3.inverse(T_c_w))
+    xyz, _ = sparse_map.positions(points)
+    depth = se3.transform(T_c_w, xyz)[:, 2]
+    return Overlap(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
+
+
+def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: LoopConfig) -> bool:
+    """Whether pixels (n,2) lie in enough parts of the image: a poster that hangs twice fills only one."""
+    camera = sparse_map.cameras[agent_of_keyframe(keyframe)]
+    column = np.clip(uv[:, 0] * (config.columns / camera.width), 0, config.columns - 1).astype(np.int64)
+    row = np.clip(uv[:, 1] * (config.rows / camera.height), 0, config.rows - 1).astype(np.int64)
+    filled = np.bincount(row * config.columns + column, minlength=config.rows * config.columns)
+    return int(np.count_nonzero(filled >= config.cell_points)) >= config.min_cells
+
+
+def _with_neighbours(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, observed: F64, camera: F64, T_c_w: F64,
+    config: LoopConfig,
+) -> tuple[F64, I32, I32, float] | None:  # fmt: skip
+    """Look for all that the old keyframe and its neighbours saw, twice, the second time closer.
+
+    Returns the pose, rows of `mine` and points (k,) that agree, and the share of what should be seen that is.
+    """
+    around = [old, *covisible_keyframes(sparse_map, old, 1)[: config.neighbours]]
+    points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in around]))
+    _, known = sparse_map.positions(points)
+    points = points[known]
+    size = sparse_map.cameras[agent_of_keyframe(new)]
+    T = T_c_w
+    for radius in (config.radius_px, 0.5 * config.radius_px):
+        seen, uv, octave, _, _ = foresee(sparse_map, points, new, se3.inverse(T))
+        if len(seen) < config.min_inliers:
+            return None
+        near = matching.match_near(
+            uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, sparse_map.keypoints.descriptor[seen],
+            mine.uv, mine.octave, mine.descriptor, (size.width, size.height), config.octave_gap, config.match,
+        )  # fmt: skip
+        if len(near.a) < config.min_inliers:
+            return None
+        a, b = near.b, seen[near.a]
+        xyz, _ = sparse_map.positions(b)
+        inlier = np.ones(len(a), np.bool_)
+        T = T.copy()
+        sigma = config.ransac.sigma_px * np.ldexp(1.0, mine.octave[a].astype(np.int32))
+        optimise_pose(
+            T, xyz, _depth_rays(sparse_map, b, xyz, config), np.ascontiguousarray(observed[a]), sigma, camera, T.copy(),
+            np.zeros(6), 3, 5, config.ransac.chi2, inlier, np.zeros((6, 6)),
+        )  # fmt: skip
+        if not np.isfinite(T).all():
+            return None
+    # Of what the new keyframe measured with depth inside the old views, how much is one with what they saw?
+    first, unique = np.unique(a[inlier], return_index=True)
+    share = len(first) / max(1, min(len(seen), _inside(sparse_map, mine, T, new, around)))
+    return T, first.astype(np.int32), np.asarray(b[inlier][unique]), share
+
+
+def _inside(sparse_map: SparseMap, mine: View, T_c_w: F64, new: KeyframeId, around: list[KeyframeId]) -> int:
+    """How many points of the new keyframe should lie inside the image of one of the old keyframes."""
+    row = sparse_map.rows[new]
+    local = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[row]), mine.xyz)
+    xyz = se3.transform(se3.inverse(T_c_w), local)[mine.known]
+    inside = np.zeros(len(xyz), np.bool_)
+    for keyframe in around:
+        other = sparse_map.rows[keyframe]
+        fx, fy, cx, cy, _ = sparse_map.keyframes.camera[other]
+        there = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[other]), xyz)
+        z = np.maximum(there[:, 2], 1e-3)
+        u, v = fx * there[:, 0] / z + cx, fy * there[:, 1] / z + cy
+        size = sparse_map.cameras[agent_of_keyframe(keyframe)]
+        inside |= (there[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < size.width) & (v < size.height)
+    return int(np.count_nonzero(inside))
+
+
+def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig) -> F64:
+    """One deviation (n,3) m of points along the rays on which they hang."""
+    rows = sparse_map.keypoints.row[points]
+    pose = sparse_map.keyframes.T_w_k[rows]
+    ray = xyz - pose[:, :3, 3]
+    depth = np.maximum(np.einsum("ni,ni->n", pose[:, :3, 2], ray), 1e-3)
+    bf = np.maximum(sparse_map.keyframes.camera[rows, 4], 1.0)
+    return np.ascontiguousarray(ray * (config.sigma_disparity_px * depth / bf)[:, None])
