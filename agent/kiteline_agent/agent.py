@@ -122,7 +122,7 @@ class Agent:
         self._full_config = config  # before the governor saves on it
         self._governor = Governor(config.governor)
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
-        self._motion_depth = DepthFromMotion(self.map, config)
+        self._motion_depth = DepthFromMotion(self.map, config, self.work)
         one_eye = rig.right is None and not rig.has_depth
         self._mono = MonoStart(self._camera, config) if one_eye else None
         self._recovery = Recovery(self.map, self._tracker, config, words)
@@ -310,6 +310,7 @@ class Agent:
         if self._mono is not None:
             if self._last_t_ns is None:
                 self._T_m_c = self._first_pose(imu)  # the camera moves from here on
+            self.work.searches += 1
             opening = self._mono.step(view, t_ns)
             if opening is None:
                 return False

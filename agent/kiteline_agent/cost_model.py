@@ -22,6 +22,7 @@ class Work:
     detected_px: int = 0
     births: int = 0
     sightings: int = 0
+    bearings: int = 0
     searches: int = 0
 
     def clear(self) -> None:
@@ -45,6 +46,7 @@ PRICES_NS: dict[str, float] = {
     "detected_px": 7,  # a pixel of the image searched for corners
     "births": 24_000,  # row search, descriptor, template, code
     "sightings": 1_500,  # code
+    "bearings": 6_000,  # a segment searched for a point without depth
     "searches": 5_000_000,  # a look for a lost place
 }
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.cost_model import Work
 from kiteline_agent.local_map import Candidates, LocalMap
 from kiteline_agent.tracker import Track, View
 from kiteline_core import alignment_kernels
@@ -26,9 +27,10 @@ _MARGIN_PX = 8.0
 class DepthFromMotion:
     """Searches the bearings of a local map in every tracked frame."""
 
-    def __init__(self, local_map: LocalMap, config: AgentConfig) -> None:
+    def __init__(self, local_map: LocalMap, config: AgentConfig, work: Work) -> None:
         self._map = local_map
         self._config = config
+        self._work = work
 
     def update(self, view: View, track: Track) -> int:
         """Look for bearings in a frame whose pose is known. Returns how many became points of the map."""
@@ -43,6 +45,7 @@ class DepthFromMotion:
         chosen = self._choose(seeds, view.first)
         if len(chosen) == 0:
             return 0
+        self._work.bearings += len(chosen)
         rows, warp = seeds.rows[chosen], seeds.warp[chosen]
         bearing, rho, sigma = self._state(rows)
         # The point is (turned + moved * rho) / rho in the camera: pixels for any inverse depth.

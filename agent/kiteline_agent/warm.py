@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent, Identity, StepInput
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_core.epipolar_kernels import search_segments
+from kiteline_core.features import build_pyramid
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
 from kiteline_core.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.se3 import from_rt
+from kiteline_core.two_view import TwoViewConfig, two_view
 
 
 def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> None:
@@ -35,3 +40,16 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
     places = PlaceIndex(words)  # forgets, which so short a flight does not
     places.add(0, pixels[:320].reshape(10, 32))
     places.remove(0)
+    _warm_one_eye(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
+
+
+def _warm_one_eye(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
+    """The start from two views, on a cloud of points (3,n) drawn from 0 to 1, and the search along a segment."""
+    x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
+    views = [np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2)]
+    two_view(*views, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
+    place = np.array([[160.0, 120.0]])
+    search_segments(
+        build_pyramid(image, 4), np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8), np.zeros(1, np.int64),
+        np.zeros(1, np.uint8), np.eye(2)[None], place, place + 5.0, 0.7, 40, 0.7, 0.9, place.copy(), np.zeros(1, np.int8),
+    )  # fmt: skip
