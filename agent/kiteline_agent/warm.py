@@ -46,10 +46,11 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
 def _warm_one_eye(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
     """The start from two views, on a cloud of points (3,n) drawn from 0 to 1, and the search along a segment."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
-    views = [np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2)]
-    two_view(*views, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
+    a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
+    two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
     place = np.array([[160.0, 120.0]])
     search_segments(
         build_pyramid(image, 4), np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8), np.zeros(1, np.int64),
-        np.zeros(1, np.uint8), np.eye(2)[None], place, place + 5.0, 0.7, 40, 0.7, 0.9, place.copy(), np.zeros(1, np.int8),
+        np.zeros(1, np.uint8), np.eye(2)[None], place, place + 5.0, 0.7, 40, 0.7, 0.9,
+        place.copy(), np.zeros(1, np.int8),
     )  # fmt: skip
