@@ -220,6 +220,7 @@ class Onboard:
             **self.flown,
             "skipped": dict(sorted(skipped.items())),
             "notes": list(self.source.report.notes),
+            "scale": "metric" if self.agent.metric else "own",
             "drain": {key: total[key] - self.flown[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
                 "cpu_ms_per_frame": self.cpu_ms,

@@ -422,6 +422,11 @@ class Agent:
         """The submap in which the agent tracks (the first one before it has begun)."""
         return submap_id(self._identity.agent, self._identity.boot, max(self._submap_number, 0))
 
+    @property
+    def metric(self) -> bool:
+        """Whether the active submap's lengths are metres; one eye alone measures in a unit of its own."""
+        return self._mono is None or self._channel.unit(self.submap) != 1.0
+
     # what the base sends
 
     def _take_corrections(self, records: list[Record]) -> None:
