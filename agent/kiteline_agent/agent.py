@@ -12,6 +12,7 @@ from kiteline_agent.camera import joined
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
+from kiteline_agent.glimpse import Glimpse
 from kiteline_agent.governor import LADDER, Governor, governed
 from kiteline_agent.inertial import GyroPreintegrator, level_rotation
 from kiteline_agent.keyframe_maker import KeyframeMaker
@@ -125,6 +126,7 @@ class Agent:
         self._motion_depth = DepthFromMotion(self.map, config, self.work)
         one_eye = rig.right is None and not rig.has_depth
         self._mono = MonoStart(self._camera, config) if one_eye else None
+        self._glimpse = Glimpse(self._camera)
         self._recovery = Recovery(self.map, self._tracker, config, words)
         self._events: list[str] = []
         self._frame_number = 0
@@ -174,6 +176,7 @@ class Agent:
         track = None
         if self._submap_number >= 0:
             track = self._tracker.track(view, se3.inverse(predicted), self._frame_number)
+            track = self._second_look(view, track)
         if track is not None and track.inliers >= self._config.pose.min_inliers:
             self._accept(track, turn, dt_s)
             # 4. Look for the depth of what was born without one.
@@ -190,6 +193,8 @@ class Agent:
             tracked = track is not None or self._begin_submap(view, frame.t_ns, imu)
         inliers = track.inliers if track is not None else 0
         self._lost = not tracked
+        if tracked:
+            self._glimpse.remember(view.left, se3.inverse(self._T_m_c))
         self._last_t_ns = frame.t_ns
         self._gyro.remember(imu)
         return self._estimate(frame.t_ns, inliers, tracked=tracked)
@@ -198,7 +203,7 @@ class Agent:
         """Whether the frame is tracked, at the effort on which the governor decides; its samples are kept anyhow."""
         if step_input.imu is not None:
             self._held_imu.append(step_input.imu)
-        decision = self._governor.frame(t_ns, step_input.cpu_ns)
+        decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=self._failures > 0)
         self._events.extend(decision.events)
         if decision.changed:
             points = self._config.align.points
@@ -219,8 +224,18 @@ class Agent:
         self.work.frames = 1
         share = 4 if first else 1
         self.work.rectified_px += frame.left.size // share if self._rectifier.bends else 0
-        self.work.pyramid_px += frame.left.size * (1 if right is None else 2)
+        self.work.pyramid_px += frame.left.size * (1 if right is None or not self._config.stereo.points else 2)
         return View(left, right, depth, first if self._rectifier.bends else 0)
+
+    def _second_look(self, view: View, track: Track) -> Track:
+        """The same track, or where it failed one that begins where the whole image seems to have gone."""
+        if track.inliers >= self._config.pose.min_inliers:
+            return track
+        guess = self._glimpse.guess(view.left)
+        if guess is None:
+            return track
+        again = self._tracker.track(view, guess, self._frame_number)
+        return again if again.inliers > track.inliers else track
 
     # motion model
 

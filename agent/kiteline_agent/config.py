@@ -148,15 +148,17 @@ class GovernorConfig:
 
     cpu_percent: float = 0.0  # of one core, over any window; 0: no budget
     window_s: float = 1.0  # s in which the budget has to hold
-    margin: float = 0.94  # share of the budget that is planned with: the rest is for what was not foreseen
-    tight: float = 0.92  # share of the budget above which effort falls
-    comfort: float = 0.82  # share below which the next better effort would have to stay, so that effort rises
-    down_s: float = 0.25  # s between two falls: a window needs time to show the first one
+    margin: float = 0.96  # share of the budget that is planned with: the rest is for what was not foreseen
+    tight: float = 0.94  # share of the budget above which effort falls
+    comfort: float = 0.86  # share below which the next better effort would have to stay, so that effort rises
+    grace_s: float = 2.0  # s at the start that are not booked: a map has to be begun
+    down_s: float = 0.25  # s between two falls: the expectations need time to show the first one
     up_s: float = 1.5  # s of comfort before a rise
-    burst: float = 0.3  # of a window that may be saved up by skipping
     max_skips: int = 6  # frames in a row; after more, a track is hard to find again
     doubt: float = 0.15  # how much dearer than expected a frame may be
-    learning: float = 0.15  # gain of the expectations
+    learning: float = 0.15  # gain of the expectations of frames
+    slow_learning: float = 0.03  # gain of the expected share of keyframes
+    first_share: float = 0.12  # of keyframes among frames, before it was seen
 
 
 @dataclass(frozen=True, slots=True)

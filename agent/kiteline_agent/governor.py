@@ -2,8 +2,8 @@
 
 A closed loop on the CPU time that is handed in with each frame. Two things are steered: an effort, one row of LADDER
 (how many points, how much stereo, how many keyframes), and, on the last row only, which frames are tracked at all.
-Before quality there is a soft target with hysteresis; before frames there is a bucket that fills at the allowed rate;
-and over both a sum over the last second that is never overdrawn but to keep the vehicle from being lost.
+Quality follows the expected load, with hysteresis; frames are let through evenly, as many as the budget bears; and
+over both stands a sum over the last second that is overdrawn only to keep the vehicle from being lost.
 """
 
 from __future__ import annotations
@@ -35,8 +35,12 @@ LADDER = (
     Effort(0.80, 0.70, 0.60, 1, 1, 1.2, 1.00, 0.60),
     Effort(0.60, 0.60, 0.50, 1, 1, 1.4, 0.75, 0.51),
     Effort(0.45, 0.45, 0.35, 0, 1, 1.5, 0.50, 0.41),
-    Effort(0.33, 0.40, 0.30, 0, 1, 1.6, 0.50, 0.37),
+    Effort(0.35, 0.40, 0.00, 0, 1, 1.6, 0.50, 0.33),
 )  # from the best to the cheapest
+
+
+_OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
+_LEAST = 0.2  # of the budget is for frames, whatever keyframes cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,42 +93,47 @@ class Governor:
         self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # a window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
-        self._bucket_ns = 0.0
+        self._turn = 0.0  # grows by the share of frames that can be tracked; at 1 it is a frame's turn
         self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
         self._keyframe_ns = 0.0  # what a keyframe adds
+        self._keyframe_share = config.first_share  # of the tracked frames
+        self._period_ns = 0.0  # between frames
+        self._first_t_ns = 0
         self._last_t_ns: int | None = None
         self._last_tracked = False
         self._last_keyframe = False
         self._calm_since_ns = 0
         self._level_since_ns = 0
         self._skipped = 0  # frames in a row
-        self._saving = False  # a keyframe waits until there is CPU time for it
-        self.window_peak_ns = 0
 
     @property
     def on(self) -> bool:
         """Whether there is a budget."""
         return self._budget_ns > 0.0
 
-    def frame(self, t_ns: int, last_cpu_ns: int) -> Decision:
-        """Decide about the frame at t_ns. last_cpu_ns: what the frame before cost, whether it was tracked or not."""
+    def frame(self, t_ns: int, last_cpu_ns: int, *, lost: bool = False) -> Decision:
+        """Decide about the frame at t_ns. last_cpu_ns: what the frame before cost, whether it was tracked or not.
+
+        lost: there is no track that a skipped frame could endanger.
+        """
         if not self.on:
             return Decision(True, 0, False, ())
         self._learn(last_cpu_ns)
         self._advance(t_ns)
-        before = self.level
+        before, pace = self.level, self._pace()
         events: list[str] = []
         self._steer(t_ns)
         track = self._affordable()
         if not track and self.level < len(LADDER) - 1:
-            self._set_level(t_ns, len(LADDER) - 1)  # quality before frames
-            track = self._affordable()
-        if not track and self._skipped >= self._config.max_skips:
+            self._set_level(t_ns, min(self.level + 2, len(LADDER) - 1))  # quality before frames
+            track = self.level < len(LADDER) - 1 or self._affordable()
+        track = self._its_turn() and track
+        if not track and not lost and self._skipped >= self._config.max_skips:
             track = True  # frames before tracking
             events.append("governor: over budget, or the track would be lost")
         if self.level != before:
-            share = self._window_ns / self._budget_ns
-            events.insert(0, f"governor: effort {before} -> {self.level} at {100.0 * share:.0f} % of the budget")
+            share = 100.0 * pace
+            events.insert(0, f"governor: effort {before} -> {self.level}, every frame took {share:.0f} % of the budget")
         if track:
             self._skipped = 0
         else:
@@ -135,87 +144,90 @@ class Governor:
 
     def may_keyframe(self, inliers: int, min_inliers: int) -> bool:
         """Whether there is CPU time for a keyframe now; always when the track hangs by a thread."""
-        if not self.on or inliers < 2 * min_inliers:
+        if not self.on or inliers < 3 * min_inliers:
             return True
-        need = self._keyframe_ns + self._frame_ns
-        if self._window_ns + need <= self._config.margin * self._budget_ns:
-            return True
-        self._saving = True
-        return False
+        return self._window_ns + self._keyframe_ns + self._frame_ns <= self._budget_ns
 
     def note_keyframe(self) -> None:
         """A keyframe was made of the frame that was asked about last."""
         self._last_keyframe = True
-        self._saving = False
 
     def _learn(self, cpu_ns: int) -> None:
         """Book what the last frame cost, and sharpen what frames and keyframes are expected to cost."""
         if self._last_t_ns is None:
             return
-        self._spent.append((self._last_t_ns, cpu_ns))
-        self._window_ns += cpu_ns
-        self._window_peak(cpu_ns)
+        if self._last_t_ns >= self._first_t_ns + self._config.grace_s * 1e9:
+            self._spent.append((self._last_t_ns, cpu_ns))
+            self._window_ns += cpu_ns
         if not self._last_tracked:
             return
         gain = self._config.learning
+        self._keyframe_share += (float(self._last_keyframe) - self._keyframe_share) * self._config.slow_learning
         if self._last_keyframe:
             extra = max(cpu_ns - self._frame_ns, 0.0) if self._frame_ns else 0.7 * cpu_ns
             self._keyframe_ns += (extra - self._keyframe_ns) * (gain if self._keyframe_ns else 1.0)
         elif self._frame_ns:
+            cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # a frame that was lost and found says little
             # Quicker to believe that frames are dear than that they are cheap.
             up = 2.0 * gain if cpu_ns > self._frame_ns else gain
             self._frame_ns += (cpu_ns - self._frame_ns) * min(up, 1.0)
         else:
             self._frame_ns = float(cpu_ns)
 
-    def _window_peak(self, cpu_ns: int) -> None:
-        self._bucket_ns -= cpu_ns
-        self.window_peak_ns = max(self.window_peak_ns, self._window_ns)
-
     def _advance(self, t_ns: int) -> None:
-        """Move the window and the bucket to a new time."""
+        """Move the window to a new time."""
         window_ns = round(self._config.window_s * 1e9)
         while self._spent and self._spent[0][0] <= t_ns - window_ns:
             self._window_ns -= self._spent.popleft()[1]
         if self._last_t_ns is None:
-            self._level_since_ns = self._calm_since_ns = t_ns
-            self._bucket_ns = self._burst_ns()
+            self._first_t_ns = self._level_since_ns = self._calm_since_ns = t_ns
             return
-        passed = (t_ns - self._last_t_ns) / window_ns
-        self._bucket_ns = min(self._bucket_ns + passed * self._config.margin * self._budget_ns, self._burst_ns())
-
-    def _burst_ns(self) -> float:
-        """How much may be saved up: a share of a window, and at least a keyframe with its frame."""
-        return max(self._config.burst * self._budget_ns, self._frame_ns + self._keyframe_ns)
+        gain = self._config.learning if self._period_ns else 1.0
+        self._period_ns += (t_ns - self._last_t_ns - self._period_ns) * gain
 
     def _affordable(self) -> bool:
-        """Whether the frame fits the window and, on the last row, the even pace of the bucket."""
-        cost = self._frame_ns * (1.0 + self._config.doubt)
-        if self._saving:
-            cost += self._keyframe_ns
-        if self._window_ns + cost > self._config.margin * self._budget_ns:
-            return False
-        if self.level < len(LADDER) - 1:
+        """Whether the last second leaves room for the frame."""
+        cost_ns = self._frame_ns * (1.0 + self._config.doubt)
+        return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
+
+    def _its_turn(self) -> bool:
+        """On the last row: whether the frame is one of those, evenly spread, that the budget lets through."""
+        pace = self._pace()
+        bearable = self._config.margin - self._keyframe_ns / self._budget_ns  # a keyframe may come at any time
+        if self.level < len(LADDER) - 1 or pace <= bearable:
+            self._turn = 0.0
             return True
-        return self._bucket_ns >= cost
+        self._turn += max(bearable, _LEAST) / pace
+        if self._turn < 1.0:
+            return False
+        self._turn -= 1.0
+        return True
 
     def _steer(self, t_ns: int) -> None:
-        """Hysteresis on the load of the last window: down at once, up only after a calm while and one row a time."""
+        """Hysteresis on the load: down at once, up only after a calm while and one row a time."""
         config = self._config
-        load = self._window_ns / self._budget_ns
-        settled = t_ns - self._level_since_ns
-        if load > config.tight and self.level < len(LADDER) - 1 and settled >= config.down_s * 1e9:
-            wish = load * 1.0
+        load = self._pace()
+        settled_ns = t_ns - self._level_since_ns
+        if load > config.tight and settled_ns >= config.down_s * 1e9:
             level = self.level
-            while level < len(LADDER) - 1 and wish > config.tight:
-                wish *= LADDER[level + 1].cost / LADDER[level].cost
+            while level < len(LADDER) - 1 and load > config.tight:
+                load *= LADDER[level + 1].cost / LADDER[level].cost
                 level += 1
-            self._set_level(t_ns, level)
+            if level != self.level:
+                self._set_level(t_ns, level)
+                return
         better = max(self.level - 1, 0)
         if load * LADDER[better].cost / LADDER[self.level].cost > config.comfort or self._skipped:
             self._calm_since_ns = t_ns
-        elif self.level > 0 and min(settled, t_ns - self._calm_since_ns) >= config.up_s * 1e9:
+        elif self.level > 0 and t_ns - self._calm_since_ns >= config.up_s * 1e9:
             self._set_level(t_ns, better)
+
+    def _pace(self) -> float:
+        """Share of the budget that tracking every frame at this effort takes."""
+        if not self._period_ns or not self._frame_ns:
+            return 0.0
+        a_frame_ns = self._frame_ns + self._keyframe_share * self._keyframe_ns
+        return a_frame_ns * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
 
     def _set_level(self, t_ns: int, level: int) -> None:
         self._frame_ns *= LADDER[level].cost / LADDER[self.level].cost

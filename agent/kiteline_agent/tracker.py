@@ -145,7 +145,7 @@ class Tracker:
     ) -> None:
         """Fill observed[:, 2] from the right image or from the depth image, where they agree to be measurable."""
         bf = self._map.camera.bf
-        if view.right is not None:
+        if view.right is not None and self._config.stereo.points:
             stereo = self._config.stereo
             disparity = bf / depth
             sure = self._map.sigma_rho.reshape(-1)[rows] * bf < _SURE * (1 << octave)
