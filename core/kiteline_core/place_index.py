@@ -87,10 +87,10 @@ class PlaceIndex:
         self._vocabulary = vocabulary
         n = len(vocabulary.weight)
         self._scratch = np.zeros(n)
-        self._first = np.full(n, -1, np.int32)
-        self._after, self._owner = np.empty(0, np.int32), np.empty(0, np.int32)
-        self._worth = np.empty(0, np.float32)
-        self._free = np.zeros(1, np.int32)
+        # A word's postings (which place has it, and how much) are a run: start, size, and room to grow.
+        self._start, self._size, self._room = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+        self._top = np.zeros(1, np.int32)
+        self._owner, self._worth = np.empty(0, np.int32), np.empty(0, np.float32)
         self._row: dict[int, int] = {}
         self._key = np.empty(0, np.int64)  # of each row; -1 unused
         self._entries: list[tuple[I32, F64]] = []
@@ -111,8 +111,6 @@ class PlaceIndex:
         """Remember a place by its descriptors (n,32); what it had before is replaced."""
         self.remove(key)
         word, value = self._vector(descriptors)
-        if self._free[0] < len(word):
-            self._grow(len(word))
         row = self._unused.pop() if self._unused else len(self._entries)
         if row == len(self._entries):
             self._entries.append((word, value))
@@ -120,9 +118,14 @@ class PlaceIndex:
                 self._key = np.concatenate([self._key, np.full(max(64, row), -1, np.int64)])
         self._entries[row] = (word, value)
         self._key[row], self._row[key] = key, row
-        kernels.insert(
-            word, value, len(word), row, self._free, self._first, self._after, self._owner, self._worth
-        )  # fmt: skip
+        done = 0
+        while True:
+            done = kernels.insert(
+                word, value, done, row, self._top, self._start, self._size, self._room, self._owner, self._worth
+            )
+            if done == len(word):
+                return
+            self._grow()
 
     def remove(self, key: int) -> None:
         """Forget a place; unknown keys are no error."""
@@ -130,7 +133,7 @@ class PlaceIndex:
         if row is None:
             return
         word, _ = self._entries[row]
-        kernels.remove(word, len(word), row, self._free, self._first, self._after, self._owner)
+        kernels.remove(word, row, self._start, self._size, self._owner, self._worth)
         self._entries[row] = (np.empty(0, np.int32), np.empty(0))
         self._key[row] = -1
         self._unused.append(row)
@@ -156,9 +159,7 @@ class PlaceIndex:
 
     def _scores(self, vector: tuple[I32, F64]) -> F64:
         total = np.zeros(len(self._entries))
-        kernels.score(
-            vector[0], vector[1], len(vector[0]), self._first, self._after, self._owner, self._worth, total
-        )  # fmt: skip
+        kernels.score(vector[0], vector[1], self._start, self._size, self._owner, self._worth, total)
         return total
 
     def _vector(self, descriptors: U8) -> tuple[I32, F64]:
@@ -167,15 +168,13 @@ class PlaceIndex:
         n = kernels.histogram(word, self._vocabulary.weight, self._scratch, out, value)
         return out[:n].copy(), value[:n].copy()
 
-    def _grow(self, needed: int) -> None:
-        old = len(self._after)
-        more = max(needed, old, 4096)
-        self._after = np.concatenate([self._after, np.full(more, -1, np.int32)])
-        self._owner = np.concatenate([self._owner, np.full(more, -1, np.int32)])
-        self._worth = np.concatenate([self._worth, np.zeros(more, np.float32)])
-        free = np.zeros(1 + old + more, np.int32)
-        held = int(self._free[0])
-        free[1 : 1 + held] = self._free[1 : 1 + held]
-        free[1 + held : 1 + held + more] = np.arange(old + more - 1, old - 1, -1, dtype=np.int32)
-        free[0] = held + more
-        self._free = free
+    def _grow(self) -> None:
+        wanted = np.where(self._size > 0, np.maximum(4, self._size + self._size // 2), 0)
+        self._room = np.minimum(self._room, wanted).astype(np.int32)
+        held, widest = int(self._room.sum()), int(self._room.max())
+        capacity = held + max(held // 2, 2 * widest) + 4096  # any run finds room at the top now
+        owner, worth = np.empty(capacity, np.int32), np.empty(capacity, np.float32)
+        kernels.move_runs(
+            self._top, self._start, self._size, self._room, self._owner, self._worth, owner, worth
+        )  # fmt: skip
+        self._owner, self._worth = owner, worth

@@ -58,48 +58,63 @@ def histogram(word: I32, weight: F32, scratch: F64, out_word: I32, out_value: F6
 
 
 @njit
-def insert(word: I32, value: F64, n: int, place: int, free: I32, first: I32, after: I32, owner: I32, worth: F32) -> int:
-    """Hang a place's n entries on their words' lists. free: (1 + capacity,) stack of unused postings, its height first.
+def insert(
+    word: I32, value: F64, done: int, place: int, top: I32, start: I32, size: I32, room: I32, owner: I32, worth: F32
+) -> int:  # fmt: skip
+    """Append a place's entries, from number `done` on, to their words' runs of postings.
 
-    first: (words,) head of each list, -1 none. after, owner, worth: (capacity,) of a posting. Returns how many hung.
+    start, size, room: (words,) of each word's run. owner, worth: (capacity,) of a posting. top: (1,) first posting that
+    no run holds, in and out. A run that is full moves to the top with half as much room again. Returns the number at
+    which it ended: less than all when there is no room at the top.
     """
-    for i in range(n):
-        if free[0] == 0:
-            return i
-        posting = free[free[0]]
-        free[0] -= 1
-        owner[posting] = place
-        worth[posting] = value[i]
-        after[posting] = first[word[i]]
-        first[word[i]] = posting
-    return n
+    for i in range(done, word.shape[0]):
+        w = word[i]
+        if size[w] == room[w]:
+            more = max(4, room[w] + room[w] // 2)
+            if top[0] + more > owner.shape[0]:
+                return i
+            for k in range(size[w]):
+                owner[top[0] + k] = owner[start[w] + k]
+                worth[top[0] + k] = worth[start[w] + k]
+            start[w], room[w] = top[0], more
+            top[0] += more
+        owner[start[w] + size[w]] = place
+        worth[start[w] + size[w]] = value[i]
+        size[w] += 1
+    return len(word)
 
 
 @njit
-def remove(word: I32, n: int, place: int, free: I32, first: I32, after: I32, owner: I32) -> None:
-    """Take a place's postings from the lists of the n words that it has."""
-    for i in range(n):
-        before, posting = -1, first[word[i]]
-        while posting >= 0 and owner[posting] != place:
-            before, posting = posting, after[posting]
-        if posting < 0:
-            continue
-        if before < 0:
-            first[word[i]] = after[posting]
-        else:
-            after[before] = after[posting]
-        free[0] += 1
-        free[free[0]] = posting
+def move_runs(top: I32, start: I32, size: I32, room: I32, owner: I32, worth: F32, owner2: I32, worth2: F32) -> None:
+    """Copy all runs to larger arrays, without the holes that moved runs left. room: (words,) of each from now on."""
+    top[0] = 0
+    for w in range(start.shape[0]):
+        for k in range(size[w]):
+            owner2[top[0] + k] = owner[start[w] + k]
+            worth2[top[0] + k] = worth[start[w] + k]
+        start[w] = top[0]
+        top[0] += room[w]
 
 
 @njit
-def score(word: I32, value: F64, n: int, first: I32, after: I32, owner: I32, worth: F32, total: F64) -> None:
-    """Likeness of each place to a vector of n entries: 1 - |a - b| / 2 in the L1 norm, which is the sum of minima.
+def remove(word: I32, place: int, start: I32, size: I32, owner: I32, worth: F32) -> None:
+    """Take a place's postings out of the runs of its words; the last of a run fills the hole."""
+    for i in range(word.shape[0]):
+        w = word[i]
+        for k in range(start[w], start[w] + size[w]):
+            if owner[k] == place:
+                size[w] -= 1
+                owner[k], worth[k] = owner[start[w] + size[w]], worth[start[w] + size[w]]
+                break
+
+
+@njit
+def score(word: I32, value: F64, start: I32, size: I32, owner: I32, worth: F32, total: F64) -> None:
+    """Likeness of each place to a vector: 1 - |a - b| / 2 in the L1 norm, which is the sum of minima.
 
     (D. Nister, H. Stewenius, "Scalable recognition with a vocabulary tree", 2006.) total: (places,) zeros in, out.
     """
-    for i in range(n):
-        posting = first[word[i]]
-        while posting >= 0:
-            total[owner[posting]] += min(value[i], float(worth[posting]))
-            posting = after[posting]
+    for i in range(word.shape[0]):
+        w = word[i]
+        for k in range(start[w], start[w] + size[w]):
+            total[owner[k]] += min(value[i], float(worth[k]))
