@@ -13,7 +13,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
 from kiteline_agent.glimpse import Glimpse
-from kiteline_agent.governor import LADDER, Governor, governed
+from kiteline_agent.governor import LADDER, Extra, Governor, governed
 from kiteline_agent.inertial import GyroPreintegrator, level_rotation
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
@@ -43,6 +43,7 @@ F64 = NDArray[np.float64]
 _SHARPEN_INFLATION = 6.0  # successive sightings share the template's error: six of them count as one
 _FAILURES_BEFORE_SUBMAP = 2  # tries, with texture in view, to find the old map before a new one opens
 _UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
+_THIN = 3  # times the fewest inliers: below it a keyframe cannot wait
 _MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
 
 
@@ -296,7 +297,8 @@ class Agent:
         why = keyframes.why_keyframe(what, self._config.keyframe)
         if why is None:
             return
-        if not self._governor.may_keyframe(track.inliers, self._config.pose.min_inliers):
+        thin = track.inliers < _THIN * self._config.pose.min_inliers
+        if not thin and not self._governor.may(Extra.KEYFRAME):
             self._events.append("governor: keyframe put off")
             return
         self._events.append(f"keyframe: {why}")
@@ -306,7 +308,7 @@ class Agent:
         sequence = 0 if parent == NO_KEYFRAME else self._sequence[self.submap] + 1
         self._sequence[self.submap] = sequence
         keyframe = keyframe_id(self.submap, sequence)
-        self._governor.note_keyframe()
+        self._governor.note(Extra.SUBMAP if track is None else Extra.KEYFRAME)
         if view.right is not None and self._rectifier.bends:
             self.work.rectified_px += view.left[view.first].size
         T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
@@ -320,6 +322,8 @@ class Agent:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
         first = self._submap_number < 0
         if not first and (self._failures < _FAILURES_BEFORE_SUBMAP or self._submaps == MAX_SUBMAPS):
+            return False
+        if not first and not self._governor.may(Extra.SUBMAP):
             return False
         opening = None
         if self._mono is not None:
@@ -386,6 +390,10 @@ class Agent:
     def _recover(self, view: View, t_ns: int) -> Track | None:
         """Look for a lost frame in all that is remembered."""
         if self._submap_number < 0:
+            return None
+        if not self._governor.may(Extra.SEARCH):
+            self._events.append("governor: search put off")
+            self._failures = max(self._failures, 1)
             return None
         self.work.searches += 1
         found = self._recovery.attempt(view, self._frame_number, self._reference)

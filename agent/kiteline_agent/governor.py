@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from enum import Enum
 
 from kiteline_agent.config import AgentConfig, GovernorConfig
 
@@ -39,6 +40,15 @@ LADDER = (
 )  # from the best to the cheapest
 
 
+class Extra(Enum):
+    """What makes a frame dear."""
+
+    KEYFRAME = "keyframe"
+    SEARCH = "search"  # for a lost place
+    SUBMAP = "submap"  # a first keyframe
+
+
+_GUESS = 3.0  # usual frames that something dear costs, before it was seen
 _OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
 _LEAST = 0.2  # of the budget is for frames, whatever keyframes cost
 
@@ -95,13 +105,13 @@ class Governor:
         self._window_ns = 0
         self._turn = 0.0  # grows by the share of frames that can be tracked; at 1 it is a frame's turn
         self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
-        self._keyframe_ns = 0.0  # what a keyframe adds
+        self._extra_ns = dict.fromkeys(Extra, 0.0)  # what each adds to a frame
         self._keyframe_share = config.first_share  # of the tracked frames
         self._period_ns = 0.0  # between frames
         self._first_t_ns = 0
         self._last_t_ns: int | None = None
         self._last_tracked = False
-        self._last_keyframe = False
+        self._last_extra: Extra | None = None  # of the last frame
         self._calm_since_ns = 0
         self._level_since_ns = 0
         self._skipped = 0  # frames in a row
@@ -139,18 +149,20 @@ class Governor:
         else:
             self._skipped += 1
             events.append("governor: frame skipped")
-        self._last_t_ns, self._last_tracked, self._last_keyframe = t_ns, track, False
+        self._last_t_ns, self._last_tracked, self._last_extra = t_ns, track, None
         return Decision(track, self.level, self.level != before, tuple(events))
 
-    def may_keyframe(self, inliers: int, min_inliers: int) -> bool:
-        """Whether there is CPU time for a keyframe now; always when the track hangs by a thread."""
-        if not self.on or inliers < 3 * min_inliers:
-            return True
-        return self._window_ns + self._keyframe_ns + self._frame_ns <= self._budget_ns
+    def may(self, extra: Extra) -> bool:
+        """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it."""
+        need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
+        if self.on and self._window_ns + need_ns > self._budget_ns and self._window_ns > _LEAST * self._budget_ns:
+            return False
+        self.note(extra)
+        return True
 
-    def note_keyframe(self) -> None:
-        """A keyframe was made of the frame that was asked about last."""
-        self._last_keyframe = True
+    def note(self, extra: Extra) -> None:
+        """Something dear is done in this frame, whether there is CPU time for it or not."""
+        self._last_extra = extra
 
     def _learn(self, cpu_ns: int) -> None:
         """Book what the last frame cost, and sharpen what frames and keyframes are expected to cost."""
@@ -162,10 +174,12 @@ class Governor:
         if not self._last_tracked:
             return
         gain = self._config.learning
-        self._keyframe_share += (float(self._last_keyframe) - self._keyframe_share) * self._config.slow_learning
-        if self._last_keyframe:
-            extra = max(cpu_ns - self._frame_ns, 0.0) if self._frame_ns else 0.7 * cpu_ns
-            self._keyframe_ns += (extra - self._keyframe_ns) * (gain if self._keyframe_ns else 1.0)
+        made = float(self._last_extra is Extra.KEYFRAME)
+        self._keyframe_share += (made - self._keyframe_share) * self._config.slow_learning
+        if self._last_extra is not None:
+            known_ns = self._extra_ns[self._last_extra]
+            more_ns = max(cpu_ns - self._frame_ns, 0.0)
+            self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * gain if known_ns else 1.0)
         elif self._frame_ns:
             cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # a frame that was lost and found says little
             # Quicker to believe that frames are dear than that they are cheap.
@@ -193,7 +207,8 @@ class Governor:
     def _its_turn(self) -> bool:
         """On the last row: whether the frame is one of those, evenly spread, that the budget lets through."""
         pace = self._pace()
-        bearable = self._config.margin - self._keyframe_ns / self._budget_ns  # a keyframe may come at any time
+        # A keyframe may come at any time.
+        bearable = self._config.margin - self._extra_ns[Extra.KEYFRAME] / self._budget_ns
         if self.level < len(LADDER) - 1 or pace <= bearable:
             self._turn = 0.0
             return True
@@ -226,11 +241,11 @@ class Governor:
         """Share of the budget that tracking every frame at this effort takes."""
         if not self._period_ns or not self._frame_ns:
             return 0.0
-        a_frame_ns = self._frame_ns + self._keyframe_share * self._keyframe_ns
+        a_frame_ns = self._frame_ns + self._keyframe_share * self._extra_ns[Extra.KEYFRAME]
         return a_frame_ns * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
 
     def _set_level(self, t_ns: int, level: int) -> None:
         self._frame_ns *= LADDER[level].cost / LADDER[self.level].cost
-        self._keyframe_ns *= LADDER[level].corners / LADDER[self.level].corners
+        self._extra_ns[Extra.KEYFRAME] *= LADDER[level].corners / LADDER[self.level].corners
         self.level = level
         self._level_since_ns = self._calm_since_ns = t_ns
