@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
 from kiteline_agent.glimpse import Glimpse
 from kiteline_agent.governor import LADDER, Extra, Governor, governed
-from kiteline_agent.inertial import GyroPreintegrator, level_rotation
+from kiteline_agent.inertial import level_rotation
+from kiteline_agent.inertial_tracker import InertialTracker
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.mono_start import MonoStart, Opening
@@ -23,9 +24,10 @@ from kiteline_agent.right_eye import RightEye, rectified
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_agent.units import UnitChannel, longer
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Camera, Culled, Depths, Found, Live, Placement, Pose, Record, Removed, Tile
+from kiteline_codec.schema import Camera, Culled, Depths, Found, Level, Live, Placement, Pose, Record, Removed, Tile
 from kiteline_core import se3
 from kiteline_core.cameras import CameraRig, Rectifier
+from kiteline_core.fixed_lag import VisualPoints
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import (
     MAX_SUBMAPS,
@@ -42,6 +44,8 @@ F64 = NDArray[np.float64]
 
 _SHARPEN_INFLATION = 6.0  # successive sightings share the template's error: six of them count as one
 _FAILURES_BEFORE_SUBMAP = 2  # tries, with texture in view, to find the old map before a new one opens
+_SCALE_EVERY = 10  # frames between two looks at the scale of one eye
+_SCALE_SIGMA = 0.02  # relative deviation at which a scale is believed
 _UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
 _THIN = 3  # times the fewest inliers: below it a keyframe cannot wait
 _MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
@@ -69,9 +73,10 @@ class StepInput:
 class Estimate:
     """What is known of the vehicle at one frame.
 
-    tracked: T_m_b is measured from at least 15 image inliers. T_m_b: (4,4) body in the submap frame, or None. T_o_b:
-    (4,4) body in the odometry frame, always continuous. keyframe, T_k_c: the same pose relative to a keyframe's camera.
-    T_w_b: (4,4) in the world, once the base has placed the submap. quality: -1 lost, 1..100.
+    tracked: T_m_b is measured from at least 15 image inliers, or (bridged) carried by the IMU for a short while.
+    T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
+    keyframe, T_k_c: the same pose relative to a keyframe's camera. T_w_b: (4,4) in the world, once the base has placed
+    the submap. quality: -1 lost, 1..100.
     """
 
     t_ns: int
@@ -115,8 +120,12 @@ class Agent:
         self._rectifier = Rectifier(rig)
         self._camera = self._rectifier.camera
         self._T_c_b = se3.inverse(self._camera.T_b_c)
-        self._has_imu = imu is not None
-        self._gyro = GyroPreintegrator()
+        one_eye = rig.right is None and not rig.has_depth
+        self._inertial = (
+            None if imu is None else InertialTracker(self._camera, imu, config.inertial, metric=not one_eye)
+        )
+        self._bridged = False  # the last pose is the IMU's alone
+        self._levelled = False  # whether the first submap's uprightness has been judged
         self.map = LocalMap(self._camera, config.local_map, config.depth_filter)
         self.work = Work()  # of the last step
         self._tracker = Tracker(self.map, config, self.work)
@@ -125,7 +134,6 @@ class Agent:
         self._governor = Governor(config.governor)
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
         self._motion_depth = DepthFromMotion(self.map, config, self.work)
-        one_eye = rig.right is None and not rig.has_depth
         self._mono = MonoStart(self._camera, config) if one_eye else None
         self._glimpse = Glimpse(self._camera)
         self._recovery = Recovery(self.map, self._tracker, config, words)
@@ -169,9 +177,9 @@ class Agent:
     def _process(self, frame: Frame, imu: ImuBatch | None) -> Estimate:
         # 1. Rectify and build pyramids.
         view = self._view(frame)
-        # 2. Predict from the gyro or from the last motion.
-        turn, dt_s = self._turn_since_last(frame.t_ns, imu)
-        predicted = self._predict(turn, dt_s)
+        # 2. Predict from the IMU or from the last motion.
+        dt_s = 0.0 if self._last_t_ns is None else (frame.t_ns - self._last_t_ns) * 1e-9
+        predicted = self._predict(frame.t_ns, imu, dt_s)
         # 3. Track against the local map, or begin a map.
         self._frame_number += 1
         track = None
@@ -179,7 +187,8 @@ class Agent:
             track = self._tracker.track(view, se3.inverse(predicted), self._frame_number)
             track = self._second_look(view, track)
         if track is not None and track.inliers >= self._config.pose.min_inliers:
-            self._accept(track, turn, dt_s)
+            track = self._fuse(track, frame.t_ns)
+            self._accept(track, dt_s)
             # 4. Look for the depth of what was born without one.
             self._motion_depth.update(view, track)
             # 5. Make a keyframe where the policy asks for one.
@@ -187,17 +196,20 @@ class Agent:
             self._join_if_found(view, track, frame.t_ns)
             tracked = True
         else:
-            # 5. Lost: search the old map; with texture in view and two failed tries, open a new submap.
-            self._T_m_c = predicted
-            self._refresh_relative()
+            # 5. Lost: the IMU carries on for a while; search the old map; with texture in view and two failed tries,
+            # open a new submap.
+            self._bridged = self._coast(predicted, frame.t_ns)
             track = self._recover(view, frame.t_ns)
-            tracked = track is not None or self._begin_submap(view, frame.t_ns, imu)
+            found = track is not None or self._begin_submap(view, frame.t_ns, imu)
+            if found:
+                self._bridged = False
+                self._restart_inertial(frame.t_ns)
+            tracked = found or self._bridged
         inliers = track.inliers if track is not None else 0
-        self._lost = not tracked
-        if tracked:
+        self._lost = not tracked or self._bridged
+        if not self._lost:
             self._glimpse.remember(view.left, se3.inverse(self._T_m_c))
         self._last_t_ns = frame.t_ns
-        self._gyro.remember(imu)
         return self._estimate(frame.t_ns, inliers, tracked=tracked)
 
     def _governed(self, t_ns: int, step_input: StepInput) -> bool:
@@ -240,27 +252,68 @@ class Agent:
 
     # motion model
 
-    def _turn_since_last(self, t_ns: int, imu: ImuBatch | None) -> tuple[F64 | None, float]:
-        """R_b0_b1 by the gyro since the last frame (None without one), and the time passed in s."""
-        if self._last_t_ns is None:
-            return None, 0.0
-        turn = self._gyro.turn(imu, self._last_t_ns, t_ns) if self._has_imu else None
-        return turn, (t_ns - self._last_t_ns) * 1e-9
+    def _predict(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
+        """T_m_c of this frame: by the IMU where there is one that knows, else by constant velocity."""
+        known = None if self._inertial is None else self._inertial.predict(imu, t_ns)
+        if known is not None:
+            return se3.orthonormalise(known.T_m_b @ self._camera.T_b_c)
+        step = self._step_T
+        if self._step_s > 0.0 and abs(dt_s / self._step_s - 1.0) > _UNEVEN:  # frames are missing in between
+            step = se3.exp(dt_s / self._step_s * se3.log(step))
+        return se3.orthonormalise(self._T_m_c @ step)
 
-    def _predict(self, turn_R_b0_b1: F64 | None, dt_s: float) -> F64:
-        """T_m_c of this frame from the last pose: constant velocity, turned by the gyro where there is one."""
-        if turn_R_b0_b1 is None:
-            step = self._step_T
-            if self._step_s > 0.0 and abs(dt_s / self._step_s - 1.0) > _UNEVEN:  # frames are missing in between
-                step = se3.exp(dt_s / self._step_s * se3.log(step))
-            return se3.orthonormalise(self._T_m_c @ step)
-        R_b_c = self._camera.T_b_c[:3, :3]
-        T = self._T_m_c.copy()
-        T[:3, :3] = T[:3, :3] @ (R_b_c.T @ turn_R_b0_b1 @ R_b_c)
-        T[:3, 3] += self._velocity_m * dt_s
-        return se3.orthonormalise(T)
+    def _fuse(self, track: Track, t_ns: int) -> Track:
+        """The track with the pose that images and IMU together give."""
+        self._bridged = False
+        if self._inertial is None:
+            return track
+        seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
+        state = self._inertial.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen)
+        if state is None:
+            self._find_scale()
+            return track
+        self._say_level()
+        return replace(track, T_c_m=se3.inverse(state.T_m_b @ self._camera.T_b_c))
 
-    def _accept(self, track: Track, turn_R_b0_b1: F64 | None, dt_s: float) -> None:
+    def _find_scale(self) -> None:
+        """One eye with an IMU: once acceleration tells how long the map's unit is, make it a metre."""
+        if self._inertial is None or self._inertial.metric or self._frame_number % _SCALE_EVERY:
+            return
+        scale = self._inertial.metric_scale()
+        if scale is None or scale[1] > _SCALE_SIGMA * scale[0]:
+            return
+        self.rescale(scale[0])
+        self._inertial.rescale(scale[0])
+        self._events.append(f"mono: metric, one unit was {scale[0]:.3g} m")
+
+    def _coast(self, predicted: F64, t_ns: int) -> bool:
+        """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
+        state = None if self._inertial is None else self._inertial.coast(t_ns)
+        self._T_m_c = predicted if state is None else state.T_m_b @ self._camera.T_b_c
+        self._refresh_relative()
+        blind_s = 0.0 if self._inertial is None else self._inertial.blind_s
+        return state is not None and blind_s <= self._config.inertial.trusted_blind_s
+
+    def _restart_inertial(self, t_ns: int) -> None:
+        """The pose was found again, or a new map began: the inertial state moves there."""
+        if self._inertial is not None:
+            self._inertial.begin_map(t_ns, self._T_m_c @ self._T_c_b)
+
+    def _say_level(self) -> None:
+        """Once the IMU knows which way is up, tell the base if the first submap lies askew: it began in motion."""
+        if self._levelled or self._inertial is None or self._inertial.metric is False:
+            return
+        self._levelled = True
+        R_l_m = self._inertial.level_R
+        askew_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
+        if self._submaps != 1 or askew_rad < self._config.inertial.askew_rad:
+            return
+        # Turned about where the vehicle is now, so that its place in the world does not jump.
+        here = (self._T_m_c @ self._T_c_b)[:3, 3]
+        self._channel.put(Level(self.submap, se3.from_rt(R_l_m, here - R_l_m @ here)))
+        self._events.append(f"submap lies {np.degrees(askew_rad):.1f} degrees askew")
+
+    def _accept(self, track: Track, dt_s: float) -> None:
         """Take over a measured pose and what it says of the points and of the motion."""
         before = self._T_m_c
         self._T_m_c = se3.inverse(track.T_c_m)
@@ -268,9 +321,6 @@ class Agent:
         self._step_s = dt_s
         if dt_s > 0.0:
             self._velocity_m = (self._T_m_c[:3, 3] - before[:3, 3]) / dt_s
-            if turn_R_b0_b1 is not None and not self._lost:
-                R_b_c = self._camera.T_b_c[:3, :3]
-                self._gyro.correct(R_b_c @ self._step_T[:3, :3] @ R_b_c.T, turn_R_b0_b1, dt_s)
         self._failures = 0
         if self._mono is not None:
             self._mono.tracked(track.depth_m[track.inlier])
@@ -312,11 +362,10 @@ class Agent:
         if view.right is not None and self._rectifier.bends:
             self.work.rectified_px += view.left[view.first].size
         T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
-        # The keyframe's pose is its code's value: move with it by the rounding, and let odometry absorb it.
-        self._reference, self._T_k_c = keyframe, np.eye(4)
+        # The keyframe lies where its code says, a rounding away from the camera.
+        self._reference, self._T_k_c = keyframe, se3.inverse(T_m_k) @ self._T_m_c
         self._keyframe_t_ns, self._keyframe_frame = t_ns, self._frame_number
         self._recovery.remember(keyframe)
-        self._move_map_pose(T_m_k)
 
     def _begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
@@ -360,11 +409,10 @@ class Agent:
         T_m_a = self._T_m_c @ se3.inverse(opening.T_a_b)
         self._add_keyframe(opening.view, None, opening.t_ns, NO_KEYFRAME, T_m_a)
         opening.sharpen(self.map, self._reference, self._config.align.sigma_px)
-        self._move_map_pose(self._T_m_c @ opening.T_a_b)
         track = self._tracker.track(view, se3.inverse(self._T_m_c), self._frame_number)
         if track.inliers < self._config.pose.min_inliers:
             return False
-        self._accept(track, None, 0.0)
+        self._accept(track, 0.0)
         self._step_T = se3.exp(se3.log(opening.T_a_b) / opening.frames)
         dt_s = (t_ns - opening.t_ns) * 1e-9
         self._velocity_m = (self._T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
@@ -417,6 +465,7 @@ class Agent:
         if self._keyframe_frame != self._frame_number:
             self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
         self._return_to(found)
+        self._restart_inertial(t_ns)
         self._add_keyframe(view, found.track, t_ns, found.keyframe, self._T_k_c)
 
     def _return_to(self, found: Recovered) -> None:
@@ -433,7 +482,7 @@ class Agent:
 
     def _first_pose(self, imu: ImuBatch | None) -> F64:
         """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""
-        if self._has_imu and imu is not None and len(imu.t_ns):
+        if self._inertial is not None and imu is not None and len(imu.t_ns):
             R_m_b = level_rotation(imu.accel.mean(axis=0))
         else:
             R_m_c = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -467,7 +516,10 @@ class Agent:
         self.map.settle()
         slot = self.map.slot_of(self._reference)
         if slot >= 0:
+            before = self._T_m_c
             self._move_map_pose(self.map.T_m_k[slot] @ self._T_k_c)
+            if self._inertial is not None:
+                self._inertial.shift_map(se3.orthonormalise(self._T_m_c @ se3.inverse(before)))
 
     def _move_map_pose(self, T_m_c: F64) -> None:
         """Set the pose in m without moving it in o."""
@@ -488,7 +540,7 @@ class Agent:
         return Estimate(
             t_ns,
             tracked,
-            False,
+            self._bridged,
             T_m_b if tracked else None,
             self._T_o_m @ T_m_b,
             self._reference,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from kiteline_agent.inertial_tracker import InertialConfig
 from kiteline_core.features import DetectorConfig
 from kiteline_core.matching import MatchConfig
 from kiteline_core.pnp import RansacConfig
@@ -173,6 +174,7 @@ class AgentConfig:
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
+    inertial: InertialConfig = field(default_factory=InertialConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)
     motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)
     mono_start: MonoStartConfig = field(default_factory=MonoStartConfig)

@@ -36,6 +36,8 @@ class InertialConfig:
     window_frames: int = 60  # most frames that are kept while waiting; a scale needs some seconds
     max_residual_m: float = 0.02  # of the alignment: above it the poses do not fit the IMU, wait on
     max_gravity_error: float = 0.12  # relative, of its length as found without knowing it
+    trusted_blind_s: float = 1.0  # so long the IMU alone counts as tracking
+    askew_rad: float = 0.035  # a map that leans by more than two degrees is set upright
     max_coast_s: float = 5.0  # longer without images, the position means nothing
     offset_memory_s: float = 60.0  # a time offset drifts slowly
     offset_start_sigma_s: float = 0.02  # cameras without a trigger line

@@ -38,6 +38,7 @@ class Track:
     """What the tracker measured. T_c_m: (4,4). rows: (n,) of the local map. observed: (n,3) u, v, disparity px (< 0:
     none). sigma_px: (n,). depth_m: (n,) of the points in the camera. inlier: (n,). information: (6,6) of T_c_m, left
     perturbation. inliers: how many. rms: whitened error of the inliers. tried: how many points were looked for.
+    xyz: (n,3) m where the points are thought to be. ray: (n,3) m, one deviation of their depth.
     """
 
     T_c_m: F64
@@ -50,6 +51,8 @@ class Track:
     inliers: int
     rms: float
     tried: int
+    xyz: F64
+    ray: F64
 
 
 class Tracker:
@@ -123,8 +126,9 @@ class Tracker:
         T = T_c_m.copy()
         inlier = np.ones(len(rows), np.bool_)
         information = np.zeros((6, 6))
+        xyz, ray = candidates.xyz[chosen], candidates.ray[chosen]
         inliers, rms = pose_kernels.optimise_pose(
-            T, candidates.xyz[chosen], candidates.ray[chosen], observed, sigma_px, self._map.intrinsics,
+            T, xyz, ray, observed, sigma_px, self._map.intrinsics,
             T_c_m, self._zero_prior, config.pose.rounds, config.pose.iterations, config.pose.chi2, inlier, information,
         )  # fmt: skip
         return Track(
@@ -138,6 +142,8 @@ class Tracker:
             int(inliers),
             float(rms),
             len(found),
+            xyz,
+            ray,
         )
 
     def _add_disparities(

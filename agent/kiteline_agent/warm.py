@@ -12,7 +12,7 @@ from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.epipolar_kernels import search_segments
 from kiteline_core.features import build_pyramid
-from kiteline_core.frame import Frame
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import AgentId
 from kiteline_core.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.se3 import from_rt
@@ -31,16 +31,22 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
     right = np.ascontiguousarray(np.roll(image, -8, axis=1))
     centres = pixels[: 32 * nodes(4, 2)].view(np.uint64).reshape(-1, 4)
     words = Vocabulary(4, 2, centres, np.ones(16, np.float32))
-    agent = Agent(small, None, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
-    for k in range(6):
+    agent = Agent(small, ImuCalibration(), config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+    for k in range(14):
         # At last the picture jumps by a quarter of its width: lost, and found again by its descriptors.
-        shift = 0 if k < 5 else -80
+        shift = 0 if k < 13 else -80
         eyes = [np.ascontiguousarray(np.roll(eye, shift, axis=1)) for eye in (image, right)]
-        agent.step(StepInput(Frame(k * 50_000_000, eyes[0], eyes[1])), k * 50_000_000)
+        agent.step(StepInput(Frame(k * 50_000_000, eyes[0], eyes[1]), _resting(k)), k * 50_000_000)
     places = PlaceIndex(words)  # forgets, which so short a flight does not
     places.add(0, pixels[:320].reshape(10, 32))
     places.remove(0)
     _warm_one_eye(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
+
+
+def _resting(k: int) -> ImuBatch:
+    """Inertial samples of a standing vehicle between frames k - 1 and k."""
+    t_ns = np.arange(k * 50_000_000 - 45_000_000, k * 50_000_000 + 1, 5_000_000, np.int64)
+    return ImuBatch(t_ns, np.zeros((10, 3)), np.tile([0.0, 0.0, 9.81], (10, 1)))
 
 
 def _warm_one_eye(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
