@@ -36,7 +36,7 @@ from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw import process
 from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.cpu import CpuQuota, rss_mib
+from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
 from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mavlink_frames import mounting
@@ -81,6 +81,8 @@ class Onboard:
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(source.rig, config)
+        if whole_process:
+            release_memory()
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
         self.camera = Camera(source, until_ns, time.process_time_ns)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
 import os
 import resource
 import time
@@ -11,6 +13,8 @@ from types import TracebackType
 from typing import Self
 
 _MIB = 1024.0 * 1024.0
+_MADV_DONTNEED = 4  # Linux, on every architecture
+_COMPILERS = ("libllvmlite", "libLLVM")
 _CGROUP = Path("/sys/fs/cgroup/cpu")
 _PERIOD_US = 50_000  # us; a twentieth of the one-second window in which the limit has to hold
 _LEAST_QUOTA_US = 1_000  # us; what the kernel accepts at least
@@ -43,6 +47,23 @@ def rss_mib() -> float:
 def peak_rss_mib() -> float:
     """The most resident memory that this process has had, in MiB; 0 where the system does not tell."""
     return _status_mib("VmHWM")
+
+
+def release_memory() -> None:
+    """Give back what only the start needed: freed heap, and the compiler's code once the kernels are compiled.
+
+    Code is dropped from the resident pages only (read-only, backed by its file): were it run again, it would be read
+    again. Does nothing where the system has no such calls.
+    """
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError, ValueError):
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.malloc_trim(0)
+        for line in Path("/proc/self/maps").read_text().splitlines():
+            fields = line.split(maxsplit=5)
+            if len(fields) == 6 and fields[1] == "r-xp" and any(name in fields[5] for name in _COMPILERS):
+                begin, end = (int(text, 16) for text in fields[0].split("-"))
+                libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
 
 
 class QuotaError(OSError):
