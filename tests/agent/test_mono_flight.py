@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
 from kiteline_agent.alone import AloneChannel
-from kiteline_agent.config import AgentConfig
+from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.depth_from_motion import sigma_of_meeting
 from kiteline_agent.mono_start import MonoStart
 from kiteline_agent.tracker import View
@@ -22,7 +23,7 @@ from kiteline_codec.channel import RecordChannel, plain_pair
 from kiteline_codec.schema import Births, Depths, Head, Live, Pose, Sightings
 from kiteline_core import se3
 from kiteline_core.cameras import CameraModel, CameraRig, Rectifier
-from kiteline_core.features import build_pyramid
+from kiteline_core.features import DetectorConfig, build_pyramid
 from kiteline_core.frame import Frame
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
 from kiteline_hw.sources import open_source
@@ -131,6 +132,34 @@ def test_bearings_find_their_true_depth() -> None:
     ratio = np.concatenate(ratios)
     assert len(ratios) >= 4 and len(ratio) > 80
     assert np.mean(np.abs(ratio / np.median(ratio) - 1.0) < 0.05) > 0.9
+
+
+def test_points_too_far_for_stereo_get_their_depth_from_motion() -> None:
+    baseline_m = 0.12
+    # 36 baselines are 4.3 m: half of what is seen lies beyond.
+    detector = DetectorConfig(cell_px=16)
+    config = replace(AgentConfig(), detector=detector, local_map=LocalMapConfig(max_far_ratio=36.0))
+    T_c_r = se3.from_rt(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
+    rig = CameraRig(CAMERA, CAMERA, np.eye(4), T_c_r, has_body=False)
+    near, far = plain_pair()
+    one = Agent(rig, None, config, Identity(AgentId(0), 0), near)
+    made: dict[int, int] = {}
+    for k in range(40):
+        both = Frame(k * 50_000_000, frame(k).left, room(path(k) @ T_c_r)[0])
+        estimate = step(one, both)
+        assert estimate.tracked
+        made.setdefault(int(estimate.keyframe), k)
+    open_ = [(r.keyframe, r.index[r.inv_depth == 0]) for r in far.receive((), 0) if isinstance(r, Births)]
+    ratios = []
+    for keyframe, index in open_:
+        slot = one.map.slot_of(keyframe)
+        depth = room(path(made[keyframe]))[1]
+        known = index[one.map.usable[slot, index]]
+        uv = one.map.uv[slot, known].astype(int)
+        ratios.append(1.0 / one.map.rho[slot, known] / depth[uv[:, 1], uv[:, 0]])
+    ratio = np.concatenate(ratios)
+    assert len(ratio) > 30
+    assert np.mean(np.abs(ratio - 1.0) < 0.05) > 0.9
 
 
 def test_standing_and_turning_begin_nothing() -> None:
