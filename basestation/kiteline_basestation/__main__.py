@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import json
 import os
 import signal
@@ -36,6 +37,7 @@ from kiteline_codec.schema import WireError
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
+from kiteline_core.place_index import Vocabulary
 from kiteline_hw import process
 from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.cpu import rss_mib
@@ -44,6 +46,7 @@ from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, LinkHub
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_lockstep import LockstepServer
 
 _COLLECT_S = 120.0  # s that an agent may take for one tick of a lock-step flight before it counts as gone
@@ -110,8 +113,9 @@ class Ground:
         self.spec = spec
         self.config = base_config(spec.config)
         codec_warm.warm()
-        warm(self.config)
-        self.station = Station(self.config, open_channel)
+        words = place_words()
+        warm(self.config, words)
+        self.station = Station(self.config, open_channel, words)
         self.jobs: LockstepJobs | Worker = LockstepJobs() if jobs is None else jobs
         self.phase = Phase.FLY
         self.now_ns = -1
@@ -236,6 +240,14 @@ def _log_metadata(spec: BaseSpec, config: BaseConfig) -> dict[str, str]:
     unlogged = ("folder", "config", "link", "store", "web")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
     return {"role": "base", "spec": json.dumps(plain), "config": configuration.describe(config)}
+
+
+def place_words() -> Vocabulary | None:
+    """The words by which places are recognised; None where what loops need is not installed."""
+    if importlib.util.find_spec("gtsam") is None:
+        print("gtsam is not installed: no loops are closed, no maps joined; pip install 'kiteline[base]'", file=sys.stderr)
+        return None
+    return shipped_words()
 
 
 def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:

@@ -77,7 +77,8 @@ class LoopConfig:
 
     share: str = "all"  # agents whose maps may become one: "all", "none", or groups such as "0 1, 1 2"
     enabled: bool = True
-    candidates: int = 3  # most alike keyframes that are looked at
+    candidates: int = 3  # most alike keyframes of other maps that are looked at
+    candidates_here: int = 2  # of the same map
     min_gap: int = 12  # keyframes of the same submap between two that may close a loop
     max_shared: int = 15  # points that two keyframes share already: more are no news
     min_likeness: float = 0.02  # of the bags of words: below it two places have little in common
@@ -140,6 +141,9 @@ class CullConfig:
     min_found: float = 0.25  # share of the keyframes that should see a point and do
     min_visible: int = 4  # keyframes that should have seen it before it is judged
     min_observations: int = 2  # observations that must remain after the outlier test
+    keyframe_age: int = 10  # keyframes of its submap after it before a keyframe may be found to tell nothing new
+    keyframe_share: float = 0.9  # of its points that others see as well
+    keyframe_others: int = 3  # how many others have to see them, at no coarser a scale
     max_offset_px: float = 8.0  # px that a point's bearing may leave its birth; more is another point
 
 

@@ -1,15 +1,17 @@
-"""Drops points that later keyframes should have seen and did not ("found" ratio of ORB-SLAM2)."""
+"""Drops points that later keyframes should have seen and did not, and keyframes that tell nothing new (ORB-SLAM2)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from kiteline_basestation.config import CullConfig
+from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.publisher import Publisher
 from kiteline_basestation.refind import foresee
 from kiteline_basestation.refinement import drop_points
+from kiteline_codec.schema import Kind
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
-from kiteline_core.map_tables import BIRTH, CULLED
+from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE
 from kiteline_core.sparse_map import SparseMap
 
 
@@ -32,3 +34,31 @@ def cull_weak(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, p
     weak = (visible[points] >= config.min_visible) & (found < config.min_found * visible[points])
     drop_points(sparse_map, points[weak], publisher)
     return int(np.count_nonzero(weak))
+
+
+def cull_redundant(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher
+) -> list[KeyframeId]:
+    """Judge the keyframes around this one: nearly all that they see, others see as well. Returns those dropped."""
+    out: list[KeyframeId] = []
+    for other in covisible_keyframes(sparse_map, keyframe, 15):
+        same = sparse_map.submaps[submap_of_keyframe(other)]
+        at = same.index(other)
+        if at == 0 or len(same) - at <= config.keyframe_age or not sparse_map.complete(other):
+            continue
+        if sparse_map.keyframes.pose_source[sparse_map.rows[other]] == REFINED_POSE and _redundant(sparse_map, other, config):
+            sparse_map.cull_keyframe(other)
+            publisher.touch(Kind.CULLED, other)
+            out.append(other)
+    return out
+
+
+def _redundant(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig) -> bool:
+    table, row = sparse_map.keypoints, sparse_map.rows[keyframe]
+    mine = sparse_map.observed(keyframe)
+    points = table.root[mine]
+    starts, slots = sparse_map.observations(points)
+    which = np.repeat(np.arange(len(points)), np.diff(starts))
+    finer = table.octave[slots].astype(np.int64) <= table.octave[mine[which]].astype(np.int64) + 1
+    others = np.bincount(which[finer & (table.row[slots] != row)], minlength=len(points))
+    return len(points) > 0 and float(np.mean(others >= config.keyframe_others)) >= config.keyframe_share

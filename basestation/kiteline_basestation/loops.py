@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.overlap import Overlap, find_overlap, view_of
 from kiteline_core import se3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.place_index import PlaceIndex, Vocabulary
 from kiteline_core.sparse_map import SparseMap
 
@@ -85,7 +85,7 @@ class LoopFinder:
 
     def consider(self, keyframe: KeyframeId) -> Finding | None:
         """Ask where else this place was seen. A finding is told once: its votes are used up."""
-        finding: Finding | None = None
+        finding = self._said_by_agent(keyframe)
         for old in self._candidates(keyframe):
             overlap = find_overlap(self._map, keyframe, old, self._config)
             if overlap is None:
@@ -95,6 +95,21 @@ class LoopFinder:
         return finding
 
     # -- inside ------------------------------------------------------------------------------------------------------
+
+    def _said_by_agent(self, keyframe: KeyframeId) -> Finding | None:
+        """An agent that found its old map again makes two keyframes of one instant, one in each submap."""
+        sparse_map = self._map
+        new, t_ns = submap_of_keyframe(keyframe), sparse_map.keyframes.t_ns[sparse_map.rows[keyframe]]
+        for submap in sorted(sparse_map.submaps):
+            if agent_of_submap(submap) != agent_of_submap(new) or sparse_map.island_of(submap) == sparse_map.island_of(new):
+                continue
+            for other in sparse_map.submaps[submap]:
+                if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
+                    continue
+                nothing = np.empty(0, np.int32)
+                vote = Overlap(keyframe, other, np.eye(4), self._config.min_inliers_loop, nothing, nothing, 1.0)
+                return self._finding(vote, [vote])
+        return None
 
     def _candidates(self, keyframe: KeyframeId) -> list[KeyframeId]:
         """The places most alike, at most one of each neighbourhood, and never what is known to be one with this."""
@@ -111,16 +126,20 @@ class LoopFinder:
         enough = config.min_likeness
         if before and keyframe in self._index and before[0] in self._index:
             enough = max(enough, config.min_of_neighbours * float(self._index.likeness(keyframe, before)[0]))
-        places = self._index.query(view.descriptor, known | set(near) | {keyframe}, 8 * config.candidates)
+        places = self._index.query(view.descriptor, known | set(near) | {keyframe}, 12 * config.candidates)
         out: list[KeyframeId] = []
         taken: set[int] = set()
+        left = {True: config.candidates_here, False: config.candidates}
+        island = sparse_map.island_of(submap_of_keyframe(keyframe))
         for key, score in zip(places.keys.tolist(), places.score.tolist()):
             old = KeyframeId(key)
-            if score < enough or len(out) == config.candidates:
+            if score < enough:
                 break
-            if key in taken or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old)):
+            here = sparse_map.island_of(submap_of_keyframe(old)) == island
+            if key in taken or left[here] == 0 or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old)):
                 continue
             out.append(old)
+            left[here] -= 1
             around = sparse_map.covisible(sparse_map.points_of(old))
             taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > config.max_shared)].tolist())
         return out
@@ -145,10 +164,12 @@ class LoopFinder:
             self.refused += 1
             return None
         self._votes[key] = []
-        islands = (self._map.island_of(new), self._map.island_of(old))
+        return self._finding(max(chosen, key=lambda v: (v.inliers, v.new)), chosen)
+
+    def _finding(self, best: Overlap, chosen: list[Overlap]) -> Finding:
+        islands = tuple(self._map.island_of(submap_of_keyframe(k)) for k in (best.new, best.old))
         older = self.eldest(islands)
         newer = islands[1] if older == islands[0] else islands[0]
-        best = max(chosen, key=lambda v: (v.inliers, v.new))
         X = self._motion(best)  # island of old from island of new
         if older != islands[1]:
             X = se3.inverse(X)

@@ -76,6 +76,7 @@ class MapperCounts:
     found: int = 0  # births recognised as older points
     triangulated: int = 0  # points that got their first depth here
     culled: int = 0
+    keyframes_culled: int = 0
     bundles: int = 0
     grids: int = 0
 
@@ -116,6 +117,7 @@ class Mapper:
                 self.map, keyframe, self.config.new_points, self.config.measurement, self._publisher
             )
             self.counts.culled += culling.cull_weak(self.map, keyframe, self.config.cull, self._publisher)
+            self._cull_keyframes(keyframe)
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
             if self.atlas is not None:
                 self.atlas.consider(keyframe)  # seen before, here or by others?
@@ -172,6 +174,7 @@ class Mapper:
             "found": self.counts.found,
             "triangulated": self.counts.triangulated,
             "culled": self.counts.culled,
+            "keyframes_culled": self.counts.keyframes_culled,
             "bundles": self.counts.bundles,
             "grids": self.counts.grids,
             "loops": self.atlas.loops if self.atlas else 0,
@@ -267,6 +270,12 @@ class Mapper:
             for agent in sorted({agent_of_keyframe(self.map.submaps[s][0]) for s in self.placements}):
                 for tile in tiles:
                     self._publisher.send(agent, tile)
+
+    def _cull_keyframes(self, keyframe: KeyframeId) -> None:
+        for other in culling.cull_redundant(self.map, keyframe, self.config.cull, self._publisher):
+            self.counts.keyframes_culled += 1
+            if self.atlas is not None:
+                self.atlas.finder.forget(other)
 
     def _go_on_with_atlas(self) -> None:
         """Joined maps look around in each other; where a map moved as a whole, windows are void and places change."""

@@ -15,6 +15,7 @@ from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.refind import foresee
 from kiteline_core import matching, pnp, se3
+from kiteline_core.descriptors import comparable
 from kiteline_core.ids import KeyframeId, agent_of_keyframe
 from kiteline_core.map_tables import BIRTH
 from kiteline_core.pose_kernels import optimise_pose
@@ -87,7 +88,8 @@ def find_overlap(sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config
     The poses of both are taken from their own maps; how these lie to each other is not used.
     """
     mine, theirs = view_of(sparse_map, new), view_of(sparse_map, old)
-    pairs = matching.match(mine.descriptor, mine.angle, theirs.descriptor, theirs.angle, config.match)
+    wanted, offered = comparable(mine.descriptor, theirs.descriptor)
+    pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
     a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
     if len(a) < config.min_inliers:
         return None
@@ -139,9 +141,9 @@ def _with_neighbours(
         seen, uv, octave, _, _ = foresee(sparse_map, points, new, se3.inverse(T))
         if len(seen) < config.min_inliers:
             return None
+        wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)
         near = matching.match_near(
-            uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, sparse_map.keypoints.descriptor[seen],
-            mine.uv, mine.octave, mine.descriptor, (size.width, size.height), config.octave_gap, config.match,
+            uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave, offered, (size.width, size.height), config.octave_gap, config.match,
         )  # fmt: skip
         if len(near.a) < config.min_inliers:
             return None

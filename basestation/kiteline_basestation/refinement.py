@@ -9,6 +9,7 @@ from kiteline_basestation.config import CullConfig, PublishConfig
 from kiteline_basestation.covisibility import Window
 from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
+from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import KeyframeId
 from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
@@ -25,7 +26,9 @@ def apply_bundle(
     """Write what a bundle found where it differs enough from what both sides hold."""
     if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
         return
+    before = sparse_map.keyframes.T_w_k[window.rows].copy()
     _poses(sparse_map, window, result, publisher, publish)
+    _culled_follow(sparse_map, window, before, publisher)
     dropped = _observations(sparse_map, window, result, publisher, cull)
     _points(sparse_map, window, result, dropped, publisher, cull, publish)
 
@@ -44,6 +47,23 @@ def _poses(
         if first or moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, new)
             publisher.touch(Kind.POSE, keyframe)
+
+
+def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher: Publisher) -> None:
+    """A culled keyframe sees nothing that could move it: it goes with the one from which it was measured."""
+    table = sparse_map.keyframes
+    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    for row in np.flatnonzero(table.culled[: len(sparse_map)]).tolist():
+        parent = int(table.parent[row])
+        while parent in sparse_map and parent not in number and table.culled[sparse_map.rows[KeyframeId(parent)]]:
+            parent = int(table.parent[sparse_map.rows[KeyframeId(parent)]])
+        i = number.get(parent)
+        if i is None or np.array_equal(before[i], table.T_w_k[window.rows[i]]) or int(table.id[row]) in number:
+            continue
+        keyframe = KeyframeId(int(table.id[row]))
+        moved = table.T_w_k[window.rows[i]] @ np.linalg.inv(before[i]) @ table.T_w_k[row]
+        sparse_map.set_world_pose(keyframe, se3.orthonormalise(moved))
+        publisher.touch(Kind.POSE, keyframe)
 
 
 def _observations(

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.overlap import find_overlap
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
+from kiteline_core.place_index import Vocabulary
 
 _KEYFRAMES = 8  # enough for a bundle, a grid, and points old enough to be judged
 _POINTS = 120
@@ -18,10 +22,10 @@ _FAR = 20  # points without stereo depth
 _STEP_M = 0.05  # m sideways between two keyframes
 
 
-def warm(config: BaseConfig | None = None) -> None:
+def warm(config: BaseConfig | None = None, words: Vocabulary | None = None) -> None:
     """Run every kernel once, on the types that flights use. A filled cache makes this take a fraction of a second."""
     agent, base = plain_pair()
-    station = Station(config or BaseConfig(), lambda _: base)
+    station = Station(config or BaseConfig(), lambda _: base, words)
     station.join(AgentId(0))
     done: tuple[JobDone, ...] = ()
     agent.put(Camera(AgentId(0), RectifiedCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.1, True, np.eye(4))))
@@ -31,6 +35,10 @@ def warm(config: BaseConfig | None = None) -> None:
         output = station.step({}, done, k * 1_000_000_000)
         done = tuple(run_job(job) for job in output.jobs)
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
+    if words is not None:
+        submap = submap_id(0, 0, 0)
+        easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_share=0.0)
+        find_overlap(station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0), easy)
 
 
 def _keyframe(k: int) -> list[Record]:

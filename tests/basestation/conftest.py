@@ -13,6 +13,7 @@ from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
+from kiteline_core.place_index import Vocabulary, nodes
 
 F64 = NDArray[np.float64]
 
@@ -160,6 +161,14 @@ def fly(
         flight.agent_T_m_k.append(believed)
         flight.records.append(made)
     return flight
+
+
+@pytest.fixture(scope="session")
+def words() -> Vocabulary:
+    """Words for descriptors that are noise: cells around noise."""
+    rng = np.random.default_rng(5)
+    centres = rng.integers(0, 2**64, (nodes(20, 2), 4), dtype=np.uint64)
+    return Vocabulary(20, 2, centres, np.ones(400, np.float32))
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
@@ -15,17 +14,11 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import Camera, Placement, Record
 from kiteline_core import se3
 from kiteline_core.ids import submap_of_keyframe
-from kiteline_hw.words import shipped_words
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 STEP_NS = 250_000_000
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
-
-
-@pytest.fixture(scope="module")
-def words() -> Any:
-    return shipped_words()
 
 
 def feed(mapper: Mapper, flights: Sequence[Any], delays: Sequence[int] = ()) -> list[Record]:
