@@ -13,6 +13,9 @@ F64 = NDArray[np.float64]
 
 _SMALL_RAD = 1e-7  # below this angle the series is exact to double precision
 
+_EYE = np.eye(3)
+_NEARLY = 1e-7  # from orthonormal; its square is below what numbers hold
+
 
 def skew(v: F64) -> F64:
     """The 3x3 matrix with skew(v) @ x == cross(v, x)."""
@@ -84,7 +87,11 @@ def transform(t: F64, points: F64) -> F64:
 
 def orthonormalise(t: F64) -> F64:
     """The rigid motion nearest to T: products of many rotations drift off the manifold."""
-    u, _, vt = np.linalg.svd(t[:3, :3])
+    r = t[:3, :3]
+    error = r.T @ r - _EYE
+    if np.abs(error).max() < _NEARLY:  # one step of Newton's polar iteration: what is left is the error's square
+        return from_rt(r - 0.5 * (r @ error), t[:3, 3])
+    u, _, vt = np.linalg.svd(r)
     r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return from_rt(r, t[:3, 3])
 
