@@ -194,6 +194,7 @@ class Agent:
             # 5. Make a keyframe where the policy asks for one.
             self._keyframe_if_due(view, track, frame.t_ns)
             self._join_if_found(view, track, frame.t_ns)
+            self._find_scale()
             tracked = True
         else:
             # 5. Lost: the IMU carries on for a while; search the old map; with texture in view and two failed tries,
@@ -270,7 +271,6 @@ class Agent:
         seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
         state = self._inertial.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen)
         if state is None:
-            self._find_scale()
             return track
         self._say_level()
         return replace(track, T_c_m=se3.inverse(state.T_m_b @ self._camera.T_b_c))
@@ -405,6 +405,9 @@ class Agent:
     def _open_from_two_views(self, view: View, t_ns: int, opening: Opening) -> bool:
         """The first two keyframes of one eye's map. Where the camera is now stays where it was thought to be."""
         self._events.append(f"mono: scale by convention, median depth {opening.median_depth_m:.3g} m")
+        if self._inertial is not None:
+            self._inertial.reset()
+            self._inertial.metric = False
         self._maker.begin_with(opening.points)
         T_m_a = self._T_m_c @ se3.inverse(opening.T_a_b)
         self._add_keyframe(opening.view, None, opening.t_ns, NO_KEYFRAME, T_m_a)
