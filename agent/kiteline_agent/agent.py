@@ -188,6 +188,8 @@ class Agent:
             track = self._second_look(view, track)
         if track is not None and track.inliers >= self._config.pose.min_inliers:
             track = self._fuse(track, frame.t_ns)
+            if self._lost:
+                self._land(predicted, track)
             self._accept(track, dt_s)
             # 4. Look for the depth of what was born without one.
             self._motion_depth.update(view, track)
@@ -285,6 +287,11 @@ class Agent:
         self.rescale(scale[0])
         self._inertial.rescale(scale[0])
         self._events.append(f"mono: metric, one unit was {scale[0]:.3g} m")
+
+    def _land(self, guessed_T_m_c: F64, track: Track) -> None:
+        """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
+        self._T_m_c = guessed_T_m_c
+        self._move_map_pose(se3.inverse(track.T_c_m))
 
     def _coast(self, predicted: F64, t_ns: int) -> bool:
         """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
