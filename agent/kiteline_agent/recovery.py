@@ -121,7 +121,8 @@ class Recovery:
 
     def _look(self, view: View) -> _Seen | None:
         """Corners and descriptors; None where there is no texture."""
-        corners = features.detect(view.left, np.zeros((0, 2)), self._detector)
+        detector = replace(self._detector, first=max(self._detector.first, view.first))
+        corners = features.detect(view.left, np.zeros((0, 2)), detector)
         self.textured = len(corners.uv) >= self._config.recovery.min_corners
         if not self.textured:
             return None
