@@ -18,11 +18,11 @@ from kiteline_agent.inertial import level_rotation
 from kiteline_agent.inertial_tracker import InertialTracker
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
+from kiteline_agent.metric_start import Reborn, reborn
 from kiteline_agent.mono_start import MonoStart, Opening
 from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.right_eye import RightEye, rectified
 from kiteline_agent.tracker import Track, Tracker, View
-from kiteline_agent.units import UnitChannel, longer
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Culled, Depths, Found, Level, Live, Placement, Pose, Record, Removed, Tile
 from kiteline_core import se3
@@ -116,7 +116,7 @@ class Agent:
         """words: those by which places are recognised; without them only the reference keyframe is found again."""
         self._config = config
         self._identity = identity
-        self._channel = channel = UnitChannel(channel)
+        self._channel = channel
         self._rectifier = Rectifier(rig)
         self._camera = self._rectifier.camera
         self._T_c_b = se3.inverse(self._camera.T_b_c)
@@ -196,7 +196,7 @@ class Agent:
             # 5. Make a keyframe where the policy asks for one.
             self._keyframe_if_due(view, track, frame.t_ns)
             self._join_if_found(view, track, frame.t_ns)
-            self._find_scale()
+            self._find_scale(view, track, frame.t_ns)
             tracked = True
         else:
             # 5. Lost: the IMU carries on for a while; search the old map; with texture in view and two failed tries,
@@ -277,21 +277,16 @@ class Agent:
         self._say_level()
         return replace(track, T_c_m=se3.inverse(state.T_m_b @ self._camera.T_b_c))
 
-    def _find_scale(self) -> None:
-        """One eye with an IMU: once acceleration tells how long the map's unit is, make it a metre."""
+    def _find_scale(self, view: View, track: Track, t_ns: int) -> None:
+        """One eye with an IMU: once acceleration tells how long the map's unit is, begin a map in metres."""
         if self._inertial is None or self._inertial.metric or self._frame_number % _SCALE_EVERY:
             return
         scale = self._inertial.metric_scale()
-        if scale is None or scale[1] > _SCALE_SIGMA * scale[0]:
+        if scale is None or scale[1] > _SCALE_SIGMA * scale[0] or self._submaps == MAX_SUBMAPS:
             return
-        self.rescale(scale[0])
-        self._inertial.rescale(scale[0])
-        self._events.append(f"mono: metric, one unit was {scale[0]:.3g} m")
-
-    def _land(self, guessed_T_m_c: F64, track: Track) -> None:
-        """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
-        self._T_m_c = guessed_T_m_c
-        self._move_map_pose(se3.inverse(track.T_c_m))
+        born = reborn(view, track, self.map, scale[0], self._config.detector.cell_px)
+        if len(born.sigma_rho) >= _MIN_FIRST_POINTS:
+            self._begin_in_metres(view, t_ns, scale[0], born)
 
     def _coast(self, predicted: F64, t_ns: int) -> bool:
         """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
@@ -429,19 +424,25 @@ class Agent:
         self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
         return True
 
-    def rescale(self, factor: float) -> None:
-        """Measure the active submap in another unit: all its lengths grow by `factor`; the odometry frame stays still.
-
-        For one eye, once something else knows the scale. The base goes on in the unit in which the submap began.
-        """
-        T_o_c = self._T_o_m @ self._T_m_c
-        self.map.rescale(factor)
-        self._channel.rescale(self.submap, factor)
-        if self._mono is not None:
-            self._mono.rescale(factor)
-        self._T_m_c, self._T_k_c = longer(self._T_m_c, factor), longer(self._T_k_c, factor)
-        self._step_T, self._velocity_m = longer(self._step_T, factor), factor * self._velocity_m
-        self._T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self._T_m_c))
+    def _begin_in_metres(self, view: View, t_ns: int, unit_m: float, born: Reborn) -> None:
+        """Go on in a new submap whose unit is a metre, from points that are tracked now; the old one is left behind."""
+        assert self._inertial is not None and self._mono is not None
+        self._events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
+        T_m_c = longer(self._T_m_c, unit_m)
+        T_n_c = self._T_o_m @ self._T_m_c  # the new submap's axes are those of the odometry frame
+        T_n_m = se3.orthonormalise(T_n_c @ se3.inverse(T_m_c))
+        self._inertial.rescale(unit_m)
+        self._inertial.shift_map(T_n_m)
+        self._mono.rescale(unit_m)
+        self._step_T, self._velocity_m = longer(self._step_T, unit_m), unit_m * T_n_m[:3, :3] @ self._velocity_m
+        self._T_m_c, self._T_o_m = T_n_c, np.eye(4)
+        self.map.forget(self.submap)
+        self._submap_number = self._submaps
+        self._submaps += 1
+        self.map.activate(self.submap)
+        self._maker.begin_with(born.points)
+        self._add_keyframe(view, None, t_ns, NO_KEYFRAME, self._T_m_c)
+        born.sharpen(self.map, self._reference)
 
     # the old map found again
 
@@ -507,7 +508,7 @@ class Agent:
     @property
     def metric(self) -> bool:
         """Whether the active submap's lengths are metres; one eye alone measures in a unit of its own."""
-        return self._mono is None or self._channel.unit(self.submap) != 1.0
+        return self._mono is None or (self._inertial is not None and self._inertial.metric)
 
     # what the base sends
 
@@ -560,3 +561,8 @@ class Agent:
             quality,
             T_w_m @ T_m_b if tracked and T_w_m is not None else None,
         )
+
+
+def longer(T: F64, factor: float) -> F64:
+    """T (4,4) with its translation multiplied by `factor`."""
+    return se3.from_rt(T[:3, :3], T[:3, 3] * factor)

@@ -206,13 +206,11 @@ class LocalMap:
         self.usable.reshape(-1)[rows] = True
         self.tried[rows], self.hits[rows] = 0, 0
 
-    def rescale(self, factor: float) -> None:
-        """Change the unit of length of the active submap: all its lengths grow by `factor`."""
-        slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == self.active)
-        self.T_m_k[slots, :3, 3] *= factor
-        self.T_p_k[slots, :3, 3] *= factor
-        self.rho[slots] /= factor
-        self.sigma_rho[slots] /= factor
+    def forget(self, submap: SubmapId) -> None:
+        """Drop the keyframes of a submap."""
+        slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == submap)
+        self.keyframe[slots] = NO_KEYFRAME
+        self.counts[slots] = 0
 
     # what the base made of it
 
