@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from kiteline_codec.profiles import EXACT
 from kiteline_codec.schema import Key, Record
 
 
 class AloneChannel:
     """A RecordChannel with nobody at the other end."""
+
+    profile = EXACT
+
+    def keyframe_gap_ns(self) -> int:
+        """None: there is no link."""
+        return 0
 
     def put(self, record: Record) -> Record:
         """The record as it is: no code has rounded it."""

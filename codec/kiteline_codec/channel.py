@@ -6,12 +6,24 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from kiteline_codec import messages
-from kiteline_codec.schema import Key, Record, WireError
+from kiteline_codec.pacing import Pacer
+from kiteline_codec.profiles import EXACT, PROFILES, Profile
+from kiteline_codec.schema import Head, Key, Live, Record, WireError
 from kiteline_codec.sync import Endpoint, SyncConfig, SyncStats
+from kiteline_codec.tight import Tightener
 
 
 class RecordChannel(Protocol):
     """One end of a shared set of records. Each record has one writer; a later record of the same key replaces it."""
+
+    @property
+    def profile(self) -> Profile:
+        """What to share of a keyframe at present."""
+        ...
+
+    def keyframe_gap_ns(self) -> int:
+        """How long after the last keyframe the link can take another, unless it is pressing."""
+        ...
 
     def put(self, record: Record) -> Record:
         """Share a record. Returns it as the other side will hold it: compute on with that."""
@@ -37,10 +49,16 @@ class RecordChannel(Protocol):
 class PlainChannel:
     """One of two joined ends in one process: records pass as they are, at the next `receive`. Made by `plain_pair`."""
 
+    profile = EXACT
+
     def __init__(self) -> None:
         self._arrived: list[Record] = []
         self._removed: list[Key] = []
         self._partner: PlainChannel = self
+
+    def keyframe_gap_ns(self) -> int:
+        """None: there is no link."""
+        return 0
 
     def put(self, record: Record) -> Record:
         """Hand a record over."""
@@ -81,10 +99,22 @@ def plain_pair() -> tuple[PlainChannel, PlainChannel]:
 class CodedChannel:
     """Records through the codec and an endpoint, over any link that carries packets."""
 
-    def __init__(self, config: SyncConfig, session: int) -> None:
-        self.endpoint = Endpoint(config, session)
+    def __init__(self, config: SyncConfig, session: int, profile: Profile | None = None) -> None:
+        """profile: what to share of a keyframe; None: as the link allows."""
+        self.endpoint = Endpoint(config, session, tightener=Tightener())
         self.undecodable = 0  # values whose code was no valid record: the other side speaks another schema
         self._removed: list[Key] = []
+        self._pacer = Pacer(profile, config.budget_bytes)
+        self._live_t_ns: int | None = None  # of the last pose that was shared
+
+    @property
+    def profile(self) -> Profile:
+        """What to share of a keyframe at present."""
+        return self._pacer.share(self.endpoint.throughput_bytes_s)
+
+    def keyframe_gap_ns(self) -> int:
+        """How long after the last keyframe the link can take another, unless it is pressing."""
+        return self._pacer.keyframe_gap_ns(self.endpoint.backlog_bytes, self.endpoint.throughput_bytes_s)
 
     @property
     def stats(self) -> SyncStats:
@@ -95,8 +125,19 @@ class CodedChannel:
         """Code and share a record. Raises ValueError when it cannot be coded."""
         key = messages.key(record)
         code = messages.encode(record)
-        self.endpoint.put(key, code)
+        if not isinstance(record, Live) or self._live_is_due(record.t_ns):
+            self.endpoint.put(key, code)
+        if isinstance(record, Head):
+            self._pacer.keyframe(record.t_ns)
         return messages.decode(key, code)
+
+    def _live_is_due(self, t_ns: int) -> bool:
+        """Whether the profile has room for another pose; one whose time went back is always due."""
+        last = self._live_t_ns
+        if last is not None and 0 <= t_ns - last < self._pacer.profile.live_gap_ns:
+            return False
+        self._live_t_ns = t_ns
+        return True
 
     def remove(self, key: Key) -> None:
         """Take back a record."""
@@ -123,7 +164,25 @@ class CodedChannel:
 
     def poll(self, now_ns: int) -> list[bytes]:
         """All packets that may be sent now."""
+        self._pacer.step(self.endpoint.throughput_bytes_s, now_ns)
         packets = []
         while (packet := self.endpoint.poll(now_ns)) is not None:
             packets.append(packet)
         return packets
+
+
+def coded_channel(session: int, budget_bytes: int = 0, profile: str = "", seal_bytes: int = 0) -> CodedChannel:
+    """One end of a channel over a link. budget_bytes: on the wire in any second, 0 any number. profile: wifi, radio, or
+    "" as the link allows. seal_bytes: what sealing adds to a packet. Raises ValueError.
+    """
+    if profile and profile not in PROFILES:
+        raise ValueError(f"profile {profile!r}: expected {' or '.join(PROFILES)}")
+    named = PROFILES.get(profile)
+    shape = named or Pacer(None, budget_bytes).profile
+    config = SyncConfig(
+        packet_bytes=shape.packet_bytes,
+        overhead_bytes=shape.overhead_bytes + seal_bytes,
+        budget_bytes=budget_bytes,
+        heartbeat_ns=shape.heartbeat_ns,
+    )
+    return CodedChannel(config, session, named)

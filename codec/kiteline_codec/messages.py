@@ -32,11 +32,12 @@ from kiteline_codec.schema import (
     Tile,
     WireError,
 )
+from kiteline_core import descriptors
 from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.descriptors import DESCRIPTOR_BYTES, NARROW_BYTES
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
 
 MAX_PARTS = 1 << 8
-DESCRIPTOR_BYTES = 32
 TILE_CELLS = 32  # along each side
 _TILE_BITS = 24  # of a column or row number
 _TILE_OFFSET = 1 << _TILE_BITS - 1
@@ -150,12 +151,19 @@ def _write_births(out: Writer, record: Births) -> None:
     if descriptor.shape != (len(record.index), DESCRIPTOR_BYTES):
         raise ValueError(f"descriptors are {descriptor.shape}, expected {(len(record.index), DESCRIPTOR_BYTES)}")
     write_columns(out, Kind.BIRTHS, record)
-    out.raw(descriptor.tobytes())
+    if descriptor.any():
+        narrow = descriptors.is_narrow(descriptor).all()
+        out.raw((descriptors.packed(descriptor) if narrow else descriptor).tobytes())
 
 
 def _read_births(source: Reader, key: Key) -> Births:
     n, columns = read_columns(source, Kind.BIRTHS)
-    raw = np.frombuffer(source.raw(DESCRIPTOR_BYTES * n), np.uint8).reshape(n, DESCRIPTOR_BYTES)
+    size = {NARROW_BYTES * n: NARROW_BYTES, 0: 0}.get(source.left, DESCRIPTOR_BYTES)
+    raw = np.frombuffer(source.raw(size * n), np.uint8).reshape(n, size)
+    if size < DESCRIPTOR_BYTES:
+        raw = descriptors.unpacked(raw) if size else np.zeros((n, DESCRIPTOR_BYTES), np.uint8)
+    if n and size and (not raw.any() or (size == DESCRIPTOR_BYTES and descriptors.is_narrow(raw).all())):
+        raise WireError("descriptors are written in the fewest bytes that hold them")
     return Births(keyframe=KeyframeId(key.id), part=key.part, descriptor=raw, **columns)
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from kiteline_codec import ranges
 from kiteline_codec.digest import Digest
-from kiteline_codec.packet import MASK_BITS, MAX_HEADER_BYTES, MAX_ITEM_BYTES, Item, write_item
+from kiteline_codec.packet import MASK_BITS, Item, write_item
 from kiteline_codec.packing import Writer, varint_bytes, zigzag
 from kiteline_codec.schema import Key
 
 Order = tuple[int, ...]
+Known = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value of ours that the peer holds
+Shrink = Callable[[Key, bytes, Known], bytes | None]  # a shorter form of a code, None where there is none
 
 _MIN_FRAGMENT_BYTES = 32  # a smaller one costs more for its header than it carries
 _MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
@@ -30,6 +33,7 @@ class _Entry:
     sent: bool = False  # whether any version was ever sent to this session of the peer
     queued: Order | None = None  # the order under which it waits in the queue
     waiting: bool = False  # whether it waits among the oldest
+    plain: bool = False  # a packet with it was lost: the peer may lack what a tight form builds upon
 
     @property
     def size(self) -> int:
@@ -46,6 +50,7 @@ class Flight:
     """A packet on its way: (key, version, first byte, last byte + 1) of what it carries."""
 
     sent_ns: int
+    n_bytes: int
     carried: list[tuple[Key, int, int, int]]
     lost: bool = False
 
@@ -53,13 +58,15 @@ class Flight:
 class Outbox:
     """Values to share, with their versions, in one relation between two sessions after another."""
 
-    def __init__(self, packet_bytes: int, oldest_every: int) -> None:
+    def __init__(self, packet_bytes: int, oldest_every: int, shrink: Shrink | None = None) -> None:
+        self._shrink = shrink
         self.digest = Digest()
         self.newest = 0  # versions number all changes of all values
         self.pending = 0  # values that the peer is not known to hold
+        self.pending_bytes = 0  # of their codes
         self.in_flight = 0
         self.lost = 0
-        self._whole_bytes = packet_bytes - MAX_HEADER_BYTES  # a longer item is sent in fragments
+        self.acked_bytes = 0  # of packets with values
         self._oldest_every = oldest_every
         self._entries: dict[Key, _Entry] = {}
         self._queue: list[tuple[Order, Key]] = []  # heap: most valuable first
@@ -110,6 +117,7 @@ class Outbox:
         self.digest.discard(key, entry.version, entry.code)
         self.newest += 1
         self.pending -= 1
+        self.pending_bytes -= entry.size
         del self._entries[key]
 
     def _change(self, key: Key, code: bytes | None, order: Order) -> None:
@@ -122,9 +130,11 @@ class Outbox:
             if entry.code is not None:
                 self.digest.discard(key, entry.version, entry.code)
             self.pending += entry.clean
+            self.pending_bytes -= 0 if entry.clean else entry.size
             entry.version, entry.code, entry.order = self.newest, code, order
         entry.acked = ranges.NONE
         entry.todo = ((0, entry.size),)
+        self.pending_bytes += entry.size
         if code is not None:
             self.digest.add(key, entry.version, code)
         heapq.heappush(self._versions, (entry.version, key))
@@ -158,6 +168,11 @@ class Outbox:
             heapq.heappop(heap)
         return self.newest
 
+    def held(self, key: Key) -> tuple[int, bytes] | None:
+        """Version and code of a value, None when there is none."""
+        entry = self._entries.get(key)
+        return None if entry is None or entry.code is None else (entry.version, entry.code)
+
     def restart(self) -> None:
         """A new session of the peer holds nothing: everything is to be sent, removals are moot."""
         self._flights.clear()
@@ -166,7 +181,7 @@ class Outbox:
         for key in sorted(self._entries):
             entry = self._entries[key]
             entry.todo, entry.acked = ((0, entry.size),), ranges.NONE
-            entry.sent = False
+            entry.sent = entry.plain = False
         self._requeue()
 
     def renumber(self) -> int:
@@ -189,6 +204,7 @@ class Outbox:
 
     def _requeue(self) -> None:
         self.pending = len(self._entries)
+        self.pending_bytes = sum(e.size for e in self._entries.values())
         self._versions = [(e.version, k) for k, e in self._entries.items()]
         heapq.heapify(self._versions)
         self._queue = []
@@ -236,7 +252,16 @@ class Outbox:
         """Write the most valuable values into a packet until it holds `limit` bytes, and note it as on its way."""
         self._number += 1
         carried: list[tuple[Key, int, int, int]] = []
+        along: set[Key] = set()  # carried whole by this packet
+
+        def known(key: Key) -> tuple[int, bytes] | None:
+            entry = self._entries.get(key)
+            if entry is None or entry.code is None or not (entry.clean or key in along):
+                return None
+            return entry.version, entry.code
+
         skipped: list[tuple[Key, _Entry]] = []
+        empty = limit - len(out)
         last_id = 0
         oldest = self._oldest_key() if self._number % self._oldest_every == 0 else None
         while len(skipped) < _MAX_SKIPPED:
@@ -248,13 +273,15 @@ class Outbox:
                 heapq.heappop(self._queue)
                 entry.queued = None
             oldest = None
-            item = self._item(key, entry, limit - len(out), last_id, watermark)
+            item = self._item(key, entry, limit - len(out), empty, last_id, watermark, known)
             if item is None:
                 skipped.append((key, entry))
                 continue
             write_item(out, item, last_id, watermark)
             last_id = key.id
-            start, stop = item.offset, item.offset + max(1, len(item.data))
+            start, stop = item.offset, entry.size if item.tight else item.offset + max(1, len(item.data))
+            if (start, stop) == (0, entry.size):
+                along.add(key)
             carried.append((key, entry.version, start, stop))
             entry.todo = ranges.cut(entry.todo, start, stop)
             entry.sent = True
@@ -262,11 +289,13 @@ class Outbox:
                 skipped.append((key, entry))
         for key, entry in skipped:
             self._enqueue(key, entry)
-        self._flights[self._number] = Flight(now_ns, carried)
+        self._flights[self._number] = Flight(now_ns, len(out), carried)
         self.in_flight += 1
 
-    def _item(self, key: Key, entry: _Entry, room: int, last_id: int, watermark: int) -> Item | None:
-        """What of a value fits into `room` bytes, or None."""
+    def _item(
+        self, key: Key, entry: _Entry, room: int, empty: int, last_id: int, watermark: int, known: Known
+    ) -> Item | None:  # fmt: skip
+        """What of a value fits into `room` bytes, or None. What fits a packet of its own (`empty` bytes) is not split."""
         version = entry.version
         head = (
             1 + varint_bytes(zigzag(key.id - last_id)) + varint_bytes(key.part) + varint_bytes(version - watermark - 1)
@@ -274,11 +303,18 @@ class Outbox:
         if entry.code is None:
             return Item(key, version, None, 0, b"") if head <= room else None
         code = entry.code
+        alone = head + varint_bytes(zigzag(key.id)) - varint_bytes(zigzag(key.id - last_id))  # in a packet of its own
         start, stop = entry.todo[0]
-        if len(code) + MAX_ITEM_BYTES <= self._whole_bytes:
-            if head + varint_bytes(len(code)) + len(code) > room:
+        if self._shrink is not None and not entry.plain and entry.todo == ((0, entry.size),):
+            tight = self._shrink(key, code, known)
+            if tight is not None and head + varint_bytes(len(tight)) + len(tight) <= room:
+                return Item(key, version, len(tight), 0, tight, tight=True)
+            if tight is not None and alone + varint_bytes(len(tight)) + len(tight) <= empty:
                 return None
+        if entry.todo == ((0, entry.size),) and head + varint_bytes(len(code)) + len(code) <= room:
             return Item(key, version, len(code), 0, code)
+        if alone + varint_bytes(len(code)) + len(code) <= empty:
+            return None
         head += varint_bytes(room) + varint_bytes(start) + varint_bytes(len(code))
         stop = min(stop, start + room - head)
         if stop - start < min(_MIN_FRAGMENT_BYTES, entry.todo[0][1] - start):
@@ -301,6 +337,7 @@ class Outbox:
             if behind > MASK_BITS or (behind and missing >> (behind - 1) & 1):
                 continue
             flight = self._flights.pop(number)
+            self.acked_bytes += flight.n_bytes
             if not flight.lost:
                 self.in_flight -= 1
                 if not newest:
@@ -318,6 +355,7 @@ class Outbox:
         entry.todo = ranges.cut(entry.todo, start, stop)
         if entry.acked == ((0, entry.size),):
             self.pending -= 1
+            self.pending_bytes -= entry.size
             if entry.code is None:
                 del self._entries[key]
 
@@ -347,6 +385,7 @@ class Outbox:
             for a, b in entry.acked:
                 todo = ranges.cut(todo, a, b)
             entry.todo = todo
+            entry.plain = True
             if todo:
                 self._enqueue(key, entry)
 

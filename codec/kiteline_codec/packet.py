@@ -9,7 +9,7 @@ from kiteline_codec.digest import DIGEST_BYTES
 from kiteline_codec.packing import Reader, Writer
 from kiteline_codec.schema import Key, WireError
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 CRC_BYTES = 4
 MASK_BITS = 64  # packets before the last one that an acknowledgement covers
 MAX_HEADER_BYTES = 64  # of a packet with values, checksum included
@@ -25,6 +25,7 @@ _FLAG_VALUES = 32
 _FLAGS = 63
 _FRAGMENT = 64
 _REMOVED = 128
+_TIGHT = _FRAGMENT | _REMOVED
 
 
 class VersionError(WireError):
@@ -47,13 +48,14 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A value, a part of one (fragment), or a removal (total is None)."""
+    """A value, a part of one (fragment), or a removal (total is None). tight: the data are a shorter form of it."""
 
     key: Key
     version: int
     total: int | None
     offset: int
     data: bytes
+    tight: bool = False
 
     @property
     def whole(self) -> bool:
@@ -92,7 +94,8 @@ def write_header(out: Writer, header: Header) -> None:
 def write_item(out: Writer, item: Item, last_id: int, watermark: int) -> None:
     """One item after an item of id `last_id` (0 for the first)."""
     fragment = item.total is not None and not item.whole
-    out.u8(item.key.kind | (_FRAGMENT if fragment else 0) | (_REMOVED if item.total is None else 0))
+    form = _TIGHT if item.tight else (_FRAGMENT if fragment else 0) | (_REMOVED if item.total is None else 0)
+    out.u8(item.key.kind | form)
     out.signed(item.key.id - last_id)
     out.varint(item.key.part)
     out.varint(item.version - watermark - 1)
@@ -159,11 +162,11 @@ def _read_item(source: Reader, last_id: int, watermark: int, max_value_bytes: in
         raise WireError(f"an id is not negative and fits 63 bits, found {id_}")
     key = Key(kind, id_, source.varint(0xFFFF))
     version = watermark + 1 + source.varint()
-    if tag & _REMOVED:
-        if tag & _FRAGMENT:
-            raise WireError("a removal has no fragments")
+    if tag & _TIGHT == _REMOVED:
         return Item(key, version, None, 0, b"")
     length = source.varint(max_value_bytes)
+    if tag & _TIGHT == _TIGHT:
+        return Item(key, version, length, 0, source.raw(length), tight=True)
     if not tag & _FRAGMENT:
         return Item(key, version, length, 0, source.raw(length))
     offset, total = source.varint(max_value_bytes), source.varint(max_value_bytes)

@@ -78,11 +78,17 @@ def write_columns(out: Writer, kind: Kind, record: Any) -> None:
     out.columns(values)
 
 
+def read_codes(source: Reader, kind: Kind) -> I64:
+    """The codes (columns, n) of a record's kind, unchecked. Raises WireError."""
+    n = source.varint(MAX_KEYPOINTS)
+    return source.columns(sum(_FIELDS[name].columns for name in _COLUMNS[kind]), n)
+
+
 def read_columns(source: Reader, kind: Kind) -> tuple[int, dict[str, Any]]:
     """The number of rows, and the arrays by name. Raises WireError."""
-    n = source.varint(MAX_KEYPOINTS)
     names = _COLUMNS[kind]
-    values = source.columns(sum(_FIELDS[name].columns for name in names), n)
+    values = read_codes(source, kind)
+    n = values.shape[1]
     out = {}
     row = 0
     for name in names:

@@ -42,7 +42,7 @@ def _split(record: _Section, value: F64, section_bytes: int) -> list[_Section]:
     may_grow = True
     while start < len(best):
         chosen = best[start : start + rows]
-        part = _take(record, chosen[np.argsort(record.index[chosen], kind="stable")], len(parts))
+        part = replace(take(record, chosen[np.argsort(record.index[chosen], kind="stable")]), part=len(parts))
         size = len(messages.encode(part))
         if size > section_bytes:
             if len(chosen) == 1:
@@ -60,6 +60,7 @@ def _split(record: _Section, value: F64, section_bytes: int) -> list[_Section]:
     return parts
 
 
-def _take(record: _Section, rows: NDArray[np.int64], part: int) -> _Section:
+def take(record: _Section, rows: NDArray[np.int64]) -> _Section:
+    """Some rows of a record."""
     arrays = {f.name: getattr(record, f.name)[rows] for f in fields(record) if f.name not in ("keyframe", "part")}
-    return replace(record, part=part, **arrays)
+    return replace(record, **arrays)

@@ -8,17 +8,18 @@ newest version. Nothing is queued, so nothing grows old in a queue. Packets are 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from kiteline_codec.budget import SlidingBudget
 from kiteline_codec.inbox import Inbox, Update
-from kiteline_codec.outbox import Order, Outbox
+from kiteline_codec.outbox import Known, Order, Outbox
 from kiteline_codec.packet import (
     CRC_BYTES,
     MAX_HEADER_BYTES,
     MAX_ITEM_BYTES,
     MAX_KIND,
     Header,
+    Item,
     VersionError,
     parse,
     seal,
@@ -26,6 +27,8 @@ from kiteline_codec.packet import (
 )
 from kiteline_codec.packing import Writer
 from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.throughput import Throughput
+from kiteline_codec.tight import Tightener
 
 __all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
 
@@ -38,11 +41,13 @@ _RANKS = {
     Kind.REMOVED: 1,
     Kind.CULLED: 1,
     Kind.PLACEMENT: 1,
+    Kind.LEVEL: 1,
     Kind.HEAD: 2,
     Kind.BIRTHS: 3,
-    Kind.SIGHTINGS: 4,
+    Kind.SIGHTINGS: 4,  # after the births, so that the next keyframe's sightings may build upon them
     Kind.TILE: 6,
 }
+_FIRST_PARTS = 4  # births: what makes a keyframe useful where a thin link has them short
 _RANK_OTHER_PARTS = 5
 _RANK_UNKNOWN = 6
 _MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
@@ -51,7 +56,7 @@ _MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
 def default_order(key: Key) -> Order:
     """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
     rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
-    if key.part:
+    if key.part >= (_FIRST_PARTS if key.kind == Kind.BIRTHS else 1):
         rank = max(rank, _RANK_OTHER_PARTS)
     return (rank, -key.id, key.part)
 
@@ -120,19 +125,26 @@ class SyncStats:
     peer_session: int  # 0: no peer has been heard
     restarts: int  # of the peer, noticed
     mismatches: int  # digests that differed: a defect, mended by sending everything again
+    backlog_bytes: int = 0  # of values that the peer is not known to hold
+    throughput_bytes_s: int = 0  # what the link delivered lately while values waited; 0: nothing had to wait
+    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
 
 
 class Endpoint:
     """One end of a relation between two sessions. Pure: time and packets are handed in, packets are handed out."""
 
-    def __init__(self, config: SyncConfig, session: int, name: str = "") -> None:
-        """A session number must be above 0 and larger than that of any earlier endpoint in this place."""
+    def __init__(self, config: SyncConfig, session: int, name: str = "", tightener: Tightener | None = None) -> None:
+        """A session number must be above 0 and larger than that of any earlier endpoint in this place.
+
+        tightener: makes values shorter on the wire. Both ends of a relation have one, or none.
+        """
         if not 0 < session < 1 << 56:
             raise ValueError(f"session is {session}, expected 1..2^56-1")
         self.config = config
         self.session = session
         self.name = name
-        self._out = Outbox(config.filled_bytes, config.oldest_every)
+        self._tightener = tightener
+        self._out = Outbox(config.filled_bytes, config.oldest_every, self._shrink if tightener else None)
         self._in = Inbox()
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self._peer = 0
@@ -151,6 +163,8 @@ class Endpoint:
         self._digest_sent: tuple[int, int] = (-1, 0)  # version, when
         self._rtt_ns = self._rtt_var_ns = 0
         self._backoff = 0
+        self._throughput = Throughput()
+        self.throughput_bytes_s: int | None = None  # what the link delivers; None while nothing has to wait
         self._bytes_sent = self._packets_sent = self._bytes_received = self._packets_received = 0
         self._duplicates = self._restarts = self._mismatches = 0
         self._reasons: dict[str, int] = {}
@@ -215,7 +229,13 @@ class Endpoint:
             self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, self._out.lost,
             self._duplicates, sum(n for _, n in reasons), reasons, self._rtt_ns, self._out.pending,
             self._out.in_flight, len(self._in.values), len(self._legacy), self._peer, self._restarts, self._mismatches,
+            self.backlog_bytes, self.throughput_bytes_s or 0, self.config.budget_bytes,
         )  # fmt: skip
+
+    @property
+    def backlog_bytes(self) -> int:
+        """Of values that the peer is not known to hold."""
+        return self._out.pending_bytes
 
     # ---- receiving
 
@@ -251,6 +271,10 @@ class Endpoint:
             if not self._in.room_for(items, self.config.max_inbox_bytes, self.config.max_assembly_bytes):
                 self._refuse("no memory left for it")
                 return updates
+            try:
+                items = self._grown(items)
+            except WireError as e:
+                return self._refuse(str(e))
             self._in.mark(number)
             self._owe(now_ns)
             self._in.raise_watermark(watermark)
@@ -261,6 +285,32 @@ class Endpoint:
                     updates.append(update)
         self._compare(header, now_ns)
         return updates
+
+    def _shrink(self, key: Key, code: bytes, known: Known) -> bytes | None:
+        """A shorter form of a value of ours: the peer holds what it wrote itself, and what of ours is known to it."""
+        assert self._tightener is not None
+        return self._tightener.shrink(key, code, lambda k: self._in.values.get(k) or known(k), self._out.held)
+
+    def _grown(self, items: list[Item]) -> list[Item]:
+        """The items with codes in place of tight forms. Raises WireError where a form builds upon what is not held."""
+        if not any(item.tight for item in items):
+            return items
+        if self._tightener is None:
+            raise WireError("a tight form, which this side does not read")
+        grown: list[Item] = []
+        along: dict[Key, tuple[int, bytes]] = {}
+
+        def held(key: Key) -> tuple[int, bytes] | None:
+            return along.get(key) or self._in.values.get(key) or self._out.held(key)
+
+        for item in items:
+            if item.tight:
+                code = self._tightener.grow(item.key, item.data, held)
+                item = replace(item, data=code, total=len(code), tight=False)
+            if item.whole:
+                along[item.key] = item.version, item.data
+            grown.append(item)
+        return grown
 
     def _refuse(self, reason: str) -> list[Update]:
         self._reasons[reason] = self._reasons.get(reason, 0) + 1
@@ -286,7 +336,9 @@ class Endpoint:
 
     def _take_control(self, header: Header, now_ns: int) -> None:
         if header.ack is not None:
+            before = self._out.acked_bytes
             sent_ns, number = self._out.acknowledge(*header.ack)
+            self._throughput.acked(self._out.acked_bytes - before, now_ns)
             if number:
                 self._measure(now_ns - sent_ns)
                 self._backoff = 0
@@ -347,6 +399,8 @@ class Endpoint:
     def poll(self, now_ns: int) -> bytes | None:
         """The next packet to send now, or None. Call until None."""
         c = self.config
+        self._throughput.busy(self._out.has_work(), now_ns)
+        self.throughput_bytes_s = self._throughput.bytes_s(now_ns)
         self._out.give_up(now_ns - self._rtt_ns - max(self._rtt_ns // 4, 2 * self._rtt_var_ns), self._overtaken)
         if self._out.give_up(now_ns - self._rto_ns):
             self._backoff = min(self._backoff + 1, 6)

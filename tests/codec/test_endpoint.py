@@ -145,7 +145,7 @@ def test_order_of_sending() -> None:
     got = [(key.kind, key.id, key.part) for key, _ in pair.updates[1]]
     assert got == [
         (Kind.LIVE, 0, 0), (Kind.POSE, 1, 0), (Kind.HEAD, 1, 0), (Kind.BIRTHS, 2, 0), (Kind.BIRTHS, 1, 0),
-        (Kind.SIGHTINGS, 2, 0), (Kind.BIRTHS, 1, 1), (Kind.TILE, 9, 0),
+        (Kind.BIRTHS, 1, 1), (Kind.SIGHTINGS, 2, 0), (Kind.TILE, 9, 0),
     ]  # fmt: skip
 
 
@@ -300,7 +300,7 @@ def test_another_protocol_version_is_refused_by_name() -> None:
     assert packet is not None
     other = bytes([9]) + packet[1:-4]
     assert b.receive(other + zlib.crc32(other).to_bytes(4, "little"), 0) == []
-    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 1", 1),)
+    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 2", 1),)
     assert b.receive(packet[:-1] + b"?", 0) == []
     assert b.stats.rejected == 2
     assert b.peer_session == 0

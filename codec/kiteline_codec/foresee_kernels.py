@@ -1,0 +1,98 @@
+"""Where a keyframe would see points, from what the agent wrote of them alone. Described in SPEC.md, "Foreseen".
+
+Only + - * / and comparisons of IEEE doubles, each rounded by itself and in the order written here, so that both sides
+get the same integers whatever their machines.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_PIXEL_STEPS = 16.0
+_PIXEL_ORIGIN = -64.0
+_PIXEL_CODES = 1 << 16
+_MANTISSA = 1024
+_DEPTH_CODES = 13 * _MANTISSA
+_DEPTH_SCALE = 0.0078125
+_LEAST_DEPTH = 0.05  # of the point's depth: what comes nearer to the camera than that is not foreseen
+
+
+@njit(cache=True, nogil=True)
+def compose(a: F64, b: F64, out: F64) -> None:
+    """out (4,4) = a @ b for rigid motions."""
+    for i in range(3):
+        for j in range(4):
+            v = a[i, 0] * b[0, j]
+            v = v + a[i, 1] * b[1, j]
+            v = v + a[i, 2] * b[2, j]
+            out[i, j] = v + a[i, 3] if j == 3 else v
+    out[3, 0] = out[3, 1] = out[3, 2] = 0.0
+    out[3, 3] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def invert(a: F64, out: F64) -> None:
+    """out (4,4) = inverse of a rigid motion."""
+    for i in range(3):
+        v = a[0, i] * a[0, 3]
+        v = v + a[1, i] * a[1, 3]
+        v = v + a[2, i] * a[2, 3]
+        for j in range(3):
+            out[i, j] = a[j, i]
+        out[i, 3] = -v
+    out[3, 0] = out[3, 1] = out[3, 2] = 0.0
+    out[3, 3] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _inverse_depth(code: int) -> float:
+    e, m = code // _MANTISSA, code % _MANTISSA
+    return (float(_MANTISSA + m) * float(1 << e) / _MANTISSA - 1.0) * _DEPTH_SCALE
+
+
+@njit(cache=True, nogil=True)
+def foresee(u: I64, v: I64, depth: I64, place: I64, T_k_a: F64, camera: F64, out: I64) -> None:
+    """Codes of u, v and inverse depth (3, n) of points as keyframe k would see them; -1 where nothing can be said.
+
+    u, v, depth: (n,) codes of births. place: (n,) rows of T_k_a (m,4,4). camera: fx, fy, cx, cy.
+    """
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    for i in range(u.size):
+        out[0, i] = out[1, i] = out[2, i] = -1
+        if depth[i] == 0:
+            continue
+        T = T_k_a[place[i]]
+        rho = _inverse_depth(int(depth[i]))
+        x = (float(u[i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cx) / fx
+        y = (float(v[i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cy) / fy
+        px = T[0, 0] * x
+        px = px + T[0, 1] * y
+        px = px + T[0, 2]
+        px = px + T[0, 3] * rho
+        py = T[1, 0] * x
+        py = py + T[1, 1] * y
+        py = py + T[1, 2]
+        py = py + T[1, 3] * rho
+        pz = T[2, 0] * x
+        pz = pz + T[2, 1] * y
+        pz = pz + T[2, 2]
+        pz = pz + T[2, 3] * rho
+        if not pz > _LEAST_DEPTH:
+            continue
+        a = (px / pz * fx + cx - _PIXEL_ORIGIN) * _PIXEL_STEPS + 0.5
+        b = (py / pz * fy + cy - _PIXEL_ORIGIN) * _PIXEL_STEPS + 0.5
+        if not (a >= 0.0 and a < _PIXEL_CODES and b >= 0.0 and b < _PIXEL_CODES):
+            continue
+        w = rho / pz / _DEPTH_SCALE + 1.0
+        e = 0
+        while w >= 2.0 and e < 13:
+            w = w * 0.5
+            e += 1
+        code = e * _MANTISSA + int((w - 1.0) * _MANTISSA + 0.5)
+        out[0, i], out[1, i] = int(a), int(b)
+        out[2, i] = min(max(code, 1), _DEPTH_CODES - 1)

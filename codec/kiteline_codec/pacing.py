@@ -1,0 +1,68 @@
+"""Which profile suits a link, and how long to wait between two keyframes. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from kiteline_codec.profiles import RADIO, WIFI, Profile
+
+_THIN_BYTES_S = 6_000  # below it, keyframes of the wide profile would come every second at best
+_WIDE_BYTES_S = 15_000  # above it, two a second
+_PATIENCE_NS = 3_000_000_000  # ns that a link must look thin, or wide, before the profile changes
+_LEAST_DESCRIBED = 7  # births of a keyframe: one section
+_LONGEST_GAP_NS = 5_000_000_000  # ns; beyond it a map would come apart
+
+
+class Pacer:
+    """Chooses the profile where none is given, and the pause between keyframes."""
+
+    def __init__(self, profile: Profile | None, budget_bytes: int) -> None:
+        self._fixed = profile is not None
+        self._budget_bytes = budget_bytes
+        thin = 0 < budget_bytes < _THIN_BYTES_S
+        self.profile = profile or (RADIO if thin else WIFI)
+        self._other_since_ns: int | None = None
+        self._keyframe_t_ns: int | None = None
+        self._interval_ns = 1_000_000_000  # between keyframes, smoothed
+
+    def step(self, measured_bytes_s: int | None, now_ns: int) -> None:
+        """Look at the link once in a while. measured_bytes_s: None while nothing has to wait."""
+        if self._fixed or self._budget_bytes:
+            return
+        if self.profile is WIFI:
+            change = measured_bytes_s is not None and measured_bytes_s < _THIN_BYTES_S
+        else:
+            change = measured_bytes_s is None or measured_bytes_s > _WIDE_BYTES_S
+        if not change:
+            self._other_since_ns = None
+        elif self._other_since_ns is None:
+            self._other_since_ns = now_ns
+        elif now_ns - self._other_since_ns >= _PATIENCE_NS * (1 if self.profile is WIFI else 4):
+            self.profile = RADIO if self.profile is WIFI else WIFI
+            self._other_since_ns = None
+
+    def keyframe(self, t_ns: int) -> None:
+        """A keyframe was made at a time."""
+        if self._keyframe_t_ns is not None and t_ns > self._keyframe_t_ns:
+            interval_ns = min(t_ns - self._keyframe_t_ns, _LONGEST_GAP_NS)
+            self._interval_ns += (interval_ns - self._interval_ns) // 4
+        self._keyframe_t_ns = t_ns
+
+    def share(self, measured_bytes_s: int | None) -> Profile:
+        """The profile, with no more births than the link carries at the pace at which keyframes come."""
+        rate = self._budget_bytes or measured_bytes_s
+        if not rate or not self.profile.thin:
+            return self.profile
+        room = rate * self._interval_ns // 1_000_000_000 * 3 // 4 - self.profile.sightings_room_bytes
+        p = self.profile
+        described = max(_LEAST_DESCRIBED, min(room // (3 * p.birth_bytes), p.described))
+        blank = max(0, room - described * p.birth_bytes) // p.blank_bytes
+        return replace(p, described=described, births=min(described + blank, p.births))
+
+    def keyframe_gap_ns(self, backlog_bytes: int, measured_bytes_s: int | None) -> int:
+        """How long a keyframe that is not pressing waits after the one before. backlog_bytes: still to be sent."""
+        rate = self._budget_bytes or measured_bytes_s
+        if not rate:
+            return 0
+        need = max(self.profile.keyframe_bytes, backlog_bytes)
+        return min(need * 1_000_000_000 // rate, _LONGEST_GAP_NS)

@@ -1,0 +1,154 @@
+"""What tight forms build upon: the agent's own values, decoded once for each version."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_codec import foresee_kernels as kernels
+from kiteline_codec import messages
+from kiteline_codec.packing import Reader
+from kiteline_codec.rows import read_codes
+from kiteline_codec.schema import Camera, Head, Key, Kind, WireError
+from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId, agent_of_keyframe
+
+I64 = NDArray[np.int64]
+F64 = NDArray[np.float64]
+
+Held = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value that both sides hold
+
+MAX_GENERATIONS = 64  # steps along parents to a keyframe of birth: farther, the sum of poses says little
+MASK_PARTS = 16  # parts of births that can be named
+_REMEMBERED = 256  # keyframes whose values are kept decoded
+_NO_PART = -1
+
+
+@dataclass(slots=True)
+class _Keyframe:
+    """births: (5, 2048) codes of u, v, inverse depth and octave by keypoint, and the part that they came with."""
+
+    head: Head | None = None
+    head_version: int = 0
+    part_versions: dict[int, int] = field(default_factory=dict)
+    births: I64 = field(default_factory=lambda: np.full((5, MAX_KEYPOINTS), _NO_PART, np.int64))
+
+
+class References:
+    """Headers, births and cameras as both sides hold them, kept decoded."""
+
+    def __init__(self) -> None:
+        self._keyframes: OrderedDict[int, _Keyframe] = OrderedDict()
+        self._cameras: dict[int, tuple[int, F64]] = {}
+        self.told: Head | None = None  # a header that is used as it is, whatever is held
+
+    def _keyframe(self, keyframe: int) -> _Keyframe:
+        entry = self._keyframes.get(keyframe)
+        if entry is None:
+            entry = self._keyframes[keyframe] = _Keyframe()
+            if len(self._keyframes) > _REMEMBERED:
+                self._keyframes.popitem(last=False)
+        else:
+            self._keyframes.move_to_end(keyframe)
+        return entry
+
+    def camera(self, keyframe: int, held: Held) -> tuple[int, F64] | None:
+        """Version, and fx, fy, cx, cy of the camera that saw a keyframe."""
+        agent = int(agent_of_keyframe(KeyframeId(keyframe)))
+        now = held(Key(Kind.CAMERA, agent))
+        if now is None:
+            return None
+        if agent not in self._cameras or self._cameras[agent][0] != now[0]:
+            record = messages.decode(Key(Kind.CAMERA, agent), now[1])
+            assert isinstance(record, Camera)
+            c = record.camera
+            self._cameras[agent] = now[0], np.array([c.fx, c.fy, c.cx, c.cy])
+        return self._cameras[agent]
+
+    def head(self, keyframe: int, held: Held) -> tuple[int, Head] | None:
+        """Version, and header."""
+        if self.told is not None and self.told.keyframe == keyframe:
+            return 0, self.told
+        now = held(Key(Kind.HEAD, keyframe))
+        if now is None:
+            return None
+        entry = self._keyframe(keyframe)
+        if entry.head is None or entry.head_version != now[0]:
+            record = messages.decode(Key(Kind.HEAD, keyframe), now[1])
+            assert isinstance(record, Head)
+            entry.head, entry.head_version = record, now[0]
+        return entry.head_version, entry.head
+
+    def births(self, keyframe: int, held: Held) -> tuple[dict[int, int], I64]:
+        """Versions by part of what both sides hold; codes (5, 2048) of u, v, inverse depth, octave, and the part."""
+        versions: dict[int, int] = {}
+        missing = 0
+        for part in range(MASK_PARTS):
+            now = held(Key(Kind.BIRTHS, keyframe, part))
+            if now is None:
+                missing += 1
+                if missing == 2:
+                    break
+                continue
+            versions[part] = now[0]
+            entry = self._keyframe(keyframe)
+            if entry.part_versions.get(part) != now[0]:
+                entry.births[4, entry.births[4] == part] = _NO_PART
+                values = read_codes(Reader(now[1]), Kind.BIRTHS)
+                if values.shape[1]:
+                    if values[0].min() < 0 or values[0].max() >= MAX_KEYPOINTS:
+                        raise WireError("a keypoint is out of range")
+                    entry.births[:4, values[0]] = values[1:5]
+                    entry.births[4, values[0]] = part
+                entry.part_versions[part] = now[0]
+        return versions, self._keyframe(keyframe).births
+
+    def poses(self, keyframe: int, wanted: set[int], held: Held) -> tuple[dict[int, F64], list[int]]:
+        """T_k_a (4,4) of the wanted keyframes that are found along parents, up from keyframe k to the nearest common one
+        and down again; and the versions of the headers on these ways, in order of keyframes.
+        """
+        above = self._above(keyframe, held)
+        generation = {a: i for i, (a, _) in enumerate(above)}
+        poses: dict[int, F64] = {}
+        versions: dict[int, int] = {}
+        for a in sorted(wanted):
+            below: list[tuple[int, Head, int]] = []  # from a up to below the common keyframe
+            at = a
+            while at not in generation and len(below) < MAX_GENERATIONS:
+                head = self.head(at, held)
+                if head is None or head[1].parent == NO_KEYFRAME:
+                    break
+                below.append((at, head[1], head[0]))
+                at = int(head[1].parent)
+            if at not in generation:
+                continue
+            T_k_a = above[generation[at]][1]
+            for _, head_below, _ in reversed(below):
+                T = np.empty((4, 4))
+                kernels.compose(T_k_a, np.ascontiguousarray(head_below.T_p_k), T)
+                T_k_a = T
+            poses[a] = T_k_a
+            versions.update({b: version for b, _, version in below})
+            for b, _ in above[: generation[at]]:
+                version_above = self.head(b, held)
+                assert version_above is not None
+                versions[b] = version_above[0]
+        return poses, [versions[b] for b in sorted(versions)]
+
+    def _above(self, keyframe: int, held: Held) -> list[tuple[int, F64]]:
+        """Keyframe k, its parent, and so on, with T_k_a (4,4) of each."""
+        at, T_k_a, step = keyframe, np.eye(4), np.empty((4, 4))
+        above = [(at, T_k_a)]
+        for _ in range(MAX_GENERATIONS):
+            head = self.head(at, held)
+            if head is None or head[1].parent == NO_KEYFRAME:
+                break
+            kernels.invert(np.ascontiguousarray(head[1].T_p_k), step)
+            T_k_p = np.empty((4, 4))
+            kernels.compose(T_k_a, step, T_k_p)
+            at, T_k_a = int(head[1].parent), T_k_p
+            above.append((at, T_k_a))
+        return above

@@ -1,0 +1,260 @@
+"""Integer columns as few bits as their spread asks for. The layout is described in SPEC.md, "Tight columns".
+
+Numbers are Golomb-Rice coded with a parameter that follows their size (M. Weinberger, G. Seroussi, G. Sapiro, "The
+LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixed width where that is shorter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+FIXED, ABOVE_LEAST, STEPS, AROUND_ZERO = 0, 1, 2, 3  # modes
+MAX_WIDTH = 30  # bits of one number in fixed width
+MAX_START = 15  # of the Rice parameter
+MAX_SHIFT = 4  # trailing zero bits that a column may leave out
+ESCAPE = 20  # so many ones announce a number of RAW_BITS bits
+RAW_BITS = 32
+LIMIT = 1 << 30  # magnitude of values
+_HALVE = 16  # numbers after which older ones count half
+
+
+@njit(cache=True, nogil=True)
+def _put(out: U8, bit: int, value: int, width: int) -> int:
+    left = width
+    while left > 0:
+        offset = bit & 7
+        take = min(8 - offset, left)
+        out[bit >> 3] |= np.uint8((value & ((1 << take) - 1)) << offset)
+        value >>= take
+        bit += take
+        left -= take
+    return bit
+
+
+@njit(cache=True, nogil=True)
+def _get(data: U8, bit: int, width: int) -> int:
+    value = 0
+    got = 0
+    while got < width:
+        offset = bit & 7
+        take = min(8 - offset, width - got)
+        value |= ((int(data[bit >> 3]) >> offset) & ((1 << take) - 1)) << got
+        bit += take
+        got += take
+    return value
+
+
+@njit(cache=True, nogil=True)
+def _parameter(total: int, count: int) -> int:
+    k = 0
+    while (count << k) < total and k < MAX_START:
+        k += 1
+    return k
+
+
+@njit(cache=True, nogil=True)
+def _symbol(values: I64, j: int, mode: int, shift: int, low: int) -> int:
+    """The number that stands for values[j]; of STEPS from j = 1 on."""
+    v = values[j] >> shift
+    if mode < STEPS:
+        return int(v - low)
+    if mode == STEPS:
+        v -= values[j - 1] >> shift
+    return int(2 * v if v >= 0 else -2 * v - 1)
+
+
+@njit(cache=True, nogil=True)
+def _rice_bits(values: I64, mode: int, shift: int, low: int, start: int) -> int:
+    total = 1 << start
+    count = 1
+    bits = 0
+    for j in range(1 if mode == STEPS else 0, values.size):
+        s = _symbol(values, j, mode, shift, low)
+        k = _parameter(total, count)
+        q = s >> k
+        bits += q + 1 + k if q < ESCAPE else ESCAPE + RAW_BITS
+        total += s
+        count += 1
+        if count == _HALVE:
+            total >>= 1
+            count >>= 1
+    return bits
+
+
+@njit(cache=True, nogil=True)
+def _varint_bits(value: int) -> int:
+    z = 2 * value if value >= 0 else -2 * value - 1
+    n = 8
+    while z >= 128:
+        z >>= 7
+        n += 8
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _shape(values: I64, out: I64) -> None:
+    """Mode, shift, first number and width or start of the shortest form of a column (n,), n >= 1, into out (4,)."""
+    n = values.size
+    union = 0
+    for j in range(n):
+        union |= int(values[j])
+    shift = 0
+    while shift < MAX_SHIFT and union and not union >> shift & 1:
+        shift += 1
+    low = int(values.min()) >> shift
+    first = int(values[0]) >> shift
+    span = (int(values.max()) >> shift) - low
+    width = 0
+    while span >> width:
+        width += 1
+    out[0], out[1], out[2], out[3] = FIXED, shift, low, width
+    best = n * width + _varint_bits(low)
+    for mode in (ABOVE_LEAST, STEPS, AROUND_ZERO):
+        number = low if mode == ABOVE_LEAST else first if mode == STEPS else 0
+        rest = 0 if mode == AROUND_ZERO else _varint_bits(number)
+        last = 1 << 60
+        for start in range(MAX_START + 1):
+            bits = rest + _rice_bits(values, mode, shift, low, start)
+            if bits < best:
+                best = bits
+                out[0], out[1], out[2], out[3] = mode, shift, number, start
+            if bits > last:
+                break
+            last = bits
+
+
+@njit(cache=True, nogil=True)
+def pack_tight(values: I64, out: U8) -> int:
+    """Pack values (c, n) int64, n >= 1, |value| < LIMIT, into `out` (zeroed, at least c * (7 * n + 16) + 8 bytes).
+
+    Returns the number of bytes written.
+    """
+    c, n = values.shape
+    shape = np.zeros((c, 4), np.int64)
+    at = 0
+    for i in range(c):
+        _shape(values[i], shape[i])
+        out[at] = np.uint8(shape[i, 0] << 3 | shape[i, 1])
+        out[at + 1] = np.uint8(shape[i, 3])
+        at += 2
+        if shape[i, 0] != AROUND_ZERO:
+            number = int(shape[i, 2])
+            z = 2 * number if number >= 0 else -2 * number - 1
+            while z >= 128:
+                out[at] = np.uint8(z & 127 | 128)
+                z >>= 7
+                at += 1
+            out[at] = np.uint8(z)
+            at += 1
+    bit = 8 * at
+    for i in range(c):
+        mode, shift, low, start = int(shape[i, 0]), int(shape[i, 1]), int(shape[i, 2]), int(shape[i, 3])
+        total = 1 << start
+        count = 1
+        for j in range(1 if mode == STEPS else 0, n):
+            s = _symbol(values[i], j, mode, shift, low)
+            if mode == FIXED:
+                bit = _put(out, bit, s, start)
+                continue
+            k = _parameter(total, count)
+            q = s >> k
+            if q < ESCAPE:
+                bit = _put(out, bit, (1 << q) - 1, q + 1)
+                bit = _put(out, bit, s, k)
+            else:
+                bit = _put(out, bit, (1 << ESCAPE) - 1, ESCAPE)
+                bit = _put(out, bit, s, RAW_BITS)
+            total += s
+            count += 1
+            if count == _HALVE:
+                total >>= 1
+                count >>= 1
+    return (bit + 7) >> 3
+
+
+@njit(cache=True, nogil=True)
+def unpack_tight(data: U8, at: int, values: I64) -> int:
+    """Read columns into values (c, n), n >= 1. Returns the position after them, or -1 when they are malformed."""
+    c, n = values.shape
+    shape = np.zeros((c, 4), np.int64)
+    for i in range(c):
+        if at + 2 > data.size:
+            return -1
+        mode, shift, start = int(data[at]) >> 3, int(data[at]) & 7, int(data[at + 1])
+        at += 2
+        if mode > AROUND_ZERO or shift > MAX_SHIFT or start > (MAX_WIDTH if mode == FIXED else MAX_START):
+            return -1
+        number = 0
+        if mode != AROUND_ZERO:
+            moved = 0
+            while True:
+                if at >= data.size or moved > 28:
+                    return -1
+                b = int(data[at])
+                at += 1
+                number |= (b & 127) << moved
+                if b < 128:
+                    if b == 0 and moved > 0:
+                        return -1
+                    break
+                moved += 7
+        shape[i, 0], shape[i, 1], shape[i, 2], shape[i, 3] = mode, shift, (number >> 1) ^ -(number & 1), start
+    bit = 8 * at
+    end = 8 * data.size
+    for i in range(c):
+        mode, shift, low, start = int(shape[i, 0]), int(shape[i, 1]), int(shape[i, 2]), int(shape[i, 3])
+        total = 1 << start
+        count = 1
+        last = low
+        for j in range(n):
+            if mode == STEPS and j == 0:
+                values[i, 0] = last << shift
+                continue
+            if mode == FIXED:
+                if bit + start > end:
+                    return -1
+                v = low + _get(data, bit, start)
+                bit += start
+            else:
+                k = _parameter(total, count)
+                q = 0
+                while q < ESCAPE:
+                    if bit >= end:
+                        return -1
+                    one = int(data[bit >> 3]) >> (bit & 7) & 1
+                    bit += 1
+                    if not one:
+                        break
+                    q += 1
+                width = k if q < ESCAPE else RAW_BITS
+                if bit + width > end:
+                    return -1
+                s = _get(data, bit, width)
+                bit += width
+                if q < ESCAPE:
+                    s |= q << k
+                total += s
+                count += 1
+                if count == _HALVE:
+                    total >>= 1
+                    count >>= 1
+                v = low + s if mode == ABOVE_LEAST else (s >> 1) ^ -(s & 1)
+            if mode == STEPS:
+                v += last
+                last = v
+            if v <= -LIMIT or v >= LIMIT:
+                return -1
+            v <<= shift
+            if v <= -LIMIT or v >= LIMIT:
+                return -1
+            values[i, j] = v
+    while bit & 7:
+        if int(data[bit >> 3]) >> (bit & 7) & 1:
+            return -1
+        bit += 1
+    return bit >> 3
