@@ -79,9 +79,10 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointCo
         k_a, k_b = _matrix(keyframes.camera[row]), _matrix(keyframes.camera[sparse_map.rows[other]])
         fundamental = np.linalg.inv(k_b).T @ essential @ np.linalg.inv(k_a)
         best, distance = np.empty(len(here), np.int32), np.zeros(len(here), np.int32)
+        ours, theirs = descriptors(sparse_map, here, there)
         kernels.match_epipolar(
-            table.uv[here].astype(np.float64), table.octave[here], descriptors(sparse_map, here),
-            table.uv[there].astype(np.float64), table.octave[there], descriptors(sparse_map, there),
+            table.uv[here].astype(np.float64), table.octave[here], ours,
+            table.uv[there].astype(np.float64), table.octave[there], theirs,
             fundamental, config.epipolar_px, config.max_hamming, config.ratio, best, distance,
         )  # fmt: skip
         matched = best >= 0

@@ -15,6 +15,7 @@ from kiteline_basestation.config import RefindConfig
 from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
+from kiteline_core.descriptors import comparable
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH, CULLED, NO_POSE, REFINED, REMOVED
 from kiteline_core.sparse_map import SparseMap
@@ -79,10 +80,11 @@ def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: Refi
     measured = np.where(table.inv_depth[slots] > 0, bf * table.inv_depth[slots], -1.0).astype(np.float64)
     best = np.empty(len(points), np.int32)
     distance = np.zeros(len(points), np.int32)
+    wanted, offered = descriptors(sparse_map, points, slots)
     kernels.match_projected(
-        uv, octave, angle, disparity, descriptors(sparse_map, points),
+        uv, octave, angle, disparity, wanted,
         table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured,
-        descriptors(sparse_map, slots),
+        offered,
         config.radius_px, config.octave_gap, config.angle_gap, config.disparity_px, config.max_hamming, config.ratio,
         best, distance,
     )  # fmt: skip
@@ -120,9 +122,11 @@ def foresee(
     return points, uv, octave, angle.astype(np.uint8), bf / z
 
 
-def descriptors(sparse_map: SparseMap, slots: I32) -> U64:
-    """Descriptors (n,4) uint64 of births."""
-    return np.ascontiguousarray(sparse_map.keypoints.descriptor[slots]).view(np.uint64)
+def descriptors(sparse_map: SparseMap, a: I32, b: I32) -> tuple[U64, U64]:
+    """Descriptors (n,4) and (m,4) uint64 of two sets of births, to be compared with each other."""
+    of = sparse_map.keypoints.descriptor
+    left, right = comparable(of[a], of[b])
+    return np.ascontiguousarray(left).view(np.uint64), np.ascontiguousarray(right).view(np.uint64)
 
 
 def fuse(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
