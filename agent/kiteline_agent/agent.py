@@ -353,6 +353,9 @@ class Agent:
         if not thin and not self._governor.may(Extra.KEYFRAME):
             self._events.append("governor: keyframe put off")
             return
+        gap_ns = self._channel.keyframe_gap_ns()
+        if t_ns - self._keyframe_t_ns < gap_ns and keyframes.may_wait(what, self._config.keyframe):
+            return
         self._events.append(f"keyframe: {why}")
         self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
 

@@ -12,7 +12,6 @@ from kiteline_agent.local_map import LocalMap
 from kiteline_agent.tracker import Track, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Births, Head, Sightings
-from kiteline_codec.sections import split_births, split_sightings
 from kiteline_core import alignment_kernels, se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
@@ -63,10 +62,14 @@ class KeyframeMaker:
             fresh = new_points(view, seen[:, :2], self._camera, self._config)
         self._fresh = None
         # Births first, in the order of image rows: neighbours code shortest.
-        order = np.lexsort((fresh.uv[:, 0], fresh.uv[:, 1] // self._config.detector.cell_px))
+        band = fresh.uv[:, 1] // self._config.detector.cell_px
+        profile = self._channel.profile
+        order = np.lexsort((fresh.uv[:, 0], band, np.arange(len(band)) >= profile.births))
         births, strength = self._births(keyframe, fresh, order)
-        sightings = self._sightings(keyframe, rows, seen, len(births.index))
-        head = Head(keyframe, t_ns, parent, T_p_k, len(births.index) + len(sightings.index))
+        shared = self._map.is_shared(rows)
+        sightings = self._sightings(keyframe, rows[shared], seen[shared], min(len(order), profile.births))
+        sections = profile.choose(births, strength, sightings)
+        head = Head(keyframe, t_ns, parent, T_p_k, sum(len(s.index) for s in (*sections[0], *sections[1])))
         self._work.keyframes += 1
         self._work.detected_px += view.left[0].size
         self._work.births += len(births.index)
@@ -75,14 +78,15 @@ class KeyframeMaker:
         assert isinstance(shared_head, Head)
         held = births
         uv, rho = held.uv.astype(np.float64), held.inv_depth.astype(np.float64)
-        for part in split_births(births, strength):
-            shared = self._channel.put(part)
-            assert isinstance(shared, Births)
-            uv[shared.index], rho[shared.index] = shared.uv, shared.inv_depth
-        for section in split_sightings(sightings, 1.0 / (1.0 + sightings.octave.astype(np.float64))):
+        for part in sections[0]:
+            agreed = self._channel.put(part)
+            assert isinstance(agreed, Births)
+            uv[agreed.index], rho[agreed.index] = agreed.uv, agreed.inv_depth
+        for section in sections[1]:
             self._channel.put(section)
         T_m_k = self._placed(shared_head)
         self._remember(view, shared_head, T_m_k, uv, rho, births, frame_number)
+        self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         return T_m_k
 
     def _births(self, keyframe: KeyframeId, fresh: NewPoints, order: NDArray[np.int64]) -> tuple[Births, F64]:

@@ -38,13 +38,14 @@ class Rule:
 
     name: str
     asks: Callable[[Situation, KeyframeConfig], bool]
+    pressing: bool = False  # the tracker itself needs it: it does not wait for a thin link
 
 
 # The policy. A frame becomes a keyframe when min_gap_frames have passed and any row asks for it.
 RULES = (
-    Rule("few points left", lambda s, c: s.inliers < c.min_inliers),
-    Rule("share of the reference", lambda s, c: s.inliers < c.min_share * s.reference_inliers),
-    Rule("bare image regions", lambda s, c: s.cover < c.min_cover),
+    Rule("few points left", lambda s, c: s.inliers < c.min_inliers, True),
+    Rule("share of the reference", lambda s, c: s.inliers < c.min_share * s.reference_inliers, True),
+    Rule("bare image regions", lambda s, c: s.cover < c.min_cover, True),
     Rule("new viewpoint", lambda s, c: s.moved_ratio > c.baseline_ratio),
     Rule("new direction", lambda s, c: s.turned_rad > c.rotation_rad),
     Rule("heartbeat", lambda s, c: s.seconds_since > c.max_gap_s),
@@ -56,6 +57,11 @@ def why_keyframe(situation: Situation, config: KeyframeConfig) -> str | None:
     if situation.frames_since < config.min_gap_frames:
         return None
     return next((rule.name for rule in RULES if rule.asks(situation, config)), None)
+
+
+def may_wait(situation: Situation, config: KeyframeConfig) -> bool:
+    """Whether no rule that asks for a keyframe is pressing."""
+    return not any(rule.pressing and rule.asks(situation, config) for rule in RULES)
 
 
 def situation(

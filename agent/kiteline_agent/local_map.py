@@ -66,6 +66,7 @@ class LocalMap:
         self.from_base = np.zeros(k, np.bool_)  # the pose is the base's
         self.last_seen = np.zeros(k, np.int64)  # number of the frame that last tracked a point of the slot
         self.counts = np.zeros(k, np.int64)
+        self.shared = np.zeros(k, np.int64)  # of each slot's births: the first so many are known to the base
         self.usable = np.zeros((k, b), np.bool_)
         self.seed = np.zeros((k, b), np.bool_)  # a bearing that waits for a depth from motion
         self.bearing = np.zeros((k, b, 2))
@@ -150,6 +151,14 @@ class LocalMap:
         age = np.where(self.keyframe == parent, np.iinfo(np.int64).max, self.last_seen)
         return int(np.argmin(age))
 
+    def share(self, keyframe: KeyframeId, births: int) -> None:
+        """The first so many births of a keyframe are shared with the base; the others stay here."""
+        self.shared[self.slot_of(keyframe)] = births
+
+    def is_shared(self, rows: I64) -> NDArray[np.bool_]:
+        """Which points of rows (n,) the base knows."""
+        return np.asarray(rows % self.births < self.shared[rows // self.births])
+
     def candidates(
         self, T_c_m: F64, margin_px: float, max_scale: float, *, seeds: bool = False, submap: SubmapId | None = None
     ) -> Candidates:
@@ -228,12 +237,12 @@ class LocalMap:
             self._apply_found(slot, record)
         else:  # removed births and culled points are no longer looked for
             index = record.index.astype(np.int64)
-            self.usable[slot, index[index < self.counts[slot]]] = False
-            self.seed[slot, index[index < self.counts[slot]]] = False
+            self.usable[slot, index[index < self.shared[slot]]] = False
+            self.seed[slot, index[index < self.shared[slot]]] = False
         return True
 
     def _apply_depths(self, slot: int, record: Depths) -> None:
-        keep = (record.index < self.counts[slot]) & (record.inv_depth > 0.0)
+        keep = (record.index < self.shared[slot]) & (record.inv_depth > 0.0)
         index = record.index[keep].astype(np.int64)
         never = ~self.usable[slot, index] & (self.tried[slot * self.births + index] == 0)
         fresh = never | self.seed[slot, index]
@@ -245,7 +254,7 @@ class LocalMap:
     def _apply_found(self, slot: int, record: Found) -> None:
         """A birth that shows an older point leaves, where the older one is remembered."""
         for index, point in zip(record.index.tolist(), record.point.tolist()):
-            if index < self.counts[slot] and self.slot_of(point >> KEYPOINT_BITS) >= 0:
+            if index < self.shared[slot] and self.slot_of(point >> KEYPOINT_BITS) >= 0:
                 self.usable[slot, index] = point == point_id(KeyframeId(int(self.keyframe[slot])), index)
                 self.seed[slot, index] &= self.usable[slot, index]
 
