@@ -105,7 +105,9 @@ class Onboard:
             self._log = log
             self._live = self._open(folder / "live.tum")
             self._odometry = self._open(folder / "odometry.tum")
-        disorder = LinkModelConfig(loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder)
+        disorder = LinkModelConfig(
+            loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder, delay_ns=round(spec.delay_s * 1e9)
+        )  # fmt: skip
         self._wire = LinkModel(disorder, spec.seed)
         self._overhead_bytes = channel.endpoint.config.overhead_bytes if isinstance(channel, CodedChannel) else 0
         self._whole = whole_process
@@ -398,7 +400,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     boot = process.next_number(folder / "boot")
     spec = AgentSpec(
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
-        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, cpu_percent=a.cpu,
+        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
+        cpu_percent=a.cpu,
         mavlink=a.mavlink, axes=a.axes,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
@@ -439,6 +442,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
     p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)

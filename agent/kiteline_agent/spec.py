@@ -10,8 +10,7 @@ from typing import Any
 
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
-from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_core import config as configuration
 
 
@@ -31,6 +30,8 @@ class AgentSpec:
     start_ns: int = 0  # the stamp that is flight time 0
     seconds: float = 0.0  # s of flight time to fly; 0: all
     up_bytes_s: int = 0  # B/s that the link takes; 0: any number
+    profile: str = ""  # what to share of a keyframe: wifi or radio; "": as the link allows
+    delay_s: float = 0.0  # s that a packet is under way
     loss: float = 0.0  # probability that a packet is lost
     disorder: float = 0.0  # probability that it is doubled, and that it is late
     seed: int = 0
@@ -79,4 +80,4 @@ def channel_for(spec: AgentSpec) -> RecordChannel:
     """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1."""
     if spec.link == "none":
         return AloneChannel()
-    return CodedChannel(SyncConfig(budget_bytes=spec.up_bytes_s), spec.boot + 1)
+    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile)

@@ -31,10 +31,9 @@ from kiteline_basestation.store import Codes, pack, restore, unpack
 from kiteline_basestation.warm import warm
 from kiteline_basestation.worker import Worker
 from kiteline_codec import warm as codec_warm
-from kiteline_codec.channel import CodedChannel, RecordChannel
+from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.framing import StreamFramer
 from kiteline_codec.schema import WireError
-from kiteline_codec.sync import SyncConfig
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_core.place_index import Vocabulary
@@ -205,7 +204,9 @@ class Ground:
         """The modelled link to an agent, made at first use."""
         if agent not in self._wires:
             spec = self.spec
-            model = LinkModelConfig(loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder)
+            model = LinkModelConfig(
+                loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder, delay_ns=round(spec.delay_s * 1e9)
+            )  # fmt: skip
             self._wires[agent] = LinkModel(model, spec.seed * 64 + 32 + agent)
         return self._wires[agent]
 
@@ -252,7 +253,7 @@ def place_words() -> Vocabulary | None:
 
 def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
     """Opens our end of the codec to an agent."""
-    return lambda agent: CodedChannel(SyncConfig(budget_bytes=spec.down_bytes_s), spec.session)
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile)
 
 
 def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
@@ -411,7 +412,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     session = process.next_number((Path(a.store) if a.store else state) / "session")
     spec = BaseSpec(
         folder=a.log, log_name=f"session{session:05d}.mcap" if a.log else "", session=session, link=a.link,
-        config=a.config, down_bytes_s=a.down_bytes, store=a.store, web=a.web,
+        config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, store=a.store, web=a.web,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
     process.leave(0)
@@ -445,6 +446,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
 

@@ -24,6 +24,8 @@ class BaseSpec:
     config: str = ""  # a TOML file
     start_ns: int = 0  # the stamp that is flight time 0, so that the log stands in the time of the first source
     down_bytes_s: int = 0  # B/s that the link to each agent takes; 0: any number
+    profile: str = ""  # wifi or radio: how packets are made; "": as the link allows
+    delay_s: float = 0.0  # s that a packet is under way
     loss: float = 0.0  # probability that a packet is lost
     disorder: float = 0.0  # probability that it is doubled, and that it is late
     seed: int = 0

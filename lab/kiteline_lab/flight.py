@@ -17,8 +17,7 @@ from kiteline_agent.alone import AloneChannel
 from kiteline_agent.spec import AgentSpec
 from kiteline_basestation.__main__ import Ground, coded_channels
 from kiteline_basestation.spec import BaseSpec
-from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_hw.lockstep_messages import Down, Phase
 from kiteline_hw.ports import FrameSource, LinkError
 from kiteline_lab.children import Crew, Event, ended_by
@@ -70,7 +69,7 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
         if mode == "monolith":
             ours[spec.agent], theirs[spec.agent] = plain_pair()
         elif mode == "local":
-            ours[spec.agent] = CodedChannel(SyncConfig(budget_bytes=spec.up_bytes_s), spec.boot + 1)
+            ours[spec.agent] = coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile)
         else:
             ours[spec.agent] = AloneChannel()
     with contextlib.ExitStack() as stack:

@@ -33,6 +33,8 @@ class Options:
     out: Path
     mode: str = "distributed"
     link: str = ""
+    profile: str = ""
+    delay_s: float = 0.0
     up_bytes_s: int = 0
     down_bytes_s: int = 0
     loss: float = 0.0
@@ -80,7 +82,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--link-bytes", metavar="UP[,DOWN]", default="", help="B/s on the wire each way, headers included")
     p.add_argument("--link-loss", metavar="P", type=float, default=0.0,
                    help="lose packets with this probability, and double and reorder them with the same")  # fmt: skip
-    p.add_argument("--profile", choices=tuple(PROFILES), default="wifi", help="radio: 1000 B/s up, 500 B/s down")
+    p.add_argument("--profile", choices=tuple(PROFILES), default="",
+                   help="what a keyframe may cost; radio: 1000 B/s up, 500 B/s down; default: as the link allows")  # fmt: skip
+    p.add_argument("--link-delay", metavar="S", type=float, default=0.0, help="s that a packet is under way")
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="of one core, for each agent")
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")
@@ -97,7 +101,7 @@ def options(argv: list[str]) -> Options:
     """The parsed command line; a wrong one ends the program with a usage line."""
     p = parser()
     a = p.parse_args(argv)
-    up, down = PROFILES[a.profile]
+    up, down = PROFILES.get(a.profile, (0, 0))
     if a.link_bytes:
         try:
             up, down = link_bytes(a.link_bytes)
@@ -108,7 +112,8 @@ def options(argv: list[str]) -> Options:
     if a.cpu < 0.0 or a.seconds < 0.0:
         p.error("--cpu and --seconds must not be negative")
     return Options(
-        tuple(a.sources), a.out, a.mode, a.link, up, down, a.link_loss, a.cpu, a.mono, not a.no_imu, a.realtime,
+        tuple(a.sources), a.out, a.mode, a.link, a.profile, a.link_delay, up, down, a.link_loss, a.cpu, a.mono,
+        not a.no_imu, a.realtime,
         a.config, a.seed, a.seconds, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
     )  # fmt: skip
 
@@ -137,7 +142,8 @@ def plan(o: Options) -> Plan:
         made.agents.append(
             AgentSpec(
                 source=text, folder=str(o.out / f"agent{k}"), agent=k, mono=o.mono, imu=o.imu, config=o.config,
-                start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, loss=o.loss, disorder=o.loss,
+                start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
+                delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,
                 kill_at_s=o.kill_agent_at_s if k == 0 else -1.0,
                 await_base_at_s=o.restart_base_at_s,
@@ -146,7 +152,7 @@ def plan(o: Options) -> Plan:
     if o.mode != "tracker":
         made.base = BaseSpec(
             folder=str(o.out / "base"), agents=tuple(range(len(o.sources))), config=o.config, start_ns=starts[0],
-            down_bytes_s=o.down_bytes_s, loss=o.loss, disorder=o.loss, seed=o.seed, kill_at_s=o.kill_base_at_s,
+            down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss, seed=o.seed, kill_at_s=o.kill_base_at_s,
         )  # fmt: skip
     return made
 

@@ -26,8 +26,7 @@ from kiteline_basestation.spec import BaseSpec
 from kiteline_basestation.station import Station
 from kiteline_basestation.store import restore
 from kiteline_basestation.warm import warm as base_warm
-from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_core import config as configuration
 from kiteline_core.frame import EncodedImage, ImuBatch
 from kiteline_core.ids import AgentId
@@ -101,7 +100,7 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
         raise SourceError("this is a monolith's log: what its base handed over was no packet, and is not in it")
     channel: RecordChannel = AloneChannel()
     if kind == "CodedChannel":
-        channel = CodedChannel(SyncConfig(budget_bytes=spec["up_bytes_s"]), spec["boot"] + 1)
+        channel = coded_channel(spec["boot"] + 1, spec["up_bytes_s"], spec.get("profile", ""))
     agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_words())
     out = Replayed()
     for step in steps(log):
@@ -148,8 +147,8 @@ def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first:
     config = configuration.apply(BaseConfig(), tomllib.loads(log.metadata["config"]))
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: what its agents handed over was no packet, and is not in it")
-    sync = SyncConfig(budget_bytes=spec["down_bytes_s"])
-    station = Station(config, lambda agent: CodedChannel(sync, spec["session"]))
+    budget_bytes, profile = spec["down_bytes_s"], spec.get("profile", "")
+    station = Station(config, lambda agent: coded_channel(spec["session"], budget_bytes, profile))
     jobs: dict[int, Job] = {}
     out = Replayed()
     for kept in log.messages((base_log.RESTORED,)):
