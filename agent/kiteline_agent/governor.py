@@ -133,10 +133,10 @@ class Governor:
         before, pace = self.level, self._pace()
         events: list[str] = []
         self._steer(t_ns)
-        track = self._affordable()
+        track = self._affordable(lost)
         if not track and self.level < len(LADDER) - 1:
             self._set_level(t_ns, min(self.level + 2, len(LADDER) - 1))  # quality before frames
-            track = self.level < len(LADDER) - 1 or self._affordable()
+            track = self.level < len(LADDER) - 1 or self._affordable(lost)
         track = self._its_turn() and track
         if not track and not lost and self._skipped >= self._config.max_skips:
             track = True  # frames before tracking
@@ -154,8 +154,7 @@ class Governor:
 
     def may(self, extra: Extra) -> bool:
         """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it."""
-        need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
-        if self.on and self._window_ns + need_ns > self._budget_ns and self._window_ns > _LEAST * self._budget_ns:
+        if self.on and not self._room_for(extra):
             return False
         self.note(extra)
         return True
@@ -199,10 +198,17 @@ class Governor:
         gain = self._config.learning if self._period_ns else 1.0
         self._period_ns += (t_ns - self._last_t_ns - self._period_ns) * gain
 
-    def _affordable(self) -> bool:
-        """Whether the last second leaves room for the frame."""
-        cost_ns = self._frame_ns * (1.0 + self._config.doubt)
-        return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
+    def _affordable(self, lost: bool) -> bool:
+        """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
+        if not lost:
+            cost_ns = self._frame_ns * (1.0 + self._config.doubt)
+            return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
+        return self._room_for(Extra.SEARCH)
+
+    def _room_for(self, extra: Extra) -> bool:
+        """Whether a frame with something dear fits; what never fits is done when little else was."""
+        need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
+        return self._window_ns + need_ns <= self._budget_ns or self._window_ns <= _LEAST * self._budget_ns
 
     def _its_turn(self) -> bool:
         """On the last row: whether the frame is one of those, evenly spread, that the budget lets through."""
