@@ -18,14 +18,13 @@ from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.depth_from_motion import sigma_of_meeting
 from kiteline_agent.mono_start import MonoStart
 from kiteline_agent.tracker import View
-from kiteline_agent.units import UnitChannel, record_in
-from kiteline_codec.channel import RecordChannel, plain_pair
-from kiteline_codec.schema import Births, Depths, Head, Live, Pose, Sightings
+from kiteline_codec.channel import plain_pair
+from kiteline_codec.schema import Births
 from kiteline_core import se3
 from kiteline_core.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.features import DetectorConfig, build_pyramid
-from kiteline_core.frame import Frame
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.ids import NO_KEYFRAME, AgentId, submap_of_keyframe
 from kiteline_hw.sources import open_source
 
 F64 = NDArray[np.float64]
@@ -67,7 +66,7 @@ def room(T_w_c: F64) -> tuple[U8, F64]:
     return np.asarray(image, np.uint8), best
 
 
-def path(k: int) -> F64:
+def path(k: float) -> F64:
     """A sideways and forward sweep with turns; at rest for the first frames."""
     s = max(k - 3, 0) * 0.05
     turn = se3.so3_exp(np.array([0.06 * np.sin(1.3 * s), 0.16 * np.sin(0.9 * s), 0.05 * np.sin(s)]))
@@ -79,8 +78,8 @@ def frame(k: int) -> Frame:
     return Frame(k * 50_000_000, room(path(k))[0])
 
 
-def agent(channel: RecordChannel | None = None) -> Agent:
-    return Agent(RIG, None, AgentConfig(), Identity(AgentId(0), 0), channel or AloneChannel())
+def agent() -> Agent:
+    return Agent(RIG, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
 
 
 def step(one: Agent, f: Frame) -> Estimate:
@@ -184,63 +183,46 @@ def test_a_second_start_takes_on_the_scale_of_the_first() -> None:
     assert opening.t_ns == 3
 
 
-def test_another_unit_of_length_changes_nothing_else() -> None:
-    (plain_near, plain_far), (near, far) = plain_pair(), plain_pair()
-    plain, other = agent(plain_near), agent(near)
-    for k in range(45):
-        if k == 30:
-            before = step(other, frame(k - 1)).T_o_b[:3, 3]
-            step(plain, frame(k - 1))
-            other.rescale(2.5)
-        a, b = step(plain, frame(k)), step(other, frame(k))
-        assert (a.T_m_b is None) == (b.T_m_b is None)
-        if k < 30 or a.T_m_b is None or b.T_m_b is None:
-            continue
-        np.testing.assert_allclose(b.T_m_b[:3, 3], 2.5 * a.T_m_b[:3, 3], atol=0.01)
-        if k == 30:
-            assert np.linalg.norm(b.T_o_b[:3, 3] - before) < 0.3
-    # The base still gets everything in the unit in which the submap began.
-    expected, found = ([r for r in end.receive((), 0) if isinstance(r, Head)] for end in (plain_far, far))
-    assert [h.keyframe for h in found] == [h.keyframe for h in expected] and len(found) >= 4
-    for h, e in zip(found, expected, strict=True):
-        np.testing.assert_allclose(h.T_p_k, e.T_p_k, atol=0.005)
+def imu_at(t_s: F64) -> ImuBatch:
+    """Samples of an IMU in the camera, whose y axis points down."""
+    h, gyro, accel = 1e-3, [], []
+    for t in t_s:
+        before, here, after = (path(3.0 + 20.0 * x) for x in (t - h, t, t + h))
+        gyro.append(se3.so3_log(before[:3, :3].T @ after[:3, :3]) / (2.0 * h))
+        moved = (before[:3, 3] - 2.0 * here[:3, 3] + after[:3, 3]) / h**2
+        accel.append(here[:3, :3].T @ (moved - np.array([0.0, 9.81, 0.0])))
+    return ImuBatch(np.round(t_s * 1e9).astype(np.int64), np.array(gyro), np.array(accel))
 
 
-def test_records_change_their_unit_and_back() -> None:
-    random = np.random.default_rng(0)
-    k: KeyframeId = keyframe_id(submap_id(0, 0, 1), 4)
-    n = np.arange(5, dtype=np.uint16)
-    uv, rho = random.random((5, 2)).astype(np.float32), random.random(5).astype(np.float32)
-    small, T = np.zeros(5, np.uint8), se3.exp(random.normal(0.0, 1.0, 6))
-    records = (
-        Head(k, 1, NO_KEYFRAME, T, 5),
-        Live(AgentId(0), 1, k, T, 50),
-        Pose(k, T),
-        Births(k, 0, n, uv, rho, small, small, np.zeros((5, 32), np.uint8)),
-        Sightings(k, 0, n, uv, rho, small, n.astype(np.int64)),
-        Depths(k, n, rho, uv),
-    )
-    for record in records:
-        longer = record_in(record, 4.0)
-        for name in ("T_p_k", "T_k_c", "T_m_k"):
-            if hasattr(record, name):
-                np.testing.assert_array_equal(getattr(longer, name)[:3, 3], 4.0 * T[:3, 3])
-                np.testing.assert_array_equal(getattr(longer, name)[:3, :3], T[:3, :3])
-        if isinstance(longer, Births | Sightings | Depths):
-            np.testing.assert_array_equal(longer.inv_depth, rho / np.float32(4.0))
+def test_an_imu_gives_metres() -> None:
     near, far = plain_pair()
-    door = UnitChannel(near)
-    door.rescale(submap_id(0, 0, 1), 4.0)
-    shared = door.put(records[0])
-    assert isinstance(shared, Head)
-    np.testing.assert_allclose(shared.T_p_k, T, atol=1e-12)
-    (sent,) = far.receive((), 0)
-    assert isinstance(sent, Head)
-    np.testing.assert_allclose(sent.T_p_k[:3, 3], T[:3, 3] / 4.0, atol=1e-12)
-    far.put(records[2])
-    (got,) = door.receive((), 0)
-    assert isinstance(got, Pose)
-    np.testing.assert_allclose(got.T_m_k[:3, 3], 4.0 * T[:3, 3])
+    one = Agent(RIG, ImuCalibration(), AgentConfig(), Identity(AgentId(0), 0), near)
+    estimates: list[Estimate] = []
+    words: list[str] = []
+    begin, end = 4, 110  # in full motion from the first frame on
+    for k in range(begin, end):
+        t_s = (k - 3) * 0.05
+        image = Frame(round(t_s * 1e9), frame(k).left)
+        output = one.step(StepInput(image, imu_at(t_s - np.arange(9, -1, -1) * 0.005)), image.t_ns)
+        assert output.estimate is not None
+        estimates.append(output.estimate)
+        words += output.events
+    assert any(word.startswith("mono: metric") for word in words) and one.metric
+    metric = [i for i, e in enumerate(estimates) if e.submap == estimates[-1].submap]
+    assert 10 < metric[0] < 80 and all(estimates[i].tracked for i in metric)
+    found = np.array([e.T_m_b[:3, 3] for e in estimates[metric[0] :] if e.T_m_b is not None])
+    true = np.array([path(k)[:3, 3] for k in range(begin + metric[0], end)])
+    scale, error_m = similar(found, true)
+    assert scale == pytest.approx(1.0, abs=0.05) and error_m < 0.01
+    moves = np.diff([e.T_o_b[:3, 3] for e in estimates], axis=0)
+    assert np.linalg.norm(moves, axis=1).max() < 0.1, "what flies must not jump"
+    # What is shared of the new submap is in metres, and nothing of the old one is changed.
+    births = [r for r in far.receive((), 0) if isinstance(r, Births) and (r.inv_depth > 0).any()]
+    first = [r for r in births if submap_of_keyframe(r.keyframe) == estimates[-1].submap]
+    depth = room(path(begin + metric[0]))[1]
+    ratio = [1.0 / r.inv_depth / depth[r.uv[:, 1].astype(int), r.uv[:, 0].astype(int)] for r in first]
+    assert np.median(np.concatenate(ratio)) == pytest.approx(1.0, abs=0.06)
+    assert len(births) > len(first)
 
 
 def test_deviation_of_a_meeting_is_that_of_moved_pixels() -> None:
