@@ -288,6 +288,11 @@ class Agent:
         if len(born.sigma_rho) >= _MIN_FIRST_POINTS:
             self._begin_in_metres(view, t_ns, scale[0], born)
 
+    def _land(self, guessed_T_m_c: F64, track: Track) -> None:
+        """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
+        self._T_m_c = guessed_T_m_c
+        self._move_map_pose(se3.inverse(track.T_c_m))
+
     def _coast(self, predicted: F64, t_ns: int) -> bool:
         """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
         state = None if self._inertial is None else self._inertial.coast(t_ns)

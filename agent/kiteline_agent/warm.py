@@ -45,7 +45,7 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
 
 def _resting(k: int) -> ImuBatch:
     """Inertial samples of a standing vehicle between frames k - 1 and k."""
-    t_ns = np.arange(k * 50_000_000 - 45_000_000, k * 50_000_000 + 1, 5_000_000, np.int64)
+    t_ns = np.arange(k * 50_000_000 - 45_000_000, k * 50_000_000 + 1, 5_000_000, dtype=np.int64)
     return ImuBatch(t_ns, np.zeros((10, 3)), np.tile([0.0, 0.0, 9.81], (10, 1)))
 
 
