@@ -50,7 +50,8 @@ from kiteline_hw.zenoh_lockstep import LockstepClient
 
 _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
-_DRAIN_S = 5.0  # s that a live flight waits at its end for the link to become quiet
+_DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
+_QUIET_S = 1.0  # s that it has to stay so: the base may still be working on the last keyframe
 _PROGRESS_FRAMES = 10  # frames between two words to the parent; also between two looks at the memory
 
 
@@ -368,11 +369,15 @@ def _drain_live(
     onboard.frames_are_over()
     if parent is not None:
         parent.tell("frames_over")
-    end_ns = clock.now_ns() + round(_DRAIN_S * 1e9)
-    while not stop and clock.now_ns() < end_ns and not all(settled(onboard.channel)):
+    now_ns = quiet_ns = clock.now_ns()
+    end_ns = now_ns + round(_DRAIN_S * 1e9)
+    while not stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
         stop.wait(_IDLE_TICK_S / 2)
-        for packet in onboard.step(None, None, link.receive(), clock.now_ns()):
+        now_ns = clock.now_ns()
+        for packet in onboard.step(None, None, link.receive(), now_ns):
             link.send(packet)
+        if not all(settled(onboard.channel)):
+            quiet_ns = now_ns
         process.notify("WATCHDOG=1")
 
 

@@ -14,7 +14,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -103,10 +103,17 @@ class Flown:
 
 
 class Ground:
-    """The base in flight: a station, and to each agent a modelled link. open_channel: our end of the codec."""
+    """The base in flight: a station, and to each agent a modelled link.
+
+    open_channel: our end of the codec; plain: there is no codec, so that no packets are logged.
+    """
 
     def __init__(
-        self, spec: BaseSpec, open_channel: Callable[[AgentId], RecordChannel], jobs: Worker | None = None
+        self,
+        spec: BaseSpec,
+        open_channel: Callable[[AgentId], RecordChannel],
+        jobs: Worker | None = None,
+        plain: bool = False,
     ) -> None:
         cv2.setNumThreads(1)
         self.spec = spec
@@ -129,11 +136,17 @@ class Ground:
         self._log: LogWriter | None = None
         if spec.log_name:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._log = LogWriter(self._folder / spec.log_name, _log_metadata(spec, self.config))
+            self._log = LogWriter(self._folder / spec.log_name, _log_metadata(spec, self.config, plain))
             self._log.text("/log", spec.start_ns, "info", f"base, session {spec.session}")
             self._log.flush()  # a base that dies at once leaves a log that can be read
         self._log_shift_ns = spec.start_ns
         self._wires: dict[AgentId, LinkModel] = {}
+
+    def compare(self, here: Collection[int]) -> None:
+        """Note whether the agents that are here hold what we hold; once they are gone, what was seen last counts."""
+        ends = [settled(channel) for agent, channel in self.station.channels.items() if agent in here]
+        if ends:
+            self.digest_equal = all(equal for _, equal in ends)
 
     def restore(self, kept: bytes, now_ns: int) -> None:
         """Go on from what an earlier base kept. Raises WireError."""
@@ -237,16 +250,19 @@ class Ground:
             self._log.close()
 
 
-def _log_metadata(spec: BaseSpec, config: BaseConfig) -> dict[str, str]:
+def _log_metadata(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
     unlogged = ("folder", "config", "link", "store", "web")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
-    return {"role": "base", "spec": json.dumps(plain), "config": configuration.describe(config)}
+    channel = "PlainChannel" if plain_channels else "CodedChannel"
+    return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
 
 
 def place_words() -> Vocabulary | None:
     """The words by which places are recognised; None where what loops need is not installed."""
     if importlib.util.find_spec("gtsam") is None:
-        print("gtsam is not installed: no loops are closed, no maps joined; pip install 'kiteline[base]'", file=sys.stderr)
+        print(
+            "gtsam is not installed: no loops are closed, no maps joined; pip install 'kiteline[base]'", file=sys.stderr
+        )
         return None
     return shipped_words()
 
@@ -317,6 +333,7 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
                 ground.step(packets, done, now_ns)
                 stepped_ns = now_ns
                 _send(hub, ground.outgoing(now_ns))
+                ground.compare(hub.alive())
             if page is not None:
                 page.renew(now_ns)
             if keeper is not None:
@@ -326,8 +343,6 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
             process.notify("WATCHDOG=1")
             stop.wait(_LIVE_WAIT_S)
         ground.frames_are_over()
-        ends = [settled(channel) for channel in ground.station.channels.values()]
-        ground.digest_equal = bool(ends) and all(equal for _, equal in ends)
         if keeper is not None:
             keeper.keep()
         if parent is not None and ground.flown is not None:

@@ -82,8 +82,8 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
         if flight.base is None:
             _fly_alone(onboards, progress)
         else:
-            coded = coded_channels(flight.base)
-            ground = Ground(flight.base, lambda agent: theirs[agent] if agent in theirs else coded(agent))
+            open_channel = theirs.__getitem__ if theirs else coded_channels(flight.base)
+            ground = Ground(flight.base, open_channel, plain=bool(theirs))
             stack.callback(ground.close)
             _fly_joined(onboards, ground, progress)
             outcome.base = ground.report()

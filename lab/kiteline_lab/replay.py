@@ -20,6 +20,7 @@ from kiteline_agent.spec import AgentSpec
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm as agent_warm
 from kiteline_basestation import flight_log as base_log
+from kiteline_basestation.__main__ import place_words
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import Job, run_job
 from kiteline_basestation.spec import BaseSpec
@@ -148,7 +149,7 @@ def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first:
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: what its agents handed over was no packet, and is not in it")
     budget_bytes, profile = spec["down_bytes_s"], spec.get("profile", "")
-    station = Station(config, lambda agent: coded_channel(spec["session"], budget_bytes, profile))
+    station = Station(config, lambda agent: coded_channel(spec["session"], budget_bytes, profile), place_words())
     jobs: dict[int, Job] = {}
     out = Replayed()
     for kept in log.messages((base_log.RESTORED,)):

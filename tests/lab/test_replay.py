@@ -114,6 +114,13 @@ def test_the_virtual_cpu_drops_frames(flown: Path, capsys: pytest.CaptureFixture
     assert words[words.index("dropped,") - 1] == "0"
 
 
+@pytest.mark.parametrize("half", ["agent0", "base"])
+def test_what_no_packet_carried_cannot_be_replayed(recording: Path, tmp_path: Path, half: str) -> None:
+    fly(Options((str(recording),), tmp_path, "monolith", seconds=0.3), quiet=True)
+    with pytest.raises(SourceError, match="monolith"):
+        main([str(tmp_path / half / "log.mcap"), "--verify"])
+
+
 def test_a_recording_is_no_log_of_ours(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="fly"):
         main([str(recording), "--verify"])
