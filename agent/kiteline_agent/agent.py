@@ -399,7 +399,8 @@ class Agent:
         elif not first:
             self._T_m_c = self._T_o_m @ self._T_m_c  # the new submap's axes are those of the odometry frame
             self._T_o_m = np.eye(4)
-            self._recovery.search_beside(self._frame_number)
+            if self._mono is None:  # maps of one eye differ in scale: no rigid motion joins them
+                self._recovery.search_beside(self._frame_number)
         self._events.append("submap: opened")
         self._submap_number = self._submaps
         self._submaps += 1

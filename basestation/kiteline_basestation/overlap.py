@@ -27,6 +27,10 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
 
+_UNIT_RATIO = 1.15  # of depths: what drifts of one eye leave; another unit is farther off
+_UNIT_POINTS = 8  # with depth in both maps; fewer say nothing
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """What a keyframe sees, one row an observation.
@@ -111,7 +115,22 @@ def find_overlap(sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config
     T_old_new = se3.orthonormalise(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[old]]) @ se3.inverse(T_c_w))
     xyz, _ = sparse_map.positions(points)
     depth = se3.transform(T_c_w, xyz)[:, 2]
+    if not _one_unit(sparse_map, new, mine, which, depth):
+        return None
     return Overlap(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
+
+
+def _one_unit(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32, depth: F64) -> bool:
+    """Whether the new keyframe's map has the unit of length of the other, by the depths (k,) m of points seen in both.
+
+    One eye alone has a unit of its own in each submap; a pose from points cannot tell.
+    """
+    known = mine.known[which]
+    if np.count_nonzero(known) < _UNIT_POINTS:
+        return True
+    own = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[new]]), mine.xyz[which[known]])[:, 2]
+    ratio = float(np.median(depth[known] / np.maximum(own, 1e-3)))
+    return 1.0 / _UNIT_RATIO < ratio < _UNIT_RATIO
 
 
 def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: LoopConfig) -> bool:
