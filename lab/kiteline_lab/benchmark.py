@@ -20,6 +20,7 @@ from kiteline_hw.ports import SourceError
 
 BENCHMARKS = {
     "first-flight": "kiteline_lab.bench_first_flight",
+    "agent": "kiteline_lab.bench_agent",
     "places": "kiteline_lab.bench_places",
 }  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`
 

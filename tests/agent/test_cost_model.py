@@ -1,0 +1,68 @@
+"""The virtual CPU's prices: every kind of work has one, and flights cost the same wherever they are flown."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+from kiteline_agent.agent import Agent, Identity, StepInput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.cost import VirtualCpu
+from kiteline_agent.cost_model import PRICES_NS, Work, cost_ns
+from kiteline_agent.governor import LADDER, governed
+from kiteline_core.frame import Frame
+from kiteline_core.ids import AgentId
+from kiteline_hw.sources import open_source
+
+
+def costs_of(path: Path, config: AgentConfig, frames: int = 12) -> tuple[list[int], list[Work], list[bool]]:
+    source = open_source(str(path))
+    agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), AloneChannel())
+    costs, works, tracked = [], [], []
+    for frame in [item for item in source if isinstance(item, Frame)][:frames]:
+        output = agent.step(StepInput(frame, cpu_ns=costs[-1] if costs else 0), frame.t_ns)
+        costs.append(cost_ns(agent.work))
+        works.append(replace(agent.work))
+        tracked.append(output.estimate is not None)
+    return costs, works, tracked
+
+
+def test_every_work_has_a_price() -> None:
+    assert {field.name for field in fields(Work)} == set(PRICES_NS)
+    assert all(price > 0 for price in PRICES_NS.values())
+    for name in PRICES_NS:
+        assert cost_ns(Work(**{name: 1_000})) == round(1_000 * PRICES_NS[name])
+
+
+def test_a_flight_costs_what_was_counted(recording: Path) -> None:
+    costs, works, _ = costs_of(recording, AgentConfig())
+    assert costs_of(recording, AgentConfig())[0] == costs
+    assert works[0].keyframes == 1 and works[0].births > 20 and works[0].alignments == 0
+    usual = [work for work in works[1:] if not work.keyframes]
+    assert usual and all(work.alignments > 100 and work.stereo_points > 20 for work in usual)
+    assert all(work.detected_px == 0 for work in usual)
+    assert costs[0] > max(cost for cost, work in zip(costs[1:], works[1:]) if not work.keyframes)
+
+
+def test_less_effort_is_counted_as_less(recording: Path) -> None:
+    sums = [sum(costs_of(recording, governed(AgentConfig(), row))[0]) for row in (LADDER[0], LADDER[2], LADDER[-1])]
+    assert sums[0] > sums[1] > sums[2]
+
+
+def test_an_agent_under_a_budget_skips_frames_and_keeps_to_it(recording: Path) -> None:
+    config = AgentConfig()
+    config = replace(config, governor=replace(config.governor, cpu_percent=0.5, grace_s=0.0))
+    costs, works, tracked = costs_of(recording, config, frames=30)
+    assert not all(tracked) and any(tracked[5:])
+    skipped = [cost for cost, was_tracked in zip(costs, tracked) if not was_tracked]
+    assert max(skipped) == PRICES_NS["steps"]
+    assert all(work.frames == was_tracked for work, was_tracked in zip(works, tracked))
+
+
+def test_newest_frame_wins_on_a_busy_core() -> None:
+    core = VirtualCpu(50.0)
+    core.spend(40_000_000, 0)
+    assert core.free_ns == 80_000_000
+    assert core.newest_wins(10_000_000, 50_000_000) and not core.newest_wins(50_000_000, 50_000_000)
+    assert not VirtualCpu(0.0).newest_wins(0, 50_000_000)
