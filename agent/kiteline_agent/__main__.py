@@ -6,7 +6,6 @@ behind a barrier (`fly_lockstep`), and live on real clocks (`fly_live`).
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -25,7 +24,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import cost_ns
 from kiteline_agent.flight_log import StepLog, write_step
-from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json
+from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json, parser
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm
 from kiteline_codec import warm as codec_warm
@@ -426,32 +425,6 @@ def run_child(spec: AgentSpec) -> int:
         parent.tell("error", text=str(error))
         return 2
     return 0
-
-
-def parser() -> argparse.ArgumentParser:
-    """The arguments of `kiteline agent`."""
-    p = argparse.ArgumentParser(
-        prog="kiteline agent",
-        description="The onboard half: tracks a camera, sends poses to a flight controller and thin diffs to a base.",
-        epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path. "
-        "LINK is zenoh:tcp/HOST:PORT serial:DEVICE:BAUD none. URL is udp:HOST:PORT udpin:HOST:PORT serial:DEVICE:BAUD.",
-    )
-    p.add_argument("source", metavar="SOURCE", nargs="?")
-    p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
-    p.add_argument(
-        "--agent", metavar="N", type=int, default=0, help="number of this agent, 0 to 63, its own in a group"
-    )
-    p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
-    p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
-    p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
-    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
-    p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
-    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
-    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
-    p.add_argument("--mono", action="store_true", help="the left camera alone")
-    p.add_argument("--no-imu", action="store_true", help="without inertial samples")
-    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
-    return p
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What one agent's flight is told, and what is made of it: configuration and channel."""
+"""What one agent's flight is told, on the command line or by `fly`; and its configuration and channel."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import tomllib
 from dataclasses import dataclass, fields, replace
@@ -11,6 +12,7 @@ from typing import Any
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 
 
@@ -30,6 +32,7 @@ class AgentSpec:
     start_ns: int = 0  # the stamp that is flight time 0
     seconds: float = 0.0  # s of flight time to fly; 0: all
     up_bytes_s: int = 0  # B/s that the link takes; 0: any number
+    key: str = ""  # a file with this agent's key; "": packets are not sealed
     profile: str = ""  # what to share of a keyframe: wifi or radio; "": as the link allows
     delay_s: float = 0.0  # s that a packet is under way
     loss: float = 0.0  # probability that a packet is lost
@@ -80,4 +83,31 @@ def channel_for(spec: AgentSpec) -> RecordChannel:
     """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1."""
     if spec.link == "none":
         return AloneChannel()
-    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile)
+    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
+    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline agent`."""
+    p = argparse.ArgumentParser(
+        prog="kiteline agent",
+        description="The onboard half: tracks a camera, sends poses to a flight controller and thin diffs to a base.",
+        epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path. "
+        "LINK is zenoh:tcp/HOST:PORT serial:DEVICE:BAUD none. URL is udp:HOST:PORT udpin:HOST:PORT serial:DEVICE:BAUD.",
+    )
+    p.add_argument("source", metavar="SOURCE", nargs="?")
+    p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
+    p.add_argument(
+        "--agent", metavar="N", type=int, default=0, help="number of this agent, 0 to 63, its own in a group"
+    )
+    p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
+    p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
+    p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
+    p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
+    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--mono", action="store_true", help="the left camera alone")
+    p.add_argument("--no-imu", action="store_true", help="without inertial samples")
+    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
+    return p

@@ -6,7 +6,6 @@ behind a barrier (`fly_lockstep`), and live on real clocks (`fly_live`).
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib.util
 import json
@@ -17,19 +16,19 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.flight_log import RESTORED, write_step
-from kiteline_basestation.jobs import Job, JobDone, run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.outputs import counts, keyframe_poses, map_files
-from kiteline_basestation.spec import BaseSpec, base_config, from_json
+from kiteline_basestation.spec import BaseSpec, base_config, from_json, parser
 from kiteline_basestation.station import Station, StationOutput
 from kiteline_basestation.store import Codes, pack, restore, unpack
 from kiteline_basestation.warm import warm
-from kiteline_basestation.worker import Worker
+from kiteline_basestation.worker import LockstepJobs, Worker
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.framing import StreamFramer
@@ -48,13 +47,15 @@ from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_lockstep import LockstepServer
 
+if TYPE_CHECKING:
+    from kiteline_basestation.web.status_page import StatusPage
+
 _COLLECT_S = 120.0  # s that an agent may take for one tick of a lock-step flight before it counts as gone
 _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
 _DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is still not quiet is given up
 _LIVE_WAIT_S = 0.005  # s between two looks at the links of a live base: small beside the camera's period
 _LIVE_STEP_NS = 50_000_000  # ns between two steps without news: keeps acknowledgements and heartbeats moving
 _KEEP_NS = 2_000_000_000  # ns between two copies of the shared values on disk
-_PAGE_NS = 400_000_000  # ns between two snapshots for the status page
 _MEMORY_STEPS = 10  # steps between two looks at the memory
 
 
@@ -63,35 +64,6 @@ def settled(channel: RecordChannel) -> tuple[bool, bool]:
     if isinstance(channel, CodedChannel):
         return channel.endpoint.quiet, channel.endpoint.digest_equal
     return True, True
-
-
-class LockstepJobs:
-    """One worker in flight time: a job begins when the worker is free and is done after its modelled cost."""
-
-    def __init__(self) -> None:
-        self.cpu_ms: dict[str, list[float]] = {}
-        self._waiting: list[tuple[int, JobDone]] = []
-        self._free_ns = 0
-
-    def add(self, jobs: Sequence[Job], now_ns: int) -> None:
-        """Run jobs now; their results are handed out later."""
-        for job in jobs:
-            begin_ns = time.process_time_ns()
-            done = run_job(job)
-            self.cpu_ms.setdefault(job.kind, []).append((time.process_time_ns() - begin_ns) / 1e6)
-            self._free_ns = max(now_ns, self._free_ns) + done.cost_ops
-            self._waiting.append((self._free_ns, done))
-
-    def done(self, now_ns: int) -> tuple[JobDone, ...]:
-        """What is done by now, in order."""
-        done = tuple(result for end_ns, result in self._waiting if end_ns <= now_ns)
-        self._waiting = self._waiting[len(done) :]
-        return done
-
-    @property
-    def idle(self) -> bool:
-        """Nothing is running."""
-        return not self._waiting
 
 
 @dataclass(slots=True)
@@ -320,7 +292,7 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         ground = Ground(spec, coded_channels(spec), worker)
         stack.callback(ground.close)
         keeper = Keeper(Path(spec.store), ground, clock.now_ns()) if spec.store else None
-        page = Page(spec.web, ground, clock.now_ns(), stack) if spec.web else None
+        page = _page(spec, ground, clock.now_ns(), stack) if spec.web else None
         if parent is not None:
             parent.tell("ready")
         process.notify("READY=1")
@@ -335,7 +307,7 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
                 _send(hub, ground.outgoing(now_ns))
                 ground.compare(hub.alive())
             if page is not None:
-                page.renew(now_ns)
+                page.renew(ground.station, now_ns)
             if keeper is not None:
                 keeper.keep_at_times(now_ns)
             if parent is not None and parent.said() == "frames_over":
@@ -389,30 +361,17 @@ class Keeper:
         process.write_atomically(self._path, pack(agents))
 
 
-class Page:
-    """The status page; it shows a snapshot that the mapper's own loop renews."""
+def _page(spec: BaseSpec, ground: Ground, now_ns: int, stack: contextlib.ExitStack) -> StatusPage:
+    """The status page, served until the stack ends. Raises LinkError."""
+    from kiteline_basestation.web.status_page import StatusPage  # the plain install lacks what it needs
 
-    def __init__(self, where: str, ground: Ground, now_ns: int, stack: contextlib.ExitStack) -> None:
-        from kiteline_basestation.web.overview import nothing, overview
-        from kiteline_basestation.web.server import address, serve
-
-        self._overview = overview
-        self._ground = ground
-        self._started_ns = now_ns
-        self._taken_ns = 0
-        self._snapshot = nothing(now_ns)
-        try:
-            handle = serve(*address(where), lambda: self._snapshot)
-        except ValueError as error:
-            raise LinkError(f"--web: {error}") from error
-        stack.callback(handle.close)
-        print(f"status page: {handle.url}", file=sys.stderr)
-
-    def renew(self, now_ns: int) -> None:
-        """Take a new snapshot, if the last one is old enough."""
-        if now_ns - self._taken_ns >= _PAGE_NS:
-            self._taken_ns = now_ns
-            self._snapshot = self._overview(self._ground.station, now_ns, self._started_ns)
+    try:
+        page = StatusPage(spec.web, now_ns)
+    except ValueError as error:
+        raise LinkError(f"--web: {error}") from error
+    stack.callback(page.close)
+    print(f"status page: {page.url}", file=sys.stderr)
+    return page
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -446,24 +405,6 @@ def run_child(spec: BaseSpec) -> int:
         parent.tell("error", text=str(error))
         return 2
     return 0
-
-
-def parser() -> argparse.ArgumentParser:
-    """The arguments of `kiteline base`."""
-    p = argparse.ArgumentParser(
-        prog="kiteline base",
-        description="The base station: makes one better map of what any number of agents send, and sends it back.",
-        epilog="LINK is zenoh:tcp/HOST:PORT (0.0.0.0 listens on all addresses) or serial:DEVICE:BAUD.",
-    )
-    p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
-    p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")
-    p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
-    p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
-    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
-    p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
-    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
-    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
-    return p
 
 
 if __name__ == "__main__":

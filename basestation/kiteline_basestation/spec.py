@@ -1,7 +1,8 @@
-"""What a base's flight is told, and the configuration made of it."""
+"""What a base's flight is told, on the command line or by `fly`, and the configuration made of it."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import tomllib
 from dataclasses import dataclass, fields
@@ -58,3 +59,21 @@ def base_config(path: str) -> BaseConfig:
     if not isinstance(section, dict):
         raise configuration.ConfigError(f"{path}: [base] is a section")
     return configuration.apply(BaseConfig(), section, "base")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline base`."""
+    p = argparse.ArgumentParser(
+        prog="kiteline base",
+        description="The base station: makes one better map of what any number of agents send, and sends it back.",
+        epilog="LINK is zenoh:tcp/HOST:PORT (0.0.0.0 listens on all addresses) or serial:DEVICE:BAUD.",
+    )
+    p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
+    p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")
+    p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
+    p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
+    p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
+    return p

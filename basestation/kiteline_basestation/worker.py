@@ -1,4 +1,4 @@
-"""A process for jobs, so that the mapper's loop never waits for one."""
+"""Who does the jobs: a process beside the mapper's loop, or (in lock-step) this one, in modelled time."""
 
 from __future__ import annotations
 
@@ -97,3 +97,32 @@ class Worker:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
+
+
+class LockstepJobs:
+    """One worker in flight time: a job begins when the worker is free and is done after its modelled cost."""
+
+    def __init__(self) -> None:
+        self.cpu_ms: dict[str, list[float]] = {}
+        self._waiting: list[tuple[int, JobDone]] = []
+        self._free_ns = 0
+
+    def add(self, jobs: Sequence[Job], now_ns: int) -> None:
+        """Run jobs now; their results are handed out later."""
+        for job in jobs:
+            begin_ns = time.process_time_ns()
+            done = run_job(job)
+            self.cpu_ms.setdefault(job.kind, []).append((time.process_time_ns() - begin_ns) / 1e6)
+            self._free_ns = max(now_ns, self._free_ns) + done.cost_ops
+            self._waiting.append((self._free_ns, done))
+
+    def done(self, now_ns: int) -> tuple[JobDone, ...]:
+        """What is done by now, in order."""
+        done = tuple(result for end_ns, result in self._waiting if end_ns <= now_ns)
+        self._waiting = self._waiting[len(done) :]
+        return done
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is running."""
+        return not self._waiting

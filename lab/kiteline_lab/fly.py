@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--link-loss", metavar="P", type=float, default=0.0,
                    help="lose packets with this probability, and double and reorder them with the same")  # fmt: skip
     p.add_argument("--profile", choices=tuple(PROFILES), default="",
-                   help="what a keyframe may cost; radio: 1000 B/s up, 500 B/s down; default: as the link allows")  # fmt: skip
+                   help="cost of a keyframe; radio: 1000 B/s up, 500 B/s down; default: what the link takes")  # fmt: skip
     p.add_argument("--link-delay", metavar="S", type=float, default=0.0, help="s that a packet is under way")
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="of one core, for each agent")
     p.add_argument("--mono", action="store_true", help="the left camera alone")
@@ -152,7 +152,8 @@ def plan(o: Options) -> Plan:
     if o.mode != "tracker":
         made.base = BaseSpec(
             folder=str(o.out / "base"), agents=tuple(range(len(o.sources))), config=o.config, start_ns=starts[0],
-            down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss, seed=o.seed, kill_at_s=o.kill_base_at_s,
+            down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
+            seed=o.seed, kill_at_s=o.kill_base_at_s,
         )  # fmt: skip
     return made
 

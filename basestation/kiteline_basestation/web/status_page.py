@@ -1,0 +1,34 @@
+"""The status page of a running base. It shows a snapshot that the mapper's own loop renews: no lock is needed."""
+
+from __future__ import annotations
+
+from kiteline_basestation.station import Station
+from kiteline_basestation.web.overview import nothing, overview
+from kiteline_basestation.web.server import address, serve
+
+_PERIOD_NS = 400_000_000  # ns between two snapshots: a little faster than the page asks for them
+
+
+class StatusPage:
+    """A served page. where: HOST:PORT. Raises ValueError for another address, OSError when it cannot listen."""
+
+    def __init__(self, where: str, now_ns: int) -> None:
+        self._started_ns = now_ns
+        self._taken_ns = 0
+        self._snapshot = nothing(now_ns)
+        self._handle = serve(*address(where), lambda: self._snapshot)
+
+    @property
+    def url(self) -> str:
+        """Where it is."""
+        return self._handle.url
+
+    def renew(self, station: Station, now_ns: int) -> None:
+        """Take a new snapshot, if the last one is old enough."""
+        if now_ns - self._taken_ns >= _PERIOD_NS:
+            self._taken_ns = now_ns
+            self._snapshot = overview(station, now_ns, self._started_ns)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._handle.close()
