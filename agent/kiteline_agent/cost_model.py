@@ -53,4 +53,4 @@ PRICES_NS: dict[str, float] = {
 
 def cost_ns(work: Work) -> int:
     """CPU time in ns that the modelled core takes for a step."""
-    return round(sum(price * getattr(work, name) for name, price in PRICES_NS.items()))
+    return round(sum(price * int(getattr(work, name)) for name, price in PRICES_NS.items()))

@@ -19,7 +19,9 @@ from kiteline_hw.sources import open_source
 def costs_of(path: Path, config: AgentConfig, frames: int = 12) -> tuple[list[int], list[Work], list[bool]]:
     source = open_source(str(path))
     agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), AloneChannel())
-    costs, works, tracked = [], [], []
+    costs: list[int] = []
+    works: list[Work] = []
+    tracked: list[bool] = []
     for frame in [item for item in source if isinstance(item, Frame)][:frames]:
         output = agent.step(StepInput(frame, cpu_ns=costs[-1] if costs else 0), frame.t_ns)
         costs.append(cost_ns(agent.work))
