@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--link-loss", metavar="P", type=float, default=0.0,
                    help="lose packets with this probability, and double and reorder them with the same")  # fmt: skip
     p.add_argument("--profile", choices=tuple(PROFILES), default="",
-                   help="cost of a keyframe; radio: 1000 B/s up, 500 B/s down; default: what the link takes")  # fmt: skip
+                   help="cost of a keyframe; radio: 1000 B/s up, 500 B/s down; default: by the link")  # fmt: skip
     p.add_argument("--link-delay", metavar="S", type=float, default=0.0, help="s that a packet is under way")
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="of one core, for each agent")
     p.add_argument("--mono", action="store_true", help="the left camera alone")
