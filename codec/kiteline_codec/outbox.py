@@ -295,7 +295,7 @@ class Outbox:
     def _item(
         self, key: Key, entry: _Entry, room: int, empty: int, last_id: int, watermark: int, known: Known
     ) -> Item | None:  # fmt: skip
-        """What of a value fits into `room` bytes, or None. What fits a packet of its own (`empty` bytes) is not split."""
+        """What of a value fits into `room` bytes, or None. What fits a packet of its own, `empty`, is not split."""
         version = entry.version
         head = (
             1 + varint_bytes(zigzag(key.id - last_id)) + varint_bytes(key.part) + varint_bytes(version - watermark - 1)

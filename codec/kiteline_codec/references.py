@@ -107,8 +107,8 @@ class References:
         return versions, self._keyframe(keyframe).births
 
     def poses(self, keyframe: int, wanted: set[int], held: Held) -> tuple[dict[int, F64], list[int]]:
-        """T_k_a (4,4) of the wanted keyframes that are found along parents, up from keyframe k to the nearest common one
-        and down again; and the versions of the headers on these ways, in order of keyframes.
+        """T_k_a (4,4) of the wanted keyframes that are found along parents, up from keyframe k to the nearest common
+        one and down again; and the versions of the headers on these ways, in order of keyframes.
         """
         above = self._above(keyframe, held)
         generation = {a: i for i, (a, _) in enumerate(above)}

@@ -1,0 +1,134 @@
+"""Seals: only what a key's holder wrote, once, goes through."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_codec import seal
+from kiteline_codec.seal import Direction, Opener, Sealer, Suite, fingerprint, seal_bytes
+
+KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
+GOLDEN = (
+    "03050199184d8354e404494843e3e8dfdd10bc2818126c",
+    "8305016b6974651c305abc036f3490",
+)
+SUITES = pytest.mark.parametrize("suite", list(Suite))
+
+
+def sealer(suite: Suite, boot: int = 5, key: bytes = KEY, agent: int = 3) -> Sealer:
+    return Sealer(key, agent, boot, Direction.UP, suite)
+
+
+def opener() -> Opener:
+    return Opener({3: KEY, 4: OTHER}, Direction.UP)
+
+
+def test_golden_bytes() -> None:
+    assert sealer(Suite.TAGGED).seal(b"kite").hex() == GOLDEN[1]
+    assert sealer(Suite.ENCRYPTED).seal(b"kite").hex() == GOLDEN[0]
+
+
+@SUITES
+def test_a_packet_goes_through_once(suite: Suite) -> None:
+    ours, theirs = sealer(suite), opener()
+    sealed = [ours.seal(bytes([i]) * i) for i in range(20)]
+    for i in [*range(0, 20, 2), *range(1, 20, 2)]:
+        assert theirs.open(sealed[i]) == (3, bytes([i]) * i)
+        assert theirs.open(sealed[i]) is None
+    assert theirs.counters.opened == theirs.counters.replayed == 20
+    assert max(map(len, sealed)) - 19 <= seal_bytes(suite)
+
+
+@SUITES
+@given(st.binary(min_size=1, max_size=60), st.data())
+def test_no_changed_packet_goes_through(suite: Suite, packet: bytes, data: st.DataObject) -> None:
+    sealed = bytearray(sealer(suite).seal(packet))
+    theirs = opener()
+    if data.draw(st.booleans()):
+        sealed[data.draw(st.integers(0, len(sealed) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    else:
+        del sealed[data.draw(st.integers(0, len(sealed) - 1)) :]
+    assert theirs.open(bytes(sealed)) is None
+    assert theirs.counters.refused == 1
+
+
+@given(st.binary(max_size=100))
+def test_any_bytes_are_refused_and_counted(data: bytes) -> None:
+    theirs = opener()
+    assert theirs.open(data) is None
+    assert theirs.counters.refused == 1
+
+
+@SUITES
+def test_strangers_directions_and_other_keys_are_refused(suite: Suite) -> None:
+    theirs = opener()
+    assert theirs.open(sealer(suite, agent=9).seal(b"x")) is None
+    assert theirs.open(Sealer(KEY, 3, 5, Direction.DOWN, suite).seal(b"x")) is None
+    assert theirs.counters.unknown == 2
+    assert theirs.open(sealer(suite, key=OTHER).seal(b"x")) is None
+    assert theirs.counters.forged == 1
+    assert theirs.counters.by_agent == {9: 1, 3: 2}
+
+
+@SUITES
+def test_a_restart_goes_on_and_what_came_before_it_is_old(suite: Suite) -> None:
+    before, after, theirs = sealer(suite, 5), sealer(suite, 6), opener()
+    early, late = before.seal(b"1"), before.seal(b"2")
+    assert theirs.open(early) is not None
+    assert theirs.open(after.seal(b"3")) == (3, b"3")
+    assert theirs.open(late) is None
+    assert theirs.counters.replayed == 1
+    assert theirs.boots == {3: 6}
+    again = Opener({3: KEY}, Direction.UP, theirs.boots)
+    assert again.open(late) is None
+    assert again.open(after.seal(b"4")) is not None
+
+
+@SUITES
+def test_a_forged_packet_does_not_move_the_window(suite: Suite) -> None:
+    theirs = opener()
+    assert theirs.open(sealer(suite, boot=1 << 30, key=OTHER).seal(b"x")) is None
+    assert theirs.open(sealer(suite).seal(b"x")) is not None
+
+
+@SUITES
+def test_what_is_too_late_is_refused(suite: Suite) -> None:
+    ours, theirs = sealer(suite), opener()
+    late = ours.seal(b"late")
+    for _ in range(seal.WINDOW_PACKETS - 1):
+        last = ours.seal(b"")
+    assert theirs.open(last) is not None
+    assert theirs.open(late) is not None
+    ours, theirs = sealer(suite), opener()
+    late = ours.seal(b"late")
+    for _ in range(seal.WINDOW_PACKETS):
+        last = ours.seal(b"")
+    assert theirs.open(last) is not None
+    assert theirs.open(late) is None
+
+
+def test_no_nonce_comes_twice() -> None:
+    nonces = {
+        seal._nonce(suite << 7 | direction << 6 | agent, boot, counter)
+        for suite in Suite for direction in Direction for agent in (0, 1, 63) for boot in (0, 1, 256)
+        for counter in (1, 2, 256, 65536)
+    }  # fmt: skip
+    assert len(nonces) == 2 * 2 * 3 * 3 * 4
+
+
+def test_encrypted_packets_tell_nothing() -> None:
+    assert b"secret" not in sealer(Suite.ENCRYPTED).seal(b"secret" * 5)
+
+
+def test_bad_keys_and_numbers_are_errors() -> None:
+    with pytest.raises(ValueError, match="32 bytes"):
+        Sealer(b"short", 0, 0, Direction.UP, Suite.TAGGED)
+    with pytest.raises(ValueError, match="boot"):
+        Sealer(KEY, 0, -1, Direction.UP, Suite.TAGGED)
+    ours = sealer(Suite.TAGGED)
+    ours._counter = (1 << 48) - 1
+    with pytest.raises(OverflowError):
+        ours.seal(b"")
+    assert fingerprint(KEY) != fingerprint(OTHER)
