@@ -13,13 +13,14 @@ import platform
 import re
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from kiteline_hw.ports import SourceError
 
 BENCHMARKS = {
     "first-flight": "kiteline_lab.bench_first_flight",
+    "front-end": "kiteline_lab.bench_front_end",
     "agent": "kiteline_lab.bench_agent",
     "places": "kiteline_lab.bench_places",
 }  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`
@@ -53,11 +54,12 @@ def is_true(name: str, wanted: str, met: bool, measured: str = "") -> Bar:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Where a benchmark reads and writes. say: tells people how far it is."""
+    """Where a benchmark reads and writes. say: tells people how far it is. more: Markdown to stand below the bars."""
 
     data: Path
     folder: Path
     say: Callable[[str], None]
+    more: list[str] = field(default_factory=list)
 
     def source(self, name: str) -> str:
         """The path of a recording. Raises SourceError when it is not there."""
@@ -92,7 +94,7 @@ def machine() -> str:
     )
 
 
-def section(name: str, title: str, bars: Sequence[Bar]) -> str:
+def section(name: str, title: str, bars: Sequence[Bar], more: Sequence[str] = ()) -> str:
     """The Markdown of one benchmark."""
     met = sum(bar.met for bar in bars)
     lines = [
@@ -100,6 +102,8 @@ def section(name: str, title: str, bars: Sequence[Bar]) -> str:
         "| bar | wanted | measured | met |", "|---|---|---|---|",
     ]  # fmt: skip
     lines += [f"| {bar.name} | {bar.wanted} | {bar.measured} | {'yes' if bar.met else '**no**'} |" for bar in bars]
+    for text in more:
+        lines += ["", text]
     return "\n".join(lines) + "\n"
 
 
@@ -131,8 +135,9 @@ def main(argv: list[str]) -> int:
     for name in a.names or BENCHMARKS:
         module = importlib.import_module(BENCHMARKS[name])
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:
-            bars: list[Bar] = module.run(Bench(data, a.keep or Path(scratch), lambda text: print(text, flush=True)))
-        text = section(name, module.TITLE, bars)
+            bench = Bench(data, a.keep or Path(scratch), lambda text: print(text, flush=True))
+            bars: list[Bar] = module.run(bench)
+        text = section(name, module.TITLE, bars, bench.more)
         print("\n" + text)
         a.results.parent.mkdir(parents=True, exist_ok=True)
         old = a.results.read_text() if a.results.exists() else ""

@@ -1,0 +1,167 @@
+"""Which front-end: templates, flow or descriptors, in all else the same agent, without a base, on the same flights."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.tracker import Tracker
+from kiteline_agent.warm import warm
+from kiteline_core.frame import Frame, ImuBatch, Trajectory
+from kiteline_core.ids import AgentId
+from kiteline_hw.ports import FrameSource
+from kiteline_hw.sim.config import read_config
+from kiteline_hw.sim.source import SimSource
+from kiteline_hw.sources import open_source
+from kiteline_hw.words import shipped_words
+from kiteline_lab import metrics
+from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
+from kiteline_lab.front_ends import DescriptorTracker, FlowTracker, OtherAgent
+from kiteline_lab.simulate import record
+
+TITLE = "Front-end"
+
+F64 = NDArray[np.float64]
+
+KINDS: dict[str, type[Tracker]] = {"templates": Tracker, "flow": FlowTracker, "descriptors": DescriptorTracker}
+_HALL_S, _HALL_START_S = 15.0, 25.0  # the fast part of the path, 1.3 to 1.8 m/s
+_REPEATS = 2  # flights are equal but for the clock: a frame costs the least of its times
+_NOTE = "CPU: process time of a step, without decoding. Errors: rmse, the agent alone, aligned without scale."
+_EQUAL = 1.1  # accuracies nearer than this are equal: what another seed of noise changes
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """One front-end on one flight. cpu_ms: (n,) of a step. ate_m, rpe_mm, rpe_deg: rmse. inliers: mean of a frame."""
+
+    cpu_ms: F64
+    ate_m: float
+    rpe_mm: float
+    rpe_deg: float
+    keyframes: int
+    inliers: float
+    tracked: int
+    frames: int
+    submaps: int
+
+
+def run(bench: Bench) -> list[Bar]:
+    """The table, and as bars what the choice rests on."""
+    cv2.setNumThreads(1)
+    flights = _flights(bench)
+    results = {}
+    for name, opened in flights.items():
+        for kind in KINDS:
+            bench.say(f"flying {name} by {kind}")
+            results[name, kind] = fly(kind, opened)
+    bench.more.append(table(results))
+    bars = []
+    for name in flights:
+        ours = results[name, "templates"]
+        others = {kind: results[name, kind] for kind in KINDS if kind != "templates"}
+        bars.append(is_true(f"{name}: every frame tracked", "all", ours.tracked == ours.frames,
+                            f"{ours.tracked} of {ours.frames}"))  # fmt: skip
+        best = min((o for o in others.values() if o.tracked == o.frames), key=lambda o: o.rpe_mm, default=None)
+        if best is not None:
+            bars.append(at_most(f"{name}: relative error, over the best other", ours.rpe_mm / best.rpe_mm, _EQUAL, ""))
+        even = [o for o in others.values() if o.rpe_mm <= _EQUAL * ours.rpe_mm and o.tracked == o.frames]
+        what = f"{name}: CPU, over the cheapest that is as accurate"
+        if even:
+            cost = min(float(o.cpu_ms.mean()) for o in even)
+            bars.append(at_most(what, float(ours.cpu_ms.mean()) / cost, 1.0, ""))
+        else:
+            bars.append(is_true(what, "<= 1", True, "no other is as accurate"))
+    return bars
+
+
+def table(results: dict[tuple[str, str], Flown]) -> str:
+    """All figures as Markdown."""
+    heads = (
+        "flight", "front-end", "CPU mean ms", "p95", "ATE m", "error a frame mm", "degrees", "keyframes", "inliers",
+        "tracked",
+    )  # fmt: skip
+    lines = [_NOTE, "", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for (name, kind), r in results.items():
+        tracked = "all" if r.tracked == r.frames else f"{r.tracked} of {r.frames}, {r.submaps} submaps"
+        lines.append(
+            f"| {name} | {kind} | {r.cpu_ms.mean():.2f} | {np.percentile(r.cpu_ms, 95):.2f} | {r.ate_m:.4f} | "
+            f"{r.rpe_mm:.2f} | {r.rpe_deg:.4f} | {r.keyframes} | {r.inliers:.0f} | {tracked} |"
+        )
+    return "\n".join(lines)
+
+
+def fly(kind: str, opened: Callable[[], FrameSource], repeats: int = _REPEATS) -> Flown:
+    """Fly a source by one front-end. Raises SourceError."""
+    cpu = []
+    for _ in range(repeats):
+        source = opened()
+        cpu_ms, estimates = _steps(_agent(kind, source), source)
+        cpu.append(cpu_ms)
+    truth = source.ground_truth
+    assert truth is not None, "a flight without truth says nothing about accuracy"
+    posed = [(e.t_ns, e.T_m_b) for e in estimates if e.T_m_b is not None]
+    found = metrics.evaluate(Trajectory(np.array([t for t, _ in posed]), np.array([T for _, T in posed])), truth)
+    assert found.rpe_frame is not None
+    return Flown(
+        np.min(cpu, axis=0), found.ate_m.rmse, 1000.0 * found.rpe_frame.translation_m.rmse,
+        found.rpe_frame.rotation_deg.rmse, len({e.keyframe for e in estimates}),
+        float(np.mean([e.inliers for e in estimates[1:]])), sum(e.tracked for e in estimates), len(estimates),
+        len({e.submap for e in estimates}),
+    )  # fmt: skip
+
+
+def _agent(kind: str, source: FrameSource) -> Agent:
+    config, identity, words = AgentConfig(), Identity(AgentId(0), 0), shipped_words()
+    warm(source.rig, config)
+    tracker = KINDS[kind]
+    if issubclass(tracker, DescriptorTracker | FlowTracker):
+        return OtherAgent(tracker, source.rig, source.imu, config, identity, AloneChannel(), words)
+    return Agent(source.rig, source.imu, config, identity, AloneChannel(), words)
+
+
+def _steps(agent: Agent, items: Iterable[Frame | ImuBatch]) -> tuple[F64, list[Estimate]]:
+    cpu_ms: list[float] = []
+    estimates: list[Estimate] = []
+    imu: ImuBatch | None = None
+    for item in items:
+        if isinstance(item, ImuBatch):
+            imu = item
+            continue
+        begin_ns = time.process_time_ns()
+        estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
+        cpu_ms.append((time.process_time_ns() - begin_ns) / 1e6)
+        assert estimate is not None
+        estimates.append(estimate)
+        imu = None
+    return np.array(cpu_ms), estimates
+
+
+def _flights(bench: Bench) -> dict[str, Callable[[], FrameSource]]:
+    room, kitti = bench.source("room_flight.mcap"), bench.source("kitti_straight")
+    bench.say("rendering a hall")
+    hall = bench.folder / "hall.mcap"
+    _record_hall(hall, bench.source("trajectories/MH_03_medium.txt"))
+    return {
+        "room_flight": lambda: open_source(room),
+        "room_flight, no IMU": lambda: open_source(room, imu=False),
+        "kitti_straight": lambda: open_source(kitti),
+        "simulated hall": lambda: open_source(str(hall)),
+    }
+
+
+def _record_hall(path: Path, trajectory: str) -> None:
+    if path.exists():
+        return
+    config = read_config("hall", trajectory=trajectory, seed=3, seconds=_HALL_S, start=_HALL_START_S)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    record(SimSource(config, os.cpu_count() or 1, None), path)
