@@ -11,8 +11,10 @@ from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
 from kiteline_core.sparse_map import SparseMap
 
 
-@pytest.mark.parametrize(("unit", "known", "one"), [(1.0, 40, True), (1.08, 40, True), (1.4, 40, False), (0.6, 40, False),
-                                                     (0.6, 5, True)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("unit", "known", "one"),
+    [(1.0, 40, True), (1.08, 40, True), (1.4, 40, False), (0.6, 40, False), (0.6, 5, True)],
+)
 def test_depths_in_both_maps_tell_the_unit(unit: float, known: int, one: bool) -> None:
     random = np.random.default_rng(0)
     keyframe = keyframe_id(submap_id(0, 0, 0), 0)
