@@ -30,18 +30,21 @@ from kiteline_agent.warm import warm
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.framing import StreamFramer
+from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw import process
 from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
+from kiteline_hw.key_store import read_keys
 from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mavlink_frames import mounting
 from kiteline_hw.mavlink_out import MavlinkPoseSink
 from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, SourceError
+from kiteline_hw.sealed_link import SealedLink
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
 from kiteline_hw.words import shipped_words
@@ -328,6 +331,8 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
         stack.callback(onboard.close)
         link = open_link(spec.link, "agent", spec.agent, framer=StreamFramer, required=False)
         stack.callback(link.close)
+        if spec.key:
+            link = _sealed(spec, link)
         clock = MonotonicClock()
         sink = _pose_sink(spec, source, clock, stack)
         if spec.cpu_percent > 0.0:
@@ -359,6 +364,16 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
         _drain_live(onboard, link, clock, parent, stop)
         if parent is not None:
             parent.tell("result", report=onboard.report())
+
+
+def _sealed(spec: AgentSpec, link: ByteLink) -> ByteLink:
+    """The link with its packets sealed. Raises LinkError without a key for this agent."""
+    keys = read_keys(Path(spec.key))
+    if spec.agent not in keys:
+        raise LinkError(f"{spec.key} has no key for agent {spec.agent}; `kiteline keys new {spec.agent}` makes one")
+    key = {spec.agent: keys[spec.agent]}
+    sealer = Sealer(key[spec.agent], spec.agent, spec.boot + 1, Direction.UP, suite_for(spec.link))
+    return SealedLink(link, spec.agent, sealer, Opener(key, Direction.DOWN))
 
 
 def _drain_live(
@@ -405,7 +420,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     spec = AgentSpec(
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
-        cpu_percent=a.cpu,
+        key=a.key, cpu_percent=a.cpu,
         mavlink=a.mavlink, axes=a.axes,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())

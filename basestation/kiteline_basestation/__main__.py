@@ -33,16 +33,19 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.framing import StreamFramer
 from kiteline_codec.schema import WireError
+from kiteline_codec.seal import Direction, Opener, Sealer, seal_bytes, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_core.place_index import Vocabulary
 from kiteline_hw import process
 from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.cpu import rss_mib
+from kiteline_hw.key_store import read_keys
 from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, LinkHub
+from kiteline_hw.sealed_link import SealedHub
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_lockstep import LockstepServer
@@ -241,7 +244,8 @@ def place_words() -> Vocabulary | None:
 
 def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
     """Opens our end of the codec to an agent."""
-    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile)
+    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed)
 
 
 def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
@@ -287,6 +291,8 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
     with contextlib.ExitStack() as stack:
         hub = open_link(spec.link, "base", framer=StreamFramer, required=False)
         stack.callback(hub.close)
+        if spec.key:
+            hub = _sealed(spec, hub)
         worker = Worker()
         stack.callback(worker.close)
         ground = Ground(spec, coded_channels(spec), worker)
@@ -320,6 +326,17 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         if parent is not None and ground.flown is not None:
             parent.tell("flown", keyframes=ground.flown.keyframes)
             parent.tell("result", report=ground.report(), keyframes=ground.snapshot().keyframes)
+
+
+def _sealed(spec: BaseSpec, hub: LinkHub) -> LinkHub:
+    """The hub with its packets sealed; agents without a key are not heard. Raises LinkError."""
+    keys = read_keys(Path(spec.key))
+
+    def sealer(agent: int) -> Sealer | None:
+        key = keys.get(agent)
+        return None if key is None else Sealer(key, agent, spec.session, Direction.DOWN, suite_for(spec.link))
+
+    return SealedHub(hub, sealer, Opener(keys, Direction.UP))
 
 
 def _send(hub: LinkHub, packets: Mapping[AgentId, Sequence[bytes]]) -> None:
@@ -386,7 +403,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     session = process.next_number((Path(a.store) if a.store else state) / "session")
     spec = BaseSpec(
         folder=a.log, log_name=f"session{session:05d}.mcap" if a.log else "", session=session, link=a.link,
-        config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, store=a.store, web=a.web,
+        config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
     process.leave(0)

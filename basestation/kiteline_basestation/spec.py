@@ -25,6 +25,7 @@ class BaseSpec:
     config: str = ""  # a TOML file
     start_ns: int = 0  # the stamp that is flight time 0, so that the log stands in the time of the first source
     down_bytes_s: int = 0  # B/s that the link to each agent takes; 0: any number
+    key: str = ""  # a file with the keys of agents; "": packets are not sealed
     profile: str = ""  # wifi or radio: how packets are made; "": as the link allows
     delay_s: float = 0.0  # s that a packet is under way
     loss: float = 0.0  # probability that a packet is lost
@@ -74,6 +75,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; hear no agent without a key in it")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p

@@ -172,26 +172,35 @@ class Opener:
         suite, direction, agent = Suite(first >> 7), first >> 6 & 1, first & _MAX_AGENT
         body_at = len(sealed) - source.left
         if source.left < _TAG_BYTES[suite]:
-            return self._refuse("truncated", agent)
+            self._refuse("truncated", agent)
+            return None
         key = self._keys.get((agent, suite))
         if key is None or direction != self._direction:
-            return self._refuse("unknown", agent)
+            self._refuse("unknown", agent)
+            return None
         window = self._windows[agent]
         if not window.is_new(boot, counter):
-            return self._refuse("replayed", agent)
-        head, body = sealed[:body_at], sealed[body_at:]
-        if suite == Suite.TAGGED:
-            packet = body[:-8]
-            if not hmac.compare_digest(_tag(key, head + packet), body[-8:]):
-                return self._refuse("forged", agent)
-        else:
-            try:
-                packet = ChaCha20Poly1305(key).decrypt(_nonce(first, boot, counter), body, head)
-            except InvalidTag:
-                return self._refuse("forged", agent)
+            self._refuse("replayed", agent)
+            return None
+        packet = self._sound(key, suite, sealed[:body_at], sealed[body_at:], _nonce(first, boot, counter))
+        if packet is None:
+            self._refuse("forged", agent)
+            return None
         window.mark(boot, counter)
         self.counters.opened += 1
         return agent, packet
+
+    @staticmethod
+    def _sound(key: bytes, suite: Suite, head: bytes, body: bytes, nonce: bytes) -> bytes | None:
+        """The packet, None where the seal does not hold."""
+        if suite == Suite.TAGGED:
+            packet = body[: -_TAG_BYTES[suite]]
+            sound = hmac.compare_digest(_tag(key, head + packet), body[-_TAG_BYTES[suite] :])
+            return packet if sound else None
+        try:
+            return ChaCha20Poly1305(key).decrypt(nonce, body, head)
+        except InvalidTag:
+            return None
 
     def _refuse(self, why: str, agent: int) -> None:
         setattr(self.counters, why, getattr(self.counters, why) + 1)
