@@ -69,7 +69,8 @@ class KeyframeMaker:
         shared = self._map.is_shared(rows)
         sightings = self._sightings(keyframe, rows[shared], seen[shared], min(len(order), profile.births))
         sections = profile.choose(births, strength, sightings)
-        head = Head(keyframe, t_ns, parent, T_p_k, sum(len(s.index) for s in (*sections[0], *sections[1])))
+        n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
+        head = Head(keyframe, t_ns, parent, T_p_k, n_keypoints)
         self._work.keyframes += 1
         self._work.detected_px += view.left[0].size
         self._work.births += len(births.index)

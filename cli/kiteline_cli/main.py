@@ -36,6 +36,7 @@ COMMANDS = (
     Command("convert", "turn a data set or a ROS 2 bag into a kiteline log"),
     Command("log", "look into logs and mend them: info, recover, cut, merge"),
     Command("export", "a base's map in the formats of other tools: TUM, PLY, PGM, g2o"),
+    Command("keys", "make and show the keys with which agents and base seal their packets"),
     Command("doctor", "check this machine, and warm the compiled kernels"),
     Command("bench", "measure, and write docs/results.md"),
 )
