@@ -36,7 +36,7 @@ LADDER = (
     Effort(0.80, 0.70, 0.60, 1, 1, 1.2, 1.00, 0.60),
     Effort(0.60, 0.60, 0.50, 1, 1, 1.4, 0.75, 0.51),
     Effort(0.45, 0.45, 0.35, 0, 1, 1.5, 0.50, 0.41),
-    Effort(0.35, 0.40, 0.00, 0, 1, 1.6, 0.50, 0.33),
+    Effort(0.35, 0.40, 0.30, 0, 1, 1.6, 0.50, 0.36),
 )  # from the best to the cheapest
 
 
@@ -48,6 +48,7 @@ class Extra(Enum):
     SUBMAP = "submap"  # a first keyframe
 
 
+_LONGER = 1.01  # growth of the expected period a frame, should the camera become slower
 _GUESS = 3.0  # usual frames that something dear costs, before it was seen
 _OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
 _LEAST = 0.2  # of the budget is for frames, whatever keyframes cost
@@ -135,7 +136,7 @@ class Governor:
         self._steer(t_ns)
         track = self._affordable(lost)
         if not track and self.level < len(LADDER) - 1:
-            self._set_level(t_ns, min(self.level + 2, len(LADDER) - 1))  # quality before frames
+            self._set_level(t_ns, self.level + 1)  # quality before frames
             track = self.level < len(LADDER) - 1 or self._affordable(lost)
         track = self._its_turn() and track
         if not track and not lost and self._skipped >= self._config.max_skips:
@@ -195,8 +196,9 @@ class Governor:
         if self._last_t_ns is None:
             self._first_t_ns = self._level_since_ns = self._calm_since_ns = t_ns
             return
-        gain = self._config.learning if self._period_ns else 1.0
-        self._period_ns += (t_ns - self._last_t_ns - self._period_ns) * gain
+        # Frames that a busy core passed over were not asked about: the shortest period is the camera's.
+        passed_ns = float(t_ns - self._last_t_ns)
+        self._period_ns = min(passed_ns, _LONGER * self._period_ns) if self._period_ns else passed_ns
 
     def _affordable(self, lost: bool) -> bool:
         """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
