@@ -1,0 +1,40 @@
+"""A short run of the fuzzer over the kept corpus; `kiteline bench fuzz` makes a long one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from kiteline_codec import messages
+from kiteline_codec.schema import Key
+from kiteline_lab import fuzz
+
+HERE = Path(__file__).parent
+
+
+def values() -> list[tuple[Key, bytes]]:
+    entries = json.loads((HERE / "golden" / "records.json").read_text())
+    return [(Key(*e["key"]), bytes.fromhex(e["code"])) for e in entries]
+
+
+def test_nothing_but_refusals() -> None:
+    corpus = fuzz.read_corpus(HERE / "corpus")
+    assert len(corpus) > 20
+    found = fuzz.fuzz(corpus, values(), 12_000, seed=1)
+    assert found.failures == []
+    assert found.refused > 4_000
+    assert found.accepted > 100
+    assert found.slowest_s < 0.25
+    assert found.grown_mib < 100
+
+
+def test_it_would_find_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(key: Key, code: bytes) -> None:
+        raise IndexError("beyond the end")
+
+    monkeypatch.setattr(messages, "decode", broken)
+    found = fuzz.fuzz(fuzz.read_corpus(HERE / "corpus"), values(), 600, seed=1)
+    assert len(found.failures) == 20
+    assert "IndexError" in found.failures[0]
