@@ -25,7 +25,7 @@ from kiteline_basestation.publisher import Publisher
 from kiteline_basestation.refinement import apply_bundle
 from kiteline_codec.schema import Kind
 from kiteline_core import se3
-from kiteline_core.bundle import BundleResult
+from kiteline_core.bundle import BundleConfig, BundleResult
 from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH
 from kiteline_core.place_index import Vocabulary
@@ -79,6 +79,19 @@ class Atlas:
         """How many jobs are under way."""
         return len(self._graphs) + len(self._fulls)
 
+    def busy_with(self, island: SubmapId) -> bool:
+        """Whether a correction of a map is under way."""
+        due = island in self._graph_due or island in self._full_due or island in self._graphs.values()
+        return due or any(i == island for i, _ in self._fulls.values())
+
+    def fits(self, island: SubmapId) -> bool:
+        """Whether one bundle can hold a whole map."""
+        return len(keyframes_of(self._map, island)) <= self._config.graph.max_full
+
+    def bundle_all(self, island: SubmapId) -> None:
+        """Bundle a whole map anew."""
+        self._full_due.add(island)
+
     def consider(self, keyframe: KeyframeId) -> None:
         """Ask whether a new keyframe's place is known, and remember it."""
         self.finder.add(keyframe)
@@ -130,6 +143,13 @@ class Atlas:
     def _ask(self, keyframe: KeyframeId) -> None:
         finding = self.finder.consider(keyframe)
         if finding is None:
+            return
+        if finding.against is not None:
+            a, b = finding.against
+            for merge in reversed(self.merges):
+                if (a in merge.moved) != (b in merge.moved):
+                    self.undo(merge)
+                    return
             return
         if finding.loop:
             self.loops += 1
@@ -222,7 +242,7 @@ class Atlas:
         wide = replace(self._config.window, fixed=config.max_full // 2)
         return window(self._map, keyframes, wide, self._config.measurement, {first})
 
-    def _full_config(self):  # type: ignore[no-untyped-def]
+    def _full_config(self) -> BundleConfig:
         config = self._config.graph
         return replace(self._config.bundle, robust_trials=config.robust_trials, final_trials=config.final_trials)
 
@@ -271,7 +291,9 @@ class Atlas:
         self.undone += 1
         self._void(merge.into)
         mine = set(merge.moved)
-        self._edges = [v for v in self._edges if (submap_of_keyframe(v.new) in mine) == (submap_of_keyframe(v.old) in mine)]
+        self._edges = [
+            v for v in self._edges if (submap_of_keyframe(v.new) in mine) == (submap_of_keyframe(v.old) in mine)
+        ]
         self._fresh.pop(merge.into, None)
         self._revisit = [k for k in self._revisit if submap_of_keyframe(k) not in mine]
         inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> 20, sorted(mine))

@@ -77,12 +77,12 @@ class LoopConfig:
 
     share: str = "all"  # agents whose maps may become one: "all", "none", or groups such as "0 1, 1 2"
     enabled: bool = True
-    candidates: int = 3  # most alike keyframes of other maps that are looked at
-    candidates_here: int = 2  # of the same map
+    candidates: int = 4  # most alike keyframes of other maps that are looked at
+    candidates_here: int = 3  # of the same map
     min_gap: int = 12  # keyframes of the same submap between two that may close a loop
     max_shared: int = 15  # points that two keyframes share already: more are no news
     min_likeness: float = 0.02  # of the bags of words: below it two places have little in common
-    min_of_neighbours: float = 0.35  # share of the likeness that a keyframe has to the one before it
+    min_of_neighbours: float = 0.1  # share of the likeness that a keyframe has to the one before it
     match: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
     sigma_disparity_px: float = 0.4  # one deviation of the disparities from which points hang on their rays
@@ -110,6 +110,8 @@ class LoopConfig:
     drift_rad_m: float = 0.002  # this turn for each metre
     small_m: float = 0.02  # correction that needs no pose graph: fusing points is enough
     small_rad: float = 0.005
+    off_plane: float = 0.03  # of the median depth: so far from a plane lies what is no part of it
+    min_off_plane: float = 0.15  # share of the points that join maps and lie off their plane: a wallpaper has copies
     twin_m: float = 1.0  # places of one map that look the same and lie further apart than this are twins
 
 
@@ -131,6 +133,19 @@ class GraphConfig:
     final_trials: int = 6  # after it
     revisits: int = 2  # keyframes a step that look again for what joined maps know
     min_kept: float = 0.5  # share of the points fused by a merge that the bundle must keep, else it was wrong
+
+
+@dataclass(frozen=True, slots=True)
+class DisparityConfig:
+    """The constant error of an agent's disparities, found from its motion."""
+
+    every: int = 12  # keyframes between two looks
+    min_seen: int = 4  # observations with depth of a point that is used
+    min_points: int = 300
+    min_range: float = 1.8  # ratio of near to far disparities (90 to 10 %): less says nothing of an offset
+    least_px: float = 0.02  # smaller offsets stay: the estimate is no better
+    deviations: float = 4.0  # by which an offset must stand out
+    most_px: float = 0.5  # more is no calibration error, but something else
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,5 +186,6 @@ class BaseConfig:
     cull: CullConfig = field(default_factory=CullConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
+    disparity: DisparityConfig = field(default_factory=DisparityConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     grid: GridConfig = field(default_factory=GridConfig)

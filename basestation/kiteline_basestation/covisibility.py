@@ -107,14 +107,17 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     table = sparse_map.keypoints
     rows = table.row[slots]
     deep = np.zeros(len(sparse_map), bool)
+    offset = np.zeros(len(sparse_map))
     for row in np.unique(rows).tolist():
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
+        offset[row] = sparse_map.disparity_offset_px.get(agent, 0.0)
         deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & deep[rows]
     measured = np.empty((len(slots), 3))
     measured[:, :2] = table.uv[slots]
-    measured[:, 2] = np.where(ranged, sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots], -1.0)
+    disparity = sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots] - offset[rows]
+    measured[:, 2] = np.where(ranged, np.maximum(disparity, 0.0), -1.0)
     octave = table.octave[slots].astype(np.float64)
     aligned = config.sigma_growth**octave
     fused = (table.kind[slots] == BIRTH) & (table.root[slots] != slots)

@@ -46,7 +46,9 @@ def cull_redundant(
         at = same.index(other)
         if at == 0 or len(same) - at <= config.keyframe_age or not sparse_map.complete(other):
             continue
-        if sparse_map.keyframes.pose_source[sparse_map.rows[other]] == REFINED_POSE and _redundant(sparse_map, other, config):
+        if sparse_map.keyframes.pose_source[sparse_map.rows[other]] == REFINED_POSE and _redundant(
+            sparse_map, other, config
+        ):
             sparse_map.cull_keyframe(other)
             publisher.touch(Kind.CULLED, other)
             out.append(other)

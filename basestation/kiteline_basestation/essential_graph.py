@@ -49,10 +49,10 @@ def optimise(inputs: GraphInputs) -> GraphResult:
     """Where the keyframes lie when all edges are heard."""
     import gtsam  # heavy, and needed only here
 
-    noises = {}
+    noises: dict[tuple[float, ...], gtsam.noiseModel.Base] = {}
     for row in np.unique(np.column_stack([inputs.sigma, inputs.loop]), axis=0):
         sigmas = np.array([row[1]] * 3 + [row[0]] * 3)  # gtsam has rotation first
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         if row[2]:
             huber = gtsam.noiseModel.mEstimator.Huber.Create(inputs.config.huber)
             noise = gtsam.noiseModel.Robust.Create(huber, noise)
@@ -77,7 +77,9 @@ def optimise(inputs: GraphInputs) -> GraphResult:
         poses = inputs.T_w_k.copy()
     poses[inputs.held] = inputs.T_w_k[inputs.held]
     work = int(optimiser.iterations()) * (8_000 * len(inputs.edges) + 6_000 * len(poses))
-    return GraphResult(inputs.keyframes, poses, residuals(inputs, poses), 300_000 + 6_000 * len(inputs.edges) + work // 4)
+    return GraphResult(
+        inputs.keyframes, poses, residuals(inputs, poses), 300_000 + 6_000 * len(inputs.edges) + work // 4
+    )
 
 
 def residuals(inputs: GraphInputs, T_w_k: F64) -> F64:

@@ -7,13 +7,13 @@ how two maps lie to each other, or for how far one has drifted. A few keyframes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
-from kiteline_basestation.overlap import Overlap, find_overlap, view_of
+from kiteline_basestation.overlap import Overlap, View, find_overlap, view_of
 from kiteline_core import se3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.place_index import PlaceIndex, Vocabulary
@@ -26,13 +26,14 @@ F64 = NDArray[np.float64]
 class Finding:
     """Enough votes. newer, older: islands (the same one: a loop). T_older_newer: (4,4) how the newer has to move.
 
-    votes: those that agree.
+    votes: those that agree. against: submaps of one map whose places contradict how they were joined.
     """
 
     newer: SubmapId
     older: SubmapId
     T_older_newer: F64
     votes: tuple[Overlap, ...]
+    against: tuple[SubmapId, SubmapId] | None = None
 
     @property
     def loop(self) -> bool:
@@ -66,6 +67,7 @@ class LoopFinder:
         self._index = PlaceIndex(words)
         self._shares = Shares(config.share)
         self._votes: dict[tuple[SubmapId, SubmapId], list[Overlap]] = {}  # by the submaps of old and new
+        self._doubts: dict[tuple[SubmapId, SubmapId], int] = {}  # how often a join of two submaps was taken back
         self._born: dict[SubmapId, int] = {}  # when the base first heard of a submap
         self.proofs = 0  # overlaps that geometry proved
         self.refused = 0  # findings that were no drift, or of places that have twins
@@ -86,8 +88,9 @@ class LoopFinder:
     def consider(self, keyframe: KeyframeId) -> Finding | None:
         """Ask where else this place was seen. A finding is told once: its votes are used up."""
         finding = self._said_by_agent(keyframe)
-        for old in self._candidates(keyframe):
-            overlap = find_overlap(self._map, keyframe, old, self._config)
+        view = view_of(self._map, keyframe)
+        for old in self._candidates(keyframe, view):
+            overlap = find_overlap(self._map, keyframe, old, self._config, view)
             if overlap is None:
                 continue
             self.proofs += 1
@@ -101,20 +104,23 @@ class LoopFinder:
         sparse_map = self._map
         new, t_ns = submap_of_keyframe(keyframe), sparse_map.keyframes.t_ns[sparse_map.rows[keyframe]]
         for submap in sorted(sparse_map.submaps):
-            if agent_of_submap(submap) != agent_of_submap(new) or sparse_map.island_of(submap) == sparse_map.island_of(new):
+            if agent_of_submap(submap) != agent_of_submap(new) or sparse_map.island_of(submap) == sparse_map.island_of(
+                new
+            ):
                 continue
             for other in sparse_map.submaps[submap]:
                 if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
+                    continue
+                if self._doubts.get((min(new, submap), max(new, submap)), 0):
                     continue
                 nothing = np.empty(0, np.int32)
                 vote = Overlap(keyframe, other, np.eye(4), self._config.min_inliers_loop, nothing, nothing, 1.0)
                 return self._finding(vote, [vote])
         return None
 
-    def _candidates(self, keyframe: KeyframeId) -> list[KeyframeId]:
+    def _candidates(self, keyframe: KeyframeId, view: View) -> list[KeyframeId]:
         """The places most alike, at most one of each neighbourhood, and never what is known to be one with this."""
         sparse_map, config = self._map, self._config
-        view = view_of(sparse_map, keyframe)
         if len(view.slots) < config.min_inliers:
             return []
         shared = sparse_map.covisible(sparse_map.points_of(keyframe))
@@ -136,7 +142,11 @@ class LoopFinder:
             if score < enough:
                 break
             here = sparse_map.island_of(submap_of_keyframe(old)) == island
-            if key in taken or left[here] == 0 or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old)):
+            if (
+                key in taken
+                or left[here] == 0
+                or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old))
+            ):
                 continue
             out.append(old)
             left[here] -= 1
@@ -153,18 +163,43 @@ class LoopFinder:
         votes.append(vote)
         self._votes[key] = votes
         same_map = self._map.island_of(new) == self._map.island_of(old)
-        if same_map and (vote.inliers < config.min_inliers_loop or not self._drift_explains(vote)):
-            return None
         chosen = [v for v in votes if self._agree(v, vote)]
         supporters = {v.new for v in chosen}
+        best = max(chosen, key=lambda v: (v.inliers, v.new))
+        if same_map and not self._drift_explains(vote):
+            if new == old or len(supporters) < config.votes:
+                return None
+            self._doubts[key] = self._doubts.get(key, 0) + 1
+            return replace(self._finding(best, chosen), against=key)
+        if same_map and vote.inliers < config.min_inliers_loop:
+            return None
         against = {v.new for v in votes} - supporters
-        if len(supporters) < config.votes + config.against * len(against):
+        needed = config.votes * (1 + 2 * self._doubts.get(key, 0)) + config.against * len(against)
+        if len(supporters) < needed or not (same_map or self._stands_out(chosen)):
             return None
         if not same_map and any(self._has_twin(v) for v in chosen[-config.votes :]):
             self.refused += 1
             return None
-        self._votes[key] = []
-        return self._finding(max(chosen, key=lambda v: (v.inliers, v.new)), chosen)
+        if same_map:
+            self._votes[key] = []  # those that joined maps stay, to be weighed against later ones
+        return self._finding(best, chosen)
+
+    def _stands_out(self, votes: list[Overlap]) -> bool:
+        """Whether points lie off the plane that fits most of them: what is flat may hang in two places."""
+        points = np.unique(np.concatenate([v.theirs for v in votes]))
+        xyz, known = self._map.positions(points.astype(np.int32))
+        xyz = xyz[known]
+        if len(xyz) < self._config.min_inliers:
+            return False
+        limit = self._config.off_plane * float(np.median([v.depth_m for v in votes]))
+        inside = np.ones(len(xyz), np.bool_)
+        distance = np.zeros(len(xyz))
+        for _ in range(4):
+            centre = xyz[inside].mean(axis=0)
+            normal = np.linalg.svd(xyz[inside] - centre, full_matrices=False)[2][2]
+            distance = np.abs((xyz - centre) @ normal)
+            inside = distance <= max(limit, float(np.median(distance)))
+        return float(np.mean(distance > limit)) >= self._config.min_off_plane
 
     def _finding(self, best: Overlap, chosen: list[Overlap]) -> Finding:
         islands = tuple(self._map.island_of(submap_of_keyframe(k)) for k in (best.new, best.old))
@@ -232,7 +267,7 @@ class LoopFinder:
         return total
 
     def _has_twin(self, vote: Overlap) -> bool:
-        """Whether one of the two maps shows the same place somewhere else too: then nobody knows which of them it is."""
+        """Whether one of the two maps shows the same place elsewhere too: then nobody knows which of them it is."""
         return any(self._twin_of(k) for k in (vote.old, vote.new))
 
     def _twin_of(self, keyframe: KeyframeId) -> bool:
@@ -254,7 +289,7 @@ class LoopFinder:
             looked += 1
             if looked > config.candidates:
                 return False
-            overlap = find_overlap(sparse_map, keyframe, other, config)
+            overlap = find_overlap(sparse_map, keyframe, other, config, view)
             if overlap is None:
                 continue
             X = self._motion(overlap)

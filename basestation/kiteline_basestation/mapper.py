@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation import culling, newpoints, refind
+from kiteline_basestation import culling, disparity, newpoints, refind
 from kiteline_basestation.atlas import Atlas
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.covisibility import Window, local_window
@@ -97,6 +97,7 @@ class Mapper:
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
+        self._calibrate_at = 2 * self.config.disparity.every  # keyframes, when offsets of disparities are looked at
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
         self.atlas: Atlas | None = None
@@ -124,6 +125,7 @@ class Mapper:
             self._grid_due += 1
             self.counts.keyframes += 1
         self._go_on_with_atlas()
+        self._calibrate()
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.atlas is not None:
             jobs += self.atlas.jobs()
@@ -292,6 +294,26 @@ class Mapper:
             self._place_island(island)
             self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
         self.atlas.moved.clear()
+
+    def _calibrate(self) -> None:
+        """Now and then, see whether an agent's disparities are off as a whole; if so, its map is bundled anew."""
+        config = self.config.disparity
+        if self.atlas is None or self.counts.keyframes < self._calibrate_at:
+            return
+        self._calibrate_at = self.counts.keyframes + config.every
+        for agent in sorted(self.map.measures_depth):
+            island = self.map.island_of(
+                max(s for s, ks in self.map.submaps.items() if agent_of_keyframe(ks[0]) == agent)
+            )
+            if self.atlas.busy_with(island) or not self.atlas.fits(island):
+                continue
+            applied = self.map.disparity_offset_px.get(agent, 0.0)
+            found = disparity.estimate(self.map, agent, applied, config)
+            if found is None or abs(applied + found.value_px) > config.most_px:
+                continue
+            if abs(found.value_px) > max(config.least_px, config.deviations * found.sigma_px):
+                self.map.disparity_offset_px[agent] = applied + found.value_px
+                self.atlas.bundle_all(island)
 
     def _place_island(self, island: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place."""

@@ -86,12 +86,15 @@ def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
     )  # fmt: skip
 
 
-def find_overlap(sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig) -> Overlap | None:
+def find_overlap(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig, view: View | None = None
+) -> Overlap | None:  # fmt: skip
     """Whether `new` sees what `old` and its neighbours saw, and how the two then lie; None without proof.
 
-    The poses of both are taken from their own maps; how these lie to each other is not used.
+    The poses of both are taken from their own maps; how these lie to each other is not used. view: of `new`, if known.
     """
-    mine, theirs = view_of(sparse_map, new), view_of(sparse_map, old)
+    mine = view_of(sparse_map, new) if view is None else view
+    theirs = view_of(sparse_map, old)
     wanted, offered = comparable(mine.descriptor, theirs.descriptor)
     pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
     a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
@@ -162,7 +165,8 @@ def _with_neighbours(
             return None
         wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)
         near = matching.match_near(
-            uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave, offered, (size.width, size.height), config.octave_gap, config.match,
+            uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave,
+            offered, (size.width, size.height), config.octave_gap, config.match,
         )  # fmt: skip
         if len(near.a) < config.min_inliers:
             return None

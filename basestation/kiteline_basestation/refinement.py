@@ -54,9 +54,9 @@ def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher
     table = sparse_map.keyframes
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     for row in np.flatnonzero(table.culled[: len(sparse_map)]).tolist():
-        parent = int(table.parent[row])
-        while parent in sparse_map and parent not in number and table.culled[sparse_map.rows[KeyframeId(parent)]]:
-            parent = int(table.parent[sparse_map.rows[KeyframeId(parent)]])
+        parent = KeyframeId(int(table.parent[row]))
+        while parent in sparse_map and parent not in number and table.culled[sparse_map.rows[parent]]:
+            parent = KeyframeId(int(table.parent[sparse_map.rows[parent]]))
         i = number.get(parent)
         if i is None or np.array_equal(before[i], table.T_w_k[window.rows[i]]) or int(table.id[row]) in number:
             continue

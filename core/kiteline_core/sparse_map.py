@@ -66,6 +66,7 @@ class SparseMap:
         self.islands: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
+        self.disparity_offset_px: dict[AgentId, float] = {}  # what an agent's disparities are too large by
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots that name a point of a keyframe that is not here yet
 
@@ -227,7 +228,8 @@ class SparseMap:
         """The opposite of `fuse` for births at slots (n,): each is a point of its own again, seen where it is named."""
         table = self.keypoints
         kernels.link(births, births, table.root, table.first, table.next)
-        slots = np.flatnonzero((table.kind[: self.slots] == SIGHTING) & (table.root[: self.slots] >= 0)).astype(np.int32)
+        hangs = (table.kind[: self.slots] == SIGHTING) & (table.root[: self.slots] >= 0)
+        slots = np.flatnonzero(hangs).astype(np.int32)
         self._link_sightings(slots[np.isin(self.find_points(table.point[slots]), births)])
 
     # -- questions ---------------------------------------------------------------------------------------------------

@@ -125,7 +125,7 @@ def fly(
         known = np.array([r in tracked and n - tracked[r][1] <= memory for r in rows.tolist()], bool)
         ids = np.array([tracked[r][0] if k else -1 for r, k in zip(rows.tolist(), known, strict=True)], np.int64)
         flips = np.packbits(rng.random((len(rows), 256)) < 0.06, axis=1)
-        made: list[Record] = [Head(keyframe, 10**9 + n * 250_000_000, parent, T_p_k, len(rows))]
+        made: list[Record] = [Head(keyframe, 10**9 + submap * 10**12 + n * 250_000_000, parent, T_p_k, len(rows))]
         index = np.arange(len(rows), dtype=np.uint16)
         for kind, mask in (("birth", ~known), ("sighting", known)):
             for part, some in enumerate(np.array_split(np.flatnonzero(mask), 3)):
@@ -171,7 +171,87 @@ def words() -> Vocabulary:
     return Vocabulary(20, 2, centres, np.ones(400, np.float32))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_flight() -> Callable[..., Flight]:
     """The maker of synthetic flights."""
     return fly
+
+
+@pytest.fixture(scope="session")
+def ring() -> Scene:
+    """A corridor that runs in a ring of 16 m radius, 4 m wide, every piece of wall another."""
+    rng = np.random.default_rng(11)
+    points = 7000
+    phi, z = rng.uniform(0, 2 * np.pi, points), rng.uniform(-1.2, 1.2, points)
+    radius = np.where(rng.random(points) < 0.6, 18.0, 14.0)
+    world = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], 1)
+
+    def path(turns: float) -> F64:
+        a = 2 * np.pi * turns
+        here = np.array([16.0 * np.cos(a), 16.0 * np.sin(a), 0.1 * np.sin(5 * a)])
+        return look(here, np.array([-np.sin(a), np.cos(a), 0.0]) + 0.35 * np.array([np.cos(a), np.sin(a), 0.0]))
+
+    descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
+    return Scene(world, descriptors, rng.uniform(-0.4, 1.4, points), rng.integers(0, 256, points), path)
+
+
+def straight(pieces: int, period_m: float, same: float, seed: int, turns_around: bool = False) -> Scene:
+    """A straight corridor whose walls repeat: this share of each piece's points is the same in every piece."""
+    rng = np.random.default_rng(seed)
+    n = 260
+    piece = np.stack([rng.uniform(0, period_m, n), rng.choice([-1.5, 1.5], n), rng.uniform(-1.2, 1.2, n)], 1)
+    descriptor = rng.integers(0, 256, (n, 32), dtype=np.uint8)
+    size, direction = rng.uniform(-0.4, 1.4, n), rng.integers(0, 256, n)
+    world, described = [], []
+    for k in range(pieces):
+        own = rng.random(n) >= same
+        at, code = piece + [k * period_m, 0.0, 0.0], descriptor.copy()
+        at[own] = np.stack(
+            [rng.uniform(0, period_m, n) + k * period_m, rng.choice([-1.5, 1.5], n), rng.uniform(-1.2, 1.2, n)], 1
+        )[own]
+        code[own] = rng.integers(0, 256, (int(own.sum()), 32), dtype=np.uint8)
+        world.append(at)
+        described.append(code)
+    length = (pieces - 2) * period_m
+
+    def path(turns: float) -> F64:
+        return look(np.array([turns * length, 0.0, 0.0]), np.array([0.5, 1.0, 0.0]))
+
+    return Scene(
+        np.concatenate(world), np.concatenate(described), np.tile(size, pieces), np.tile(direction, pieces), path
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def corridor() -> Scene:
+    """Ten times the same 3 m of wall."""
+    return straight(10, 3.0, 1.0, 12)
+
+
+def two_rooms(shared: float, seed: int) -> tuple[Scene, Scene]:
+    """Two rooms of 8 x 7 x 3 m and 10 x 9 x 3 m: of each wall's paper this share is the same in both."""
+    first = room(np.random.default_rng(seed), 900)
+    other = room(np.random.default_rng(seed + 1), 900)
+    half, wide = np.array([4.0, 3.5, 1.5]), np.array([5.0, 4.5, 1.5])
+    world = other.world * (wide / half)
+    same = np.random.default_rng(seed + 2).random(900) < shared
+    copied = first.world[same]
+    on_x = np.abs(np.abs(copied[:, 0]) - half[0]) < 1e-9  # the paper is not stretched: only the wall stands elsewhere
+    copied[on_x, 0] *= wide[0] / half[0]
+    copied[~on_x, 1] *= wide[1] / half[1]
+    world[same] = copied
+    descriptors, size, direction = other.descriptors.copy(), other.size.copy(), other.direction.copy()
+    descriptors[same], size[same], direction[same] = first.descriptors[same], first.size[same], first.direction[same]
+    return first, Scene(world, descriptors, size, direction, circle)
+
+
+@pytest.fixture(scope="session")
+def papered() -> tuple[Scene, Scene]:
+    """Two rooms with one wallpaper all over."""
+    return two_rooms(1.0, 30)
+
+
+@pytest.fixture(scope="session")
+def half_papered() -> tuple[Scene, Scene]:
+    """Two rooms that share half of what hangs on their walls."""
+    return two_rooms(0.5, 40)

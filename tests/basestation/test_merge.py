@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
@@ -63,3 +65,57 @@ def test_two_agents_in_one_room_get_one_map(make_flight: MakeFlight, words: Any)
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
     last = [r for r in published if isinstance(r, Placement) and r.submap == submap_of_keyframe(b.keyframes[0])][-1]
     assert np.allclose(last.T_w_m, ELSEWHERE, atol=0.03)
+
+
+@pytest.mark.parametrize("rooms", ["papered", "half_papered"])
+def test_two_rooms_with_one_wallpaper_stay_two(
+    make_flight: MakeFlight, request: pytest.FixtureRequest, words: Any, rooms: str
+) -> None:
+    one, other = request.getfixturevalue(rooms)
+    a = make_flight(keyframes=40, turns=1.0, scene=one)
+    b = make_flight(keyframes=40, turns=1.0, scene=other, variant=1, agent=1)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [a, b])
+    assert mapper.atlas is not None
+    assert mapper.atlas.finder.proofs > 0  # single walls do look alike
+    assert mapper.summary()["merges"] == 0
+    assert mapper.summary()["maps"] == 2
+
+
+def test_agents_in_a_corridor_that_repeats_stay_apart(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
+    a = make_flight(keyframes=40, turns=0.6, scene=corridor)
+    b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [a, b])
+    assert mapper.summary()["merges"] == 0
+
+
+def test_three_agents_in_a_chain_and_one_that_keeps_to_itself(make_flight: MakeFlight, words: Any) -> None:
+    flights = [
+        make_flight(keyframes=24, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))
+        for n in range(3)
+    ]
+    for share, merges in (("all", 2), ("0 1", 1), ("none", 0)):
+        config = replace(BaseConfig(), loops=replace(BaseConfig().loops, share=share))
+        mapper = Mapper(config, words)
+        feed(mapper, flights)
+        assert mapper.summary()["merges"] == merges
+        if merges == 2:
+            assert np.sqrt(np.mean(joint_error_m(mapper, flights) ** 2)) < 0.02
+
+
+def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flight: MakeFlight, words: Any) -> None:
+    a = make_flight(keyframes=30, turns=0.6)
+    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, submap=1, T_w_m=ELSEWHERE)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [a, b], [0, 30])
+    assert mapper.summary()["merges"] == 1
+    assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
+    assert mapper.atlas is not None
+    mapper.atlas.undo(mapper.atlas.merges[0])
+    table, sparse_map = mapper.map.keypoints, mapper.map
+    slots = np.flatnonzero(table.root[: sparse_map.slots] >= 0)
+    here = sparse_map.keyframes.id[table.row[slots]] >> 20
+    there = sparse_map.keyframes.id[table.row[table.root[slots]]] >> 20
+    assert np.array_equal(here, there)  # no point of one is seen from the other
+    assert mapper.summary()["maps"] == 2

@@ -1,0 +1,97 @@
+"""The essential graph: loops spread drift over the way, wrong loops hardly count, and 1000 keyframes take no time."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GraphConfig
+from kiteline_basestation.essential_graph import GraphInputs, optimise, residuals
+from kiteline_core import se3
+
+F64 = NDArray[np.float64]
+
+
+def ring(n: int, per_turn: int, loops: int, wrong: int = 0, seed: int = 0) -> tuple[F64, GraphInputs]:
+    """n poses around a circle with drifting odometry and some loops, the last `wrong` of them 3 m off."""
+    rng = np.random.default_rng(seed)
+    true = []
+    for i in range(n):
+        a = 2 * np.pi * i / per_turn
+        true.append(se3.from_rt(se3.so3_exp(np.array([0, 0, a])), np.array([9 * np.cos(a), 9 * np.sin(a), 0.01 * i])))
+    poses = np.array(true)
+    start, edges, between = [poses[0]], [], []
+    for i in range(1, n):
+        step = se3.inverse(poses[i - 1]) @ poses[i] @ se3.exp(np.r_[rng.normal(0, 0.01, 3), rng.normal(0, 0.001, 3)])
+        start.append(start[-1] @ step)
+        edges.append((i - 1, i))
+        between.append(step)
+    for i in range(2, n, 2):
+        edges.append((i - 2, i))
+        between.append(se3.inverse(start[i - 2]) @ start[i])
+    near = len(edges)
+    for k in range(loops):
+        a = int(rng.integers(0, n - per_turn))
+        edges.append((a, a + per_turn))
+        off = se3.from_rt(np.eye(3), np.array([3.0, 0.0, 0.0])) if k >= loops - wrong else np.eye(4)
+        between.append(se3.inverse(poses[a]) @ poses[a + per_turn] @ off)
+    sigma = np.tile([0.01, 0.003], (len(edges), 1))
+    held = np.zeros(n, np.bool_)
+    held[0] = True
+    inputs = GraphInputs(
+        np.arange(n), np.array(start), held, np.array(edges), np.array(between), sigma,
+        np.arange(len(edges)) >= near, GraphConfig(),
+    )  # fmt: skip
+    return poses, inputs
+
+
+def rms(a: F64, b: F64) -> float:
+    return float(np.sqrt(np.mean(np.sum((a[:, :3, 3] - b[:, :3, 3]) ** 2, axis=1))))
+
+
+def test_loops_take_drift_back_and_what_is_held_stays() -> None:
+    true, inputs = ring(200, 60, 12)
+    result = optimise(inputs)
+    assert rms(result.T_w_k, true) < 0.5 * rms(inputs.T_w_k, true)
+    assert np.array_equal(result.T_w_k[0], inputs.T_w_k[0])
+    rotations = result.T_w_k[:, :3, :3]
+    assert np.allclose(rotations @ np.swapaxes(rotations, 1, 2), np.eye(3), atol=1e-9)
+    assert np.array_equal(result.T_w_k, optimise(inputs).T_w_k)
+
+
+def test_without_loops_nothing_moves() -> None:
+    _, inputs = ring(40, 60, 0)
+    assert np.allclose(optimise(inputs).T_w_k, inputs.T_w_k, atol=1e-9)
+
+
+def test_a_wrong_loop_stands_out_and_does_little_harm() -> None:
+    true, inputs = ring(200, 60, 12, wrong=1)
+    result = optimise(inputs)
+    loops = result.residual[inputs.loop]
+    assert int(np.argmax(loops)) == len(loops) - 1
+    assert loops[-1] > 5 * np.median(loops)
+    assert rms(result.T_w_k, true) < rms(inputs.T_w_k, true)
+
+
+def test_residuals_are_those_of_the_logarithm() -> None:
+    _, inputs = ring(30, 12, 4)
+    moved = inputs.T_w_k @ se3.exp(np.array([0.01, -0.02, 0.01, 0.002, 0.001, -0.003]))
+    got = residuals(inputs, moved)
+    for i, (a, b) in enumerate(inputs.edges.tolist()):
+        error = se3.inverse(inputs.T_a_b[i]) @ se3.inverse(moved[a]) @ moved[b]
+        turn = float(np.linalg.norm(se3.so3_log(error[:3, :3])))
+        expected = np.hypot(np.linalg.norm(error[:3, 3]) / 0.01, turn / 0.003)
+        assert np.isclose(got[i], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_a_thousand_keyframes_take_milliseconds() -> None:
+    _, inputs = ring(1000, 250, 20)
+    optimise(inputs)
+    took = []
+    for _ in range(3):
+        begin = time.process_time()
+        optimise(inputs)
+        took.append(time.process_time() - begin)
+    assert min(took) < 0.1  # the bar is 0.05 s; this only says that it is no order of magnitude

@@ -1,0 +1,114 @@
+"""Loops: drift over a long way is taken back when the place is seen again, and corridors that repeat fool nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import BaseConfig, RefindConfig
+from kiteline_basestation.jobs import Job, JobDone, run_job
+from kiteline_basestation.loops import Shares
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.schema import Camera, Pose, Record
+from kiteline_core.ids import AgentId
+
+F64 = NDArray[np.float64]
+MakeFlight = Callable[..., Any]
+MakeScene = Callable[..., Any]
+STEP_NS = 250_000_000
+
+
+def feed(mapper: Mapper, flights: list[Any], late: int = 0) -> tuple[list[Record], list[Job]]:
+    """One keyframe of each flight a step; jobs come back `late` steps after the next one."""
+    open_jobs: list[tuple[int, JobDone]] = []
+    published: list[Record] = []
+    jobs: list[Job] = []
+    for n in range(max(len(f.records) for f in flights) + 60 + 2 * late):
+        arrivals = []
+        for flight in flights:
+            records: list[Record] = [Camera(flight.agent, flight.camera)] if n == 0 else []
+            records += flight.records[n] if n < len(flight.records) else []
+            arrivals.append((flight.agent, tuple(records)))
+        done = tuple(d for at, d in open_jobs if at <= n)
+        open_jobs = [(at, d) for at, d in open_jobs if at > n]
+        output = mapper.step(MapperInput(tuple(arrivals), done), n * STEP_NS)
+        for job in output.jobs:
+            delay = late if job.kind in ("graph", "full") else 0
+            open_jobs.append((n + 1 + delay, run_job(job)))
+        jobs.extend(output.jobs)
+        for _, out in output.publish:
+            published.extend(out)
+    return published, jobs
+
+
+def errors_m(mapper: Mapper, flight: Any) -> F64:
+    poses = [mapper.map.pose(k) for k in flight.keyframes]
+    return np.array([np.linalg.norm(p[:3, 3] - t[:3, 3]) for p, t in zip(poses, flight.true_T_m_k) if p is not None])
+
+
+@pytest.fixture(scope="module")
+def around(make_flight: MakeFlight, ring: Any, words: Any) -> Any:
+    """A flight around a ring, mapped: (how late large jobs come back, or -1 without loops) -> flight and mapper."""
+    flight = make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.02, seed=3, noise_px=0.7, memory=2)
+    flown: dict[int, Any] = {}
+
+    def get(late: int) -> Any:
+        if late not in flown:
+            mapper = Mapper(BaseConfig(), words if late >= 0 else None)
+            flown[late] = (mapper, *feed(mapper, [flight], max(late, 0)))
+        return (flight, *flown[late])
+
+    return get
+
+
+@pytest.mark.parametrize("late", [0, 6])
+def test_a_ring_is_closed_while_new_keyframes_come(around: Any, late: int) -> None:
+    flight, mapper, published, jobs = around(late)
+    blind = around(-1)[1]
+    assert mapper.summary()["loops"] >= 1
+    assert {"graph", "full"} <= {job.kind for job in jobs}
+    assert mapper.idle
+    assert np.mean(errors_m(mapper, flight)[-8:]) < 0.3 * np.mean(errors_m(blind, flight)[-8:])
+    last = {r.keyframe: r.T_m_k for r in published if isinstance(r, Pose)}
+    for keyframe in flight.keyframes[1:]:  # what was published is what the map holds
+        assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
+
+
+def test_the_same_flight_gives_the_same_map(around: Any, words: Any) -> None:
+    flight, mapper, _, _ = around(0)
+    again = Mapper(BaseConfig(), words)
+    feed(again, [flight])
+    for keyframe in flight.keyframes:
+        assert np.array_equal(mapper.map.pose(keyframe), again.map.pose(keyframe))
+
+
+def test_windows_that_repeat_along_a_corridor_close_no_loop(
+    make_flight: MakeFlight, corridor: Any, words: Any
+) -> None:  # fmt: skip
+    flight = make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [flight])
+    assert mapper.atlas is not None
+    assert mapper.atlas.finder.proofs > 0  # they do look alike
+    assert mapper.summary()["loops"] == 0
+    assert np.max(errors_m(mapper, flight)) < 0.3
+
+
+def test_who_shares_with_whom() -> None:
+    a, b, c = AgentId(0), AgentId(1), AgentId(2)
+    assert Shares("all").together(a, c)
+    assert not Shares("none").together(a, c) and Shares("none").together(a, a)
+    chain = Shares("0 1, 1 2")
+    assert chain.together(a, b) and chain.together(c, b) and not chain.together(a, c)
+    with pytest.raises(ValueError, match="expected"):
+        Shares("0-1")
+
+
+def test_a_config_without_loops_has_none(make_flight: MakeFlight, words: Any) -> None:
+    config = replace(BaseConfig(), refind=RefindConfig(), loops=replace(BaseConfig().loops, enabled=False))
+    assert Mapper(config, words).atlas is None
