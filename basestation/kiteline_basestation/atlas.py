@@ -7,7 +7,7 @@ undone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from kiteline_basestation.refinement import apply_bundle
 from kiteline_codec.schema import Kind
 from kiteline_core import se3
 from kiteline_core.bundle import BundleConfig, BundleResult
-from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH
 from kiteline_core.place_index import Vocabulary
 from kiteline_core.sparse_map import SparseMap
@@ -137,6 +137,30 @@ class Atlas:
             self._settle(island, part, done.result)
             return True
         return False
+
+    def rejoin(self, placements: Mapping[SubmapId, F64]) -> None:
+        """Take up what an earlier base had joined: submaps with common points, at T_w_m (4,4)."""
+        sparse_map, table = self._map, self._map.keypoints
+        number = self._map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS
+        roots = table.root[: sparse_map.slots]
+        crossing = np.flatnonzero((roots >= 0) & (number != number[np.maximum(roots, 0)]))
+        pairs = {(int(number[s]), int(number[roots[s]])) for s in crossing.tolist()}
+        upright = [s for s, T in placements.items() if np.array_equal(T, np.eye(4))]  # the world's first
+        for a, b in sorted(pairs):
+            old, new = (sparse_map.island_of(SubmapId(s)) for s in (a, b))
+            if old == new or old not in placements or new not in placements:
+                continue
+            eldest = next((s for s in upright if s in (old, new)), min(old, new))
+            other = new if eldest == old else old
+            joined = sparse_map.island(other)
+            frames = {s: se3.inverse(placements[eldest]) @ placements[s] for s in joined if s in placements}
+            self.merges.append(Merge(other, eldest, {s: sparse_map.frame(s) for s in joined}, ()))
+            for submap, frame in frames.items():
+                sparse_map.islands[submap] = eldest
+                sparse_map.move_submap(submap, se3.orthonormalise(frame))
+        for keyframe, row in sparse_map.rows.items():
+            if sparse_map.pose(keyframe) is not None and not sparse_map.keyframes.culled[row]:
+                self.finder.add(keyframe)
 
     # -- findings ----------------------------------------------------------------------------------------------------
 
@@ -275,7 +299,7 @@ class Atlas:
         table = self._map.keypoints
         roots = np.unique(table.root[np.array(merge.fused, np.int64).ravel()])
         which = np.repeat(part.points, np.diff(part.problem.starts))
-        submap = self._map.keyframes.id[table.row[part.slots]] >> 20
+        submap = self._map.keyframes.id[table.row[part.slots]] >> SEQUENCE_BITS
         mine = np.isin(submap, sorted(merge.moved)) & np.isin(which, roots)
         if int(np.count_nonzero(mine)) < self._config.loops.min_inliers:
             return False
@@ -296,7 +320,7 @@ class Atlas:
         ]
         self._fresh.pop(merge.into, None)
         self._revisit = [k for k in self._revisit if submap_of_keyframe(k) not in mine]
-        inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> 20, sorted(mine))
+        inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, sorted(mine))
         roots = table.root[: sparse_map.slots]
         crossing = np.flatnonzero((roots >= 0) & (inside != inside[np.maximum(roots, 0)])).astype(np.int32)
         sparse_map.part(crossing[table.kind[crossing] == BIRTH])

@@ -146,6 +146,11 @@ class Mapper:
                 self.placements[record.submap] = record.T_w_m
             self.adopt(record)
 
+    def rejoin(self) -> None:
+        """After all was restored: maps that shared points are one again, and every keyframe is a known place."""
+        if self.atlas is not None:
+            self.atlas.rejoin(self.placements)
+
     @property
     def idle(self) -> bool:
         """Whether no job is open and nothing is left to be done with what came."""

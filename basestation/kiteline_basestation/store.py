@@ -69,12 +69,13 @@ def restore(station: Station, kept: bytes, now_ns: int) -> None:
     """Put what an earlier base kept into a station that begins, and share with the agents again what is ours. What an
     agent still holds comes again and replaces what it told the earlier base. Raises WireError.
     """
-    for agent, codes in unpack(kept).items():
-        _restore(station, agent, codes, now_ns)
-
-
-def _restore(station: Station, agent: AgentId, codes: Codes, now_ns: int) -> None:
-    channel = station.join(agent)
-    received = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
-    own = tuple(channel.put(messages.decode(key, codes.own[key])) for key in sorted(codes.own))
-    station.mapper.restore(agent, received, own, now_ns)
+    agents = unpack(kept)
+    for agent, codes in agents.items():
+        station.join(agent)
+        received = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
+        station.mapper.restore(agent, received, (), now_ns)
+    for agent, codes in agents.items():  # what is ours may tell of points of several agents
+        channel = station.join(agent)
+        own = tuple(channel.put(messages.decode(key, codes.own[key])) for key in sorted(codes.own))
+        station.mapper.restore(agent, (), own, now_ns)
+    station.mapper.rejoin()
