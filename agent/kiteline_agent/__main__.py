@@ -18,13 +18,14 @@ from typing import Any, TextIO
 
 import cv2
 
-from kiteline_agent.agent import Agent, Estimate, Identity, StepInput, StepOutput
+from kiteline_agent.agent import Agent
 from kiteline_agent.camera import Camera
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import cost_ns
 from kiteline_agent.flight_log import StepLog, write_step
 from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json, parser
+from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm
 from kiteline_codec import warm as codec_warm

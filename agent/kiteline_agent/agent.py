@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from kiteline_agent.metric_start import Reborn, reborn
 from kiteline_agent.mono_start import MonoStart, Opening
 from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.right_eye import RightEye, rectified
+from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Culled, Depths, Found, Level, Live, Placement, Pose, Record, Removed, Tile
@@ -32,7 +33,6 @@ from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import (
     MAX_SUBMAPS,
     NO_KEYFRAME,
-    AgentId,
     KeyframeId,
     SubmapId,
     keyframe_id,
@@ -49,56 +49,6 @@ _SCALE_SIGMA = 0.02  # relative deviation at which a scale is believed
 _UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
 _THIN = 3  # times the fewest inliers: below it a keyframe cannot wait
 _MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Who this agent is. boot: counts starts, never reused."""
-
-    agent: AgentId
-    boot: int
-
-
-@dataclass(frozen=True, slots=True)
-class StepInput:
-    """All that enters a step. cpu_ns: process CPU time that the last frame took, as measured or modelled outside."""
-
-    frame: Frame | None = None
-    imu: ImuBatch | None = None
-    packets: tuple[bytes, ...] = ()
-    cpu_ns: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """What is known of the vehicle at one frame.
-
-    tracked: T_m_b is measured from at least 15 image inliers, or (bridged) carried by the IMU for a short while.
-    T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
-    keyframe, T_k_c: the same pose relative to a keyframe's camera. T_w_b: (4,4) in the world, once the base has placed
-    the submap. quality: -1 lost, 1..100.
-    """
-
-    t_ns: int
-    tracked: bool
-    bridged: bool
-    T_m_b: F64 | None
-    T_o_b: F64
-    keyframe: KeyframeId
-    T_k_c: F64
-    submap: SubmapId
-    inliers: int
-    quality: int
-    T_w_b: F64 | None
-
-
-@dataclass(frozen=True, slots=True)
-class StepOutput:
-    """All that leaves a step. events: short words for the log, in order."""
-
-    estimate: Estimate | None
-    packets: tuple[bytes, ...]
-    events: tuple[str, ...]
 
 
 class Agent:

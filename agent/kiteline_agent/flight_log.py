@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.agent import Estimate, StepInput, StepOutput
+from kiteline_agent.step import Estimate, StepInput, StepOutput
 from kiteline_core.frame import Frame, ImuBatch
 
 STEP, IMU, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
@@ -79,7 +79,8 @@ def estimate_from_json(value: Mapping[str, Any]) -> Estimate:
     known = {field.name for field in fields(Estimate)}
     if known != set(value):
         raise ValueError(f"logged estimate has fields {sorted(value)}, expected {sorted(known)}")
-    return Estimate(**{name: _matrix(v) if isinstance(v, list) else v for name, v in value.items()})
+    fields_of: dict[str, Any] = {name: _matrix(v) if isinstance(v, list) else v for name, v in value.items()}
+    return Estimate(**fields_of)
 
 
 def _matrix(numbers: Sequence[float]) -> NDArray[np.float64]:

@@ -84,7 +84,7 @@ def channel_for(spec: AgentSpec) -> RecordChannel:
     if spec.link == "none":
         return AloneChannel()
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
-    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed)
+    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.agent import Agent, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.step import Identity, StepInput
 from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.epipolar_kernels import search_segments

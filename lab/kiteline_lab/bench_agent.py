@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
 from kiteline_hw.cpu import CpuQuota

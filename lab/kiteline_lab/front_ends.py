@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent import local_map_kernels
-from kiteline_agent.agent import Agent, Identity
+from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.local_map import Candidates, LocalMap
 from kiteline_agent.recovery import Recovery
+from kiteline_agent.step import Identity
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_core import features, matching, pose_kernels, se3

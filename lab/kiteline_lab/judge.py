@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.agent import Estimate
 from kiteline_agent.flight_log import ESTIMATE, estimate_from_json
 from kiteline_agent.spec import AgentSpec
+from kiteline_agent.step import Estimate
 from kiteline_agent.tally import Tally, live_pose
 from kiteline_core.cameras import Rectifier
 from kiteline_core.frame import Trajectory

@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 
 from kiteline_agent import flight_log as agent_log
-from kiteline_agent.agent import Agent, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.spec import AgentSpec
+from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm as agent_warm
 from kiteline_basestation import flight_log as base_log

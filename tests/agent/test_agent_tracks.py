@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core import se3
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from pathlib import Path
 
-from kiteline_agent.agent import Agent, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import PRICES_NS, Work, cost_ns
 from kiteline_agent.governor import LADDER, governed
+from kiteline_agent.step import Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
 from kiteline_hw.sources import open_source

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_agent.agent import Estimate
 from kiteline_agent.camera import Camera, joined
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.flight_log import estimate_from_json, estimate_to_json
 from kiteline_agent.spec import AgentSpec, agent_config, from_json
+from kiteline_agent.step import Estimate
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_core import se3
 from kiteline_core.config import ConfigError

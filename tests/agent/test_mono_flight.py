@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.depth_from_motion import sigma_of_meeting
 from kiteline_agent.mono_start import MonoStart
+from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracker import View
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import Births

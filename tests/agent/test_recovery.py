@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig, LocalMapConfig
+from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.schema import Head, Record
 from kiteline_core import se3
 from kiteline_core.cameras import CameraRig

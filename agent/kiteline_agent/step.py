@@ -1,0 +1,63 @@
+"""What enters one step of the agent and what leaves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId
+
+F64 = NDArray[float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who this agent is. boot: counts starts, never reused."""
+
+    agent: AgentId
+    boot: int
+
+
+@dataclass(frozen=True, slots=True)
+class StepInput:
+    """All that enters a step. cpu_ns: process CPU time that the last frame took, as measured or modelled outside."""
+
+    frame: Frame | None = None
+    imu: ImuBatch | None = None
+    packets: tuple[bytes, ...] = ()
+    cpu_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is known of the vehicle at one frame.
+
+    tracked: T_m_b is measured from at least 15 image inliers, or (bridged) carried by the IMU for a short while.
+    T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
+    keyframe, T_k_c: the same pose relative to a keyframe's camera. T_w_b: (4,4) in the world, once the base has placed
+    the submap. quality: -1 lost, 1..100.
+    """
+
+    t_ns: int
+    tracked: bool
+    bridged: bool
+    T_m_b: F64 | None
+    T_o_b: F64
+    keyframe: KeyframeId
+    T_k_c: F64
+    submap: SubmapId
+    inliers: int
+    quality: int
+    T_w_b: F64 | None
+
+
+@dataclass(frozen=True, slots=True)
+class StepOutput:
+    """All that leaves a step. events: short words for the log, in order."""
+
+    estimate: Estimate | None
+    packets: tuple[bytes, ...]
+    events: tuple[str, ...]
