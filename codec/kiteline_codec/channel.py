@@ -7,7 +7,7 @@ from typing import Protocol
 
 from kiteline_codec import messages
 from kiteline_codec.pacing import Pacer
-from kiteline_codec.profiles import EXACT, PROFILES, Profile
+from kiteline_codec.profiles import EXACT, PROFILES, RADIO, Profile
 from kiteline_codec.schema import Head, Key, Live, Record, WireError
 from kiteline_codec.sync import Endpoint, SyncConfig, SyncStats
 from kiteline_codec.tight import Tightener
@@ -171,17 +171,26 @@ class CodedChannel:
         return packets
 
 
-def coded_channel(session: int, budget_bytes: int = 0, profile: str = "", seal_bytes: int = 0) -> CodedChannel:
+# What a link adds to a packet of the radio profile: frames of a serial line; four pieces in MAVLink's TUNNEL.
+_LINK_BYTES = {"serial": 7, "mavlink": 76}
+
+
+def coded_channel(
+    session: int, budget_bytes: int = 0, profile: str = "", seal_bytes: int = 0, link: str = ""
+) -> CodedChannel:
     """One end of a channel over a link. budget_bytes: on the wire in any second, 0 any number. profile: wifi, radio, or
-    "" as the link allows. seal_bytes: what sealing adds to a packet. Raises ValueError.
+    "" as the link allows. seal_bytes: what sealing adds to a packet. link: its name, LINK. Raises ValueError.
     """
+    kind = link.partition(":")[0]
+    if not profile and kind in _LINK_BYTES:
+        profile = RADIO.name
     if profile and profile not in PROFILES:
         raise ValueError(f"profile {profile!r}: expected {' or '.join(PROFILES)}")
     named = PROFILES.get(profile)
     shape = named or Pacer(None, budget_bytes).profile
     config = SyncConfig(
         packet_bytes=shape.packet_bytes,
-        overhead_bytes=shape.overhead_bytes + seal_bytes,
+        overhead_bytes=_LINK_BYTES.get(kind, shape.overhead_bytes) + seal_bytes,
         budget_bytes=budget_bytes,
         heartbeat_ns=shape.heartbeat_ns,
     )

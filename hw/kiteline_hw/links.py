@@ -1,4 +1,4 @@
-"""Opens the links that users name: zenoh:ENDPOINT, serial:DEVICE:BAUD, none."""
+"""Opens the links that users name: zenoh:ENDPOINT, serial:DEVICE:BAUD, mavlink:URL, none."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal, overload
 from kiteline_hw.ports import ByteLink, Framer, LinkError, LinkHub
 from kiteline_hw.serial_port import parse_serial
 
-LINK_FORMS = "zenoh:tcp/HOST:PORT, serial:DEVICE:BAUD or none"
+LINK_FORMS = "zenoh:tcp/HOST:PORT, serial:DEVICE:BAUD, mavlink:udp:HOST:PORT or none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +61,7 @@ def split_link(spec: str) -> tuple[str, str]:
     kind, _, address = spec.partition(":")
     if kind == "none" and not address:
         return kind, ""
-    if kind == "mavlink":
-        raise LinkError(f"link {spec!r}: links through a flight controller are not there yet; use {LINK_FORMS}")
-    if kind not in ("zenoh", "serial") or not address:
+    if kind not in ("zenoh", "serial", "mavlink") or not address:
         raise LinkError(f"unknown link {spec!r}: expected {LINK_FORMS}")
     return kind, address
 
@@ -111,6 +109,12 @@ def open_link(
         from kiteline_hw.zenoh_link import ZenohHub, ZenohLink
 
         return ZenohLink(address, agent, group=group) if role == "agent" else ZenohHub(address, group=group)
+    if kind == "mavlink":
+        from kiteline_hw.mavlink_tunnel import AGENT_END, BASE_END
+        from kiteline_hw.mavlink_tunnel_link import MavlinkTunnelLink
+
+        tunnel = MavlinkTunnelLink(address, AGENT_END if role == "agent" else BASE_END, required=required)
+        return tunnel if role == "agent" else OneLinkHub(tunnel, agent)
     if framer is None:
         raise LinkError(f"link {spec!r}: a serial line needs framing and none was handed in")
     from kiteline_hw.serial_link import SerialLink

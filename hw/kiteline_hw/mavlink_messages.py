@@ -67,7 +67,28 @@ class Odometry:
     estimator_type: int = 3  # MAV_ESTIMATOR_TYPE_VIO: PX4 discards the covariance of a naive one
 
 
-Incoming = Heartbeat | TimeSync | HighresImu | Odometry
+@dataclass(frozen=True, slots=True)
+class Tunnel:
+    """Message 385: bytes for somebody, carried by whoever is on the way. data: at most 128 bytes."""
+
+    system: int
+    component: int
+    target_system: int
+    target_component: int
+    payload_type: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class RadioStatus:
+    """What a telemetry radio says of itself. txbuf: percent of its send buffer that is free."""
+
+    txbuf: int
+    rssi: int
+    remote_rssi: int
+
+
+Incoming = Heartbeat | TimeSync | HighresImu | Odometry | Tunnel | RadioStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +172,17 @@ class MavlinkCodec:
             )
         )
 
+    def tunnel(self, target_system: int, target_component: int, payload_type: int, data: bytes) -> bytes:
+        """TUNNEL with up to 128 bytes."""
+        padded = list(data) + [0] * (128 - len(data))
+        return self._pack(
+            common.MAVLink_tunnel_message(target_system, target_component, payload_type, len(data), padded)
+        )  # fmt: skip
+
+    def radio_status(self, txbuf: int, rssi: int = 200, remote_rssi: int = 200) -> bytes:
+        """RADIO_STATUS, as a radio sends it."""
+        return self._pack(common.MAVLink_radio_status_message(rssi, remote_rssi, txbuf, 30, 30, 0, 0))
+
     def receive(self, data: bytes, *, datagram: bool = False) -> list[Incoming]:
         """Take any bytes in any pieces; the messages that they completed. Never raises.
 
@@ -224,5 +256,10 @@ class MavlinkCodec:
                 m.child_frame_id,
                 m.estimator_type,
             )
+        if kind == "TUNNEL":
+            payload = bytes(m.payload[: min(m.payload_length, 128)])
+            return Tunnel(system, component, m.target_system, m.target_component, m.payload_type, payload)
+        if kind == "RADIO_STATUS":
+            return RadioStatus(m.txbuf, m.rssi, m.remrssi)
         self.unknown += 1
         return None

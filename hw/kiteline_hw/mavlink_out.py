@@ -45,7 +45,7 @@ def parse_mavlink_url(url: str) -> MavlinkUrl:
     return MavlinkUrl("udpin" if kind == "udpin" else "udpout", host, int(port))
 
 
-class _Udp:
+class MavlinkUdp:
     """A UDP socket that never blocks. Listening, it answers whoever last spoke; else it hears its target only."""
 
     def __init__(self, url: MavlinkUrl) -> None:
@@ -120,12 +120,12 @@ class MavlinkPoseSink:
         self._outbox: deque[bytes] = deque(maxlen=_OUTBOX)
         self._closed = threading.Event()
         self.refused = 0  # messages that nobody took
-        self._udp: _Udp | None = None
+        self._udp: MavlinkUdp | None = None
         self._serial: SerialPort | None = None
         if where.kind == "serial":
             self._serial = SerialPort(where.address, where.port, self._on_serial, self._next_out, required=required)
         else:
-            self._udp = _Udp(where)
+            self._udp = MavlinkUdp(where)
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
         self._thread.start()
 

@@ -67,11 +67,11 @@ def test_none() -> None:
 @pytest.mark.parametrize(
     ("spec", "words"),
     [
-        ("", "expected zenoh:tcp/HOST:PORT, serial:DEVICE:BAUD or none"),
+        ("", "expected zenoh:tcp/HOST:PORT, serial:DEVICE:BAUD, mavlink"),
         ("zenoh:", "unknown link"),
         ("none:x", "unknown link"),
         ("carrier-pigeon:7", "unknown link 'carrier-pigeon:7'"),
-        ("mavlink:udp:1.2.3.4:1", "not there yet"),
+        ("mavlink:pigeon:1", "expected udp:HOST:PORT"),
         ("serial:/dev/ttyNONE", "expected DEVICE:BAUD"),
         ("serial:/dev/ttyNONE:57600", "cannot open serial port /dev/ttyNONE"),
     ],
