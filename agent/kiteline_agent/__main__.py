@@ -244,7 +244,8 @@ class Onboard:
 
 
 def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
-    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config", "link")}
+    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
+    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
     return {
         "role": "agent",
         "channel": type(channel).__name__,

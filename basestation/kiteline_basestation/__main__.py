@@ -226,8 +226,9 @@ class Ground:
 
 
 def _log_metadata(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
-    unlogged = ("folder", "config", "link", "store", "web")
+    unlogged = ("folder", "config", "store", "web")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
+    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
     channel = "PlainChannel" if plain_channels else "CodedChannel"
     return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
 
@@ -245,7 +246,7 @@ def place_words() -> Vocabulary | None:
 def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
     """Opens our end of the codec to an agent."""
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
-    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed)
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)
 
 
 def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:

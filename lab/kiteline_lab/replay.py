@@ -29,6 +29,7 @@ from kiteline_basestation.station import Station
 from kiteline_basestation.store import restore
 from kiteline_basestation.warm import warm as base_warm
 from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.frame import EncodedImage, ImuBatch
 from kiteline_core.ids import AgentId
@@ -102,7 +103,7 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
         raise SourceError("this is a monolith's log: what its base handed over was no packet, and is not in it")
     channel: RecordChannel = AloneChannel()
     if kind == "CodedChannel":
-        channel = coded_channel(spec["boot"] + 1, spec["up_bytes_s"], spec.get("profile", ""))
+        channel = _channel(spec, spec["boot"] + 1, spec["up_bytes_s"])
     agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_words())
     out = Replayed()
     for step in steps(log):
@@ -143,14 +144,20 @@ def _imu(step: Step) -> ImuBatch:
     return batches[0].imu()
 
 
+def _channel(spec: dict[str, Any], session: int, budget_bytes: int) -> RecordChannel:
+    """One end of the codec as it was in flight."""
+    link = spec.get("link", "")
+    sealed = seal_bytes(suite_for(link + ":")) if spec.get("key") else 0
+    return coded_channel(session, budget_bytes, spec.get("profile", ""), sealed, link)
+
+
 def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first: bool = True) -> Replayed:
     """Run a base again. Raises SourceError for a log that cannot be replayed."""
     spec = _spec(log)
     config = configuration.apply(BaseConfig(), tomllib.loads(log.metadata["config"]))
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: what its agents handed over was no packet, and is not in it")
-    budget_bytes, profile = spec["down_bytes_s"], spec.get("profile", "")
-    station = Station(config, lambda agent: coded_channel(spec["session"], budget_bytes, profile), place_words())
+    station = Station(config, lambda agent: _channel(spec, spec["session"], spec["down_bytes_s"]), place_words())
     jobs: dict[int, Job] = {}
     out = Replayed()
     for kept in log.messages((base_log.RESTORED,)):
