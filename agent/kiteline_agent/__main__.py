@@ -415,7 +415,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if a.spec:
         process.leave(run_child(from_json(a.spec)))
     if not a.source:
-        p.error("a SOURCE is needed")
+        p.error("a SOURCE is required")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
     folder = (Path(a.log) if a.log else state) / f"agent{a.agent}"
     boot = process.next_number(folder / "boot")
