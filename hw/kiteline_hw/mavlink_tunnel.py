@@ -2,8 +2,8 @@
 
 A packet goes in pieces of at most `chunk_bytes`: one byte of packet number, one of place (index, count), then bytes of
 the packet. Pieces leave evenly at a rate that follows the radio's free buffer as PX4's own streams do (in its
-mavlink_main.cpp, update_radio_status), so that the controller's telemetry keeps its place. Both ends send heartbeats: routers on the
-way learn by them where to send.
+mavlink_main.cpp, update_radio_status), so that the controller's telemetry keeps its place. Both ends send heartbeats:
+routers on the way learn by them where to send.
 """
 
 from __future__ import annotations

@@ -187,8 +187,53 @@ class TwoEnds(RuleBasedStateMachine):
             assert end.stats.mismatches == 0
 
 
+class FarApart(TwoEnds):
+    """The same with the faults of radio: long delays, bursts, dead directions, turns, hours of silence."""
+
+    @precondition(lambda self: self.wire)
+    @rule(seconds=st.sampled_from([1, 5]))
+    def delay(self, seconds: int) -> None:
+        """What is on the wire arrives so much later, after all that follows it."""
+        late, self.wire = self.wire, []
+        for _ in range(seconds * 4):
+            self.send(250)
+            self.deliver_in_order(1000)
+        for to, packet in late:
+            self.arrive(to, packet)
+
+    @rule(end=END, n=st.integers(1, 20))
+    def one_way(self, end: int, n: int) -> None:
+        """For a while nothing reaches one end: a burst, or a direction that is dead."""
+        for _ in range(n):
+            self.send(100)
+            self.wire = [(to, packet) for to, packet in self.wire if to != end]
+            self.deliver_in_order(1000)
+
+    @rule(first=END, turns=st.integers(1, 6), overlap=st.booleans())
+    def half_duplex(self, first: int, turns: int, overlap: bool) -> None:
+        """The ends take turns; what is sent out of turn is lost, or waits."""
+        for turn in range(turns):
+            self.send(60)
+            speaker = (first + turn) % 2
+            for to, packet in self.wire:
+                if to != speaker:
+                    self.arrive(to, packet)
+            self.wire = [(to, packet) for to, packet in self.wire if to == speaker and overlap]
+
+    @rule(hours=st.sampled_from([1, 24]), heard=st.booleans())
+    def silence(self, hours: int, heard: bool) -> None:
+        """Nobody hears anybody for hours, while both go on trying now and then."""
+        if not heard:
+            self.wire = []
+        for _ in range(3):
+            self.send(hours * 1_200_000)
+            self.wire = []
+
+
 TwoEnds.TestCase.settings = settings(max_examples=300, stateful_step_count=40)
 TestAgreement = TwoEnds.TestCase
+FarApart.TestCase.settings = settings(max_examples=150, stateful_step_count=30)
+TestFarApart = FarApart.TestCase
 
 
 def older_versions_win(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,6 +297,26 @@ def the_budget_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SlidingBudget, "spend", lambda self, now_ns, n: None)
 
 
+def silence_is_forever(monkeypatch: pytest.MonkeyPatch) -> None:
+    rto = Endpoint._rto_ns.fget
+
+    def planted(self: Endpoint) -> int:
+        return 1 << 62 if self._backoff >= 4 else int(rto(self))  # type: ignore[misc]
+
+    monkeypatch.setattr(Endpoint, "_rto_ns", property(planted))
+
+
+def late_packets_count_as_new(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Inbox, "is_new", lambda self, number: True)
+
+    def planted(self: Inbox, item: Item) -> Update | None:
+        self.values.pop(item.key, None) if item.whole and item.version > self.watermark else None
+        return apply(self, item)
+
+    apply = Inbox.apply
+    monkeypatch.setattr(Inbox, "apply", planted)
+
+
 DEFECTS: list[Callable[[pytest.MonkeyPatch], Any]] = [
     older_versions_win,
     losses_are_not_repaired,
@@ -261,10 +326,17 @@ DEFECTS: list[Callable[[pytest.MonkeyPatch], Any]] = [
     the_last_fragment_completes_a_value,
     the_budget_forgets,
 ]
+FAR_DEFECTS: list[Callable[[pytest.MonkeyPatch], Any]] = [silence_is_forever, late_packets_count_as_new]
 
 
-@pytest.mark.parametrize("plant", DEFECTS, ids=lambda f: f.__name__)
-def test_a_planted_defect_is_found(plant: Callable[[pytest.MonkeyPatch], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("plant", "machine"),
+    [(d, TwoEnds) for d in DEFECTS] + [(d, FarApart) for d in FAR_DEFECTS],
+    ids=lambda f: f.__name__,
+)
+def test_a_planted_defect_is_found(
+    plant: Callable[[pytest.MonkeyPatch], Any], machine: type[TwoEnds], monkeypatch: pytest.MonkeyPatch
+) -> None:
     plant(monkeypatch)
     quick = settings(
         max_examples=1500,
@@ -275,4 +347,4 @@ def test_a_planted_defect_is_found(plant: Callable[[pytest.MonkeyPatch], Any], m
         deadline=None,
     )
     with pytest.raises((AssertionError, pytest.fail.Exception)):
-        run_state_machine_as_test(TwoEnds, settings=quick)
+        run_state_machine_as_test(machine, settings=quick)

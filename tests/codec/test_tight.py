@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import time
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from kiteline_codec import foresee_kernels, messages, quantise
 from kiteline_codec.packing import Reader, Writer
 from kiteline_codec.schema import Births, Camera, Depths, Head, Key, Kind, Record, Sightings, WireError
+from kiteline_codec.sync import Endpoint, SyncConfig
 from kiteline_codec.tight import Tightener
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
@@ -216,3 +218,58 @@ def test_a_keyframe_is_made_tight_quickly() -> None:
             assert form is None or b.grow(key, form, values.get) == code
         best = min(best, time.process_time() - start)
     assert best < 0.008  # typically 1.5 ms
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1, 0.4]))
+def test_endpoints_agree_whatever_is_lost(seed: int, loss: float) -> None:
+    """Each keyframe's sections are put as it comes, over a link that loses and delays; both ends hold the same."""
+    draw = random.Random(seed)
+    config = SyncConfig(packet_bytes=400, overhead_bytes=10, budget_bytes=draw.choice([0, 3000]))
+    a, b = (Endpoint(config, 1, tightener=Tightener()) for _ in range(2))
+    wire: list[tuple[int, int, bytes]] = []
+    now_ns, waiting = 0, flight(seed, births=24)
+    while waiting or not (a.digest_equal and b.digest_equal):
+        assert now_ns < 200 * 10**9
+        now_ns += 50_000_000
+        if waiting and draw.random() < 0.3:
+            for record in waiting[:4]:
+                a.put(messages.key(record), messages.encode(record))
+            del waiting[:4]
+        for to, end in ((1, a), (0, b)):
+            while (packet := end.poll(now_ns)) is not None:
+                if draw.random() >= loss:
+                    wire.append((now_ns + draw.randrange(1, 200_000_000), to, packet))
+        for due in sorted(w for w in wire if w[0] <= now_ns):
+            (a, b)[due[1]].receive(due[2], now_ns)
+        wire = [w for w in wire if w[0] > now_ns]
+    assert b.peer_values() == a.own_values()
+    assert b.stats.mismatches == 0
+    assert not loss or b.stats.rejected <= a.stats.packets_sent // 4
+
+
+def test_a_refused_form_is_followed_by_the_code_itself() -> None:
+    """A receiver that lost what a form builds upon gets the plain code after the sender has noticed."""
+    config = SyncConfig(overhead_bytes=0)
+    a, b = (Endpoint(config, 1, tightener=Tightener()) for _ in range(2))
+    records = flight(3)
+    now_ns = 0
+
+    def run(ms: int) -> None:
+        nonlocal now_ns
+        for _ in range(ms // 10):
+            now_ns += 10_000_000
+            for end, other in ((a, b), (b, a)):
+                while (packet := end.poll(now_ns)) is not None:
+                    other.receive(packet, now_ns)
+
+    for record in records[:-1]:
+        a.put(messages.key(record), messages.encode(record))
+    run(2000)
+    for key in [k for k in b._in.values if k.kind == Kind.BIRTHS]:
+        version, code = b._in.values[key]
+        b._in.values[key] = (version + 1000, code)  # as if they were other versions
+    a.put(messages.key(records[-1]), messages.encode(records[-1]))
+    run(3000)
+    assert b.stats.rejected >= 1
+    assert "other values" in b.stats.reasons[0][0] or "not held" in b.stats.reasons[0][0]
+    assert b.peer_values()[messages.key(records[-1])] == messages.encode(records[-1])
