@@ -34,7 +34,7 @@ def test_each_front_end_follows_the_room(data_dir: Path, kind: str) -> None:
     def opened() -> FrameSource:
         return Beginning(open_source(str(data_dir / "room_flight.mcap"), imu=False), 60)  # type: ignore[return-value]
 
-    flown = bench.fly(kind, opened, repeats=1)
+    flown = bench.fly(kind, opened, starts=1)
     assert flown.tracked == flown.frames == 60
     assert flown.submaps == 1
     assert 2 <= flown.keyframes <= 20
@@ -44,8 +44,8 @@ def test_each_front_end_follows_the_room(data_dir: Path, kind: str) -> None:
 
 
 def test_the_table_has_a_line_a_flight_and_front_end_and_names_what_was_lost() -> None:
-    good = Flown(np.array([1.0, 3.0]), 0.01, 1.5, 0.02, 7, 200.0, 10, 10, 1)
-    bad = Flown(np.array([1.0, 3.0]), 0.5, 20.0, 0.2, 9, 50.0, 8, 10, 2)
+    good = Flown(np.array([1.0, 3.0]), 0.01, 1.5, 0.02, 7.0, 200.0, 10, 10, 1)
+    bad = Flown(np.array([1.0, 3.0]), 0.5, 20.0, 0.2, 9.0, 50.0, 8, 10, 2)
     lines = bench.table({("a room", "templates"): good, ("a room", "flow"): bad}).splitlines()
     assert lines[-2] == "| a room | templates | 2.00 | 2.90 | 0.0100 | 1.50 | 0.0200 | 7 | 200 | all |"
     assert lines[-1].endswith("| 8 of 10, 2 submaps |")
