@@ -27,9 +27,14 @@ class LinkModelConfig:
     duplicate: float = 0.0  # chance that a packet arrives twice
     reorder: float = 0.0  # chance that a packet is held back, so that later ones overtake it
     reorder_ns: int = 50_000_000  # ns; the longest that it is held back, uniform
+    turn_ns: int = 0  # ns; half-duplex: both directions take turns of so long. 0: both always
+    turn: int = 0  # whether this direction has the first (0) or the second (1) of two turns
+    outages: tuple[tuple[int, int], ...] = ()  # from, to in ns: what is sent meanwhile is lost
 
     def __post_init__(self) -> None:
         for field in fields(self):
+            if field.name == "outages":
+                continue
             value = getattr(self, field.name)
             if field.name in ("loss", "burst", "duplicate", "reorder"):
                 if not 0.0 <= value <= 1.0:
@@ -80,8 +85,8 @@ class LinkModel:
         if c.rate_bytes_s and self._waiting_bytes and self._waiting_bytes + size > c.queue_bytes:
             self.stats.overflowed += 1
             return False
-        begins_ns = max(now_ns, self._wire_free_ns)
-        self._wire_free_ns = begins_ns + (-(-size * 1_000_000_000 // c.rate_bytes_s) if c.rate_bytes_s else 0)
+        takes_ns = -(-size * 1_000_000_000 // c.rate_bytes_s) if c.rate_bytes_s else 0
+        self._wire_free_ns = self._through(max(now_ns, self._wire_free_ns), takes_ns)
         self._waiting.append((self._wire_free_ns, size))
         self._waiting_bytes += size
         self.stats.wire_bytes += size
@@ -89,7 +94,8 @@ class LinkModel:
             self._in_burst = draw[0] >= 1.0 / c.burst_packets
         else:
             self._in_burst = draw[0] < c.burst
-        if self._in_burst or draw[1] < c.loss:
+        out = any(begin_ns <= now_ns < end_ns for begin_ns, end_ns in c.outages)
+        if out or self._in_burst or draw[1] < c.loss:
             self.stats.lost += 1
             return True
         arrival_ns = self._wire_free_ns + c.delay_ns + int(draw[2] * c.jitter_ns)
@@ -102,6 +108,23 @@ class LinkModel:
             self.stats.duplicated += 1
             self._fly(arrival_ns + int(draw[6] * c.reorder_ns), packet)
         return True
+
+    def _through(self, begins_ns: int, takes_ns: int) -> int:
+        """When a transmission that begins at a time is over: it goes on only in this direction's turns."""
+        turn_ns = self.config.turn_ns
+        if not turn_ns:
+            return begins_ns + takes_ns
+        at_ns = begins_ns
+        while True:
+            into_ns = (at_ns - self.config.turn * turn_ns) % (2 * turn_ns)
+            if into_ns >= turn_ns:
+                at_ns += 2 * turn_ns - into_ns
+                continue
+            used_ns = min(takes_ns, turn_ns - into_ns)
+            takes_ns -= used_ns
+            at_ns += used_ns
+            if not takes_ns:
+                return at_ns
 
     def _fly(self, arrival_ns: int, packet: bytes) -> None:
         self._order += 1
