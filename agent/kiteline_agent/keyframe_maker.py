@@ -72,7 +72,7 @@ class KeyframeMaker:
         n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
         head = Head(keyframe, t_ns, parent, T_p_k, n_keypoints)
         self._work.keyframes += 1
-        self._work.detected_px += view.left[0].size
+        self._work.detected_px += view.left[max(view.first, self._config.detector.first)].size
         self._work.births += len(births.index)
         self._work.sightings += len(sightings.index)
         shared_head = self._channel.put(head)
