@@ -16,6 +16,7 @@ class IntakeConfig:
 
     patience_s: float = 2.0  # a keyframe whose sections are still under way is used as it is after this long
     orphan_s: float = 10.0  # a submap whose first keyframes never come is begun at the oldest known one after this long
+    carry_s: float = 1.5  # a submap that begins so soon after the last one was left begins there: odometry carried on
     per_step: int = 4  # keyframes taken up in one step, so that a backlog does not hold up the rest
     max_pending: int = 20_000  # sections kept without their header; more are a broken peer
 
@@ -39,6 +40,14 @@ class WindowConfig:
     fixed: int = 15  # keyframes that only hold: those that see most of the same points
     min_shared: int = 12  # points that two covisible keyframes share at least
     min_points: int = 20  # fewer points hold no pose
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """The agent's own pose of a keyframe in its parent, where a bundle has little else."""
+
+    enough: int = 60  # observations of a keyframe above which its points alone hold it: every keyframe of a wide link
+    sigma_px: float = 0.25  # of each of 12 made-up points: a tracked pose is as good as 100 points of 0.5 px
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +189,7 @@ class BaseConfig:
     intake: IntakeConfig = field(default_factory=IntakeConfig)
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
+    links: LinkConfig = field(default_factory=LinkConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
     refind: RefindConfig = field(default_factory=RefindConfig)
     new_points: NewPointConfig = field(default_factory=NewPointConfig)

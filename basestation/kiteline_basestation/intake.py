@@ -26,6 +26,7 @@ class Intake:
         self._partial: set[KeyframeId] = set()  # used before they were complete
         self.live: dict[AgentId, Live] = {}
         self.last_of: dict[SubmapId, Live] = {}  # the last that was heard in each submap
+        self.tracked_ns: dict[SubmapId, int] = {}  # stamp of the last pose in each submap that was no guess
         self.levels: dict[SubmapId, Level] = {}  # what agents say of which way is up
         self.last_seen_ns: dict[AgentId, int] = {}
         self.refused = 0  # records that contradict what is known
@@ -40,7 +41,10 @@ class Intake:
                 held = self.live.get(record.agent)
                 if held is None or record.t_ns >= held.t_ns:
                     self.live[record.agent] = record
-                    self.last_of[submap_of_keyframe(record.keyframe)] = record
+                    submap = submap_of_keyframe(record.keyframe)
+                    self.last_of[submap] = record
+                    if record.quality > 0:
+                        self.tracked_ns[submap] = record.t_ns
             elif isinstance(record, Head):
                 self._take_head(record, now_ns)
             elif isinstance(record, Level):

@@ -17,6 +17,7 @@ from kiteline_basestation.covisibility import Window, local_window
 from kiteline_basestation.grid import Grid, GridMap
 from kiteline_basestation.intake import Intake
 from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
+from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
 from kiteline_codec.schema import Placement, Record
@@ -252,10 +253,14 @@ class Mapper:
         else:
             before = SubmapId(submap - 1)
             live, T_w_before = self._intake.last_of.get(before), self.placements.get(before)
-            begin = self.map.pose(self.map.submaps[submap][0])
+            first = self.map.submaps[submap][0]
+            begin = self.map.pose(first)
             left = self.map.pose(live.keyframe) if live else None
             if live is None or T_w_before is None or left is None or begin is None:
                 return
+            tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
+            if self.map.keyframes.t_ns[self.map.rows[first]] - tracked_ns > self.config.intake.carry_s * 1e9:
+                return  # a place that it reached unseen: it is found when it is recognised
             T_w_m = se3.orthonormalise(T_w_before @ left @ live.T_k_c @ se3.inverse(begin))
         self.placements[submap] = T_w_m
         self._publisher.place(submap, T_w_m)
@@ -266,9 +271,8 @@ class Mapper:
         if isinstance(done.result, BundleResult):
             opened = self._windows.pop(done.id, None)
             if opened is not None:  # else superseded
-                apply_bundle(
-                    self.map, opened[1], done.result, self._publisher, self.config.cull, self.config.publish
-                )  # fmt: skip
+                result = without_links(opened[1], done.result)
+                apply_bundle(self.map, opened[1], result, self._publisher, self.config.cull, self.config.publish)
                 self.counts.bundles += 1
         elif isinstance(done.result, GridMap) and done.id == self._grid_job:
             self._grid_job = 0
@@ -354,7 +358,8 @@ class Mapper:
             if left:
                 self._stale[submap] = left
             if part is not None:
-                job = Job(self._next_job(), "bundle", BundleInputs(part.problem, self.config.bundle))
+                problem = with_links(self.map, part, self.config.links)
+                job = Job(self._next_job(), "bundle", BundleInputs(problem, self.config.bundle))
                 jobs.append(job)
                 self._windows[job.id] = (submap, part)
                 self._served[submap] = job.id

@@ -303,10 +303,22 @@ def test_a_backlog_is_worked_off_from_the_oldest_on(make_flight: MakeFlight) -> 
 def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) -> None:
     flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
     mapper = Mapper()
-    live = Live(flight.agent, 77, flight.keyframes[2], se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0])), 80)
+    seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, Head)) - 10**9
+    live = Live(flight.agent, seen_ns, flight.keyframes[2], se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0])), 80)
     feed(mapper, flight, [*flight.records, [live]])
     published = feed(mapper, later, later.records)
     (placement,) = [r for r in published if isinstance(r, Placement)]
     left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
     assert left is not None and begin is not None
     assert np.allclose(placement.T_w_m @ begin, left @ live.T_k_c, atol=1e-9)
+
+
+def test_a_submap_that_begins_long_after_the_last_was_left_has_no_place(make_flight: MakeFlight) -> None:
+    flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
+    mapper = Mapper()
+    seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, Head)) - 5 * 10**9
+    tracked = Live(flight.agent, seen_ns, flight.keyframes[2], np.eye(4), 80)
+    guessed = Live(flight.agent, seen_ns + 49 * 10**8, flight.keyframes[2], np.eye(4), -1)
+    feed(mapper, flight, [*flight.records, [tracked], [guessed]])
+    assert not any(isinstance(r, Placement) for r in feed(mapper, later, later.records))
+    assert submap_of_keyframe(later.keyframes[0]) not in mapper.placements
