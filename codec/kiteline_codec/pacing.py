@@ -53,7 +53,7 @@ class Pacer:
         rate = self._budget_bytes or measured_bytes_s
         if not rate or not self.profile.thin:
             return self.profile
-        room = rate * self._interval_ns // 1_000_000_000 * 3 // 4 - self.profile.sightings_room_bytes
+        room = rate * self._interval_ns // 1_000_000_000 - self.profile.sightings_room_bytes
         p = self.profile
         described = max(_LEAST_DESCRIBED, min(room // (3 * p.birth_bytes), p.described))
         blank = max(0, room - described * p.birth_bytes) // p.blank_bytes

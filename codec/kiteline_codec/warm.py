@@ -1,25 +1,37 @@
-"""Compile all kernels of the codec before the first packet, by coding one section there and back."""
+"""Compile all kernels of the codec before the first packet, by sharing two small keyframes there and back."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kiteline_codec import messages
-from kiteline_codec.schema import Births
-from kiteline_core.ids import keyframe_id, submap_id
+from kiteline_codec.channel import coded_channel
+from kiteline_codec.schema import Births, Camera, Depths, Head, Sightings
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, keyframe_id, submap_id
+
+_TICK_NS = 50_000_000
+_TICKS = 8  # enough for greetings, values and acknowledgements to pass
 
 
 def warm() -> None:
     """Run every kernel once, on the types that flights use."""
-    n = 20
-    births = Births(
-        keyframe_id(submap_id(0, 0, 0), 0),
-        0,
-        np.arange(n, dtype=np.uint16),
-        np.linspace(10.0, 400.0, 2 * n, dtype=np.float32).reshape(n, 2),
-        np.linspace(0.1, 1.0, n, dtype=np.float32),
-        np.zeros(n, np.uint8),
-        np.zeros(n, np.uint8),
-        np.zeros((n, 32), np.uint8),
-    )
-    messages.decode(messages.key(births), messages.encode(births))
+    n = 40
+    first, second = (keyframe_id(submap_id(0, 0, 0), k) for k in (0, 1))
+    index = np.arange(n, dtype=np.uint16)
+    uv = np.linspace(20.0, 400.0, 2 * n, dtype=np.float32).reshape(n, 2)
+    depth = np.linspace(0.1, 1.0, n, dtype=np.float32)
+    flat = np.zeros(n, np.uint8)
+    point = (first << KEYPOINT_BITS) + np.arange(n, dtype=np.int64)
+    camera = RectifiedCamera(752, 480, 450.0, 450.0, 376.0, 240.0, 0.1, True, np.eye(4))
+    agent, base = coded_channel(1), coded_channel(1)
+    agent.put(Camera(AgentId(0), camera))
+    for tick in range(_TICKS):
+        if tick == 2:
+            agent.put(Head(first, 0, NO_KEYFRAME, np.eye(4), n))
+            agent.put(Births(first, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
+        if tick == 4:
+            agent.put(Head(second, _TICK_NS, first, np.eye(4), n))
+            agent.put(Sightings(second, 0, index, uv + 1.0, depth, flat, point))
+            base.put(Depths(first, index, depth, np.zeros((n, 2), np.float32)))
+        base.receive(agent.poll(tick * _TICK_NS), tick * _TICK_NS)
+        agent.receive(base.poll(tick * _TICK_NS), tick * _TICK_NS)

@@ -1,0 +1,94 @@
+"""What the agent measured between a keyframe and its parent, for bundles in which keyframes are seen by few points.
+
+A thin link carries a tenth of what the tracker saw, but the pose relative to the parent is made of all of it. It enters
+a bundle as a few made-up points that both keyframes see just where that pose puts them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import LinkConfig
+from kiteline_basestation.covisibility import Window
+from kiteline_core import se3
+from kiteline_core.bundle import BundleProblem, BundleResult
+from kiteline_core.ids import KeyframeId, agent_of_keyframe
+from kiteline_core.sparse_map import SparseMap
+
+F64 = NDArray[np.float64]
+
+_GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
+_DEPTHS = (0.7, 1.8)  # times the median depth: near points hold the position, far ones the direction
+
+
+def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> BundleProblem:
+    """The window's problem with the links of those of its keyframes that see few points; made-up points come last."""
+    problem = window.problem
+    table = sparse_map.keyframes
+    counts = np.bincount(problem.camera, minlength=len(window.rows))
+    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    points, camera, measured, sigma = [], [], [], []
+    for k, row in enumerate(window.rows.tolist()):
+        p = number.get(int(table.parent[row]))
+        agent = agent_of_keyframe(KeyframeId(int(table.id[row])))
+        deep = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
+        if p is None or not deep or not (problem.free[k] or problem.free[p]):
+            continue
+        few = 1.0 - min(counts[k], counts[p]) / config.enough
+        if few <= 0.0:
+            continue
+        seen = _made_up(sparse_map, problem, k, p, table.T_p_k[row])
+        if seen is None:
+            continue
+        in_k, in_p, world = seen
+        points.append(world)
+        first, second = (p, k) if p < k else (k, p)
+        for i in range(len(world)):
+            camera += [first, second]
+            measured += [in_p[i], in_k[i]] if p < k else [in_k[i], in_p[i]]
+            sigma += [[config.sigma_px / few, config.sigma_px / few]] * 2
+    if not points:
+        return problem
+    added = np.concatenate(points)
+    return replace(
+        problem,
+        points=np.concatenate([problem.points, added]),
+        starts=np.concatenate(
+            [problem.starts, problem.starts[-1] + 2 * np.arange(1, len(added) + 1, dtype=np.int32)]
+        ).astype(np.int32),
+        camera=np.concatenate([problem.camera, np.array(camera, np.int32)]),
+        measured=np.concatenate([problem.measured, np.array(measured)]),
+        sigma=np.concatenate([problem.sigma, np.array(sigma)]),
+    )
+
+
+def _made_up(
+    sparse_map: SparseMap, problem: BundleProblem, k: int, p: int, T_p_k: F64
+) -> tuple[F64, F64, F64] | None:  # fmt: skip
+    """What both keyframes measure (n,3) of made-up points, and where these are now (n,3)."""
+    own = problem.camera == k
+    depth = problem.measured[own, 2]
+    depth = depth[depth > 0]
+    typical = problem.lens[k, 4] / float(np.median(depth)) if len(depth) else 3.0
+    local = np.concatenate([np.column_stack([_GRID, np.ones(len(_GRID))]) * typical * d for d in _DEPTHS])
+    in_parent = se3.transform(T_p_k, local)
+    ahead = in_parent[:, 2] > 0.1 * typical
+    if np.count_nonzero(ahead) < 4:
+        return None
+    local, in_parent = local[ahead], in_parent[ahead]
+    world = se3.transform(se3.inverse(problem.T_c_m[k]), local)
+    return _seen(problem.lens[k], local), _seen(problem.lens[p], in_parent), world
+
+
+def _seen(lens: F64, xyz: F64) -> F64:
+    """u, v, disparity (n,3) px of points in a camera."""
+    inv = 1.0 / xyz[:, 2]
+    return np.column_stack([lens[0] * xyz[:, 0] * inv + lens[2], lens[1] * xyz[:, 1] * inv + lens[3], lens[4] * inv])
+
+
+def without_links(window: Window, result: BundleResult) -> BundleResult:
+    """The result for the window's own points and observations."""
+    return replace(result, points=result.points[: len(window.points)], inlier=result.inlier[: len(window.slots)])

@@ -1,0 +1,82 @@
+"""Links between keyframes that see few points: they hold poses, and leave well-seen ones alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from kiteline_basestation.config import BaseConfig, LinkConfig
+from kiteline_basestation.covisibility import window
+from kiteline_basestation.odometry_links import with_links, without_links
+from kiteline_core import se3
+from kiteline_core.bundle import bundle
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
+from kiteline_core.sparse_map import SparseMap
+
+CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
+SUBMAP = submap_id(0, 0, 0)
+KEYFRAMES, BIRTHS = 6, 14
+
+
+def flight(noise_px: float) -> tuple[SparseMap, list[np.ndarray]]:
+    """Keyframes along x with few births each, seen again by the next; links are exact, pixels are not."""
+    rng = np.random.default_rng(1)
+    sparse_map = SparseMap()
+    sparse_map.set_camera(AgentId(0), CAMERA)
+    truth = [se3.from_rt(np.eye(3), np.array([0.15 * k, 0.0, 0.0])) for k in range(KEYFRAMES)]
+    before: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 3)), np.zeros(0, np.int64))
+    for k, T in enumerate(truth):
+        keyframe = keyframe_id(SUBMAP, k)
+        seen = len(before[1])
+        parent = KeyframeId(keyframe - 1) if k else NO_KEYFRAME
+        T_p_k = se3.inverse(truth[k - 1]) @ T if k else T
+        sparse_map.add_keyframe(keyframe, k, parent, T_p_k, BIRTHS + seen)
+        uv = rng.uniform(60, (690, 420), (BIRTHS, 2)).astype(np.float32)
+        rho = rng.uniform(0.2, 0.5, BIRTHS)
+        noisy = (rho + rng.normal(0, noise_px, BIRTHS) / CAMERA.bf).astype(np.float32)
+        index = np.arange(BIRTHS, dtype=np.uint16)
+        sparse_map.put_births(
+            keyframe, 0, index, uv, noisy, np.zeros(BIRTHS, np.uint8), np.zeros(BIRTHS, np.uint8),
+            rng.integers(0, 256, (BIRTHS, 32)).astype(np.uint8),
+        )  # fmt: skip
+        if seen:
+            local = se3.transform(se3.inverse(T), before[0])
+            at = local[:, :2] / local[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
+            at = (at + rng.normal(0, noise_px, at.shape)).astype(np.float32)
+            depth = (1.0 / local[:, 2] + rng.normal(0, noise_px, seen) / CAMERA.bf).astype(np.float32)
+            rows = np.arange(BIRTHS, BIRTHS + seen, dtype=np.uint16)
+            sparse_map.put_sightings(keyframe, 0, rows, at, depth, np.zeros(seen, np.uint8), before[1])
+        ray = np.column_stack([(uv - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(BIRTHS)])
+        before = se3.transform(T, ray / rho[:, None]), keyframe << 11 | np.arange(BIRTHS)
+    return sparse_map, truth
+
+
+def error_m(poses: np.ndarray, truth: list[np.ndarray]) -> float:
+    return float(max(np.linalg.norm(np.linalg.inv(a)[:3, 3] - b[:3, 3]) for a, b in zip(poses, truth, strict=True)))
+
+
+def test_links_hold_what_few_points_cannot() -> None:
+    sparse_map, truth = flight(noise_px=1.5)
+    config = BaseConfig()
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+    part = window(sparse_map, keyframes, config.window, config.measurement)
+    assert part is not None
+    alone = bundle(part.problem, config.bundle)
+    linked = with_links(sparse_map, part, config.links)
+    assert len(linked.points) > len(part.problem.points)
+    result = without_links(part, bundle(linked, config.bundle))
+    assert len(result.points) == len(part.points)
+    assert len(result.inlier) == len(part.slots)
+    assert error_m(result.T_c_m, truth) < 0.5 * error_m(alone.T_c_m, truth)
+
+
+def test_keyframes_with_many_points_need_no_link() -> None:
+    sparse_map, _ = flight(noise_px=0.3)
+    config = BaseConfig()
+    part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
+    assert part is not None
+    assert with_links(sparse_map, part, LinkConfig(enough=5)) is part.problem
+    held = replace(part, problem=replace(part.problem, free=np.zeros(len(part.rows), bool)))
+    assert with_links(sparse_map, held, config.links) is held.problem
