@@ -42,6 +42,13 @@ def local_window(
 ) -> Window | None:
     """The keyframe, its most covisible ones, all they see, and the keyframes that hold these points in place."""
     free = [keyframe, *covisible_keyframes(sparse_map, keyframe, config.min_shared)[: config.free - 1]]
+    parent = keyframe
+    while len(free) < config.free // 2:  # few points are known: go on along the way that the agent came
+        parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[parent]]))
+        if parent not in sparse_map or sparse_map.pose(parent) is None:
+            break
+        if parent not in free:
+            free.append(parent)
     return window(sparse_map, free, config, measurement)
 
 
