@@ -15,7 +15,9 @@ from kiteline_core.epipolar_kernels import search_segments
 from kiteline_core.features import build_pyramid
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import AgentId
+from kiteline_core.matching import MatchConfig, match
 from kiteline_core.place_index import PlaceIndex, Vocabulary, nodes
+from kiteline_core.pnp import solve_pnp
 from kiteline_core.se3 import from_rt
 from kiteline_core.two_view import TwoViewConfig, two_view
 
@@ -38,10 +40,23 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
         shift = 0 if k < 13 else -80
         eyes = [np.ascontiguousarray(np.roll(eye, shift, axis=1)) for eye in (image, right)]
         agent.step(StepInput(Frame(k * 50_000_000, eyes[0], eyes[1]), _resting(k)), k * 50_000_000)
-    places = PlaceIndex(words)  # forgets, which so short a flight does not
-    places.add(0, pixels[:320].reshape(10, 32))
-    places.remove(0)
+    _warm_recovery(words, pixels)
     _warm_one_eye(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
+
+
+def _warm_recovery(words: Vocabulary, noise: NDArray[np.uint8]) -> None:
+    """A place looked up, descriptors matched, and a pose from points, on 40 corners of noise."""
+    descriptor, angle = noise[:1280].reshape(40, 32).copy(), np.zeros(40, np.uint8)
+    places = PlaceIndex(words)
+    for key in (0, 1):
+        places.add(key, descriptor)
+    places.query(descriptor)
+    places.remove(0)
+    match(descriptor, angle, descriptor, angle, MatchConfig())
+    points = noise[1280:1400].reshape(40, 3) / 128.0 + np.array([-1.0, -1.0, 2.0])
+    observed = np.column_stack([100.0 * points[:, :2] / points[:, 2:] + 150.0, np.full(40, -1.0)])
+    camera = np.array([100.0, 100.0, 150.0, 150.0, 10.0])
+    solve_pnp(points, np.zeros((40, 3)), observed, np.zeros(40, np.uint8), camera, 0)
 
 
 def _resting(k: int) -> ImuBatch:

@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.agent import Agent, Estimate, Identity, StepInput
+from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracker import Tracker
 from kiteline_agent.warm import warm
 from kiteline_core.frame import Frame, ImuBatch, Trajectory
