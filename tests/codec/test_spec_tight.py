@@ -1,0 +1,228 @@
+"""A second reader of tight forms, written from codec/SPEC.md in plain Python, reads what the codec writes."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+from collections.abc import Callable
+from math import floor
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from kiteline_codec import messages
+from kiteline_codec.schema import Camera, Head, Key, Kind, Sightings
+from kiteline_codec.tight import Tightener
+
+
+def load(name: str) -> ModuleType:
+    """A test file beside this one as a module."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+SPEC, TIGHT = load("test_spec"), load("test_tight")
+Rows = list[list[int]]
+
+
+def tight(s: Any, c: int, n: int) -> Rows:
+    if not n:
+        return [[] for _ in range(c)]
+    heads = []
+    for _ in range(c):
+        first, start = s.u8(), s.u8()
+        heads.append((first >> 3, first & 7, start, 0 if first >> 3 == 3 else s.signed()))
+    bits = 8 * s.at
+
+    def bit() -> int:
+        nonlocal bits
+        bits += 1
+        return s.data[(bits - 1) >> 3] >> ((bits - 1) & 7) & 1
+
+    def number(width: int) -> int:
+        return sum(bit() << i for i in range(width))
+
+    out = []
+    for mode, shift, start, first in heads:
+        total, count, column = 1 << start, 1, []
+        for j in range(n):
+            if mode == 2 and j == 0:
+                column.append(first)
+                continue
+            if mode == 0:
+                column.append(first + number(start))
+                continue
+            k = next((k for k in range(15) if count << k >= total), 15)
+            q = 0
+            while q < 20 and bit():
+                q += 1
+            v = (q << k) + number(k) if q < 20 else number(32)
+            total, count = total + v, count + 1
+            if count == 16:
+                total, count = total // 2, 8
+            z = -(v + 1) // 2 if v % 2 else v // 2
+            column.append({1: first + v, 2: column[-1] + z if column else 0, 3: z}[mode])
+        out.append([v << shift for v in column])
+    s.at = (bits + 7) // 8
+    return out
+
+
+def ungap(gaps: list[int]) -> list[int]:
+    out, last = [], -1
+    for g in gaps:
+        last += g + 1
+        out.append(last)
+    return out
+
+
+def product(a: Rows, b: Any) -> Any:
+    out = [[a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j] for j in range(4)] for i in range(3)]
+    return [[*row[:3], row[3] + a[i][3]] for i, row in enumerate(out)]
+
+
+def inverse(a: Any) -> Any:
+    return [[a[0][i], a[1][i], a[2][i], -(a[0][i] * a[0][3] + a[1][i] * a[1][3] + a[2][i] * a[2][3])] for i in range(3)]
+
+
+def foresee(birth: list[int], T: Any, camera: Any) -> list[int] | None:
+    u, v, code = birth[:3]
+    if not code:
+        return None
+    e, m = divmod(code, 1024)
+    r = ((1024 + m) * 2**e / 1024 - 1) / 128
+    x, y = (u / 16 - 64 - camera.cx) / camera.fx, (v / 16 - 64 - camera.cy) / camera.fy
+    p = [T[i][0] * x + T[i][1] * y + T[i][2] + T[i][3] * r for i in range(3)]
+    if not p[2] > 0.05:
+        return None
+    a = floor((p[0] / p[2] * camera.fx + camera.cx + 64) * 16 + 0.5)
+    b = floor((p[1] / p[2] * camera.fy + camera.cy + 64) * 16 + 0.5)
+    if not (0 <= a < 65536 and 0 <= b < 65536):
+        return None
+    w, e = r / p[2] / 0.0078125 + 1, 0
+    while w >= 2 and e < 13:
+        w, e = w / 2, e + 1
+    return [a, b, min(max(1024 * e + floor((w - 1) * 1024 + 0.5), 1), 13311)]
+
+
+def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[int]], list[int], Any]:
+    """Columns, versions used, and the source before its checksum."""
+    s = SPEC.Source(form)
+    n, step = s.varint(), s.varint()
+    records = {k: messages.decode(k, code) for k, (_, code) in values.items()}
+    heads = {k.id: (values[k][0], r.parent, r.T_p_k.tolist()) for k, r in records.items() if isinstance(r, Head)}
+    if step:
+        heads[key.id] = (0, key.id - step, s.pose())
+    table, last = [], key.id
+    for _ in range(s.varint()):
+        last -= s.varint()
+        table.insert(0, last)
+    counts, masks = tight(s, 2, len(table))
+    gaps = tight(s, 1, n)[0]
+    points, births, used, octave = [], [], [], []
+    for a, count, mask in zip(table, counts, masks, strict=True):
+        known: dict[int, list[int]] = {}
+        for part in range(mask.bit_length()):
+            if mask >> part & 1:
+                version, code = values[Key(4, a, part)]
+                b = SPEC.Source(code)
+                columns = b.columns(6, b.varint())
+                known |= {i: [u, v, d, o] for i, u, v, d, o, _ in zip(*columns, strict=True)}
+                used.append(version)
+        for keypoint in ungap(gaps[len(points) : len(points) + count]):
+            points.append(a << 11 | keypoint)
+            births.append((a, known.get(keypoint)))
+    ways: dict[int, Any] = {}
+    on_way: dict[int, int] = {}
+    for a in [a for a, mask in zip(table, masks, strict=True) if mask]:
+        up = [key.id]
+        while up[-1] in heads and heads[up[-1]][1] >= 0:
+            up.append(heads[up[-1]][1])
+        down = [a]
+        while down[-1] not in up:
+            down.append(heads[down[-1]][1])
+        above = up[: up.index(down[-1])]
+        T: Any = np.eye(4).tolist()
+        for k in above:
+            T = product(T, inverse(heads[k][2]))
+        for k in reversed(down[:-1]):
+            T = product(T, heads[k][2])
+        ways[a] = T
+        on_way |= {k: heads[k][0] for k in above + down[:-1]}
+    if ways:
+        used += [on_way[k] for k in sorted(on_way)]
+        used.append(next(v for k, (v, _) in values.items() if k.kind == Kind.CAMERA))
+    camera = next(r.camera for r in records.values() if isinstance(r, Camera))
+    seen = [foresee(b, ways[a], camera) if b else None for a, b in births]
+    steps = s.u8()
+    su, sd = steps >> 4, steps & 15
+    index, octave = tight(s, 2, n)
+    near = tight(s, 3, sum(x is not None for x in seen))
+    far = tight(s, 3, sum(x is None for x in seen))
+    rows = []
+    i = j = 0
+    for x in seen:
+        if x is None:
+            rows.append([far[c][j] for c in range(3)])
+            j += 1
+            continue
+        z = near[2][i] - 1
+        depth = 0 if z < 0 else ((-(z + 1) // 2 if z % 2 else z // 2) + (x[2] >> sd)) << sd
+        rows.append([(near[0][i] + (x[0] >> su)) << su, (near[1][i] + (x[1] >> su)) << su, depth])
+        i += 1
+    columns = {
+        "index": [k + v for k, v in enumerate(index)],
+        "u": [r[0] for r in rows], "v": [r[1] for r in rows], "depth": [r[2] for r in rows],
+        "octave": [o + (b[3] if b else 0) for o, (_, b) in zip(octave, births, strict=True)], "point": points,
+    }  # fmt: skip
+    return columns, used, s
+
+
+@pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != Kind.HEAD or key.id % 64 < 5])
+def test_sightings(held: Callable[[Key], bool]) -> None:
+    values = TIGHT.coded(TIGHT.flight(7, keyframes=6, births=40))
+    compared = 0
+    for key, (_, code) in values.items():
+        if key.kind != Kind.SIGHTINGS:
+            continue
+        known = {k: v for k, v in values.items() if held(k)}
+        form = Tightener().shrink(key, code, known.get, values.get)
+        if form is None:
+            continue
+        columns, used, s = read_sightings(key, form, known)
+        record = messages.decode(key, code)
+        assert isinstance(record, Sightings)
+        n = SPEC.Source(code).varint()
+        plain = SPEC.Source(code[len(SPEC.varint(n)) :]).columns(5, n)
+        assert [columns[c] for c in ("index", "u", "v", "depth", "octave")] == plain
+        assert columns["point"] == record.point.tolist()
+        checksum = crc32(code + b"".join(struct.pack("<q", v) for v in used))
+        assert s.raw(4) == checksum.to_bytes(4, "little")
+        assert s.at == len(form)
+        compared += len(columns["index"])
+    assert compared > 200
+
+
+def test_births() -> None:
+    values = TIGHT.coded(TIGHT.flight(7, keyframes=1, births=40))
+    for key, (_, code) in values.items():
+        if key.kind != Kind.BIRTHS:
+            continue
+        form = Tightener().shrink(key, code, {}.get, {}.get)
+        assert form is not None
+        s = SPEC.Source(form)
+        head = s.varint()
+        n, size = head // 4, (0, 16, 32)[head % 4]
+        columns = tight(s, 6, n)
+        plain = SPEC.Source(code)
+        assert plain.varint() == n
+        assert [ungap(columns[0]), *columns[1:]] == plain.columns(6, n)
+        assert s.raw(size * n) == plain.raw(size * n)
+        assert s.raw(4) == crc32(code).to_bytes(4, "little")
