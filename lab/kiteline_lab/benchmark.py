@@ -23,6 +23,7 @@ BENCHMARKS = {
     "front-end": "kiteline_lab.bench_front_end",
     "agent": "kiteline_lab.bench_agent",
     "places": "kiteline_lab.bench_places",
+    "mapper": "kiteline_lab.bench_mapper",
 }  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`
 
 _HEAD = (
