@@ -121,6 +121,19 @@ class CodedChannel:
         """The endpoint's numbers."""
         return self.endpoint.stats
 
+    def report(self) -> dict[str, int | str]:
+        """The link in a few numbers, as seen from this end."""
+        stats = self.endpoint.stats
+        return {
+            "profile": self._pacer.profile.name,
+            "budget_bytes_s": stats.budget_bytes,
+            "backlog_bytes": stats.backlog_bytes,
+            "rtt_ms": stats.rtt_ns // 1_000_000,
+            "packets_sent": stats.packets_sent,
+            "packets_lost": stats.lost,
+            "packets_refused": stats.rejected,
+        }
+
     def put(self, record: Record) -> Record:
         """Code and share a record. Raises ValueError when it cannot be coded."""
         key = messages.key(record)

@@ -110,10 +110,11 @@ class References:
         """T_k_a (4,4) of the wanted keyframes that are found along parents, up from keyframe k to the nearest common
         one and down again; and the versions of the headers on these ways, in order of keyframes.
         """
-        above = self._above(keyframe, held)
-        generation = {a: i for i, (a, _) in enumerate(above)}
+        above = self._above(keyframe, wanted, held)
+        generation = {a: i for i, (a, _, _) in enumerate(above)}
         poses: dict[int, F64] = {}
         versions: dict[int, int] = {}
+        highest = 0
         for a in sorted(wanted):
             below: list[tuple[int, Head, int]] = []  # from a up to below the common keyframe
             at = a
@@ -132,23 +133,26 @@ class References:
                 T_k_a = T
             poses[a] = T_k_a
             versions.update({b: version for b, _, version in below})
-            for b, _ in above[: generation[at]]:
-                version_above = self.head(b, held)
-                assert version_above is not None
-                versions[b] = version_above[0]
+            highest = max(highest, generation[at])
+        versions.update({b: version for b, _, version in above[:highest]})
         return poses, [versions[b] for b in sorted(versions)]
 
-    def _above(self, keyframe: int, held: Held) -> list[tuple[int, F64]]:
-        """Keyframe k, its parent, and so on, with T_k_a (4,4) of each."""
+    def _above(self, keyframe: int, wanted: set[int], held: Held) -> list[tuple[int, F64, int]]:
+        """Keyframe k, its parent, and so on until all wanted were met, with T_k_a (4,4) and the header's version of each
+        (0 for the last, whose header is not used).
+        """
         at, T_k_a, step = keyframe, np.eye(4), np.empty((4, 4))
-        above = [(at, T_k_a)]
+        left = len(wanted - {at})
+        above: list[tuple[int, F64, int]] = []
         for _ in range(MAX_GENERATIONS):
-            head = self.head(at, held)
+            head = self.head(at, held) if left else None
             if head is None or head[1].parent == NO_KEYFRAME:
                 break
+            above.append((at, T_k_a, head[0]))
             kernels.invert(np.ascontiguousarray(head[1].T_p_k), step)
             T_k_p = np.empty((4, 4))
             kernels.compose(T_k_a, step, T_k_p)
             at, T_k_a = int(head[1].parent), T_k_p
-            above.append((at, T_k_a))
+            left -= at in wanted
+        above.append((at, T_k_a, 0))
         return above

@@ -1,0 +1,216 @@
+"""The thin line's bars: bytes, budgets, delays, outages, serial lines, a flight controller's radio, CPU."""
+
+from __future__ import annotations
+
+import json
+import random
+import resource
+from typing import Any
+
+import numpy as np
+
+from kiteline_codec.profiles import RADIO
+from kiteline_codec.schema import Key, Kind
+from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_hw.mavlink_tunnel import TunnelConfig, TunnelEnd
+from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sim.serial_pair import SerialPair
+from kiteline_hw.sim.telemetry_radio import RoutingController, TelemetryConfig
+from kiteline_hw.sources import open_source
+from kiteline_lab.bench_link_cpu import coding_ms, packet_ms
+from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
+from kiteline_lab.fly import Options, flight_starts, fly
+from kiteline_lab.link_watch import watch
+
+TITLE = "The thin line"
+
+_FLIGHT = "room_flight.mcap"
+_MINUTE_NS = 60_000_000_000
+_TICK_NS = 50_000_000
+
+
+def run(bench: Bench) -> list[Bar]:
+    """All bars, in the order of the promise."""
+    return [
+        *_profiles(bench), *_thin(bench), *_serial(bench), *_tunnel(bench), *_outage(bench), *_cpu(bench),
+    ]  # fmt: skip
+
+
+def _fly(bench: Bench, folder: str, **options: Any) -> dict[str, Any]:
+    bench.say(f"flying {_FLIGHT} ({folder})")
+    report, outcome = fly(Options((bench.source(_FLIGHT),), bench.folder / folder, **options), quiet=True)
+    report["failed"] = outcome.failed
+    return dict(report)
+
+
+def _ate(report: dict[str, Any], what: str) -> float:
+    return float(report["agents"][0]["accuracy"][what]["ate_m"])
+
+
+def _ratio(name: str, report: dict[str, Any], other: dict[str, Any], what: str, limit: float) -> Bar:
+    """A bar on one flight's ATE over another's."""
+    return at_most(name, _ate(report, what) / max(_ate(other, what), 1e-4), limit, "", 2)
+
+
+def _profiles(bench: Bench) -> list[Bar]:
+    """Both profiles over a link that takes everything, against a flight without any codec."""
+    plain = _fly(bench, "link_monolith", mode="monolith")
+    wifi = _fly(bench, "link_wifi", profile="wifi")
+    radio = _fly(bench, "link_radio", profile="radio")
+    return [
+        at_most("wifi: bytes a keyframe", wifi["agents"][0]["bytes_per_keyframe"] / 1000.0, 8.0, "kB", 2),
+        at_most(
+            "wifi: ATE base over that of a monolith", _ate(wifi, "base") / max(_ate(plain, "base"), 1e-4), 1.25, "", 2
+        ),
+        at_most("radio: bytes a keyframe", radio["agents"][0]["bytes_per_keyframe"] / 1000.0, 2.5, "kB", 2),
+        _ratio("radio: ATE base over that of wifi", radio, wifi, "base", 1.5),
+        is_true("digests of both", "equal", wifi["base"]["digest_equal"] and radio["base"]["digest_equal"]),
+    ]
+
+
+def _thin(bench: Bench) -> list[Bar]:
+    """1000 B/s up, 500 B/s down, a tenth lost, 200 ms late; then 300 B/s."""
+    wifi = json.loads((bench.folder / "link_wifi" / "report.json").read_text())
+    alone = _fly(bench, "link_alone", mode="tracker")
+    thin = _fly(bench, "link_1000", profile="radio", up_bytes_s=1000, down_bytes_s=500, loss=0.1, delay_s=0.2)
+    scarce = _fly(bench, "link_300", profile="radio", up_bytes_s=300, down_bytes_s=300)
+    seen = watch(bench.folder / "link_1000", 0, _start_ns(bench), RADIO.overhead_bytes)
+    keyframes = thin["agents"][0]["keyframes"]
+    early = sum(delay <= 3.0 for delay in seen.head_delays_s) / keyframes
+    gap = max(seen.pose_gaps_s, default=1e9)
+    return [
+        at_most("1000 B/s: bytes in any second, up", seen.most_bytes_s, 1000, "B", 0),
+        Bar("1000 B/s: headers within 3 s", ">= 80 %", f"{100 * early:.0f} % of {keyframes}", early >= 0.8),
+        _ratio("1000 B/s: ATE base over that of wifi", thin, wifi, "base", 2.0),
+        _ratio("1000 B/s: ATE live over that of the tracker alone", thin, alone, "live", 1.0),
+        at_most("1000 B/s: longest gap between poses on the base", gap, 1.0, "s", 2),
+        is_true(
+            "300 B/s: a map at the end", "points and poses", scarce["base"]["map_points"] > 20 and not scarce["failed"],
+            f"{scarce['base']['map_points']} points, {scarce['base']['keyframes']} keyframes",
+        ),
+    ]  # fmt: skip
+
+
+def _start_ns(bench: Bench) -> int:
+    source = open_source(bench.source(_FLIGHT))
+    try:
+        return flight_starts([source])[0]
+    finally:
+        source.close()
+
+
+def _serial(bench: Bench) -> list[Bar]:
+    """A live flight over a cable of 57,600 baud whose ends take turns, with bit errors."""
+    with SerialPair(baud=57600, turn_s=0.1, bit_errors=1e-4, seed=4) as pair:
+        link = f"serial:{pair.a}:57600,{pair.b}:57600"
+        report = _fly(
+            bench, "link_serial", link=link, realtime=True, profile="radio", up_bytes_s=1000, down_bytes_s=500
+        )
+    wifi = json.loads((bench.folder / "link_wifi" / "report.json").read_text())
+    return [
+        at_most(
+            "serial line: ATE base over that of wifi", _ate(report, "base") / max(_ate(wifi, "base"), 1e-4), 2.0, "", 2
+        ),
+        is_true("serial line: digests at the end", "equal", report["base"]["digest_equal"] is True),
+    ]
+
+
+def _tunnel(bench: Bench) -> list[Bar]:
+    """What 500 B/s of telemetry pay for a tunnel of 1000 B/s beside them, in the model of a routing controller."""
+    bench.say("tunnel through a modelled flight controller")
+    alone, _ = telemetry_p95_ms(0)
+    shared, goodput = telemetry_p95_ms(1000)
+    return [
+        at_most("TUNNEL: growth of the telemetry's delay, p95", 100.0 * (shared / alone - 1.0), 20.0, "%", 1),
+        Bar("TUNNEL: packets' bytes that arrive", ">= 500 B/s", f"{goodput:.0f} B/s", goodput >= 500),
+    ]
+
+
+def telemetry_p95_ms(rate_bytes_s: int, seconds: int = 120) -> tuple[float, float]:
+    """p95 of the telemetry's delay in ms, and B/s of packets that arrive, with as much traffic as the rate allows."""
+    draw = random.Random(2)
+    controller = RoutingController(None, TelemetryConfig(bytes_s=500))
+    a = TunnelEnd(TunnelConfig(rate_bytes_s=max(1, rate_bytes_s)))
+    b = TunnelEnd(TunnelConfig(system=255, peer_system=1, rate_bytes_s=max(1, rate_bytes_s // 2)))
+    to_a: list[bytes] = []
+    to_b: list[bytes] = []
+    arrived = 0
+    for tick in range(seconds * 100):
+        now_ns = tick * 10_000_000
+        for end, incoming in ((a, to_a), (b, to_b)):
+            for message in incoming:
+                packets = end.receive(message)
+                arrived += sum(map(len, packets)) if end is b else 0
+            while rate_bytes_s and end.send(draw.randbytes(150)):
+                pass
+        out = (a.poll(now_ns), b.poll(now_ns)) if rate_bytes_s else ([], [])
+        to_a, to_b = controller.step(*out, now_ns)
+    return float(np.percentile(controller.up.telemetry_delay_ns, 95)) / 1e6, arrived / seconds
+
+
+def _outage(bench: Bench) -> list[Bar]:
+    """Ten minutes up, ten down, up again, at two keyframes a second."""
+    bench.say("ten minutes without a link")
+    draw = random.Random(5)
+    config = SyncConfig(budget_bytes=1_000_000)
+    agent, base = Endpoint(config, 1), Endpoint(config, 1)
+    model = LinkModelConfig(
+        rate_bytes_s=2_000_000, delay_ns=20_000_000, loss=0.01, outages=((10 * _MINUTE_NS, 20 * _MINUTE_NS),)
+    )
+    up, down = LinkModel(model, 1), LinkModel(model, 2)
+    before_mib = 0.0
+    most_mib = 0.0
+    synced_s = first_pose_s = None
+    pose_before = b""
+    for tick in range(21 * 60 * 20):
+        now_ns = tick * _TICK_NS
+        if now_ns < 20 * _MINUTE_NS:
+            agent.put(Key(Kind.LIVE, 0), draw.randbytes(29))
+            if tick % 10 == 0:
+                _keyframe(agent, tick // 10, draw)
+        elif now_ns == 20 * _MINUTE_NS:
+            pose_before = base.peer_values()[Key(Kind.LIVE, 0)]
+        for packet in up.deliver(now_ns):
+            base.receive(packet, now_ns)
+        for packet in down.deliver(now_ns):
+            agent.receive(packet, now_ns)
+        for end, wire in ((agent, up), (base, down)):
+            while (out := end.poll(now_ns)) is not None:
+                wire.send(out, now_ns)
+        if now_ns == 10 * _MINUTE_NS:
+            before_mib = agent.stats.backlog_bytes / 2**20
+        most_mib = max(most_mib, agent.stats.backlog_bytes / 2**20) if tick % 20 == 0 else most_mib
+        if now_ns >= 20 * _MINUTE_NS:
+            since_s = (now_ns - 20 * _MINUTE_NS) / 1e9
+            if first_pose_s is None and base._in.values[Key(Kind.LIVE, 0)][1] != pose_before:
+                first_pose_s = since_s
+            if agent.digest_equal and base.digest_equal:
+                synced_s = since_s
+                break
+    rss_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    bench.more.append(
+        f"Outage: backlog {most_mib:.1f} MiB at its end ({before_mib:.2f} before), process {rss_mib:.0f} MiB."
+    )
+    return [
+        at_most(
+            "after 10 minutes without a link: synchronised", synced_s if synced_s is not None else 999.0, 30.0, "s", 1
+        ),
+        at_most("the same: outbox", most_mib, 20.0, "MiB", 1),
+        at_most("the same: first pose", first_pose_s if first_pose_s is not None else 999.0, 2.5, "s", 2),
+    ]
+
+
+def _keyframe(agent: Endpoint, number: int, draw: random.Random) -> None:
+    agent.put(Key(Kind.HEAD, number), draw.randbytes(26))
+    for part in range(7):
+        agent.put(Key(Kind.BIRTHS, number, part), draw.randbytes(930))
+    agent.put(Key(Kind.SIGHTINGS, number), draw.randbytes(500))
+
+
+def _cpu(bench: Bench) -> list[Bar]:
+    """Coding and tight forms of a keyframe there and back; an endpoint's work a packet."""
+    bench.say("CPU of codec and endpoint")
+    return [
+        at_most("codec: CPU of a keyframe there and back", coding_ms(), 2.0, "ms", 2),
+        at_most("endpoint: CPU a packet, both ends, tight forms apart", packet_ms(), 0.3, "ms", 3),
+    ]

@@ -1,0 +1,74 @@
+"""What crossed a link, read from the logs of a flight: bytes in any second, how late headers and poses came."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from kiteline_agent import flight_log as agent_log
+from kiteline_basestation import flight_log as base_log
+from kiteline_codec import messages
+from kiteline_codec.packet import parse
+from kiteline_codec.schema import Head, Kind, Live, WireError
+from kiteline_hw.mcap_log_read import LogReader
+from kiteline_lab.replay import steps
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """Of one direction, or of one agent's values on the base. Times in s, of flight."""
+
+    most_bytes_s: int  # in any one-second window, overhead included
+    head_delays_s: list[float]  # from capture to arrival of each keyframe's header, before the flight's last second
+    pose_gaps_s: list[float]  # between arrivals of live poses
+
+
+def most_in_a_second(log: Path, topic: str, overhead_bytes: int) -> int:
+    """The most bytes that left in any window of one second, both ends included."""
+    window: deque[tuple[int, int]] = deque()
+    most = total = 0
+    with LogReader(log) as reader:
+        for step in steps(reader):
+            now_ns = int(step.head["now_ns"])
+            sent = sum(len(packet) + overhead_bytes for packet in step.blobs(topic))
+            window.append((now_ns, sent))
+            total += sent
+            while now_ns - window[0][0] > _SECOND_NS:
+                total -= window.popleft()[1]
+            most = max(most, total)
+    return most
+
+
+def arrivals(base_folder: Path, agent: int, start_ns: int) -> tuple[list[float], list[float]]:
+    """How late each header came, and the gaps between live poses, in s."""
+    heads: dict[int, float] = {}
+    poses_ns: list[int] = []
+    with LogReader(base_folder / "log.mcap") as reader:
+        for step in steps(reader):
+            now_ns = int(step.head["now_ns"])
+            for packet in step.blobs(base_log.packets_in(agent)):
+                try:
+                    _, items = parse(packet, 1 << 20)
+                except WireError:
+                    continue
+                for item in items:
+                    if item.key.kind not in (Kind.HEAD, Kind.LIVE) or not item.whole:
+                        continue
+                    record = messages.decode(item.key, item.data)
+                    if isinstance(record, Head):
+                        heads.setdefault(record.keyframe, (now_ns + start_ns - record.t_ns) / 1e9)
+                    elif isinstance(record, Live):
+                        poses_ns.append(now_ns)
+    gaps = [(b - a) / 1e9 for a, b in pairwise(poses_ns)]
+    return list(heads.values()), gaps
+
+
+def watch(folder: Path, agent: int, start_ns: int, overhead_bytes: int) -> Watched:
+    """All of an agent's link, upwards."""
+    delays, gaps = arrivals(folder / "base", agent, start_ns)
+    most = most_in_a_second(folder / f"agent{agent}" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
+    return Watched(most, delays, gaps)
