@@ -226,6 +226,7 @@ class Onboard:
         return {
             "source": self.source.name,
             **self.flown,
+            "link": self.channel.report() if isinstance(self.channel, CodedChannel) else {},
             "skipped": dict(sorted(skipped.items())),
             "notes": list(self.source.report.notes),
             "scale": "metric" if self.agent.metric else "own",

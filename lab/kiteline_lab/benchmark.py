@@ -22,6 +22,8 @@ BENCHMARKS = {
     "first-flight": "kiteline_lab.bench_first_flight",
     "front-end": "kiteline_lab.bench_front_end",
     "agent": "kiteline_lab.bench_agent",
+    "link": "kiteline_lab.bench_link",
+    "fuzz": "kiteline_lab.bench_fuzz",
     "places": "kiteline_lab.bench_places",
     "mapper": "kiteline_lab.bench_mapper",
 }  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`

@@ -126,18 +126,29 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{s.getsockname()[1]}"
 
 
+def link_ends(link: str, realtime: bool) -> tuple[str, str]:
+    """LINK of the agents and of the base. `serial:` and `mavlink:` name both ends, the agent's first, with a comma
+    between. Raises LinkError.
+    """
+    kind, _, address = link.partition(":")
+    if kind in ("serial", "mavlink") and realtime and address.count(",") == 1:
+        ends = address.split(",")
+        return f"{kind}:{ends[0]}", f"{kind}:{ends[1]}"
+    if link and kind != "zenoh":
+        raise LinkError(
+            f"--link {link}: fly joins its processes by zenoh:tcp/HOST:PORT, or with --realtime by "
+            "serial:A:BAUD,B:BAUD or mavlink:URL,URL, the agent's end first"
+        )
+    endpoint = address or free_endpoint()
+    return (f"zenoh:{endpoint}",) * 2 if realtime else (f"lockstep:{endpoint}",) * 2
+
+
 def fly_processes(flight: Flight, link: str, realtime: bool) -> Outcome:
     """Fly as one process an agent and one for the base. Raises LinkError when the base cannot begin."""
     assert flight.base is not None
-    endpoint = link.removeprefix("zenoh:") if link else free_endpoint()
-    if link and not link.startswith("zenoh:"):
-        raise LinkError(
-            f"--link {link}: fly joins its processes by zenoh:tcp/HOST:PORT; serial lines are for "
-            "`kiteline agent` and `kiteline base`"
-        )
-    kind = "zenoh" if realtime else "lockstep"
-    base = replace(flight.base, link=f"{kind}:{endpoint}")
-    agents = [replace(spec, link=f"{kind}:{endpoint}") for spec in flight.agents]
+    up, down = link_ends(link, realtime)
+    base = replace(flight.base, link=down)
+    agents = [replace(spec, link=up) for spec in flight.agents]
     with contextlib.ExitStack() as stack:
         crew = stack.enter_context(Crew())
         progress = stack.enter_context(Progress("flying", flight.frames, "frames")) if not flight.quiet else None
@@ -160,7 +171,7 @@ class _Supervisor:
         self._bases = 1
         self._flying = {f"agent{spec.agent}" for spec in agents}
         self._base_up = True
-        self._live = base.link.startswith("zenoh:")
+        self._live = not base.link.startswith("lockstep:")
         self._over: set[str] = set()  # live agents that have flown their last frame
         self._errors: dict[str, str] = {}
 
