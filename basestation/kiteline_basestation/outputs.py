@@ -39,7 +39,18 @@ def map_files(mapper: Mapper) -> dict[str, bytes]:
 def counts(mapper: Mapper) -> dict[str, int]:
     """The base's part of report.json that the map itself tells."""
     summary = mapper.summary()
-    names = ("keyframes", "loops", "merges", "found", "triangulated", "culled", "keyframes_culled", "bundles", "grids", "refused_records")
+    names = (
+        "keyframes",
+        "loops",
+        "merges",
+        "found",
+        "triangulated",
+        "culled",
+        "keyframes_culled",
+        "bundles",
+        "grids",
+        "refused_records",
+    )
     return {"map_points": _whole(summary["points"]), **{name: _whole(summary[name]) for name in names}}
 
 
