@@ -138,8 +138,8 @@ class References:
         return poses, [versions[b] for b in sorted(versions)]
 
     def _above(self, keyframe: int, wanted: set[int], held: Held) -> list[tuple[int, F64, int]]:
-        """Keyframe k, its parent, and so on until all wanted were met, with T_k_a (4,4) and the header's version of each
-        (0 for the last, whose header is not used).
+        """Keyframe k, its parent, and so on until all wanted were met, with T_k_a (4,4) and the version of the header;
+        0 for the last one, whose header is not used.
         """
         at, T_k_a, step = keyframe, np.eye(4), np.empty((4, 4))
         left = len(wanted - {at})

@@ -57,6 +57,29 @@ _COLUMNS: dict[Kind, tuple[str, ...]] = {
 }
 
 
+_LIMITS = {
+    kind: tuple(
+        np.array([getattr(_FIELDS[name], end) for name in names for _ in range(_FIELDS[name].columns)], np.int64)
+        for end in ("low", "high")
+    )
+    for kind, names in _COLUMNS.items()
+}
+
+
+def _out_of_range(kind: Kind, values: I64) -> str:
+    """What is wrong with the codes (columns, n) of a kind, "" when nothing is."""
+    if not values.shape[1]:
+        return ""
+    low, high = _LIMITS[kind]
+    least, most = values.min(axis=1), values.max(axis=1)
+    wrong = np.flatnonzero((least < low) | (most > high))
+    if not len(wrong):
+        return ""
+    i = int(wrong[0])
+    names = [name for name in _COLUMNS[kind] for _ in range(_FIELDS[name].columns)]
+    return f"{names[i]} is {least[i]}..{most[i]}, expected {low[i]}..{high[i]}"
+
+
 def write_columns(out: Writer, kind: Kind, record: Any) -> None:
     """The number of rows and the columns of a record's kind. Raises ValueError for values that have no code."""
     n = len(record.index)
@@ -69,10 +92,10 @@ def write_columns(out: Writer, kind: Kind, record: Any) -> None:
     for name in names:
         field = _FIELDS[name]
         codes = field.codes(getattr(record, name))
-        if n and (codes.min() < field.low or codes.max() > field.high):
-            raise ValueError(f"{name} is {codes.min()}..{codes.max()}, expected {field.low}..{field.high}")
         values[row : row + field.columns] = codes
         row += field.columns
+    if wrong := _out_of_range(kind, values):
+        raise ValueError(wrong)
     if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
         raise ValueError("indices must increase")
     out.columns(values)
@@ -89,13 +112,13 @@ def read_columns(source: Reader, kind: Kind) -> tuple[int, dict[str, Any]]:
     names = _COLUMNS[kind]
     values = read_codes(source, kind)
     n = values.shape[1]
+    if wrong := _out_of_range(kind, values):
+        raise WireError(wrong)
     out = {}
     row = 0
     for name in names:
         field = _FIELDS[name]
         codes = values[row : row + field.columns]
-        if n and (codes.min() < field.low or codes.max() > field.high):
-            raise WireError(f"{name} is {codes.min()}..{codes.max()}, expected {field.low}..{field.high}")
         out[name] = field.values(codes)
         row += field.columns
     if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
