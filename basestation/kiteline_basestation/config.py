@@ -46,16 +46,8 @@ class WindowConfig:
 class LinkConfig:
     """The agent's own pose of a keyframe in its parent, where a bundle has little else."""
 
-    enough: int = 60  # observations of a keyframe above which its points alone hold it: every keyframe of a wide link
-    sigma_px: float = 0.25  # of each of 12 made-up points: a tracked pose is as good as 100 points of 0.5 px
-
-
-@dataclass(frozen=True, slots=True)
-class LinkConfig:
-    """The agent's own pose of a keyframe in its parent, where a bundle has little else."""
-
     enough: int = 80  # observations of a keyframe above which its points alone hold it: every keyframe of a wide link
-    sigma_px: float = 0.25  # of each of 12 made-up points where there is nothing else; it grows with what there is
+    sigma_px: float = 0.15  # of each of 12 made-up points where there is nothing else; it grows with what there is
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +189,6 @@ class BaseConfig:
     intake: IntakeConfig = field(default_factory=IntakeConfig)
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
-    links: LinkConfig = field(default_factory=LinkConfig)
     links: LinkConfig = field(default_factory=LinkConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
     refind: RefindConfig = field(default_factory=RefindConfig)

@@ -18,7 +18,6 @@ from kiteline_basestation.grid import Grid, GridMap
 from kiteline_basestation.intake import Intake
 from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.odometry_links import with_links, without_links
-from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
 from kiteline_codec.schema import Placement, Record
