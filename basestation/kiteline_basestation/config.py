@@ -28,6 +28,7 @@ class MeasurementConfig:
     sigma_px: float = 0.25  # one standard deviation of an aligned pixel coordinate at octave 0
     sigma_growth: float = 1.4  # by which it grows with each octave: alignment is finer than its pixels
     sigma_disparity_px: float = 0.4  # the same of a disparity; sightings of a point share its template's error
+    sigma_settled_px: float = 0.2  # the same once the offset of the agent's disparities is known
     fused_px: float = 0.6  # the same of a birth that shows an older point: two detections of one corner
     fused_growth: float = 2.0  # corners are found to a share of their level's pixels
 
@@ -149,11 +150,13 @@ class DisparityConfig:
     """The constant error of an agent's disparities, found from its motion."""
 
     every: int = 12  # keyframes between two looks
+    rounds: int = 3  # further looks after each, while bundles of the whole map still show more
     min_seen: int = 4  # observations with depth of a point that is used
     min_points: int = 300
     min_range: float = 1.8  # ratio of near to far disparities (90 to 10 %): less says nothing of an offset
-    least_px: float = 0.02  # smaller offsets stay: the estimate is no better
-    deviations: float = 4.0  # by which an offset must stand out
+    least_px: float = 0.008  # smaller offsets stay: the estimate is no better
+    deviations: float = 3.0  # by which an offset must stand out
+    settled_px: float = 0.005  # deviation of the estimate below which an offset is known
     most_px: float = 0.5  # more is no calibration error, but something else
 
 

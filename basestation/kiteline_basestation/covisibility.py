@@ -115,10 +115,13 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     rows = table.row[slots]
     deep = np.zeros(len(sparse_map), bool)
     offset = np.zeros(len(sparse_map))
+    sigma = np.full(len(sparse_map), config.sigma_disparity_px)
     for row in np.unique(rows).tolist():
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
         offset[row] = sparse_map.disparity_offset_px.get(agent, 0.0)
+        if agent in sparse_map.disparity_known:
+            sigma[row] = config.sigma_settled_px
         deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & deep[rows]
     measured = np.empty((len(slots), 3))
@@ -129,7 +132,7 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     aligned = config.sigma_growth**octave
     fused = (table.kind[slots] == BIRTH) & (table.root[slots] != slots)
     pixel = np.where(fused, config.fused_px * config.fused_growth**octave, config.sigma_px * aligned)
-    return measured, np.stack([pixel, config.sigma_disparity_px * aligned], 1)
+    return measured, np.stack([pixel, sigma[rows] * aligned], 1)
 
 
 def _inverted(poses: F64) -> F64:

@@ -98,6 +98,8 @@ class Mapper:
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
+        self._calibrate_soon = False
+        self._rounds = 0  # looks since the last regular one
         self._calibrate_at = 2 * self.config.disparity.every  # keyframes, when offsets of disparities are looked at
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
@@ -267,6 +269,8 @@ class Mapper:
 
     def _finish(self, done: JobDone) -> None:
         if self.atlas is not None and self.atlas.finish(done):
+            if isinstance(done.result, BundleResult) and self._rounds < self.config.disparity.rounds:
+                self._calibrate_soon = True  # a bundle of the whole map may show more
             return
         if isinstance(done.result, BundleResult):
             opened = self._windows.pop(done.id, None)
@@ -307,9 +311,13 @@ class Mapper:
     def _calibrate(self) -> None:
         """Now and then, see whether an agent's disparities are off as a whole; if so, its map is bundled anew."""
         config = self.config.disparity
-        if self.atlas is None or self.counts.keyframes < self._calibrate_at:
+        due = self.counts.keyframes >= self._calibrate_at
+        if self.atlas is None or not (due or self._calibrate_soon):
             return
-        self._calibrate_at = self.counts.keyframes + config.every
+        self._rounds = 0 if due else self._rounds + 1
+        if due:
+            self._calibrate_at = self.counts.keyframes + config.every
+        self._calibrate_soon = False
         for agent in sorted(self.map.measures_depth):
             island = self.map.island_of(
                 max(s for s, ks in self.map.submaps.items() if agent_of_keyframe(ks[0]) == agent)
@@ -322,6 +330,9 @@ class Mapper:
                 continue
             if abs(found.value_px) > max(config.least_px, config.deviations * found.sigma_px):
                 self.map.disparity_offset_px[agent] = applied + found.value_px
+                self.atlas.bundle_all(island)
+            elif found.sigma_px < config.settled_px and agent not in self.map.disparity_known:
+                self.map.disparity_known.add(agent)
                 self.atlas.bundle_all(island)
 
     def _place_island(self, island: SubmapId) -> None:

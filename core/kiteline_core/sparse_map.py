@@ -67,6 +67,7 @@ class SparseMap:
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, float] = {}  # what an agent's disparities are too large by
+        self.disparity_known: set[AgentId] = set()  # agents whose offset is known well
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots that name a point of a keyframe that is not here yet
 
