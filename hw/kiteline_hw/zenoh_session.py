@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -24,8 +25,15 @@ Role = Literal["client", "base"]
 
 
 def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
-    """The configuration of a session. endpoint: a Zenoh locator such as tcp/127.0.0.1:7447. Raises LinkError."""
-    config = zenoh.Config()
+    """The configuration of a session. endpoint: a Zenoh locator such as tcp/127.0.0.1:7447. Raises LinkError.
+
+    A file that the environment variable ZENOH_CONFIG names is the ground on which this one stands: it is the place for
+    certificates and access control.
+    """
+    try:
+        config = zenoh.Config.from_env() if os.environ.get("ZENOH_CONFIG") else zenoh.Config()
+    except zenoh.ZError as error:
+        raise LinkError(f"ZENOH_CONFIG={os.environ['ZENOH_CONFIG']} is no configuration of Zenoh: {error}") from error
     options: dict[str, Any] = {
         "mode": "client" if role == "client" else "peer",
         "connect/endpoints": [endpoint] if role == "client" else [],
