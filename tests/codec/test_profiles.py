@@ -1,0 +1,159 @@
+"""What a profile shares of a keyframe, and how the pace follows the link."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_codec import messages
+from kiteline_codec.channel import coded_channel
+from kiteline_codec.pacing import Pacer
+from kiteline_codec.profiles import EXACT, RADIO, WIFI, Profile
+from kiteline_codec.schema import Births, Head, Live, Sightings
+from kiteline_codec.throughput import Throughput
+from kiteline_core import descriptors
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+
+KEYFRAME = keyframe_id(submap_id(1, 2, 3), 40)
+SECOND = 1_000_000_000
+
+
+def a_keyframe(births: int, sightings: int, seed: int = 0) -> tuple[Births, np.ndarray, Sightings]:
+    rng = np.random.default_rng(seed)
+    born = Births(
+        KEYFRAME, 0, np.arange(births, dtype=np.uint16), rng.uniform(0, 700, (births, 2)).astype(np.float32),
+        rng.uniform(0, 1, births).astype(np.float32), rng.integers(0, 3, births).astype(np.uint8),
+        rng.integers(0, 256, births).astype(np.uint8), rng.integers(0, 256, (births, 32)).astype(np.uint8),
+    )  # fmt: skip
+    point = np.sort(rng.permutation(4000)[:sightings]).astype(np.int64)
+    seen = Sightings(
+        KEYFRAME, 0, np.arange(births, births + sightings, dtype=np.uint16),
+        rng.uniform(0, 700, (sightings, 2)).astype(np.float32), rng.uniform(-1, 1, sightings).astype(np.float32),
+        rng.integers(0, 3, sightings).astype(np.uint8), point,
+    )  # fmt: skip
+    return born, rng.uniform(size=births), seen
+
+
+@given(st.sampled_from([WIFI, RADIO, EXACT]), st.integers(0, 200), st.integers(0, 250))
+def test_what_is_shared(profile: Profile, births: int, sightings: int) -> None:
+    born, strength, seen = a_keyframe(births, sightings)
+    n = min(births, profile.births)
+    seen = replace(seen, index=np.arange(n, n + sightings, dtype=np.uint16))
+    parts, sections = profile.choose(born, strength, seen)
+    assert [p.part for p in parts] == list(range(len(parts)))
+    index = np.sort(np.concatenate([p.index for p in parts])) if parts else np.zeros(0)
+    assert np.array_equal(index, np.arange(n))
+    rows = np.concatenate([s.index for s in sections]) if sections else np.zeros(0)
+    assert np.array_equal(rows, np.arange(n, n + min(sightings, profile.sightings)))
+    named = sum(int(p.descriptor.any(axis=1).sum()) for p in parts)
+    assert named == min(n, profile.described)
+    for part in parts:
+        assert len(messages.encode(part)) <= profile.births_bytes
+        assert np.abs(part.uv - born.uv[part.index]).max() == 0
+        known = born.inv_depth[part.index] > 0
+        assert np.array_equal(part.inv_depth > 0, known)
+        assert np.abs(part.inv_depth - born.inv_depth[part.index]).max() < 0.01
+        if profile.narrow:
+            assert descriptors.is_narrow(part.descriptor).all()
+    for section in sections:
+        original = {int(p): i for i, p in enumerate(seen.point)}
+        at = [original[int(p)] for p in section.point]
+        assert np.abs(section.uv - seen.uv[at]).max() <= profile.pixel_step / 32 + 1e-4
+
+
+def test_narrow_descriptors_are_compared_like_wide_ones() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.integers(0, 256, (50, 32)).astype(np.uint8)
+    b = a ^ (rng.uniform(size=a.shape) < 0.1).astype(np.uint8)
+
+    def distance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = descriptors.comparable(x, y)
+        return np.unpackbits(x[:, None] ^ y[None], axis=2).sum(axis=2)
+
+    assert np.array_equal(distance(a, b), np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2))
+    narrow = descriptors.narrowed(a)
+    assert np.array_equal(distance(narrow, b), distance(narrow, descriptors.narrowed(b)))
+    assert np.array_equal(distance(narrow, b).argmin(axis=1), np.arange(50))
+    assert np.array_equal(descriptors.unpacked(descriptors.packed(a)), narrow)
+    assert len(descriptors.BITS) == 128
+    blank = np.zeros((2, 32), np.uint8)
+    assert distance(blank, np.concatenate([blank, narrow])).min() > 80
+
+
+def test_radio_keeps_its_promise_of_bytes() -> None:
+    born, strength, seen = a_keyframe(200, 200)
+    parts, sections = RADIO.choose(born, strength, replace(seen, index=seen.index - 200 + 96))
+    assert sum(len(messages.encode(s)) for s in (*parts, *sections)) < 3000  # plain; tight forms take a third off
+
+
+def test_a_budget_chooses_the_profile() -> None:
+    assert Pacer(None, 1000).profile is RADIO
+    assert Pacer(None, 100_000).profile is WIFI
+    assert Pacer(WIFI, 1000).profile is WIFI
+    assert coded_channel(1, 800).profile.name == "radio"
+    assert coded_channel(1, 0, link="serial:/dev/ttyUSB0:57600").profile.name == "radio"
+    assert coded_channel(1).profile is WIFI
+    with pytest.raises(ValueError, match="wifi or radio"):
+        coded_channel(1, profile="pigeon")
+
+
+def test_measured_throughput_chooses_the_profile_with_patience() -> None:
+    pacer = Pacer(None, 0)
+    for tick in range(29):
+        pacer.step(2000, tick * SECOND // 10)
+    assert pacer.profile is WIFI
+    pacer.step(2000, 40 * SECOND // 10)
+    assert pacer.profile is RADIO
+    pacer.step(50_000, 5 * SECOND)
+    pacer.step(50_000, 8 * SECOND)
+    assert pacer.profile is RADIO
+    pacer.step(50_000, 20 * SECOND)
+    assert pacer.profile is WIFI
+
+
+def test_throughput_is_known_only_while_there_is_more_to_send() -> None:
+    meter = Throughput()
+    for tick in range(40):
+        now_ns = tick * SECOND // 10
+        meter.busy(True, now_ns)
+        meter.acked(150, now_ns)
+    assert meter.bytes_s(now_ns) == pytest.approx(1500, rel=0.1)
+    meter.busy(False, now_ns)
+    assert meter.bytes_s(now_ns) is None
+
+
+def test_the_pause_between_keyframes_follows_the_link() -> None:
+    assert Pacer(None, 0).keyframe_gap_ns(10_000_000, None) == 0
+    assert Pacer(RADIO, 1000).keyframe_gap_ns(0, None) == RADIO.keyframe_bytes * SECOND // 1000
+    assert Pacer(RADIO, 1000).keyframe_gap_ns(3000, None) == 3 * SECOND
+    assert Pacer(RADIO, 300).keyframe_gap_ns(1 << 30, None) == 5 * SECOND
+
+
+def test_births_follow_the_pace_of_keyframes() -> None:
+    pacer = Pacer(RADIO, 1000)
+    for i in range(30):
+        pacer.keyframe(i * 400_000_000)
+    fast = pacer.share(None)
+    for i in range(30):
+        pacer.keyframe(20 * SECOND + i * 3 * SECOND)
+    slow = pacer.share(None)
+    assert 7 <= fast.births < slow.births <= RADIO.births
+    assert fast.described < slow.described <= RADIO.described
+    assert Pacer(WIFI, 1000).share(None) is WIFI
+
+
+def test_live_poses_are_thinned_by_their_time() -> None:
+    channel = coded_channel(1, 1000)
+    sent = set()
+    for i in range(100):
+        channel.put(Live(AgentId(0), i * 50_000_000, KEYFRAME, np.eye(4), 50))
+        sent.add(next(iter(channel.endpoint.own_values().values())))
+    assert len(sent) == 17  # 5 s at one in 0.3 s
+    channel.put(Live(AgentId(0), 0, KEYFRAME, np.eye(4), 50))
+    channel.put(Head(KEYFRAME, 0, NO_KEYFRAME, np.eye(4), 0))
+    assert channel.report()["profile"] == "radio"
+    assert channel.report()["backlog_bytes"] > 0
