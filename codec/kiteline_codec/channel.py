@@ -184,8 +184,9 @@ class CodedChannel:
         return packets
 
 
-# What a link adds to a packet of the radio profile: frames of a serial line; four pieces in MAVLink's TUNNEL.
-_LINK_BYTES = {"serial": 7, "mavlink": 76}
+# What a link adds to a packet: IPv4 and UDP; frames of a serial line; four pieces in MAVLink's TUNNEL.
+_LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
+_RADIOS = ("serial", "mavlink")
 
 
 def coded_channel(
@@ -195,7 +196,7 @@ def coded_channel(
     "" as the link allows. seal_bytes: what sealing adds to a packet. link: its name, LINK. Raises ValueError.
     """
     kind = link.partition(":")[0]
-    if not profile and kind in _LINK_BYTES:
+    if not profile and kind in _RADIOS:
         profile = RADIO.name
     if profile and profile not in PROFILES:
         raise ValueError(f"profile {profile!r}: expected {' or '.join(PROFILES)}")
