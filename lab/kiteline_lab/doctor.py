@@ -34,6 +34,7 @@ PLAIN = {  # distribution: module, for what the drone needs
     "pyserial": "serial",
     "PyYAML": "yaml",
     "cobs": "cobs",
+    "cryptography": "cryptography",
 }
 EXTRAS = {
     "base": {"gtsam": "gtsam", "websockets": "websockets"},
