@@ -61,6 +61,7 @@ class Atlas:
         self.merges: list[Merge] = []
         self.undone = 0
         self.moved: set[SubmapId] = set()  # maps (eldest submap) that moved as a whole since the mapper last asked
+        self._returned: dict[SubmapId, int] = {}  # where in each submap the way last was where it had been before
         self._edges: list[Overlap] = []  # proved loops, edges of the pose graph
         self._fresh: dict[SubmapId, list[Overlap]] = {}  # of each map, those whose points are not fused yet
         self._graph_due: set[SubmapId] = set()
@@ -95,7 +96,25 @@ class Atlas:
     def consider(self, keyframe: KeyframeId) -> None:
         """Ask whether a new keyframe's place is known, and remember it."""
         self.finder.add(keyframe)
+        if self._old_company(keyframe) and self._is_return(keyframe):
+            self.loops += 1  # so little drift that its points were found where they were foreseen
         self._ask(keyframe)
+
+    def _old_company(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe sees points together with one that its submap left long ago."""
+        shared = self._map.covisible(self._map.points_of(keyframe))
+        rows = np.flatnonzero(shared >= self._config.loops.min_inliers)
+        same = self._map.submaps[submap_of_keyframe(keyframe)]
+        old = set(same[: max(0, same.index(keyframe) - self._config.loops.loop_gap)])
+        return any(k in old for k in self._map.keyframes.id[rows].tolist())
+
+    def _is_return(self, keyframe: KeyframeId) -> bool:
+        """Whether the way comes back with this keyframe, and did not already a few keyframes ago."""
+        submap = submap_of_keyframe(keyframe)
+        at = self._map.submaps[submap].index(keyframe)
+        before = self._returned.get(submap, -self._config.loops.loop_gap - 1)
+        self._returned[submap] = at
+        return at - before > self._config.loops.loop_gap
 
     def revisit(self) -> list[KeyframeId]:
         """A few keyframes of merged maps look for what the other map knows. Returns them: bundles are due there."""
@@ -176,7 +195,7 @@ class Atlas:
                     return
             return
         if finding.loop:
-            self.loops += 1
+            self.loops += self._is_return(keyframe)
         else:
             self._join(finding)
         self._edges.extend(finding.votes)

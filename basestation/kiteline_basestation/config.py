@@ -90,6 +90,7 @@ class LoopConfig:
     candidates: int = 4  # most alike keyframes of other maps that are looked at
     candidates_here: int = 3  # of the same map
     min_gap: int = 12  # keyframes of the same submap between two that may close a loop
+    loop_gap: int = 30  # keyframes back that points have to be seen again for it to count as a loop
     max_shared: int = 15  # points that two keyframes share already: more are no news
     min_likeness: float = 0.02  # of the bags of words: below it two places have little in common
     min_of_neighbours: float = 0.1  # share of the likeness that a keyframe has to the one before it

@@ -87,6 +87,16 @@ def test_the_same_flight_gives_the_same_map(around: Any, words: Any) -> None:
         assert np.array_equal(mapper.map.pose(keyframe), again.map.pose(keyframe))
 
 
+def test_a_loop_without_drift_counts_too(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=60, turns=1.5, drift_m=0.001)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [flight])
+    assert mapper.summary()["loops"] == 1  # the second round goes on where the first was: one loop, not one a keyframe
+    short = Mapper(BaseConfig(), words)
+    feed(short, [make_flight(keyframes=36, turns=0.7)])
+    assert short.summary()["loops"] == 0
+
+
 def test_windows_that_repeat_along_a_corridor_close_no_loop(
     make_flight: MakeFlight, corridor: Any, words: Any
 ) -> None:  # fmt: skip
