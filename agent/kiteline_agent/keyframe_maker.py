@@ -77,8 +77,7 @@ class KeyframeMaker:
         self._work.sightings += len(sightings.index)
         shared_head = self._channel.put(head)
         assert isinstance(shared_head, Head)
-        held = births
-        uv, rho = held.uv.astype(np.float64), held.inv_depth.astype(np.float64)
+        uv, rho = births.uv.astype(np.float64), births.inv_depth.astype(np.float64)
         for part in sections[0]:
             agreed = self._channel.put(part)
             assert isinstance(agreed, Births)

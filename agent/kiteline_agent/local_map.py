@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from kiteline_agent import local_map_kernels as kernels
 from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_codec.schema import Culled, Depths, Found, Head, Pose, Removed
-from kiteline_core import se3
 from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -23,7 +22,6 @@ from kiteline_core.ids import (
     NO_KEYFRAME,
     SEQUENCE_BITS,
     KeyframeId,
-    PointId,
     SubmapId,
     point_id,
 )
@@ -266,12 +264,3 @@ class LocalMap:
             parent = self.slot_of(int(self.parent[slot]))
             if parent >= 0:
                 self.T_m_k[slot] = self.T_m_k[parent] @ self.T_p_k[slot]
-
-    def position_of(self, point: PointId) -> F64 | None:
-        """Position (3,) in m of a point, None when it is not remembered."""
-        slot = self.slot_of(point >> KEYPOINT_BITS)
-        index = point & ((1 << KEYPOINT_BITS) - 1)
-        if slot < 0 or index >= self.counts[slot]:
-            return None
-        b = np.array([self.bearing[slot, index, 0], self.bearing[slot, index, 1], 1.0]) / self.rho[slot, index]
-        return np.asarray(se3.transform(self.T_m_k[slot], b[None, :])[0])

@@ -3,36 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from numpy import float64
 from numpy.typing import NDArray
 
+from kiteline_agent.step import Estimate
 from kiteline_core import tum
 from kiteline_core.ids import KeyframeId, SubmapId
 
 F64 = NDArray[float64]
-
-
-class FlownFrame(Protocol):
-    """The part of an Estimate that is counted."""
-
-    @property
-    def t_ns(self) -> int: ...
-    @property
-    def tracked(self) -> bool: ...
-    @property
-    def T_m_b(self) -> F64 | None: ...
-    @property
-    def T_o_b(self) -> F64: ...
-    @property
-    def T_w_b(self) -> F64 | None: ...
-    @property
-    def keyframe(self) -> KeyframeId: ...
-    @property
-    def submap(self) -> SubmapId: ...
-    @property
-    def bridged(self) -> bool: ...
 
 
 @dataclass(slots=True)
@@ -53,7 +32,7 @@ class Tally:
         """How many frames the source gave."""
         return self.tracked + self.lost + self.dropped
 
-    def count(self, estimate: FlownFrame | None) -> None:
+    def count(self, estimate: Estimate | None) -> None:
         """Count one frame that was given to the agent; None when it was passed over to save CPU time."""
         if estimate is None:
             self.dropped += 1
@@ -83,19 +62,19 @@ class Tally:
         }
 
 
-def live_pose(estimate: FlownFrame) -> F64 | None:
+def live_pose(estimate: Estimate) -> F64 | None:
     """The body in w where the base has placed the submap, else in m; None for a frame that was not tracked."""
     if not estimate.tracked:
         return None
     return estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
 
 
-def live_line(estimate: FlownFrame) -> str:
+def live_line(estimate: Estimate) -> str:
     """The frame's line in live.tum; empty where it has no pose."""
     pose = live_pose(estimate)
     return "" if pose is None else tum.line(estimate.t_ns, pose)
 
 
-def odometry_line(estimate: FlownFrame) -> str:
+def odometry_line(estimate: Estimate) -> str:
     """The frame's line in odometry.tum."""
     return tum.line(estimate.t_ns, estimate.T_o_b)

@@ -14,7 +14,7 @@ from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
 from kiteline_core import se3
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
@@ -104,8 +104,3 @@ def move_keyframes(
             sparse_map.set_world_pose(keyframe, goal[keyframe])
             publisher.touch(Kind.POSE, keyframe)
     return largest
-
-
-def submaps_between(sparse_map: SparseMap, votes: tuple[Overlap, ...]) -> set[SubmapId]:
-    """Submaps that votes speak of."""
-    return {submap_of_keyframe(k) for v in votes for k in (v.new, v.old)}

@@ -6,13 +6,13 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.step import Estimate
 from kiteline_core import se3, tum
-from kiteline_core.ids import KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
 Report = dict[str, Any]
@@ -26,24 +26,7 @@ BASE_KEYS = ("map_points", "loops", "merges", "digest_equal", "timing")
 BASE_TIMINGS = ("bundle_ms", "grid_ms", "rss_mib")
 
 
-class TrackedFrame(Protocol):
-    """What the agent knew of a frame when it was flown; kiteline_agent's Estimate is one."""
-
-    @property
-    def t_ns(self) -> int: ...
-    @property
-    def tracked(self) -> bool: ...
-    @property
-    def T_m_b(self) -> F64 | None: ...
-    @property
-    def keyframe(self) -> KeyframeId: ...
-    @property
-    def T_k_c(self) -> F64: ...
-    @property
-    def submap(self) -> SubmapId: ...
-
-
-def compose(frames: Sequence[TrackedFrame], T_w_k: Mapping[int, F64], T_b_c: F64) -> list[tuple[int, F64]]:
+def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) -> list[tuple[int, F64]]:
     """Every tracked frame in w: (t_ns, T_w_b), from the agent's frames and the base's keyframe poses (camera in w).
 
     A frame whose keyframe the base does not hold (still on its way when the flight ended) hangs on the agent's own
