@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent import keyframes
 from kiteline_agent.camera import joined
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
@@ -20,9 +19,12 @@ from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.metric_start import Reborn, reborn
 from kiteline_agent.mono_start import MonoStart, Opening
+from kiteline_agent.pose_state import PoseState
 from kiteline_agent.recovery import Recovered, Recovery
+from kiteline_agent.reference import Reference
 from kiteline_agent.right_eye import RightEye, rectified
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
+from kiteline_agent.submaps import Submaps
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Culled, Depths, Found, Level, Live, Placement, Pose, Record, Removed, Tile
@@ -31,24 +33,12 @@ from kiteline_core.cameras import CameraRig, Rectifier
 from kiteline_core.fixed_lag import VisualPoints
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import (
-    MAX_SUBMAPS,
     NO_KEYFRAME,
-    KeyframeId,
     SubmapId,
-    keyframe_id,
-    submap_id,
 )
 from kiteline_core.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
-
-_SHARPEN_INFLATION = 6.0  # successive sightings share the template's error: six of them count as one
-_FAILURES_BEFORE_SUBMAP = 2  # tries, with texture in view, to find the old map before a new one opens
-_SCALE_EVERY = 10  # frames between two looks at the scale of one eye
-_SCALE_SIGMA = 0.02  # relative deviation at which a scale is believed
-_UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
-_THIN = 3  # times the fewest inliers: below it a keyframe cannot wait
-_MIN_FIRST_POINTS = 40  # points with depth that a first keyframe must have
 
 
 class Agent:
@@ -80,6 +70,9 @@ class Agent:
         self.work = Work()  # of the last step
         self._tracker = Tracker(self.map, config, self.work)
         self._maker = KeyframeMaker(self.map, self._camera, config, channel, self.work)
+        self._pose = PoseState()
+        self._reference = Reference(self.map, self._camera, self._maker)
+        self._submaps = Submaps(identity, self.map, self._pose, self._reference, self._maker)
         self._full_config = config  # before the governor saves on it
         self._governor = Governor(config.governor)
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
@@ -90,21 +83,8 @@ class Agent:
         self._events: list[str] = []
         self._frame_number = 0
         self._last_t_ns: int | None = None
-        self._submap_number = -1
-        self._submaps = 0  # how many have been opened
-        self._sequence: dict[SubmapId, int] = {}  # how many keyframes after the first each submap has
         self._failures = 0  # tries since the old map was lost that had texture in view
         self._lost = False  # the last frame had no pose
-        self._T_m_c = np.eye(4)
-        self._T_o_m = np.eye(4)
-        self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame: the motion model
-        self._step_s = 0.0  # s that the last motion took
-        self._velocity_m: F64 = np.zeros(3)  # m/s in the submap frame
-        self._reference: KeyframeId = NO_KEYFRAME
-        self._T_k_c = np.eye(4)
-        self._reference_inliers = 0
-        self._keyframe_t_ns = 0
-        self._keyframe_frame = 0
         self._placements: dict[SubmapId, F64] = {}
         self.tiles: dict[tuple[int, int], Tile] = {}
         channel.put(Camera(identity.agent, self._camera))
@@ -133,7 +113,7 @@ class Agent:
         # 3. Track against the local map, or begin a map.
         self._frame_number += 1
         track = None
-        if self._submap_number >= 0:
+        if self._submaps.any:
             track = self._tracker.track(view, se3.inverse(predicted), self._frame_number)
             track = self._second_look(view, track)
         if track is not None and track.inliers >= self._config.pose.min_inliers:
@@ -161,7 +141,7 @@ class Agent:
         inliers = track.inliers if track is not None else 0
         self._lost = not tracked or self._bridged
         if not self._lost:
-            self._glimpse.remember(view.left, se3.inverse(self._T_m_c))
+            self._glimpse.remember(view.left, self._pose.T_c_m)
         self._last_t_ns = frame.t_ns
         return self._estimate(frame.t_ns, inliers, tracked=tracked)
 
@@ -177,13 +157,13 @@ class Agent:
             self._tracker.configure(self._config)
             self._maker.configure(self._config)
             self.map.searched = self._config.local_map.searched
-            self._reference_inliers = self._reference_inliers * self._config.align.points // points
+            self._reference.fewer_points(points, self._config.align.points)
         return decision.track
 
     def _view(self, frame: Frame) -> View:
         levels = self._config.pyramid.levels
         # Coarse images are for a track that holds: what is lost or begins needs all there is.
-        first = self._config.pyramid.first if self._submap_number >= 0 and self._failures == 0 else 0
+        first = self._config.pyramid.first if self._submaps.any and self._failures == 0 else 0
         left = rectified(frame.left, self._rectifier, 0, levels, first)
         right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels, first)
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
@@ -210,10 +190,7 @@ class Agent:
         known = None if self._inertial is None else self._inertial.predict(imu, t_ns)
         if known is not None:
             return se3.orthonormalise(known.T_m_b @ self._camera.T_b_c)
-        step = self._step_T
-        if self._step_s > 0.0 and abs(dt_s / self._step_s - 1.0) > _UNEVEN:  # frames are missing in between
-            step = se3.exp(dt_s / self._step_s * se3.log(step))
-        return se3.orthonormalise(self._T_m_c @ step)
+        return self._pose.predict(dt_s)
 
     def _fuse(self, track: Track, t_ns: int) -> Track:
         """The track with the pose that images and IMU together give."""
@@ -229,32 +206,33 @@ class Agent:
 
     def _find_scale(self, view: View, track: Track, t_ns: int) -> None:
         """One eye with an IMU: once acceleration tells how long the map's unit is, begin a map in metres."""
-        if self._inertial is None or self._inertial.metric or self._frame_number % _SCALE_EVERY:
+        limits = self._config.mono_start
+        if self._inertial is None or self._inertial.metric or self._frame_number % limits.scale_every:
             return
         scale = self._inertial.metric_scale()
-        if scale is None or scale[1] > _SCALE_SIGMA * scale[0] or self._submaps == MAX_SUBMAPS:
+        if scale is None or scale[1] > limits.scale_sigma * scale[0] or not self._submaps.room:
             return
         born = reborn(view, track, self.map, scale[0], self._config.detector.cell_px)
-        if len(born.sigma_rho) >= _MIN_FIRST_POINTS:
+        if len(born.sigma_rho) >= self._config.local_map.first_points:
             self._begin_in_metres(view, t_ns, scale[0], born)
 
     def _land(self, guessed_T_m_c: F64, track: Track) -> None:
         """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
-        self._T_m_c = guessed_T_m_c
-        self._move_map_pose(se3.inverse(track.T_c_m))
+        self._pose.T_m_c = guessed_T_m_c
+        self._pose.move_map(se3.inverse(track.T_c_m))
 
     def _coast(self, predicted: F64, t_ns: int) -> bool:
         """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
         state = None if self._inertial is None else self._inertial.coast(t_ns)
-        self._T_m_c = predicted if state is None else state.T_m_b @ self._camera.T_b_c
-        self._refresh_relative()
+        self._pose.T_m_c = predicted if state is None else state.T_m_b @ self._camera.T_b_c
+        self._reference.refresh(self._pose.T_m_c)
         blind_s = 0.0 if self._inertial is None else self._inertial.blind_s
         return state is not None and blind_s <= self._config.inertial.trusted_blind_s
 
     def _restart_inertial(self, t_ns: int) -> None:
         """The pose was found again, or a new map began: the inertial state moves there."""
         if self._inertial is not None:
-            self._inertial.begin_map(t_ns, self._T_m_c @ self._T_c_b)
+            self._inertial.begin_map(t_ns, self._pose.T_m_c @ self._T_c_b)
 
     def _say_level(self) -> None:
         """Once the IMU knows which way is up, tell the base if the first submap lies askew: it began in motion."""
@@ -263,192 +241,147 @@ class Agent:
         self._levelled = True
         R_l_m = self._inertial.level_R
         askew_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
-        if self._submaps != 1 or askew_rad < self._config.inertial.askew_rad:
+        if self._submaps.opened != 1 or askew_rad < self._config.inertial.askew_rad:
             return
         # Turned about where the vehicle is now, so that its place in the world does not jump.
-        here = (self._T_m_c @ self._T_c_b)[:3, 3]
+        here = (self._pose.T_m_c @ self._T_c_b)[:3, 3]
         self._channel.put(Level(self.submap, se3.from_rt(R_l_m, here - R_l_m @ here)))
         self._events.append(f"submap lies {np.degrees(askew_rad):.1f} degrees askew")
 
     def _accept(self, track: Track, dt_s: float) -> None:
         """Take over a measured pose and what it says of the points and of the motion."""
-        before = self._T_m_c
-        self._T_m_c = se3.inverse(track.T_c_m)
-        self._step_T = se3.orthonormalise(se3.inverse(before) @ self._T_m_c)
-        self._step_s = dt_s
-        if dt_s > 0.0:
-            self._velocity_m = (self._T_m_c[:3, 3] - before[:3, 3]) / dt_s
+        self._pose.measured(se3.inverse(track.T_c_m), dt_s)
         self._failures = 0
         if self._mono is not None:
             self._mono.tracked(track.depth_m[track.inlier])
         self.map.note_tracking(track.rows, track.inlier, self._frame_number)
-        self.map.sharpen(track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, _SHARPEN_INFLATION)
-        self._refresh_relative()
-
-    def _refresh_relative(self) -> None:
-        slot = self.map.slot_of(self._reference)
-        if slot >= 0:
-            self._T_k_c = se3.inverse(self.map.T_m_k[slot]) @ self._T_m_c
+        self.map.sharpen(
+            track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, self._config.depth_filter.inflation
+        )
+        self._reference.refresh(self._pose.T_m_c)
 
     # keyframes and submaps
 
     def _keyframe_if_due(self, view: View, track: Track, t_ns: int) -> None:
-        slot = self.map.slot_of(self._reference)
-        frames_since = self._frame_number - self._keyframe_frame
-        if frames_since == 1:
-            self._reference_inliers = track.inliers
-        what = keyframes.situation(
-            track, self._camera, self.map.T_m_k[slot], frames_since, (t_ns - self._keyframe_t_ns) * 1e-9,
-            self._reference_inliers,
-        )  # fmt: skip
-        why = keyframes.why_keyframe(what, self._config.keyframe)
-        if why is None:
+        wish = self._reference.asks(track, t_ns, self._frame_number, self._config, self._channel.keyframe_gap_ns())
+        if wish is None:
             return
-        thin = track.inliers < _THIN * self._config.pose.min_inliers
-        if not thin and not self._governor.may(Extra.KEYFRAME):
+        if not wish.urgent and not self._governor.may(Extra.KEYFRAME):
             self._events.append("governor: keyframe put off")
-            return
-        gap_ns = self._channel.keyframe_gap_ns()
-        if t_ns - self._keyframe_t_ns < gap_ns and keyframes.may_wait(what, self._config.keyframe):
-            return
-        self._events.append(f"keyframe: {why}")
-        self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
+        elif not wish.waits:
+            self._events.append(f"keyframe: {wish.why}")
+            self._add_keyframe(view, track, t_ns)
 
-    def _add_keyframe(self, view: View, track: Track | None, t_ns: int, parent: KeyframeId, T_p_k: F64) -> None:
-        sequence = 0 if parent == NO_KEYFRAME else self._sequence[self.submap] + 1
-        self._sequence[self.submap] = sequence
-        keyframe = keyframe_id(self.submap, sequence)
-        self._governor.note(Extra.SUBMAP if track is None else Extra.KEYFRAME)
+    def _add_keyframe(self, view: View, track: Track, t_ns: int) -> None:
+        self._reference.add(view, track, t_ns, self._frame_number, self._submaps.active, self._pose.T_m_c)
+        self._note_keyframe(view, Extra.KEYFRAME)
+
+    def _note_keyframe(self, view: View, extra: Extra) -> None:
+        """What follows every keyframe: it is booked, and its place remembered."""
+        self._governor.note(extra)
         if view.right is not None and self._rectifier.bends:
             self.work.rectified_px += view.left[view.first].size
-        T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, self._frame_number)
-        # The keyframe lies where its code says, a rounding away from the camera.
-        self._reference, self._T_k_c = keyframe, se3.inverse(T_m_k) @ self._T_m_c
-        self._keyframe_t_ns, self._keyframe_frame = t_ns, self._frame_number
-        self._recovery.remember(keyframe)
+        self._recovery.remember(self._reference.keyframe)
 
     def _begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
-        first = self._submap_number < 0
-        if not first and (self._failures < _FAILURES_BEFORE_SUBMAP or self._submaps == MAX_SUBMAPS):
-            return False
-        if not first and not self._governor.may(Extra.SUBMAP):
-            return False
+        first = not self._submaps.any
+        if not first:
+            tried = self._failures >= self._config.recovery.failures
+            if not tried or not self._submaps.room or not self._governor.may(Extra.SUBMAP):
+                return False
+        # 1. See whether this frame can begin a map: by two views, or by what the pair gives.
         opening = None
         if self._mono is not None:
             if self._last_t_ns is None:
-                self._T_m_c = self._first_pose(imu)  # the camera moves from here on
+                self._pose.T_m_c = self._first_pose(imu)  # the camera moves from here on
             self.work.searches += 1
             opening = self._mono.step(view, t_ns)
             if opening is None:
                 return False
-        elif not self._maker.enough(view, _MIN_FIRST_POINTS):
+        elif not self._maker.enough(view, self._config.local_map.first_points):
             return False
-        if first and opening is None:
-            self._T_m_c = self._first_pose(imu)
-        elif not first:
-            self._T_m_c = self._T_o_m @ self._T_m_c  # the new submap's axes are those of the odometry frame
-            self._T_o_m = np.eye(4)
+        # 2. Set the camera into it.
+        if not first:
+            self._pose.enter_submap()
             if self._mono is None:  # maps of one eye differ in scale: no rigid motion joins them
                 self._recovery.search_beside(self._frame_number)
+        elif opening is None:
+            self._pose.T_m_c = self._first_pose(imu)
+        # 3. Open it.
         self._events.append("submap: opened")
-        self._submap_number = self._submaps
-        self._submaps += 1
         self._failures = 0
-        self._step_T = np.eye(4)
-        self._velocity_m = np.zeros(3)
-        self.map.activate(self.submap)
         if opening is not None:
             return self._open_from_two_views(view, t_ns, opening)
-        self._add_keyframe(view, None, t_ns, NO_KEYFRAME, self._T_m_c)
+        self._submaps.open_from_pair(view, t_ns, self._frame_number)
+        self._note_keyframe(view, Extra.SUBMAP)
         return True
 
     def _open_from_two_views(self, view: View, t_ns: int, opening: Opening) -> bool:
-        """The first two keyframes of one eye's map. Where the camera is now stays where it was thought to be."""
+        """The first two keyframes of one eye's map."""
         self._events.append(f"mono: scale by convention, median depth {opening.median_depth_m:.3g} m")
         if self._inertial is not None:
             self._inertial.reset()
             self._inertial.metric = False
-        self._maker.begin_with(opening.points)
-        T_m_a = self._T_m_c @ se3.inverse(opening.T_a_b)
-        self._add_keyframe(opening.view, None, opening.t_ns, NO_KEYFRAME, T_m_a)
-        opening.sharpen(self.map, self._reference, self._config.align.sigma_px)
-        track = self._tracker.track(view, se3.inverse(self._T_m_c), self._frame_number)
+        T_m_a = self._submaps.open_from_two_views(self._frame_number, opening, self._config.align.sigma_px)
+        self._note_keyframe(view, Extra.SUBMAP)
+        track = self._tracker.track(view, self._pose.T_c_m, self._frame_number)
         if track.inliers < self._config.pose.min_inliers:
             return False
         self._accept(track, 0.0)
-        self._step_T = se3.exp(se3.log(opening.T_a_b) / opening.frames)
         dt_s = (t_ns - opening.t_ns) * 1e-9
-        self._velocity_m = (self._T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
-        self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
+        velocity = (self._pose.T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
+        self._pose.go_on(se3.exp(se3.log(opening.T_a_b) / opening.frames), velocity)
+        self._add_keyframe(view, track, t_ns)
         return True
 
     def _begin_in_metres(self, view: View, t_ns: int, unit_m: float, born: Reborn) -> None:
-        """Go on in a new submap whose unit is a metre, from points that are tracked now; the old one is left behind."""
+        """Go on in a new submap whose unit is a metre."""
         assert self._inertial is not None and self._mono is not None
         self._events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
-        T_m_c = longer(self._T_m_c, unit_m)
-        T_n_c = self._T_o_m @ self._T_m_c  # the new submap's axes are those of the odometry frame
-        T_n_m = se3.orthonormalise(T_n_c @ se3.inverse(T_m_c))
+        T_n_m = self._submaps.open_in_metres(view, t_ns, self._frame_number, unit_m, born)
+        self._note_keyframe(view, Extra.SUBMAP)
         self._inertial.rescale(unit_m)
         self._inertial.shift_map(T_n_m)
         self._mono.rescale(unit_m)
-        self._step_T, self._velocity_m = longer(self._step_T, unit_m), unit_m * T_n_m[:3, :3] @ self._velocity_m
-        self._T_m_c, self._T_o_m = T_n_c, np.eye(4)
-        self.map.forget(self.submap)
-        self._submap_number = self._submaps
-        self._submaps += 1
-        self.map.activate(self.submap)
-        self._maker.begin_with(born.points)
-        self._add_keyframe(view, None, t_ns, NO_KEYFRAME, self._T_m_c)
-        born.sharpen(self.map, self._reference)
 
     # the old map found again
 
     def _recover(self, view: View, t_ns: int) -> Track | None:
         """Look for a lost frame in all that is remembered."""
-        if self._submap_number < 0:
+        if not self._submaps.any:
             return None
         if not self._governor.may(Extra.SEARCH):
             self._events.append("governor: search put off")
             self._failures = max(self._failures, 1)
             return None
         self.work.searches += 1
-        found = self._recovery.attempt(view, self._frame_number, self._reference)
+        found = self._recovery.attempt(view, self._frame_number, self._reference.keyframe)
         if found is None:
             self._failures += self._recovery.textured
             return None
         self._events.append("recovered")
         self._return_to(found)
-        # Nothing is known of the motion since: the next frame is looked for where this one was.
-        self._step_T, self._velocity_m = np.eye(4), np.zeros(3)
+        self._pose.stand()
         self._keyframe_if_due(view, found.track, t_ns)
         return found.track
 
     def _join_if_found(self, view: View, track: Track, t_ns: int) -> None:
         """Beside a young submap, look for the old ones; where one is found, a keyframe in each says how they lie."""
-        found = self._recovery.beside(view, self._frame_number, self._T_m_c)
+        found = self._recovery.beside(view, self._frame_number, self._pose.T_m_c)
         if found is None:
             return
         self._events.append("submap: joined to an older one")
         self.map.note_tracking(found.track.rows, found.track.inlier, self._frame_number)
-        if self._keyframe_frame != self._frame_number:
-            self._add_keyframe(view, track, t_ns, self._reference, self._T_k_c)
+        if not self._reference.is_of(self._frame_number):
+            self._add_keyframe(view, track, t_ns)
         self._return_to(found)
         self._restart_inertial(t_ns)
-        self._add_keyframe(view, found.track, t_ns, found.keyframe, self._T_k_c)
+        self._add_keyframe(view, found.track, t_ns)
 
     def _return_to(self, found: Recovered) -> None:
-        """Go on in the submap and from the keyframe where the old map was found; the odometry frame stays still."""
-        self._submap_number = found.submap % MAX_SUBMAPS
-        self.map.activate(found.submap)
-        self._reference = found.keyframe
-        self._move_map_pose(se3.inverse(found.T_c_m))
-        self._refresh_relative()
+        self._submaps.return_to(found, self._frame_number)
         self._failures = 0
-        self._reference_inliers = found.track.inliers
-        self.map.last_seen[self.map.slot_of(found.keyframe)] = self._frame_number
-        self.map.note_tracking(found.track.rows, found.track.inlier, self._frame_number)
 
     def _first_pose(self, imu: ImuBatch | None) -> F64:
         """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""
@@ -462,7 +395,7 @@ class Agent:
     @property
     def submap(self) -> SubmapId:
         """The submap in which the agent tracks (the first one before it has begun)."""
-        return submap_id(self._identity.agent, self._identity.boot, max(self._submap_number, 0))
+        return self._submaps.active
 
     @property
     def metric(self) -> bool:
@@ -484,44 +417,32 @@ class Agent:
         if not touched:
             return
         self.map.settle()
-        slot = self.map.slot_of(self._reference)
-        if slot >= 0:
-            before = self._T_m_c
-            self._move_map_pose(self.map.T_m_k[slot] @ self._T_k_c)
+        T_m_k = self._reference.T_m_k
+        if T_m_k is not None:
+            before = self._pose.T_m_c
+            self._pose.move_map(T_m_k @ self._reference.T_k_c)
             if self._inertial is not None:
-                self._inertial.shift_map(se3.orthonormalise(self._T_m_c @ se3.inverse(before)))
-
-    def _move_map_pose(self, T_m_c: F64) -> None:
-        """Set the pose in m without moving it in o."""
-        T_o_c = self._T_o_m @ self._T_m_c
-        change = T_m_c[:3, :3] @ self._T_m_c[:3, :3].T
-        self._velocity_m = change @ self._velocity_m
-        self._T_m_c = se3.orthonormalise(T_m_c)
-        self._T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self._T_m_c))
+                self._inertial.shift_map(se3.orthonormalise(self._pose.T_m_c @ se3.inverse(before)))
 
     # what is known
 
     def _estimate(self, t_ns: int, inliers: int, *, tracked: bool) -> Estimate:
-        T_m_b = self._T_m_c @ self._T_c_b
+        T_m_b = self._pose.T_m_c @ self._T_c_b
         T_w_m = self._placements.get(self.submap)
         quality = -1 if not tracked else max(1, min(100, inliers * 100 // 150)) if inliers else 50
-        if self._reference != NO_KEYFRAME:
-            self._channel.put(Live(self._identity.agent, t_ns, self._reference, self._T_k_c, quality))
+        keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c
+        if keyframe != NO_KEYFRAME:
+            self._channel.put(Live(self._identity.agent, t_ns, keyframe, T_k_c, quality))
         return Estimate(
             t_ns,
             tracked,
             self._bridged,
             T_m_b if tracked else None,
-            self._T_o_m @ T_m_b,
-            self._reference,
-            self._T_k_c.copy(),
+            self._pose.T_o_m @ T_m_b,
+            keyframe,
+            T_k_c.copy(),
             self.submap,
             inliers,
             quality,
             T_w_m @ T_m_b if tracked and T_w_m is not None else None,
         )
-
-
-def longer(T: F64, factor: float) -> F64:
-    """T (4,4) with its translation multiplied by `factor`."""
-    return se3.from_rt(T[:3, :3], T[:3, 3] * factor)

@@ -69,6 +69,7 @@ class KeyframeConfig:
     min_cover: float = 0.45  # share of 96 px image cells that hold a tracked point
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
     rotation_rad: float = 0.30  # a turn that has replaced a quarter of the view
+    thin: float = 3.0  # times the fewest inliers of a pose: below it a keyframe cannot wait for CPU time
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +80,7 @@ class LocalMapConfig:
     births: int = 200  # points a keyframe can bear
     searched: int = 48  # keyframes whose points are looked for: those seen last
     max_far_ratio: float = 400.0  # depth over baseline beyond which stereo says nothing
+    first_points: int = 40  # with depth, that a first keyframe must have
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,7 @@ class DepthFilterConfig:
 
     refined_sigma_px: float = 0.08  # virtual disparity error of a depth that the base refined
     floor_px: float = 0.06  # virtual disparity error that the filter never claims to beat
+    inflation: float = 6.0  # successive sightings share the template's error: so many count as one
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +103,8 @@ class MonoStartConfig:
     min_flow: float = 0.02  # of the focal length, median: below it two views are hardly two
     min_share: float = 0.4  # of the first corners; with fewer left a new first frame is taken
     max_frames: int = 40  # after which a new first frame is taken: the view has changed too much
+    scale_every: int = 10  # frames between two looks at the scale that an IMU gives
+    scale_sigma: float = 0.02  # relative deviation at which that scale is believed
     two_view: TwoViewConfig = field(default_factory=TwoViewConfig)
 
 
@@ -138,6 +143,7 @@ class RecoveryConfig:
     min_pnp_inliers: int = 12  # of P3P; chance matches reach 8
     min_inliers: int = 30  # of the tracker from that pose
     min_share: float = 0.4  # of the points that the tracker looked for: a place that only resembles has fewer
+    failures: int = 2  # tries, with texture in view, to find the old map before a new one opens
     beside_frames: int = 20  # how long the search goes on beside a young submap: 1 s
     agree_ratio: float = 0.05  # of the depth: two results beside a young submap may differ by so much
     agree_rad: float = 0.035  # 2 degrees, the same for the turn

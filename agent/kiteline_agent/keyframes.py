@@ -52,6 +52,15 @@ RULES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """A keyframe is asked for. why: the rule. urgent: the track is thin. waits: the link cannot carry it yet."""
+
+    why: str
+    urgent: bool
+    waits: bool
+
+
 def why_keyframe(situation: Situation, config: KeyframeConfig) -> str | None:
     """The name of the first rule that asks for a keyframe, or None."""
     if situation.frames_since < config.min_gap_frames:
