@@ -67,10 +67,11 @@ class PoseState:
         self.T_o_m = np.eye(4)
 
     def rescale(self, metres: float) -> F64:
-        """A submap in metres begins here, one unit of the old one being so many. T_new_old (4,4), of lengths in m."""
+        """A submap in metres begins where the camera is, one unit of the old one being so many. T_new_old (4,4), with
+        the old one's lengths in metres.
+        """
         T_m_c = longer(self.T_m_c, metres)
-        self.T_m_c = self.T_o_m @ T_m_c
-        self.T_o_m = np.eye(4)
+        self.enter_submap()
         T_n_m = se3.orthonormalise(self.T_m_c @ se3.inverse(T_m_c))
         self._step_T, self.velocity = longer(self._step_T, metres), metres * T_n_m[:3, :3] @ self.velocity
         return T_n_m
