@@ -56,20 +56,35 @@ def _inverse_depth(code: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def foresee(u: I64, v: I64, depth: I64, place: I64, T_k_a: F64, camera: F64, out: I64) -> None:
+def pick(births: I64, keypoint: I64, mask: int, out: I64) -> None:
+    """Codes (4, n) of the births at keypoints (n,), as they are where they came with a part that the mask names.
+
+    births: (5, 2048) codes of u, v, inverse depth and octave by keypoint, and the part, -1 where there is none.
+    """
+    for i in range(keypoint.size):
+        at = keypoint[i]
+        part = births[4, at]
+        if part >= 0 and (mask >> part) & 1 == 1:
+            for k in range(4):
+                out[k, i] = births[k, at]
+
+
+@njit(cache=True, nogil=True)
+def foresee(born: I64, place: I64, T_k_a: F64, camera: F64, out: I64) -> None:
     """Codes of u, v and inverse depth (3, n) of points as keyframe k would see them; -1 where nothing can be said.
 
-    u, v, depth: (n,) codes of births. place: (n,) rows of T_k_a (m,4,4). camera: fx, fy, cx, cy.
+    born: (3 or more, n) codes of u, v and inverse depth of births, -1 where they are not known. place: (n,) rows of
+    T_k_a (m,4,4). camera: fx, fy, cx, cy.
     """
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    for i in range(u.size):
+    for i in range(place.size):
         out[0, i] = out[1, i] = out[2, i] = -1
-        if depth[i] == 0:
+        if born[0, i] < 0 or born[2, i] == 0:
             continue
         T = T_k_a[place[i]]
-        rho = _inverse_depth(int(depth[i]))
-        x = (float(u[i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cx) / fx
-        y = (float(v[i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cy) / fy
+        rho = _inverse_depth(int(born[2, i]))
+        x = (float(born[0, i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cx) / fx
+        y = (float(born[1, i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cy) / fy
         px = T[0, 0] * x
         px = px + T[0, 1] * y
         px = px + T[0, 2]

@@ -34,6 +34,8 @@ class _Entry:
     queued: Order | None = None  # the order under which it waits in the queue
     waiting: bool = False  # whether it waits among the oldest
     plain: bool = False  # a packet with it was lost: the peer may lack what a tight form builds upon
+    form: bytes | None = None  # its tight form, where there is one
+    form_of: int = -1  # the state of what the peer is known to hold in which `form` was made; -1: not made
 
     @property
     def size(self) -> int:
@@ -58,8 +60,14 @@ class Flight:
 class Outbox:
     """Values to share, with their versions, in one relation between two sessions after another."""
 
-    def __init__(self, packet_bytes: int, oldest_every: int, shrink: Shrink | None = None) -> None:
+    def __init__(
+        self, packet_bytes: int, oldest_every: int, shrink: Shrink | None = None, basis: frozenset[int] = frozenset()
+    ) -> None:
+        """basis: kinds of values that tight forms build upon."""
         self._shrink = shrink
+        self._basis = basis
+        self._leant = False  # whether a tight form was built upon values of the same packet
+        self._known_state = 0  # counts changes of what of the basis the peer is known to hold
         self.digest = Digest()
         self.newest = 0  # versions number all changes of all values
         self.pending = 0  # values that the peer is not known to hold
@@ -116,6 +124,7 @@ class Outbox:
             return
         self.digest.discard(key, entry.version, entry.code)
         self.newest += 1
+        self._known_state += key.kind in self._basis
         self.pending -= 1
         self.pending_bytes -= entry.size
         del self._entries[key]
@@ -123,6 +132,7 @@ class Outbox:
     def _change(self, key: Key, code: bytes | None, order: Order) -> None:
         self.newest += 1
         entry = self._entries.get(key)
+        self._known_state += key.kind in self._basis
         if entry is None:
             entry = self._entries[key] = _Entry(self.newest, code, order, ranges.NONE)
             self.pending += 1
@@ -132,6 +142,7 @@ class Outbox:
             self.pending += entry.clean
             self.pending_bytes -= 0 if entry.clean else entry.size
             entry.version, entry.code, entry.order = self.newest, code, order
+        entry.form_of = -1
         entry.acked = ranges.NONE
         entry.todo = ((0, entry.size),)
         self.pending_bytes += entry.size
@@ -173,8 +184,13 @@ class Outbox:
         entry = self._entries.get(key)
         return None if entry is None or entry.code is None else (entry.version, entry.code)
 
+    def basis_changed(self) -> None:
+        """What tight forms build upon is another now: forms that were made are made anew."""
+        self._known_state += 1
+
     def restart(self) -> None:
         """A new session of the peer holds nothing: everything is to be sent, removals are moot."""
+        self.basis_changed()
         self._flights.clear()
         self._number = self.in_flight = 0
         self._entries = {k: e for k, e in self._entries.items() if e.code is not None}
@@ -188,6 +204,7 @@ class Outbox:
         """Give every value a new version. Returns the version up to which all is void."""
         self.newest += 1
         void = self.newest
+        self.basis_changed()
         self._flights.clear()
         self.in_flight = 0
         self._entries = {k: e for k, e in self._entries.items() if e.code is not None}
@@ -253,10 +270,15 @@ class Outbox:
         self._number += 1
         carried: list[tuple[Key, int, int, int]] = []
         along: set[Key] = set()  # carried whole by this packet
+        self._leant = False
 
         def known(key: Key) -> tuple[int, bytes] | None:
             entry = self._entries.get(key)
-            if entry is None or entry.code is None or not (entry.clean or key in along):
+            if entry is None or entry.code is None:
+                return None
+            if key in along:
+                self._leant = True
+            elif entry.todo or not entry.clean:
                 return None
             return entry.version, entry.code
 
@@ -306,7 +328,7 @@ class Outbox:
         alone = head + varint_bytes(zigzag(key.id)) - varint_bytes(zigzag(key.id - last_id))  # in a packet of its own
         start, stop = entry.todo[0]
         if self._shrink is not None and not entry.plain and entry.todo == ((0, entry.size),):
-            tight = self._shrink(key, code, known)
+            tight = self._form(key, entry, code, known)
             if tight is not None and head + varint_bytes(len(tight)) + len(tight) <= room:
                 return Item(key, version, len(tight), 0, tight, tight=True)
             if tight is not None and alone + varint_bytes(len(tight)) + len(tight) <= empty:
@@ -320,6 +342,15 @@ class Outbox:
         if stop - start < min(_MIN_FRAGMENT_BYTES, entry.todo[0][1] - start):
             return None
         return Item(key, version, len(code), start, code[start:stop])
+
+    def _form(self, key: Key, entry: _Entry, code: bytes, known: Known) -> bytes | None:
+        """The tight form of a value; the one that was made before, while what the peer is known to hold stands."""
+        assert self._shrink is not None
+        if entry.form_of != self._known_state:
+            self._leant = False
+            entry.form = self._shrink(key, code, known)
+            entry.form_of = -1 if self._leant else self._known_state  # values of one packet are not known in the next
+        return entry.form
 
     def acknowledge(self, last: int, missing: int) -> tuple[int, int]:
         """The peer has packet `last`, and those of the 64 before it whose bit in `missing` is not set.
@@ -354,6 +385,7 @@ class Outbox:
         entry.acked = ranges.add(entry.acked, start, stop)
         entry.todo = ranges.cut(entry.todo, start, stop)
         if entry.acked == ((0, entry.size),):
+            self._known_state += key.kind in self._basis
             self.pending -= 1
             self.pending_bytes -= entry.size
             if entry.code is None:

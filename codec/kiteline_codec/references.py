@@ -25,6 +25,7 @@ MAX_GENERATIONS = 64  # steps along parents to a keyframe of birth: farther, the
 MASK_PARTS = 16  # parts of births that can be named
 _REMEMBERED = 256  # keyframes whose values are kept decoded
 _NO_PART = -1
+_BIRTHS, _HEAD = int(Kind.BIRTHS), int(Kind.HEAD)
 
 
 @dataclass(slots=True)
@@ -72,7 +73,7 @@ class References:
         """Version, and header."""
         if self.told is not None and self.told.keyframe == keyframe:
             return 0, self.told
-        now = held(Key(Kind.HEAD, keyframe))
+        now = held(Key(_HEAD, keyframe))
         if now is None:
             return None
         entry = self._keyframe(keyframe)
@@ -85,16 +86,16 @@ class References:
     def births(self, keyframe: int, held: Held) -> tuple[dict[int, int], I64]:
         """Versions by part of what both sides hold; codes (5, 2048) of u, v, inverse depth, octave, and the part."""
         versions: dict[int, int] = {}
+        entry = self._keyframe(keyframe)
         missing = 0
         for part in range(MASK_PARTS):
-            now = held(Key(Kind.BIRTHS, keyframe, part))
+            now = held(Key(_BIRTHS, keyframe, part))
             if now is None:
                 missing += 1
                 if missing == 2:
                     break
                 continue
             versions[part] = now[0]
-            entry = self._keyframe(keyframe)
             if entry.part_versions.get(part) != now[0]:
                 entry.births[4, entry.births[4] == part] = _NO_PART
                 values = read_codes(Reader(now[1]), Kind.BIRTHS)
@@ -104,7 +105,7 @@ class References:
                     entry.births[:4, values[0]] = values[1:5]
                     entry.births[4, values[0]] = part
                 entry.part_versions[part] = now[0]
-        return versions, self._keyframe(keyframe).births
+        return versions, entry.births
 
     def poses(self, keyframe: int, wanted: set[int], held: Held) -> tuple[dict[int, F64], list[int]]:
         """T_k_a (4,4) of the wanted keyframes that are found along parents, up from keyframe k to the nearest common

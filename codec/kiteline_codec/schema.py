@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,9 +187,8 @@ class Tile:
 Record = Camera | Live | Head | Births | Sightings | Level | Pose | Depths | Found | Removed | Culled | Placement | Tile
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Key:
-    """The name of a value: what it is, of what, and which part of it."""
+class Key(NamedTuple):
+    """The name of a value: what it is, of what, and which part of it. A tuple, since it is hashed without end."""
 
     kind: int
     id: int  # keyframe, submap or agent id; a tile's packed column and row

@@ -28,7 +28,7 @@ from kiteline_codec.packet import (
 from kiteline_codec.packing import Writer
 from kiteline_codec.schema import Key, Kind, WireError
 from kiteline_codec.throughput import Throughput
-from kiteline_codec.tight import Tightener
+from kiteline_codec.tight import BASIS_KINDS, Tightener
 
 __all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
 
@@ -144,7 +144,7 @@ class Endpoint:
         self.session = session
         self.name = name
         self._tightener = tightener
-        self._out = Outbox(config.filled_bytes, config.oldest_every, self._shrink if tightener else None)
+        self._out = Outbox(config.filled_bytes, config.oldest_every, self._shrink if tightener else None, BASIS_KINDS)
         self._in = Inbox()
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self._peer = 0
@@ -281,6 +281,8 @@ class Endpoint:
             for item in items:
                 update = self._in.apply(item)
                 if update is not None:
+                    if update.key.kind in BASIS_KINDS:
+                        self._out.basis_changed()
                     self._legacy.pop(update.key, None)
                     updates.append(update)
         self._compare(header, now_ns)

@@ -8,6 +8,7 @@ sender then sends the code itself.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from struct import pack
 from zlib import crc32
@@ -23,12 +24,16 @@ from kiteline_codec.rows import MAX_KEYFRAME_ID, read_codes
 from kiteline_codec.schema import Head, Key, Kind, WireError
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId
 
+F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 TIGHT_KINDS = frozenset({int(Kind.BIRTHS), int(Kind.SIGHTINGS), int(Kind.DEPTHS)})
+BASIS_KINDS = frozenset({int(Kind.CAMERA), int(Kind.HEAD), int(Kind.BIRTHS)})  # what forms build upon
 _CRC_BYTES = 4
 _MAX_SHIFT = 8
 _DESCRIPTOR_SIZES = (0, 16, 32)
+_UNBORN: tuple[dict[int, int], I64] = ({}, np.full((5, 0), -1, np.int64))  # a keyframe whose births are not used
+_REMEMBERED = 64  # forms of births that are kept: they build upon nothing, and are asked for until they fit a packet
 
 
 class Tightener:
@@ -36,6 +41,7 @@ class Tightener:
 
     def __init__(self) -> None:
         self._references = References()
+        self._births: OrderedDict[Key, tuple[bytes, bytes | None]] = OrderedDict()  # codes and their forms
 
     def shrink(self, key: Key, code: bytes, held: Held, own: Held) -> bytes | None:
         """A shorter form of a code, for a peer that holds what `held` gives; None where there is none.
@@ -44,11 +50,11 @@ class Tightener:
         """
         if key.kind not in TIGHT_KINDS:
             return None
+        if key.kind == Kind.BIRTHS:
+            return self._shrink_births(key, code)
         out = Writer()
         try:
-            if key.kind == Kind.BIRTHS:
-                versions = _shrink_births(out, code)
-            elif key.kind == Kind.SIGHTINGS:
+            if key.kind == Kind.SIGHTINGS:
                 versions = self._shrink_sightings(out, key, code, held, own)
             else:
                 versions = self._shrink_depths(out, key, code, held)
@@ -74,6 +80,23 @@ class Tightener:
             raise WireError("a tight form was made with other values than are held")
         return code
 
+    def _shrink_births(self, key: Key, code: bytes) -> bytes | None:
+        made = self._births.get(key)
+        if made is not None and made[0] == code:
+            return made[1]
+        out = Writer()
+        form = None
+        try:
+            _shrink_births(out, code)
+            form = out.bytes() + _checksum(code, ())
+        except (ValueError, WireError):
+            pass
+        form = form if form is not None and len(form) < len(code) else None
+        self._births[key] = code, form
+        if len(self._births) > _REMEMBERED:
+            self._births.popitem(last=False)
+        return form
+
     # ---- sightings
 
     def _shrink_sightings(self, out: Writer, key: Key, code: bytes, held: Held, own: Held) -> list[int]:
@@ -85,16 +108,19 @@ class Tightener:
         if n == 0 or np.diff(place << KEYPOINT_BITS | keypoint).min(initial=1) <= 0 or table[-1] > key.id:
             raise ValueError("points must increase, and be born before they are seen again")
         self._references.told = self._untold_head(key, held, own)
+        ends = np.searchsorted(place, np.arange(len(table)), side="right").tolist()
+        born = [self._references.births(keyframe, held) for keyframe in table]
         masks = []
-        for i, keyframe in enumerate(table):
-            versions, births = self._references.births(keyframe, held)
-            parts = set(births[4, keypoint[place == i]].tolist())
+        for (versions, births), begin, end in zip(born, [0, *ends], ends, strict=False):
+            parts = set(births[4, keypoint[begin:end]].tolist())
             masks.append(sum(1 << part for part in versions if part in parts))
-        reached = self._references.poses(key.id, {a for a, m in zip(table, masks, strict=True) if m}, held)[0]
+        ways = self._references.poses(key.id, {a for a, m in zip(table, masks, strict=True) if m}, held)
         if self._references.camera(key.id, held) is None:
-            reached = {}
-        masks = [m if a in reached else 0 for a, m in zip(table, masks, strict=True)]
-        seen, octave, versions_used = self._foreseen(key.id, table, masks, place, keypoint, held)
+            ways = {}, []
+        if not all(a in ways[0] for a, m in zip(table, masks, strict=True) if m):
+            masks = [m if a in ways[0] else 0 for a, m in zip(table, masks, strict=True)]
+            ways = self._references.poses(key.id, set(ways[0]), held)
+        seen, octave, versions_used = self._foreseen(key.id, table, masks, place, keypoint, born, ways, held)
         out.varint(n)
         told = self._references.told
         out.varint(key.id - told.parent if told is not None else 0)
@@ -114,7 +140,9 @@ class Tightener:
         n = source.varint(MAX_KEYPOINTS)
         self._references.told = _read_head(source, key)
         table, masks, place, keypoint = _read_table(source, key.id, n)
-        seen, octave, versions = self._foreseen(key.id, table, masks, place, keypoint, held)
+        born = [self._references.births(a, held) if m else _UNBORN for a, m in zip(table, masks, strict=True)]
+        ways = self._references.poses(key.id, {a for a, m in zip(table, masks, strict=True) if m}, held)
+        seen, octave, versions = self._foreseen(key.id, table, masks, place, keypoint, born, ways, held)
         shifts = _read_shifts(source)
         values = np.zeros((5, n), np.int64)
         values[[0, 4]] = source.tight(2, n)
@@ -139,40 +167,40 @@ class Tightener:
         return None if head.parent == NO_KEYFRAME or head.parent >= key.id else head
 
     def _foreseen(
-        self, keyframe: int, table: Sequence[int], masks: Sequence[int], place: I64, keypoint: I64, held: Held
-    ) -> tuple[I64, I64, list[int]]:
+        self, keyframe: int, table: Sequence[int], masks: Sequence[int], place: I64, keypoint: I64,
+        born: Sequence[tuple[dict[int, int], I64]], ways: tuple[dict[int, F64], list[int]], held: Held,
+    ) -> tuple[I64, I64, list[int]]:  # fmt: skip
         """Codes (3, n) where points are foreseen (-1 where not), octaves (n,) of their births, versions used.
 
-        table: keyframes of birth; masks: which of their parts of births both sides hold. Raises WireError without them.
+        table: keyframes of birth; masks: which of their parts of births both sides hold. place: (n,) increasing rows of
+        the table. born: what `births` says of each. ways: what `poses` says of those with a mask. Raises WireError
+        where they lack what the masks name.
         """
         n = len(place)
-        born = np.full((4, n), -1, np.int64)
+        codes = np.full((4, n), -1, np.int64)
         used: list[int] = []
-        for i, mask in enumerate(masks):
+        ends = np.searchsorted(place, np.arange(len(table)), side="right").tolist()
+        for mask, (versions, births), begin, end in zip(masks, born, [0, *ends], ends, strict=False):
             if not mask:
                 continue
-            versions, births = self._references.births(table[i], held)
-            if any(mask >> part & 1 and part not in versions for part in range(mask.bit_length())):
+            parts = [part for part in range(mask.bit_length()) if mask >> part & 1]
+            if any(part not in versions for part in parts):
                 raise WireError("a tight form builds upon births that are not held")
-            used += [versions[part] for part in range(mask.bit_length()) if mask >> part & 1]
-            rows = np.flatnonzero(place == i)
-            found = births[:, keypoint[rows]]
-            here = (found[4] >= 0) & ((mask >> np.maximum(found[4], 0)) & 1 == 1)
-            born[:, rows[here]] = found[:4, here]
-        octave = np.maximum(born[3], 0)
+            used += [versions[part] for part in parts]
+            kernels.pick(births, keypoint[begin:end], mask, codes[:, begin:end])
+        octave = np.maximum(codes[3], 0)
         seen = np.full((3, n), -1, np.int64)
-        wanted = {a for a, mask in zip(table, masks, strict=True) if mask}
-        if not wanted:
+        if not any(masks):
             return seen, octave, used
         camera = self._references.camera(keyframe, held)
-        poses, heads = self._references.poses(keyframe, wanted, held)
-        if camera is None or len(poses) < len(wanted):
+        poses, heads = ways
+        if camera is None or any(mask and a not in poses for a, mask in zip(table, masks, strict=True)):
             raise WireError("a tight form builds upon headers that are not held")
-        T_k_a = np.stack([poses.get(a, np.eye(4)) for a in table])
-        known = np.flatnonzero(born[0] >= 0)
-        codes = np.empty((3, len(known)), np.int64)
-        kernels.foresee(born[0, known], born[1, known], born[2, known], place[known], T_k_a, camera[1], codes)
-        seen[:, known] = codes
+        T_k_a = np.zeros((len(table), 4, 4))
+        for i, a in enumerate(table):
+            if a in poses:
+                T_k_a[i] = poses[a]
+        kernels.foresee(codes, place, T_k_a, camera[1], seen)
         return seen, octave, [*used, *heads, camera[0]]
 
     # ---- depths

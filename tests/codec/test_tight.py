@@ -186,7 +186,7 @@ def test_foreseen_codes_are_those_of_plain_arithmetic() -> None:
     T = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.02, 0.1]))
     out = np.empty((3, n), np.int64)
     camera = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
-    foresee_kernels.foresee(u, v, depth, np.zeros(n, np.int64), T[None], camera, out)
+    foresee_kernels.foresee(np.stack([u, v, depth]), np.zeros(n, np.int64), T[None], camera, out)
     uv, rho = quantise.pixels(np.stack([u, v])).astype(np.float64), quantise.inverse_depths(depth).astype(np.float64)
     ray = np.stack([(uv[:, 0] - CAMERA.cx) / CAMERA.fx, (uv[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(n)], 1)
     p = ray @ T[:3, :3].T + rho[:, None] * T[:3, 3]
