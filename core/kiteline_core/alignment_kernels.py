@@ -35,6 +35,27 @@ def sample(image, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _cut_inside(image, left, top, template):  # type: ignore[no-untyped-def]
+    """Cut a template (21,21) uint8 whose first pixel is at (left, top), all of it inside: one weight for all pixels."""
+    u1 = np.uint64(1)
+    x0 = int(left)
+    y0 = int(top)
+    fx = left - x0
+    fy = top - y0
+    for r in range(TEMPLATE):
+        upper = image[y0 + r, x0 : x0 + TEMPLATE + 1]
+        lower = image[y0 + r + 1, x0 : x0 + TEMPLATE + 1]
+        out = template[r]
+        for c in range(TEMPLATE):
+            j = np.uint64(c)
+            a = float(upper[j])
+            b = float(lower[j])
+            above = a + fx * (float(upper[j + u1]) - a)
+            below = b + fx * (float(lower[j + u1]) - b)
+            out[j] = np.uint8(np.int32(above + fy * (below - above) + 0.5))
+
+
+@njit
 def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-def]
     """Cut templates around pixels. uv: (n,2) level-0 px. octave: (n,). templates: (n,3,21,21) uint8, out.
 
@@ -47,12 +68,15 @@ def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-de
             image = pyramid[level]
             h, w = image.shape
             scale = 1.0 / (1 << level)
-            cx = uv[i, 0] * scale
-            cy = uv[i, 1] * scale
+            left = uv[i, 0] * scale - TEMPLATE_RADIUS
+            top = uv[i, 1] * scale - TEMPLATE_RADIUS
+            if left >= 0.0 and top >= 0.0 and left + TEMPLATE < w and top + TEMPLATE < h:
+                _cut_inside(image, left, top, templates[i, j])
+                continue
             for r in range(TEMPLATE):
-                y = min(max(cy + r - TEMPLATE_RADIUS, 0.0), h - 1.001)
+                y = min(max(top + r, 0.0), h - 1.001)
                 for c in range(TEMPLATE):
-                    x = min(max(cx + c - TEMPLATE_RADIUS, 0.0), w - 1.001)
+                    x = min(max(left + c, 0.0), w - 1.001)
                     templates[i, j, r, c] = np.uint8(sample(image, x, y) + 0.5)
 
 

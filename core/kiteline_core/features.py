@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import feature_kernels as kernels
+from kiteline_core.corner_kernels import fast_corners
 
 U8 = NDArray[np.uint8]
 Pyramid = tuple[U8, ...]
@@ -73,18 +74,10 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
     best_level = np.zeros((rows, columns), np.uint8)
     for level in range(config.first, min(config.levels, len(pyramid))):
         image = pyramid[level]
-        fast = cv2.FastFeatureDetector.create(config.fast_threshold, True)
-        found = fast.detect(image)
-        if not found:
-            continue
-        xy = np.array(cv2.KeyPoint.convert(found), np.float32).astype(np.int32)
         margin = max(kernels.BORDER, config.margin_px >> level)
-        inside = (
-            (xy[:, 0] >= margin) & (xy[:, 1] >= margin)
-            & (xy[:, 0] < image.shape[1] - margin) & (xy[:, 1] < image.shape[0] - margin)
-        )  # fmt: skip
-        xy = np.ascontiguousarray(xy[inside])
-        score = np.empty(len(xy))
+        corners = np.empty((max(image.size // 4, 1), 2), np.int32)
+        n = fast_corners(image, config.fast_threshold, margin, 1 << level, float(config.cell_px), occupied, corners)
+        xy, score = corners[:n], np.empty(n)
         kernels.corner_scores(image, xy, score)
         kernels.best_per_cell(
             xy, score, level, float(config.cell_px), config.min_score, occupied, best_score, best_xy, best_level
@@ -107,8 +100,7 @@ def describe(pyramid: Pyramid, uv: NDArray[np.float64], octave: U8) -> tuple[U8,
         angle = np.empty(len(rows))
         kernels.orientations(pyramid[level], xy, angle)
         code = np.round(angle * (128.0 / np.pi)).astype(np.int64) & 255
-        blurred = cv2.GaussianBlur(pyramid[level], (7, 7), 2.0)
         bits = np.empty((len(rows), 32), np.uint8)
-        kernels.describe(blurred, xy, code * (np.pi / 128.0), PATTERN, bits)
+        kernels.describe(pyramid[level], xy, code * (np.pi / 128.0), PATTERN, bits)
         angle_code[rows], descriptor[rows] = code.astype(np.uint8), bits
     return angle_code, descriptor

@@ -13,6 +13,38 @@ GRID_STEP = 4  # px; between grid points a lens bends by less than 0.01 px
 
 
 @njit
+def _row_costs(patch, image, y, first, mean, total, cost):  # type: ignore[no-untyped-def]
+    """Zero-mean SAD of a patch (SIDE, SIDE) int16 with those whose left columns are `first` and the next (n,) of a row.
+
+    mean: of the patch. total, cost: (n,) int32, out: sums of the other patches, and their costs. All candidates are
+    done side by side, so that the loops become vectors; unsigned indices spare them the check for negative ones.
+    """
+    n = cost.shape[0]
+    for k in range(n):
+        j = np.uint64(k)
+        total[j] = 0
+        cost[j] = 0
+    for r in range(SIDE):
+        line = image[y + r - RADIUS, first : first + n + SIDE - 1]
+        for c in range(SIDE):
+            shifted = line[c : c + n]
+            for k in range(n):
+                j = np.uint64(k)
+                total[j] += np.int32(shifted[j])
+    for k in range(n):
+        j = np.uint64(k)
+        total[j] = mean - total[j] // (SIDE * SIDE)
+    for r in range(SIDE):
+        line = image[y + r - RADIUS, first : first + n + SIDE - 1]
+        for c in range(SIDE):
+            shifted = line[c : c + n]
+            here = np.int32(patch[r, c])
+            for k in range(n):
+                j = np.uint64(k)
+                cost[j] += np.int32(abs(np.int32(here - shifted[j] - total[j])))
+
+
+@njit
 def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity):  # type: ignore[no-untyped-def]
     """Coarse disparity of pixels by zero-mean SAD over whole rows, at pyramid level max(octave, 1).
 
@@ -20,7 +52,9 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
     factor of the best. disparity: (n,) float64 out, level-0 px, -1 where there is no sure match.
     """
     levels = len(left)
-    patch = np.empty((SIDE, SIDE), np.int32)
+    patch = np.empty((SIDE, SIDE), np.int16)
+    total = np.empty(left[0].shape[1], np.int32)
+    cost = np.empty(left[0].shape[1], np.int32)
     for i in range(uv.shape[0]):
         disparity[i] = -1.0
         level = min(max(int(octave[i]), 1), levels - 1)
@@ -39,31 +73,21 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
                 mean += patch[r, c]
         mean = mean // (SIDE * SIDE)
         reach = min(int(max_disparity_px / s) + 1, x - RADIUS)
+        nearest = -1 if x + 1 + RADIUS < w else 0
+        n = reach - nearest + 1  # candidate k lies at disparity reach - k
+        _row_costs(patch, b, y, x - reach - RADIUS, np.int32(mean), total[0:n], cost[0:n])
         best = 1 << 30
         second = 1 << 30
         best_d = -1
-        for d in range(-1, reach + 1):
-            xr = x - d
-            if xr + RADIUS >= w:
-                continue
-            other = 0
-            for r in range(SIDE):
-                row = y + r - RADIUS
-                for c in range(SIDE):
-                    other += int(b[row, xr + c - RADIUS])
-            shift = mean - other // (SIDE * SIDE)
-            cost = 0
-            for r in range(SIDE):
-                row = y + r - RADIUS
-                for c in range(SIDE):
-                    cost += abs(patch[r, c] - int(b[row, xr + c - RADIUS]) - shift)
-            if cost < best:
+        for d in range(nearest, reach + 1):
+            at = cost[reach - d]
+            if at < best:
                 if d - best_d > 2:
                     second = best
-                best = cost
+                best = at
                 best_d = d
-            elif cost < second and d - best_d > 2:
-                second = cost
+            elif at < second and d - best_d > 2:
+                second = at
         if best < (1 << 30) and second > uniqueness * best:
             disparity[i] = max(best_d * s, 0.0)
 

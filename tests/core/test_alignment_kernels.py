@@ -89,3 +89,23 @@ def test_flat_images_give_nothing() -> None:
 def test_sample_is_bilinear() -> None:
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
     assert kernels.sample(image, 1.25, 0.5) == pytest.approx(1.25 + 2.0)
+
+
+def test_templates_are_cut_as_one_would_by_hand() -> None:
+    pyramid = build_pyramid(warped(texture(4), np.eye(2, 3)), 4)
+    uv = np.array([[100.0, 80.0], [57.3, 121.8], [20.0, 21.5], [299.0, 219.0], [2.2, 238.9]])
+    octave = np.array([0, 1, 2, 0, 1], np.uint8)
+    templates = np.empty((len(uv), kernels.TEMPLATE_LEVELS, kernels.TEMPLATE, kernels.TEMPLATE), np.uint8)
+    kernels.cut_templates(pyramid, uv, octave, templates)
+    reach = np.arange(kernels.TEMPLATE) - kernels.TEMPLATE_RADIUS
+    for i in range(len(uv)):
+        for j in range(kernels.TEMPLATE_LEVELS):
+            image = pyramid[min(octave[i] + j, 3)].astype(np.float64)
+            h, w = image.shape
+            x, y = (uv[i] / (1 << min(octave[i] + j, 3)))[:, None] + reach
+            x, y = np.clip(x, 0.0, w - 1.001), np.clip(y, 0.0, h - 1.001)
+            left, top = x.astype(int), y.astype(int)
+            fx, fy = x - left, (y - top)[:, None]
+            above = image[np.ix_(top, left)] * (1 - fx) + image[np.ix_(top, left + 1)] * fx
+            below = image[np.ix_(top + 1, left)] * (1 - fx) + image[np.ix_(top + 1, left + 1)] * fx
+            np.testing.assert_allclose(templates[i, j], above * (1 - fy) + below * fy, atol=0.501)
