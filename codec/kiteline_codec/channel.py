@@ -135,11 +135,12 @@ class CodedChannel:
         }
 
     def put(self, record: Record) -> Record:
-        """Code and share a record. Raises ValueError when it cannot be coded."""
+        """Code and share a record, but for a live pose that is not due. Raises ValueError where there is no code."""
+        if isinstance(record, Live) and not self._live_is_due(record.t_ns):
+            return record
         key = messages.key(record)
         code = messages.encode(record)
-        if not isinstance(record, Live) or self._live_is_due(record.t_ns):
-            self.endpoint.put(key, code)
+        self.endpoint.put(key, code)
         if isinstance(record, Head):
             self._pacer.keyframe(record.t_ns)
         return messages.decode(key, code)

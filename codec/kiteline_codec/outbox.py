@@ -19,6 +19,7 @@ Shrink = Callable[[Key, bytes, Known], bytes | None]  # a shorter form of a code
 
 _MIN_FRAGMENT_BYTES = 32  # a smaller one costs more for its header than it carries
 _MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
+_MOST_SHRUNK = 4  # times a tight form may be shorter than its code: none is tried where even that would not fit
 _MAX_LATE = 2 * MASK_BITS  # packets taken for lost that are remembered in case their acknowledgement comes late
 _SLACK = 64  # outdated entries that a queue may hold beyond twice the values
 
@@ -327,6 +328,9 @@ class Outbox:
         code = entry.code
         alone = head + varint_bytes(zigzag(key.id)) - varint_bytes(zigzag(key.id - last_id))  # in a packet of its own
         start, stop = entry.todo[0]
+        fits_alone = alone + varint_bytes(len(code)) + len(code) <= empty
+        if fits_alone and len(code) > _MOST_SHRUNK * room:
+            return None
         if self._shrink is not None and not entry.plain and entry.todo == ((0, entry.size),):
             tight = self._form(key, entry, code, known)
             if tight is not None and head + varint_bytes(len(tight)) + len(tight) <= room:
@@ -335,7 +339,7 @@ class Outbox:
                 return None
         if entry.todo == ((0, entry.size),) and head + varint_bytes(len(code)) + len(code) <= room:
             return Item(key, version, len(code), 0, code)
-        if alone + varint_bytes(len(code)) + len(code) <= empty:
+        if fits_alone:
             return None
         head += varint_bytes(room) + varint_bytes(start) + varint_bytes(len(code))
         stop = min(stop, start + room - head)

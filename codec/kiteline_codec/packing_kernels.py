@@ -14,6 +14,16 @@ _MAX_VARINT = 1 << 42  # keeps sums of 2048 deltas far from the limits of int64
 
 
 @njit(cache=True, nogil=True)
+def first_outside(values: I64, low: I64, high: I64) -> int:
+    """The first of the columns (c, n) that holds a number below low or above high (c,); -1 where none does."""
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            if values[i, j] < low[i] or values[i, j] > high[i]:
+                return i
+    return -1
+
+
+@njit(cache=True, nogil=True)
 def _put_varint(out: U8, at: int, value: int) -> int:
     while value >= 128:
         out[at] = np.uint8((value & 127) | 128)

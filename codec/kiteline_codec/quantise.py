@@ -10,6 +10,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_codec import quantise_kernels as kernels
 from kiteline_core import se3
 
 F32 = NDArray[np.float32]
@@ -63,20 +64,17 @@ def inverse_depth_codes(inv_depth: F32) -> I64:
 
     Positive values below the least code take the least one: far, but known.
     """
-    x = np.asarray(inv_depth, np.float64)
-    known = x > 0
-    mantissa, exponent = np.frexp(np.where(known, np.minimum(x, 1e6), 0.0) / DEPTH_SCALE + 1.0)  # mantissa in [0.5, 1)
-    codes = (exponent.astype(np.int64) - 1) * DEPTH_MANTISSA + np.rint((2.0 * mantissa - 1.0) * DEPTH_MANTISSA).astype(
-        np.int64
-    )
-    return np.asarray(np.where(known, np.clip(codes, 1, DEPTH_CODES - 1), 0), np.int64)
+    x = np.ascontiguousarray(inv_depth, np.float64)
+    codes = np.empty(len(x), np.int64)
+    kernels.inverse_depth_codes(x, DEPTH_SCALE, DEPTH_MANTISSA, DEPTH_CODES, codes)
+    return codes
 
 
 def inverse_depths(codes: I64) -> F32:
     """Inverse depths (n,) in 1/m of codes (n,)."""
-    exponent = (codes // DEPTH_MANTISSA).astype(np.int32)
-    mantissa = 1.0 + (codes % DEPTH_MANTISSA) / DEPTH_MANTISSA
-    return ((np.ldexp(mantissa, exponent) - 1.0) * DEPTH_SCALE).astype(np.float32)
+    inv_depth = np.empty(len(codes), np.float32)
+    kernels.inverse_depths(np.ascontiguousarray(codes, np.int64), DEPTH_SCALE, DEPTH_MANTISSA, inv_depth)
+    return inv_depth
 
 
 def pose_codes(pose: F64) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kiteline_codec import quantise
 from kiteline_codec.packing import Reader, Writer
+from kiteline_codec.packing_kernels import first_outside
 from kiteline_codec.schema import Kind, WireError
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS
 
@@ -68,16 +69,12 @@ _LIMITS = {
 
 def _out_of_range(kind: Kind, values: I64) -> str:
     """What is wrong with the codes (columns, n) of a kind, "" when nothing is."""
-    if not values.shape[1]:
-        return ""
     low, high = _LIMITS[kind]
-    least, most = values.min(axis=1), values.max(axis=1)
-    wrong = np.flatnonzero((least < low) | (most > high))
-    if not len(wrong):
+    i = first_outside(values, low, high)
+    if i < 0:
         return ""
-    i = int(wrong[0])
     names = [name for name in _COLUMNS[kind] for _ in range(_FIELDS[name].columns)]
-    return f"{names[i]} is {least[i]}..{most[i]}, expected {low[i]}..{high[i]}"
+    return f"{names[i]} is {values[i].min()}..{values[i].max()}, expected {low[i]}..{high[i]}"
 
 
 def write_columns(out: Writer, kind: Kind, record: Any) -> None:

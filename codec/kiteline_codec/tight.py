@@ -284,10 +284,9 @@ def _gaps(index: I64) -> I64:
 
 def _seen_depths(births: I64, parts: Sequence[int] | dict[int, int], index: I64) -> I64:
     """Codes (n,) of inverse depths as the agent saw them, 0 where none of the parts tells."""
-    mask = sum(1 << part for part in parts)
-    found = births[:, index]
-    here = (found[4] >= 0) & ((mask >> np.maximum(found[4], 0)) & 1 == 1)
-    return np.asarray(np.where(here, found[2], 0))
+    seen = np.zeros((4, len(index)), np.int64)
+    kernels.pick(births, index, sum(1 << part for part in parts), seen)
+    return seen[2]
 
 
 # ---- points of sightings

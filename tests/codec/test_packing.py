@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec import ranges
+from kiteline_codec import packing_kernels, ranges
 from kiteline_codec.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
 from kiteline_codec.schema import WireError
 
@@ -144,3 +144,11 @@ def test_ranges_are_sets(steps: list[tuple[bool, int, int]]) -> None:
         expected = expected | set(range(a, b)) if add else expected - set(range(a, b))
         assert [i for start, stop in got for i in range(start, stop)] == sorted(expected)
         assert all(x[1] < y[0] for x, y in pairwise(got))
+
+
+@given(st.integers(0, 1000), st.integers(0, 5))
+def test_the_first_column_outside_its_limits(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    values, low, high = rng.integers(-3, 4, (3, n)), rng.integers(-3, 0, 3), rng.integers(0, 4, 3)
+    wrong = np.flatnonzero(((values < low[:, None]) | (values > high[:, None])).any(axis=1))
+    assert packing_kernels.first_outside(values, low, high) == (wrong[0] if len(wrong) else -1)

@@ -52,6 +52,25 @@ def test_inverse_depth_bounds(x: float) -> None:
         assert error <= 1e-3 * x
 
 
+def plain_depth_codes(x: np.ndarray) -> np.ndarray:
+    """Plain numpy, as SPEC.md says it."""
+    known = x > 0
+    y = np.where(known, np.minimum(x, 1e6), 0.0).astype(np.float64) / quantise.DEPTH_SCALE + 1.0
+    mantissa, exponent = np.frexp(y)
+    codes = (exponent - 1) * 1024 + np.rint((2.0 * mantissa - 1.0) * 1024)
+    return np.where(known, np.clip(codes, 1, quantise.DEPTH_CODES - 1), 0).astype(np.int64)
+
+
+def test_inverse_depths_are_those_of_plain_arithmetic() -> None:
+    rng = np.random.default_rng(1)
+    x = np.concatenate([10.0 ** rng.uniform(-8, 3, 20_000), rng.uniform(-1, 1, 100), [np.nan, np.inf]])
+    for values in (x.astype(np.float32), x, x[::3]):
+        assert np.array_equal(quantise.inverse_depth_codes(values), plain_depth_codes(values))
+    codes = np.arange(quantise.DEPTH_CODES)
+    plain = (np.ldexp(1.0 + codes % 1024 / 1024, codes // 1024) - 1.0) * quantise.DEPTH_SCALE
+    assert np.array_equal(quantise.inverse_depths(codes), plain.astype(np.float32))
+
+
 def test_inverse_depth_at_its_ends() -> None:
     codes = quantise.inverse_depth_codes(np.array([0.0, -1.0, np.nan, 1e-9, 1e9, np.inf], np.float32))
     assert codes.tolist() == [0, 0, 0, 1, quantise.DEPTH_CODES - 1, quantise.DEPTH_CODES - 1]

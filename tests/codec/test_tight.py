@@ -178,6 +178,17 @@ def test_any_bytes_are_a_code_or_an_error(kind: int, data: bytes) -> None:
         Tightener().grow(key, data, coded(flight(0, births=10)).get)
 
 
+def test_births_are_picked_by_keypoint_and_part() -> None:
+    rng = np.random.default_rng(4)
+    births = rng.integers(0, 100, (5, 2048))
+    births[4] = rng.integers(-1, 4, 2048)
+    keypoint, mask = rng.integers(0, 2048, 300), 0b101
+    out = np.full((4, 300), -7, np.int64)
+    foresee_kernels.pick(births, keypoint, mask, out)
+    named = np.isin(births[4, keypoint], (0, 2))
+    assert np.array_equal(out, np.where(named, births[:4, keypoint], -7))
+
+
 def test_foreseen_codes_are_those_of_plain_arithmetic() -> None:
     rng = np.random.default_rng(3)
     n = 200
