@@ -284,9 +284,9 @@ def _gaps(index: I64) -> I64:
 
 def _seen_depths(births: I64, parts: Sequence[int] | dict[int, int], index: I64) -> I64:
     """Codes (n,) of inverse depths as the agent saw them, 0 where none of the parts tells."""
-    seen = np.zeros((4, len(index)), np.int64)
+    seen: I64 = np.zeros((4, len(index)), np.int64)
     kernels.pick(births, index, sum(1 << part for part in parts), seen)
-    return seen[2]
+    return np.asarray(seen[2])
 
 
 # ---- points of sightings
