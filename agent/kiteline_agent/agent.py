@@ -174,14 +174,25 @@ class Agent:
         return View(left, right, depth, first if self._rectifier.bends else 0)
 
     def _second_look(self, view: View, track: Track) -> Track:
-        """The same track, or where it failed one that begins where the whole image seems to have gone."""
-        if track.inliers >= self._config.pose.min_inliers:
+        """The same track, or where it missed most points the best of others that begin elsewhere."""
+        if self._holds(track):
             return track
+        # 1. Where the whole image seems to have gone.
         guess = self._glimpse.guess(view.left)
-        if guess is None:
+        if guess is not None:
+            again = self._tracker.track(view, guess, self._frame_number)
+            track = again if again.inliers > track.inliers else track
+        # 2. Where descriptors say. Of a track that has failed altogether `_recover` takes care.
+        if self._holds(track) or track.inliers < self._config.pose.min_inliers or not self._governor.may(Extra.SEARCH):
             return track
-        again = self._tracker.track(view, guess, self._frame_number)
-        return again if again.inliers > track.inliers else track
+        self.work.searches += 1
+        found = self._recovery.attempt(view, self._frame_number, self._reference.keyframe)
+        if found is None or found.submap != self._submaps.active or found.track.inliers < track.inliers:
+            return track
+        return found.track
+
+    def _holds(self, track: Track) -> bool:
+        return track.inliers >= max(self._config.pose.min_inliers, self._config.pose.min_share * track.tried)
 
     # motion model
 

@@ -56,6 +56,7 @@ class PoseConfig:
     iterations: int = 4  # Gauss-Newton steps a round
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom
     min_inliers: int = 15  # below it a pose is not to be trusted
+    min_share: float = 0.3  # of the points looked for: good tracks find half, ones that began elsewhere a tenth
 
 
 @dataclass(frozen=True, slots=True)
