@@ -360,7 +360,7 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
                 link.send(packet)
             if frame is not None and sink is not None and onboard.estimate is not None:
                 e = onboard.estimate
-                sink.push(PoseSample(captured_ns, e.T_o_b, e.tracked, e.quality, spec.boot), clock.now_ns())
+                sink.push(PoseSample(captured_ns, e.T_o_b, e.tracked, e.quality, spec.boot, e.cov_o), clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is not None and onboard.tally.frames % _PROGRESS_FRAMES == 0:
                 parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.camera import joined
+from kiteline_agent.certainty import Certainty
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
@@ -73,6 +74,9 @@ class Agent:
         self._pose = PoseState()
         self._reference = Reference(self.map, self._camera, self._maker)
         self._submaps = Submaps(identity, self.map, self._pose, self._reference, self._maker)
+        self._certainty = Certainty(
+            self.map, self._camera.T_b_c, config.certainty, has_body=rig.has_body, has_depth=not one_eye
+        )
         self._full_config = config  # before the governor saves on it
         self._governor = Governor(config.governor)
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
@@ -131,7 +135,7 @@ class Agent:
         else:
             # 5. Lost: the IMU carries on for a while; search the old map; with texture in view and two failed tries,
             # open a new submap.
-            self._bridged = self._coast(predicted, frame.t_ns)
+            self._bridged = self._coast(predicted, frame.t_ns, dt_s)
             track = self._recover(view, frame.t_ns)
             found = track is not None or self._begin_submap(view, frame.t_ns, imu)
             if found:
@@ -230,13 +234,15 @@ class Agent:
     def _land(self, guessed_T_m_c: F64, track: Track) -> None:
         """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
         self._pose.T_m_c = guessed_T_m_c
+        self._certainty.carry(self._pose, self._T_c_b)
         self._pose.move_map(se3.inverse(track.T_c_m))
 
-    def _coast(self, predicted: F64, t_ns: int) -> bool:
+    def _coast(self, predicted: F64, t_ns: int, dt_s: float) -> bool:
         """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
         state = None if self._inertial is None else self._inertial.coast(t_ns)
         self._pose.T_m_c = predicted if state is None else state.T_m_b @ self._camera.T_b_c
         self._reference.refresh(self._pose.T_m_c)
+        self._certainty.blind(dt_s, None if state is None else state.pose_cov)
         blind_s = 0.0 if self._inertial is None else self._inertial.blind_s
         return state is not None and blind_s <= self._config.inertial.trusted_blind_s
 
@@ -263,6 +269,7 @@ class Agent:
         """Take over a measured pose and what it says of the points and of the motion."""
         self._pose.measured(se3.inverse(track.T_c_m), dt_s)
         self._failures = 0
+        self._certainty.measured(track)
         if self._mono is not None:
             self._mono.tracked(track.depth_m[track.inlier])
         self.map.note_tracking(track.rows, track.inlier, self._frame_number)
@@ -293,6 +300,7 @@ class Agent:
         if view.right is not None and self._rectifier.bends:
             self.work.rectified_px += view.left[view.first].size
         self._recovery.remember(self._reference.keyframe)
+        self._certainty.remember(self._reference.keyframe)
 
     def _begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
@@ -314,6 +322,7 @@ class Agent:
             return False
         # 2. Set the camera into it.
         if not first:
+            self._certainty.carry(self._pose, self._T_c_b)
             self._pose.enter_submap()
             if self._mono is None:  # maps of one eye differ in scale: no rigid motion joins them
                 self._recovery.search_beside(self._frame_number)
@@ -324,6 +333,7 @@ class Agent:
         self._failures = 0
         if opening is not None:
             return self._open_from_two_views(view, t_ns, opening)
+        self._certainty.begin(self._pose.T_m_c @ self._T_c_b)
         self._submaps.open_from_pair(view, t_ns, self._frame_number)
         self._note_keyframe(view, Extra.SUBMAP)
         return True
@@ -334,6 +344,7 @@ class Agent:
         if self._inertial is not None:
             self._inertial.reset()
             self._inertial.metric = False
+        self._certainty.begin(self._pose.T_m_c @ self._T_c_b)
         T_m_a = self._submaps.open_from_two_views(self._frame_number, opening, self._config.align.sigma_px)
         self._note_keyframe(view, Extra.SUBMAP)
         track = self._tracker.track(view, self._pose.T_c_m, self._frame_number)
@@ -350,7 +361,9 @@ class Agent:
         """Go on in a new submap whose unit is a metre."""
         assert self._inertial is not None and self._mono is not None
         self._events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
+        self._certainty.carry(self._pose, self._T_c_b)
         T_n_m = self._submaps.open_in_metres(view, t_ns, self._frame_number, unit_m, born)
+        self._certainty.begin(self._pose.T_m_c @ self._T_c_b)
         self._note_keyframe(view, Extra.SUBMAP)
         self._inertial.rescale(unit_m)
         self._inertial.shift_map(T_n_m)
@@ -391,7 +404,9 @@ class Agent:
         self._add_keyframe(view, found.track, t_ns)
 
     def _return_to(self, found: Recovered) -> None:
+        self._certainty.carry(self._pose, self._T_c_b)
         self._submaps.return_to(found, self._frame_number)
+        self._certainty.measured(found.track)
         self._failures = 0
 
     def _first_pose(self, imu: ImuBatch | None) -> F64:
@@ -432,6 +447,7 @@ class Agent:
         if T_m_k is not None:
             before = self._pose.T_m_c
             self._pose.move_map(T_m_k @ self._reference.T_k_c)
+            self._certainty.corrected(self._pose)
             if self._inertial is not None:
                 self._inertial.shift_map(se3.orthonormalise(self._pose.T_m_c @ se3.inverse(before)))
 
@@ -440,6 +456,7 @@ class Agent:
     def _estimate(self, t_ns: int, inliers: int, *, tracked: bool) -> Estimate:
         T_m_b = self._pose.T_m_c @ self._T_c_b
         T_w_m = self._placements.get(self.submap)
+        cov_m = self._certainty.of_map_pose(T_m_b)
         quality = -1 if not tracked else max(1, min(100, inliers * 100 // 150)) if inliers else 50
         keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c
         if keyframe != NO_KEYFRAME:
@@ -455,5 +472,7 @@ class Agent:
             self.submap,
             inliers,
             quality,
+            cov_m,
+            self._certainty.of_odometry(self._pose, self._T_c_b),
             T_w_m @ T_m_b if tracked and T_w_m is not None else None,
         )

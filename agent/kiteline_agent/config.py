@@ -151,6 +151,24 @@ class RecoveryConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class CertaintyConfig:
+    """What is not known of the sensors, and when a pose counts as good."""
+
+    calibration_px: float = 0.05  # px at the image's edge that a good calibration of one camera is off by
+    extrinsic_rad: float = 3e-4  # of the camera in the body: a hundredth of a degree or two
+    extrinsic_m: float = 1e-3  # likewise
+    least_rms: float = 0.3  # whitened residual of a frame below which its noise is not believed to be smaller
+    inflation: float = 1.0  # of the variance of a measured pose
+    refined_share: float = 0.25  # of a keyframe's variance that is left when the base has optimised it
+    blind_accel_m_s2: float = 2.0  # that an unseen vehicle may have: a multicopter that leans by twelve degrees
+    blind_turn_rad_s2: float = 2.0  # likewise
+    blind_velocity_m_s: float = 0.03  # error of the velocity between two frames
+    blind_rate_rad_s: float = 0.02  # likewise
+    good_m: float = 0.2  # a pose counts as good within so much
+    good_rad: float = 0.1745  # and so much: 10 degrees
+
+
+@dataclass(frozen=True, slots=True)
 class GovernorConfig:
     """How CPU time is held under a budget."""
 
@@ -182,6 +200,7 @@ class AgentConfig:
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
     inertial: InertialConfig = field(default_factory=InertialConfig)
+    certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)
     motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)
     mono_start: MonoStartConfig = field(default_factory=MonoStartConfig)

@@ -66,7 +66,7 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
 
 
 def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
-    """Every field of an estimate; matrices (4,4) as 16 numbers in rows."""
+    """Every field of an estimate; matrices as their numbers in rows."""
     out: dict[str, Any] = {}
     for field in fields(estimate):
         value = getattr(estimate, field.name)
@@ -85,4 +85,5 @@ def estimate_from_json(value: Mapping[str, Any]) -> Estimate:
 
 def _matrix(numbers: Sequence[float]) -> NDArray[np.float64]:
     a = np.array(numbers, np.float64)
-    return a.reshape(4, 4) if a.size == 16 else a
+    side = {16: 4, 36: 6}.get(a.size)
+    return a if side is None else a.reshape(side, side)

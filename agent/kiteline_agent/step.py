@@ -39,6 +39,8 @@ class Estimate:
     T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
     keyframe, T_k_c: the same pose relative to a keyframe's camera. T_w_b: (4,4) in the world, once the base has placed
     the submap. quality: -1 lost, 1..100.
+    cov_m: (6,6) of T_m_b against where its submap began, [translation in m, rotation about the body's axes], m and rad.
+    cov_o: (6,6) of T_o_b against where the flight began, [translation in o, rotation about the body's axes].
     """
 
     t_ns: int
@@ -51,6 +53,8 @@ class Estimate:
     submap: SubmapId
     inliers: int
     quality: int
+    cov_m: F64
+    cov_o: F64
     T_w_b: F64 | None
 
 

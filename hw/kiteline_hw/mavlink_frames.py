@@ -64,3 +64,15 @@ def local_covariance(covariance_o: F64) -> F64:
     """A (6,6) covariance [position, rotation vector] given in the axes of o, in those of l."""
     a = np.kron(np.eye(2), R_L_O)
     return np.asarray(a @ covariance_o @ a.T)
+
+
+def controller_covariance(covariance: F64, T_o_b: F64, T_b_f: F64) -> F64:
+    """Covariance (6,6) of the flight controller's pose in the axes of l, [position, rotation vector].
+
+    covariance: of T_o_b, [translation in o, rotation about the body's axes].
+    """
+    r = T_o_b[:3, :3]
+    j = np.eye(6)
+    j[:3, 3:] = -r @ se3.skew(T_b_f[:3, 3])  # a turn of the body moves what is mounted away from its origin
+    j[3:, 3:] = r
+    return local_covariance(j @ covariance @ j.T)

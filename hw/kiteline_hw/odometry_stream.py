@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kiteline_core.se3 import F64
-from kiteline_hw.mavlink_frames import body_rates, local_covariance, local_pose, upper_triangle
+from kiteline_hw.mavlink_frames import body_rates, controller_covariance, local_covariance, local_pose, upper_triangle
 from kiteline_hw.mavlink_messages import Heartbeat, HighresImu, MavlinkCodec, Odometry, TimeSync
 from kiteline_hw.ports import PoseSample
 
@@ -27,7 +27,11 @@ class OdometryConfig:
     heartbeat_ns: int = 1_000_000_000  # ns; the MAVLink routine
     longest_gap_ns: int = 250_000_000  # ns; velocities are not taken across a longer gap between poses
     shortest_gap_ns: int = 20_000_000  # ns; nor across a shorter one: noise over time
-    position_sigma_m: float = 0.03  # m; of a good pose. Both controllers read the diagonal as noise of a measurement
+    floor_m: float = 0.01  # m; added to a pose's own deviation: 5 ms of delay at 2 m/s, and how it is mounted
+    floor_rad: float = 0.005  # rad; likewise
+    position_sigma_m: float = (
+        0.03  # m; of a good pose without a covariance. Both controllers read the diagonal as noise
+    )
     angle_sigma_rad: float = 0.02  # rad; likewise
     velocity_sigma_m_s: float = 0.1  # m/s; of two poses a frame apart
     rate_sigma_rad_s: float = 0.1  # rad/s; likewise
@@ -97,7 +101,7 @@ class OdometryStream:
         velocity, rate = body_rates(before.T_o_b, pose.T_o_b, dt_s, self._T_b_f)
         position, q = local_pose(pose.T_o_b, self._T_b_f)
         quality = max(-1, min(100, pose.quality)) if pose.tracked else -1
-        pose_cov, velocity_cov = self._covariances(quality)
+        pose_cov, velocity_cov = self._covariances(pose, quality)
         return Odometry(
             time_usec=pose.t_ns // 1000,
             position_m=position.tolist(),
@@ -127,13 +131,20 @@ class OdometryStream:
         self._next_odometry_ns = due_ns + self._period_ns
         return True
 
-    def _covariances(self, quality: int) -> tuple[list[float], list[float]]:
-        """Diagonal ones; they grow as the quality falls, tenfold in standard deviation where it failed."""
+    def _covariances(self, pose: PoseSample, quality: int) -> tuple[list[float], list[float]]:
+        """Of the pose: its own, on top of a floor; where it has none, and of velocities: diagonal ones that grow as the
+        quality falls, tenfold in standard deviation where it failed.
+        """
         c = self.config
         worse = 100.0 / max(10, quality)
         sigma = worse * np.array([c.position_sigma_m] * 3 + [c.angle_sigma_rad] * 3)
         sigma_v = worse * np.array([c.velocity_sigma_m_s] * 3 + [c.rate_sigma_rad_s] * 3)
-        return upper_triangle(local_covariance(np.diag(sigma**2))), upper_triangle(np.diag(sigma_v**2))
+        if pose.cov is None:
+            of_pose = local_covariance(np.diag(sigma**2))
+        else:
+            floor = np.diag(np.repeat([c.floor_m, c.floor_rad], 3) ** 2)
+            of_pose = controller_covariance(pose.cov, pose.T_o_b, self._T_b_f) + floor
+        return upper_triangle(of_pose), upper_triangle(np.diag(sigma_v**2))
 
     def receive(self, data: bytes, now_ns: int, *, datagram: bool = False) -> list[bytes]:
         """Take what came from the flight controller, any bytes; the answers to send at once."""

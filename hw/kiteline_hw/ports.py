@@ -103,7 +103,8 @@ class Framer(Protocol):
 class PoseSample:
     """A pose for a flight controller. T_o_b: (4,4) body in the continuous odometry frame, z up. t_ns: capture time on
     the clock whose times are handed to the sink. quality: -1 failed, 0 unknown, 1..100. epoch: bumped only when the
-    odometry frame itself began anew (a restart of the agent), never for a map correction.
+    odometry frame itself began anew (a restart of the agent), never for a map correction. cov: (6,6) of T_o_b,
+    [translation in o in m, rotation about the body's axes in rad], or None where nobody knows.
     """
 
     t_ns: int
@@ -111,6 +112,7 @@ class PoseSample:
     tracked: bool
     quality: int
     epoch: int = 0
+    cov: NDArray[np.float64] | None = None
 
 
 class PoseSink(Protocol):

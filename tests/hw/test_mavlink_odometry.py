@@ -230,3 +230,24 @@ def test_signing() -> None:
     assert sender.signing_timestamp > 1000
     with pytest.raises(ValueError, match="32 bytes"):
         MavlinkCodec(signing=Signing(b"short", 0))
+
+
+def test_a_pose_of_known_covariance_takes_it_along() -> None:
+    T_b_f = mounting("flu", (0.0, 2.0, 0.0))
+    stream, controller = OdometryStream(T_b_f), FlightController("px4")
+    cov = np.diag([0.09, 0.04, 0.01, 0.0, 0.0, 0.0025])
+    for i in range(3):
+        pose = replace(circling(i * S // 30), cov=cov)
+        for message in stream.step(pose, pose.t_ns):
+            controller.receive(message, pose.t_ns)
+    data = stream.step(replace(circling(S // 5), cov=cov), S // 5)[-1]
+    found = list(MavlinkCodec().receive(data))
+    assert len(found) == 1 and isinstance(found[0], Odometry)
+    full = np.zeros((6, 6))
+    full[np.triu_indices(6)] = found[0].pose_covariance
+    # 2 m to the left of the body's origin, an error of yaw of 0.05 rad is one of 0.1 m along the body's x
+    a = 0.4 * 0.2
+    along = np.array([cos(a), sin(a)])
+    want = np.diag([0.09, 0.04]) + 0.01 * np.outer(along, along) + 1e-4 * np.eye(2)
+    np.testing.assert_allclose(full[:2, :2], np.triu(want * [[1, -1], [-1, 1]]), atol=1e-6)
+    np.testing.assert_allclose(np.diag(full)[2:], [0.0101, 2.5e-5, 2.5e-5, 0.0025 + 2.5e-5], atol=1e-6)

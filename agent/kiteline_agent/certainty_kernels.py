@@ -1,0 +1,124 @@
+"""How errors that a whole flight shares, those of the calibration, move a pose that is measured against a map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.jit import njit
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SHAPES = 10  # ways in which a calibration errs, see _bias: those of the disparity, then those of both eyes
+DISPARITY_SHAPES = 5
+
+
+@njit
+def _bias(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
+    """out (3,10): by how much u, v and disparity are off for one pixel of each error, told at the image's edge.
+
+    Disparity (the eyes differ): constant, along x and y, with the square of the distance from the centre, distortion.
+    Both eyes alike: focal length along x and y, principal point along x and y, distortion.
+    """
+    x, y = (u - camera[2]) / half_px, (v - camera[3]) / half_px
+    r2 = x * x + y * y
+    for a in range(3):
+        for k in range(SHAPES):
+            out[a, k] = 0.0
+    out[2, 0], out[2, 1], out[2, 2], out[2, 3], out[2, 4] = 1.0, x, y, r2, x * r2
+    out[0, 5], out[2, 5] = x, disparity / half_px
+    out[1, 6] = y
+    out[0, 7], out[1, 8] = 1.0, 1.0
+    out[0, 9], out[1, 9] = x * r2, y * r2
+
+
+@njit
+def sensitivity(
+    T_c_m: F64, camera: F64, half_px: float, rows: I64, inlier: Bools, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
+    births: int, T_m_k: F64, born_at: F64, rho: F64, of_keyframes: F64, h: F64, g: F64,
+) -> None:  # fmt: skip
+    """Normal equations of a pose (left perturbation of T_c_m, [translation, rotation]) by the calibration's errors.
+
+    T_c_m: (4,4). camera: fx, fy, cx, cy, bf. half_px: half the image's width. rows: (n,) slot * births + index.
+    inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. born_at:
+    (K*births,2) px. rho: (K*births,) 1/m. of_keyframes: (K,6,10) what the errors did to the keyframes, as a left
+    perturbation of T_m_k. Out: h (6,6) information, g (6,10): the pose moves by -h^-1 g for a pixel of each error.
+    """
+    fx, fy, bf = camera[0], camera[1], camera[4]
+    here, there = np.empty((3, SHAPES)), np.empty((3, SHAPES))
+    jac, pj, e = np.zeros((3, 6)), np.zeros((3, 3)), np.empty((3, SHAPES))
+    v, dk, dm, jv, ev = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(SHAPES)
+    h[:] = 0.0
+    g[:] = 0.0
+    for i in range(rows.shape[0]):
+        if not inlier[i]:
+            continue
+        px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        x = T_c_m[0, 0] * px + T_c_m[0, 1] * py + T_c_m[0, 2] * pz + T_c_m[0, 3]
+        y = T_c_m[1, 0] * px + T_c_m[1, 1] * py + T_c_m[1, 2] * pz + T_c_m[1, 3]
+        z = T_c_m[2, 0] * px + T_c_m[2, 1] * py + T_c_m[2, 2] * pz + T_c_m[2, 3]
+        if z < 0.05:
+            continue
+        measured = 3 if observed[i, 2] >= 0.0 else 2
+        iz = 1.0 / z
+        pj[0, 0], pj[0, 2] = fx * iz, -fx * x * iz * iz
+        pj[1, 1], pj[1, 2] = fy * iz, -fy * y * iz * iz
+        pj[2, 2] = -bf * iz * iz
+        for k in range(3):
+            a, b, c = pj[k, 0], pj[k, 1], pj[k, 2]
+            jac[k, 0], jac[k, 1], jac[k, 2] = a, b, c
+            jac[k, 3], jac[k, 4], jac[k, 5] = c * y - b * z, a * z - c * x, b * x - a * y
+        # how far the point in the map is off, and what that and the image's own error make of the residual
+        row = rows[i]
+        slot = row // births
+        depth = 1.0 / rho[row]
+        u0, v0 = born_at[row, 0], born_at[row, 1]
+        _bias(u0, v0, bf * rho[row], camera, half_px, there)
+        _bias(observed[i, 0], observed[i, 1], observed[i, 2], camera, half_px, here)
+        bx, by = (u0 - camera[2]) / fx, (v0 - camera[3]) / fy
+        for s in range(SHAPES):
+            farther = -depth * depth * there[2, s] / bf
+            dk[0] = there[0, s] / fx * depth + bx * farther
+            dk[1] = there[1, s] / fy * depth + by * farther
+            dk[2] = farther
+            o = of_keyframes[slot]
+            for k in range(3):
+                dm[k] = T_m_k[slot, k, 0] * dk[0] + T_m_k[slot, k, 1] * dk[1] + T_m_k[slot, k, 2] * dk[2] + o[k, s]
+            dm[0] += o[4, s] * pz - o[5, s] * py
+            dm[1] += o[5, s] * px - o[3, s] * pz
+            dm[2] += o[3, s] * py - o[4, s] * px
+            for k in range(3):
+                dk[k] = T_c_m[k, 0] * dm[0] + T_c_m[k, 1] * dm[1] + T_c_m[k, 2] * dm[2]
+            for k in range(measured):
+                e[k, s] = pj[k, 0] * dk[0] + pj[k, 1] * dk[1] + pj[k, 2] * dk[2] - here[k, s]
+        # the point's own uncertain depth is taken out, as when the pose was measured
+        s2 = sigma_px[i] * sigma_px[i]
+        vv = s2
+        for k in range(3):
+            dm[k] = T_c_m[k, 0] * ray[i, 0] + T_c_m[k, 1] * ray[i, 1] + T_c_m[k, 2] * ray[i, 2]
+        for k in range(measured):
+            v[k] = pj[k, 0] * dm[0] + pj[k, 1] * dm[1] + pj[k, 2] * dm[2]
+            vv += v[k] * v[k]
+        for s in range(SHAPES):
+            t = 0.0
+            for k in range(measured):
+                t += e[k, s] * v[k]
+            ev[s] = t
+        for a in range(6):
+            t = 0.0
+            for k in range(measured):
+                t += jac[k, a] * v[k]
+            jv[a] = t
+        for a in range(6):
+            for b in range(6):
+                t = 0.0
+                for k in range(measured):
+                    t += jac[k, a] * jac[k, b]
+                h[a, b] += (t - jv[a] * jv[b] / vv) / s2
+            for s in range(SHAPES):
+                t = 0.0
+                for k in range(measured):
+                    t += jac[k, a] * e[k, s]
+                g[a, s] += (t - jv[a] * ev[s] / vv) / s2

@@ -1,0 +1,177 @@
+"""How certain poses are: errors of calibration carried along, noise that adds up, times without images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent import certainty_kernels
+from kiteline_agent.certainty import Certainty, adjoint, probability_good
+from kiteline_agent.config import AgentConfig, CertaintyConfig
+from kiteline_agent.local_map import LocalMap
+from kiteline_agent.pose_state import PoseState
+from kiteline_agent.tracker import Track
+from kiteline_codec.schema import Head
+from kiteline_core import pose_kernels, se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+
+F64 = NDArray[np.float64]
+CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
+SHAPES = certainty_kernels.SHAPES
+
+
+def seen_with(error: F64, X: F64, T_c_m: F64) -> F64:
+    """Observations (n,3) of points X (n,3) by cameras whose calibration errs as `error` (10,) says, in px."""
+    p = X @ T_c_m[:3, :3].T + T_c_m[:3, 3]
+    uvd = np.column_stack([CAMERA.fx * p[:, 0] / p[:, 2] + CAMERA.cx, CAMERA.fy * p[:, 1] / p[:, 2] + CAMERA.cy,
+                           CAMERA.bf / p[:, 2]])  # fmt: skip
+    out = uvd.copy()
+    for i, (u, v, d) in enumerate(uvd):
+        bias = np.empty((3, SHAPES))
+        certainty_kernels._bias(u, v, d, np.array([450.0, 450.0, 370.0, 240.0, CAMERA.bf]), 376.0, bias)
+        out[i] += bias @ error
+    return out
+
+
+def scene(n: int = 120) -> F64:
+    rng = np.random.default_rng(3)
+    z = rng.uniform(2.0, 8.0, n)
+    return np.column_stack([z * rng.uniform(-0.6, 0.6, n), z * rng.uniform(-0.4, 0.4, n), z])
+
+
+def map_of(observed: F64, T_m_k: F64 | None = None) -> LocalMap:
+    config = AgentConfig()
+    local_map = LocalMap(CAMERA, config.local_map, config.depth_filter)
+    n = len(observed)
+    local_map.add(
+        Head(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k, observed[:, :2],
+        observed[:, 2] / CAMERA.bf, np.full(n, 1e-4), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
+        np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), 0,
+    )  # fmt: skip
+    return local_map
+
+
+def tracked(local_map: LocalMap, observed: F64, guess: F64, sigma_px: float = 0.3) -> Track:
+    """A pose measured against the points of keyframe 0."""
+    n = len(observed)
+    rho, b = local_map.rho[0, :n], local_map.bearing[0, :n]
+    T_m_k = local_map.T_m_k[0]
+    X = np.column_stack([b, np.ones(n)]) / rho[:, None] @ T_m_k[:3, :3].T + T_m_k[:3, 3]
+    T, inlier, h = guess.copy(), np.ones(n, np.bool_), np.zeros((6, 6))
+    sigma, ray = np.full(n, sigma_px), np.full((n, 3), 1e-4)
+    inliers, rms = pose_kernels.optimise_pose(
+        T, X, ray, observed, sigma, local_map.intrinsics, guess, np.zeros(6), 2, 8, 1e6, inlier, h
+    )
+    return Track(
+        T, np.arange(n), observed, sigma, np.ones(n), inlier, h, int(inliers), float(rms), n, X, ray
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", range(SHAPES))
+def test_what_an_error_of_calibration_does_to_a_pose_is_foreseen(shape: int) -> None:
+    X = scene()
+    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+    error = np.zeros(SHAPES)
+    error[shape] = 0.05
+    local_map = map_of(seen_with(error, X, np.eye(4)))
+    track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
+    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(), has_body=False, has_depth=True)
+    certainty.measured(track)
+    moved = se3.log(se3.inverse(track.T_c_m) @ T_c_m)  # on the left of T_m_c
+    np.testing.assert_allclose(certainty._shift @ error, moved, atol=0.04 * np.abs(moved).max() + 2e-6)
+    assert np.abs(moved).max() > 1e-5
+
+
+def test_the_error_of_a_keyframe_is_that_of_what_is_measured_against_it() -> None:
+    X = scene()
+    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+    nothing = np.zeros(SHAPES)
+    moved = se3.exp(np.array([0.01, -0.02, 0.015, 0.002, -0.003, 0.004]))
+    local_map = map_of(seen_with(nothing, X, np.eye(4)), moved)
+    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(), has_body=False, has_depth=True)
+    certainty._shift_k[0, :, 0] = se3.log(moved)
+    certainty.measured(tracked(local_map, seen_with(nothing, X, T_c_m), T_c_m))
+    # observations in the moved map put the camera at moved @ T_m_c: the same perturbation on the left
+    np.testing.assert_allclose(certainty._shift[:, 0] - _alone(X, T_c_m)[:, 0], se3.log(moved), atol=2e-4)
+
+
+def _alone(X: F64, T_c_m: F64) -> F64:
+    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
+    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(), has_body=False, has_depth=True)
+    certainty.measured(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
+    return certainty._shift
+
+
+def test_noise_of_a_measured_pose_is_what_it_says() -> None:
+    rng = np.random.default_rng(0)
+    X = scene()
+    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+    clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
+    local_map = map_of(clean)
+    config = CertaintyConfig(calibration_px=0.0, least_rms=0.0)
+    certainty = Certainty(local_map, np.eye(4), config, has_body=False, has_depth=True)
+    certainty.begin(np.eye(4))
+    nees = []
+    for _ in range(100):
+        track = tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m) + 0.15 * rng.normal(size=(120, 3)), T_c_m)
+        certainty.measured(track)
+        T = se3.inverse(track.T_c_m)
+        good = se3.inverse(T_c_m)
+        e = np.concatenate([good[:3, 3] - T[:3, 3], se3.so3_log(T[:3, :3].T @ good[:3, :3])])
+        nees.append(e @ np.linalg.solve(certainty.of_map_pose(T), e))
+    assert 5.0 < np.mean(nees) < 7.2
+
+
+def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
+    config = CertaintyConfig(calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
+    certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config, has_body=True,
+                          has_depth=True)  # fmt: skip
+    certainty.begin(np.eye(4))
+    assert not certainty.of_map_pose(np.eye(4)).any()
+    half = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi]))
+    sigma = np.sqrt(np.diag(certainty.of_map_pose(half))[3:])
+    np.testing.assert_allclose(sigma, [2e-3, 2e-3, 0.0], atol=1e-6)
+
+
+def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
+    X = scene()
+    clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
+    local_map = map_of(clean)
+    config = replace(CertaintyConfig(), calibration_px=0.0)
+    certainty = Certainty(local_map, np.eye(4), config, has_body=True, has_depth=True)
+    pose = PoseState()
+    certainty.begin(np.eye(4))
+    certainty.measured(tracked(local_map, clean, np.eye(4)))
+    before = certainty.of_odometry(pose, np.eye(4))
+    sizes = []
+    for _ in range(20):
+        certainty.blind(0.05, None)
+        sizes.append(certainty.of_odometry(pose, np.eye(4))[0, 0])
+    assert (np.diff(sizes) > 0.0).all()
+    assert np.sqrt(sizes[-1]) == pytest.approx(1.0, abs=0.1)  # half of 2 m/s^2 for a second
+    certainty.carry(pose, np.eye(4))
+    pose.move_map(se3.exp(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.3])))
+    certainty.measured(tracked(local_map, clean, np.eye(4)))
+    assert certainty.of_map_pose(np.eye(4))[0, 0] < 1e-4  # seen in the map again
+    after = certainty.of_odometry(pose, np.eye(4))
+    assert np.trace(after[:3, :3]) == pytest.approx(3 * sizes[-1], rel=0.05)  # but nobody knows the way there
+    assert after[0, 0] > before[0, 0]
+
+
+def test_how_likely_an_error_is_small() -> None:
+    rng = np.random.default_rng(1)
+    for sigma in ([0.1, 0.1, 0.1], [0.2, 0.02, 0.05], [0.01, 0.01, 0.01], [1.0, 1.0, 0.1]):
+        cov = np.zeros((6, 6))
+        cov[:3, :3] = np.diag(np.square(sigma))
+        truly = np.mean(np.linalg.norm(rng.normal(size=(20000, 3)) * sigma, axis=1) < 0.2)
+        assert probability_good(cov, 0.2, 0.17) == pytest.approx(truly, abs=0.03)
+    assert probability_good(np.zeros((6, 6)), 0.2, 0.17) == 1.0
+
+
+def test_adjoint_carries_a_perturbation_from_right_to_left() -> None:
+    T, x = se3.exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.7])), np.array([0.1, 0.2, -0.1, 0.03, 0.2, 0.1])
+    np.testing.assert_allclose(se3.exp(adjoint(T) @ x) @ T, T @ se3.exp(x), atol=1e-12)
