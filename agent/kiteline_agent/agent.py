@@ -24,11 +24,27 @@ from kiteline_agent.pose_state import PoseState
 from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.reference import Reference
 from kiteline_agent.right_eye import RightEye, rectified
+from kiteline_agent.smoothing import Smoothing
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.submaps import Submaps
 from kiteline_agent.tracker import Track, Tracker, View
+from kiteline_agent.window import Window, corners_of, with_depths, yields
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Camera, Culled, Depths, Found, Level, Live, Placement, Pose, Record, Removed, Tile
+from kiteline_codec.schema import (
+    Camera,
+    Copied,
+    Copy,
+    Culled,
+    Depths,
+    Found,
+    Level,
+    Live,
+    Placement,
+    Pose,
+    Record,
+    Removed,
+    Tile,
+)
 from kiteline_core import se3
 from kiteline_core.cameras import CameraRig, Rectifier
 from kiteline_core.fixed_lag import VisualPoints
@@ -83,7 +99,9 @@ class Agent:
         self._motion_depth = DepthFromMotion(self.map, config, self.work)
         self._mono = MonoStart(self._camera, config) if one_eye else None
         self._glimpse = Glimpse(self._camera)
-        self._recovery = Recovery(self.map, self._tracker, config, words)
+        self.window = Window(self._camera, config.window, config.matching, config.ransac, words)
+        self._smoothing = Smoothing(config.smoothing)
+        self._recovery = Recovery(self.map, self._tracker, config, words, self.window)
         self._events: list[str] = []
         self._frame_number = 0
         self._last_t_ns: int | None = None
@@ -99,6 +117,7 @@ class Agent:
         """Take in what arrived, track the frame if there is one, say what is to be sent. Never waits."""
         self._events = []
         self._take_corrections(self._channel.receive(step_input.packets, now_ns))
+        self.window.take_back(self._channel.take_removed())
         estimate = None
         self.work.clear()
         self.work.steps = 1
@@ -291,8 +310,34 @@ class Agent:
             self._add_keyframe(view, track, t_ns)
 
     def _add_keyframe(self, view: View, track: Track, t_ns: int) -> None:
+        self._yield_to_copies(view, track)
         self._reference.add(view, track, t_ns, self._frame_number, self._submaps.active, self._pose.T_m_c)
         self._note_keyframe(view, Extra.KEYFRAME)
+
+    def _yield_to_copies(self, view: View, track: Track) -> None:
+        """A keyframe's corners meet the base's copies: it takes over their depths, and moves a little towards where
+        they say that it is. The odometry frame stays still.
+        """
+        if not self.window.lies_in(self.submap):
+            return
+        fresh = self._maker.look(view, track)
+        limits = self._config.window
+        met = self.window.meet(self._pose.T_c_m, self.submap, corners_of(fresh), limits.hold_radius_px)
+        self.work.projected += len(self.window) * limits.points
+        self._maker.begin_with(fresh if met is None else with_depths(fresh, met))
+        if met is None:
+            return
+        goal = yields(self._pose.T_c_m, met, limits, self._camera.fx)
+        if goal is not None:
+            self._move_map(se3.inverse(goal))
+
+    def _move_map(self, T_m_c: F64) -> None:
+        """The camera is at T_m_c (4,4) in the submap, and moved in no other frame."""
+        before = self._pose.T_m_c
+        self._pose.move_map(T_m_c)
+        if self._inertial is not None:
+            self._inertial.shift_map(se3.orthonormalise(self._pose.T_m_c @ se3.inverse(before)))
+        self._reference.refresh(self._pose.T_m_c)
 
     def _note_keyframe(self, view: View, extra: Extra) -> None:
         """What follows every keyframe: it is booked, and its place remembered."""
@@ -387,7 +432,10 @@ class Agent:
         self._events.append("recovered")
         self._return_to(found)
         self._pose.stand()
-        self._keyframe_if_due(view, found.track, t_ns)
+        if found.lent:  # none of its points is in the local map yet
+            self._add_keyframe(view, found.track, t_ns)
+        else:
+            self._keyframe_if_due(view, found.track, t_ns)
         return found.track
 
     def _join_if_found(self, view: View, track: Track, t_ns: int) -> None:
@@ -438,6 +486,8 @@ class Agent:
                 touched |= self.map.apply(record)
             elif isinstance(record, Placement):
                 self._placements[record.submap] = record.T_w_m
+            elif isinstance(record, Copy | Copied):
+                self.window.take(record)
             elif isinstance(record, Tile):
                 self.tiles[record.column, record.row] = record
         if not touched:
@@ -445,11 +495,8 @@ class Agent:
         self.map.settle()
         T_m_k = self._reference.T_m_k
         if T_m_k is not None:
-            before = self._pose.T_m_c
-            self._pose.move_map(T_m_k @ self._reference.T_k_c)
+            self._move_map(T_m_k @ self._reference.T_k_c)
             self._certainty.corrected(self._pose)
-            if self._inertial is not None:
-                self._inertial.shift_map(se3.orthonormalise(self._pose.T_m_c @ se3.inverse(before)))
 
     # what is known
 
@@ -461,12 +508,16 @@ class Agent:
         keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c
         if keyframe != NO_KEYFRAME:
             self._channel.put(Live(self._identity.agent, t_ns, keyframe, T_k_c, quality))
+        T_o_b = self._pose.T_o_m @ T_m_b
+        T_w_b = None if T_w_m is None else T_w_m @ T_m_b
+        if T_w_m is not None and self._smoothing.on:
+            T_w_b = self._smoothing.follow(T_w_m @ se3.inverse(self._pose.T_o_m), T_o_b[:3, 3], t_ns) @ T_o_b
         return Estimate(
             t_ns,
             tracked,
             self._bridged,
             T_m_b if tracked else None,
-            self._pose.T_o_m @ T_m_b,
+            T_o_b,
             keyframe,
             T_k_c.copy(),
             self.submap,
@@ -474,5 +525,5 @@ class Agent:
             quality,
             cov_m,
             self._certainty.of_odometry(self._pose, self._T_c_b),
-            T_w_m @ T_m_b if tracked and T_w_m is not None else None,
+            T_w_b if tracked else None,
         )

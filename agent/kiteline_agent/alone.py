@@ -12,6 +12,7 @@ class AloneChannel:
     """A RecordChannel with nobody at the other end."""
 
     profile = EXACT
+    backlog_bytes = 0
 
     def keyframe_gap_ns(self) -> int:
         """None: there is no link."""

@@ -169,6 +169,37 @@ class CertaintyConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class WindowConfig:
+    """Copies of keyframes that the base lends, and what is made of them."""
+
+    copies: int = 32  # slots; the base lends fewer, an earlier base's may still be here
+    points: int = 128  # of a copy
+    sigma_px: float = 0.15  # virtual disparity error of a lent point: many views made it
+    max_scale: float = 2.5  # how much nearer or farther than in its keyframe a point may be
+    octave_gap: float = 1.2  # octaves between the size foreseen and the size found
+    corner_px: float = 1.0  # one standard deviation of a corner's place at octave 0, found twice
+    radius_px: float = 6.0  # px at octave 0 around where a lost frame's points are foreseen: what P3P leaves
+    hold_radius_px: float = 4.0  # the same of a keyframe that is tracked: more is no drift, but another corner
+    min_met: int = 12  # lent points that agree with one pose; chance matches reach 8
+    min_hold: int = 24  # of them before a keyframe yields to them
+    gain: float = 0.3  # share of the way to where they say: a keyframe's corners are placed to a third of a pixel
+    hold_px: float = 2.0  # px that a point in the middle of the view may move by it: more is for the base to judge
+    min_found: int = 30  # of them that find a lost frame
+    min_share: float = 0.15  # of those that should be in view; not every point is a corner again
+    candidates: int = 3  # copies tried in a lost frame
+    beyond_px: float = 150.0  # px beyond a copy's border of which points are matched too
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothingConfig:
+    """How corrections reach the live pose in the world. They never touch the odometry frame."""
+
+    max_m_s: float = 0.0  # m/s at which the odometry frame moves in w; 0: at once, which is nearest to the truth
+    max_rad_s: float = 0.0  # rad/s at which it turns; 0: at once
+    snap_m: float = 5.0  # farther than this is another place: taken at once
+
+
+@dataclass(frozen=True, slots=True)
 class GovernorConfig:
     """How CPU time is held under a budget."""
 
@@ -205,5 +236,7 @@ class AgentConfig:
     motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)
     mono_start: MonoStartConfig = field(default_factory=MonoStartConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     matching: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)

@@ -38,8 +38,20 @@ class KeyframeMaker:
 
     def enough(self, view: View, points: int) -> bool:
         """Whether a view by itself gives at least so many points with depth."""
-        self._fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
-        return int(np.count_nonzero(self._fresh.disparity > 0.0)) >= points
+        fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
+        enough = int(np.count_nonzero(fresh.disparity > 0.0)) >= points
+        self._fresh = fresh if enough else None
+        return enough
+
+    def look(self, view: View, track: Track) -> NewPoints:
+        """What would be born in a keyframe of a tracked frame."""
+        return new_points(view, self._seen(track)[1][:, :2], self._camera, self._config)
+
+    def _seen(self, track: Track) -> tuple[NDArray[np.int64], F64]:
+        """Rows (n,) and places (n,3) of the inliers, in order of point."""
+        keep = np.flatnonzero(track.inlier)
+        keep = keep[np.argsort(self._map.point_ids(track.rows[keep]), kind="stable")]
+        return track.rows[keep], track.observed[keep]
 
     def begin_with(self, points: NewPoints) -> None:
         """What is born in the keyframe that follows at once."""
@@ -51,16 +63,12 @@ class KeyframeMaker:
     ) -> F64:  # fmt: skip
         """Share and remember a keyframe; its pose T_m_k (4,4) as both sides hold it. Without a track, a map begins."""
         if track is None:
-            fresh, rows = self._fresh, np.zeros(0, np.int64)
-            if fresh is None:
-                fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
-            seen = np.zeros((0, 3))
+            rows, seen = np.zeros(0, np.int64), np.zeros((0, 3))
         else:
-            keep = np.flatnonzero(track.inlier)
-            keep = keep[np.argsort(self._map.point_ids(track.rows[keep]), kind="stable")]
-            rows, seen = track.rows[keep], track.observed[keep]
+            rows, seen = self._seen(track)
+        fresh, self._fresh = self._fresh, None
+        if fresh is None:
             fresh = new_points(view, seen[:, :2], self._camera, self._config)
-        self._fresh = None
         # Births first, in the order of image rows: neighbours code shortest.
         band = fresh.uv[:, 1] // self._config.detector.cell_px
         profile = self._channel.profile
@@ -85,7 +93,8 @@ class KeyframeMaker:
         for section in sections[1]:
             self._channel.put(section)
         T_m_k = self._placed(shared_head)
-        self._remember(view, shared_head, T_m_k, uv, rho, births, frame_number)
+        lent_rho = np.zeros(len(order)) if fresh.lent_rho is None else fresh.lent_rho[order]
+        self._remember(view, shared_head, T_m_k, uv, rho, lent_rho, births, frame_number)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         return T_m_k
 
@@ -121,7 +130,7 @@ class KeyframeMaker:
         return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(head.parent)] @ head.T_p_k)
 
     def _remember(
-        self, view: View, head: Head, T_m_k: F64, uv: F64, rho: F64, births: Births, frame_number: int
+        self, view: View, head: Head, T_m_k: F64, uv: F64, rho: F64, lent_rho: F64, births: Births, frame_number: int
     ) -> None:
         octave = births.octave
         templates = np.empty(
@@ -132,6 +141,9 @@ class KeyframeMaker:
         sigma = self._config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
         if view.depth_m is not None and not self._camera.stereo:
             sigma = np.maximum(sigma, _depth_camera_sigma(rho))
+        lent = lent_rho > 0.0
+        rho = np.where(lent, lent_rho, rho)
+        sigma[lent] = np.minimum(sigma[lent], self._config.window.sigma_px / self._camera.bf)
         self._map.add(
             head, T_m_k, uv, rho, sigma, octave, births.angle, births.descriptor, templates, frame_number
         )  # fmt: skip

@@ -97,7 +97,7 @@ def situation(
 @dataclass(frozen=True, slots=True)
 class NewPoints:
     """Births of a keyframe, strongest first. uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,).
-    angle: (n,). descriptor: (n,32).
+    angle: (n,). descriptor: (n,32). lent_rho: (n,) 1/m, depths that the base's copies know, 0 none; or None.
     """
 
     uv: F64
@@ -105,6 +105,7 @@ class NewPoints:
     octave: NDArray[np.uint8]
     angle: NDArray[np.uint8]
     descriptor: NDArray[np.uint8]
+    lent_rho: F64 | None = None
 
 
 def new_points(view: View, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:

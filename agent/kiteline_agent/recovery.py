@@ -15,23 +15,27 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map import LocalMap
-from kiteline_agent.tracker import Track, Tracker, View
+from kiteline_agent.tracker import Track, Tracker, View, without_points
+from kiteline_agent.window import Seen, Window
 from kiteline_core import features, matching, se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.place_index import PlaceIndex, Vocabulary
 from kiteline_core.pnp import solve_pnp
 
 F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """Where the old map was found. T_c_m: (4,4) in the submap of `keyframe`, which saw the place. track: its proof."""
+    """Where the old map was found. T_c_m: (4,4) in the submap of `keyframe`, from which to go on. track: its proof,
+    without points where it is `lent`: corners met the base's copies. depth_m: of the points in view, median.
+    """
 
     T_c_m: F64
     keyframe: KeyframeId
     track: Track
+    depth_m: float
+    lent: bool = False
 
     @property
     def submap(self) -> SubmapId:
@@ -39,22 +43,15 @@ class Recovered:
         return submap_of_keyframe(self.keyframe)
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """Corners of the lost frame. uv: (n,2) px. octave, angle: (n,). descriptor: (n,32)."""
-
-    uv: F64
-    octave: U8
-    angle: U8
-    descriptor: U8
-
-
 class Recovery:
     """Knows the places of all remembered keyframes, and searches them for a frame: a few keyframes a call, no more."""
 
-    def __init__(self, local_map: LocalMap, tracker: Tracker, config: AgentConfig, words: Vocabulary | None) -> None:
+    def __init__(
+        self, local_map: LocalMap, tracker: Tracker, config: AgentConfig, words: Vocabulary | None, window: Window
+    ) -> None:  # fmt: skip
         self._map = local_map
         self._tracker = tracker
+        self._window = window
         self._config = config
         self._detector = replace(
             config.detector, cell_px=config.recovery.cell_px, max_corners=config.recovery.max_corners
@@ -113,13 +110,12 @@ class Recovery:
         limits = self._config.recovery
         change = found.T_c_m @ T_old_young @ se3.inverse(before) @ se3.inverse(found.T_c_m)  # felt where the camera is
         turned = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
-        depth = float(np.median(found.track.depth_m[found.track.inlier]))
-        if np.linalg.norm(change[:3, 3]) > limits.agree_ratio * depth or turned > limits.agree_rad:
+        if np.linalg.norm(change[:3, 3]) > limits.agree_ratio * found.depth_m or turned > limits.agree_rad:
             return None
         self._search_until = -1
         return found
 
-    def _look(self, view: View) -> _Seen | None:
+    def _look(self, view: View) -> Seen | None:
         """Corners and descriptors; None where there is no texture."""
         detector = replace(self._detector, first=max(self._detector.first, view.first))
         corners = features.detect(view.left, np.zeros((0, 2)), detector)
@@ -127,10 +123,10 @@ class Recovery:
         if not self.textured:
             return None
         angle, descriptor = features.describe(view.left, corners.uv, corners.octave)
-        return _Seen(corners.uv, corners.octave, angle, descriptor)
+        return Seen(corners.uv, np.full(len(corners.uv), -1.0), corners.octave, angle, descriptor)
 
     def _search(
-        self, view: View, seen: _Seen, frame_number: int, reference: KeyframeId, exclude: SubmapId | None
+        self, view: View, seen: Seen, frame_number: int, reference: KeyframeId, exclude: SubmapId | None
     ) -> Recovered | None:
         """Try the reference keyframe and the most alike places, in this order."""
         tried = [reference] if self._map.slot_of(reference) >= 0 and reference != NO_KEYFRAME else []
@@ -144,10 +140,23 @@ class Recovery:
                 continue
             track = self._confirm(view, T_c_m, frame_number, submap_of_keyframe(keyframe))
             if track is not None:
-                return Recovered(track.T_c_m, keyframe, track)
-        return None
+                depth_m = float(np.median(track.depth_m[track.inlier]))
+                return Recovered(track.T_c_m, keyframe, track, depth_m)
+        return self._search_window(seen, frame_number, exclude)
 
-    def _pose_by(self, keyframe: KeyframeId, seen: _Seen, frame_number: int) -> F64 | None:
+    def _search_window(self, seen: Seen, frame_number: int, exclude: SubmapId | None) -> Recovered | None:
+        """Try the base's copies, in every submap of which a keyframe is remembered: from that one it goes on."""
+        known = self._map.keyframe[self._map.keyframe != NO_KEYFRAME]
+        submaps = {int(submap_of_keyframe(KeyframeId(k))) for k in known.tolist()} - {exclude}
+        found = self._window.find(seen, submaps, frame_number)
+        if found is None:
+            return None
+        submap, met = found
+        newest = KeyframeId(max(k for k in known.tolist() if submap_of_keyframe(KeyframeId(k)) == submap))
+        proof = without_points(met.T_c_m, len(met.corner))
+        return Recovered(met.T_c_m, newest, proof, float(np.median(met.depth_m)), lent=True)
+
+    def _pose_by(self, keyframe: KeyframeId, seen: Seen, frame_number: int) -> F64 | None:
         """Match with all that a keyframe should see, also a little beyond its border, and solve for the pose."""
         limits = self._config.recovery
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]

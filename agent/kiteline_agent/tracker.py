@@ -55,6 +55,15 @@ class Track:
     ray: F64
 
 
+def without_points(T_c_m: F64, inliers: int) -> Track:
+    """A pose (4,4) that so many corners prove, none of which is a point of the local map."""
+    none = np.zeros(0)
+    return Track(
+        T_c_m, np.zeros(0, np.int64), np.zeros((0, 3)), none, none, np.zeros(0, np.bool_), np.zeros((6, 6)), inliers,
+        0.0, inliers, np.zeros((0, 3)), np.zeros((0, 3)),
+    )  # fmt: skip
+
+
 class Tracker:
     """Stateless but for its buffers: the local map and the prediction are handed in."""
 

@@ -15,7 +15,7 @@ from kiteline_core.epipolar_kernels import search_segments
 from kiteline_core.features import build_pyramid
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import AgentId
-from kiteline_core.matching import MatchConfig, match
+from kiteline_core.matching import MatchConfig, match, match_near
 from kiteline_core.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pnp import solve_pnp
 from kiteline_core.se3 import from_rt
@@ -56,7 +56,12 @@ def _warm_recovery(words: Vocabulary, noise: NDArray[np.uint8]) -> None:
     points = noise[1280:1400].reshape(40, 3) / 128.0 + np.array([-1.0, -1.0, 2.0])
     observed = np.column_stack([100.0 * points[:, :2] / points[:, 2:] + 150.0, np.full(40, -1.0)])
     camera = np.array([100.0, 100.0, 150.0, 150.0, 10.0])
-    solve_pnp(points, np.zeros((40, 3)), observed, np.zeros(40, np.uint8), camera, 0)
+    flat = np.zeros(40, np.uint8)
+    solve_pnp(points, np.zeros((40, 3)), observed, flat, camera, 0)
+    uv = np.ascontiguousarray(observed[:, :2])
+    match_near(
+        uv, np.full(40, 4.0), np.zeros(40), descriptor, uv, flat, descriptor, (320, 240), 1.2, MatchConfig()
+    )  # fmt: skip
 
 
 def _resting(k: int) -> ImuBatch:

@@ -187,6 +187,24 @@ class PublishConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class SupplyConfig:
+    """The window of the map that each agent is kept supplied with."""
+
+    copies: int = 24  # keyframes an agent holds copies of; 0: none. They cover two views of a room and its way there
+    every_s: float = 1.0  # between two looks at what an agent needs
+    horizon_s: float = 2.0  # how far ahead along its motion: what a thin link takes to bring two keyframes
+    at_once: int = 6  # copies lent at one look: the rest may prove to be of no use a second later
+    remembered: int = 48  # newest keyframes of its own that an agent remembers by itself
+    reach: float = 1.5  # distance of a keyframe over the depth in view: farther ones see little of the same
+    min_cosine: float = 0.3  # of the angle between the optical axes: descriptors do not bear more than 70 degrees
+    looked_at: int = 60  # keyframes whose points are projected
+    min_points: int = 8  # of a keyframe that are about to be in view: fewer are not worth their bytes
+    keep: float = 1.5  # how much more a copy that is there counts than one that would have to be sent
+    pose_m: float = 0.002  # a copy that moved less stays where it is: half a pixel at 2 m
+    pose_rad: float = 0.0005  # a quarter of a pixel at 500 px of focal length
+
+
+@dataclass(frozen=True, slots=True)
 class BaseConfig:
     """All sections."""
 
@@ -202,4 +220,5 @@ class BaseConfig:
     graph: GraphConfig = field(default_factory=GraphConfig)
     disparity: DisparityConfig = field(default_factory=DisparityConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
+    supply: SupplyConfig = field(default_factory=SupplyConfig)
     grid: GridConfig = field(default_factory=GridConfig)

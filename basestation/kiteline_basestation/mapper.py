@@ -20,7 +20,7 @@ from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
-from kiteline_codec.schema import Placement, Record
+from kiteline_codec.schema import Live, Placement, Record
 from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import (
@@ -193,6 +193,10 @@ class Mapper:
             "maps": len({self.map.island_of(s) for s in self.map.submaps}),
             "jobs_open": len(self._windows) + (self._grid_job != 0) + (self.atlas.jobs_open if self.atlas else 0),
         }
+
+    def live(self, agent: AgentId) -> Live | None:
+        """The newest pose that an agent told."""
+        return self._intake.live.get(agent)
 
     def world_view(self) -> GridView:
         """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""

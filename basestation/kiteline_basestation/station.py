@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.supply import Supply
 from kiteline_codec.channel import RecordChannel
 from kiteline_core.ids import AgentId
 from kiteline_core.place_index import Vocabulary
@@ -28,6 +29,7 @@ class Station:
         self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], words: Vocabulary | None = None
     ) -> None:  # fmt: skip
         self.mapper = Mapper(config, words)
+        self.supply = Supply(config.supply, config.loops, self.mapper.map)
         self.channels: dict[AgentId, RecordChannel] = {}
         self._open_channel = open_channel
 
@@ -52,6 +54,8 @@ class Station:
             channel = self.join(agent)
             for record in records:
                 self.mapper.adopt(channel.put(record))  # from here on we compute with what the agent will hold
+        for agent, channel in sorted(self.channels.items()):
+            self.supply.serve(agent, self.mapper.live(agent), channel, now_ns)
         return StationOutput(
             tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items())), output.jobs
         )

@@ -25,6 +25,11 @@ class RecordChannel(Protocol):
         """How long after the last keyframe the link can take another, unless it is pressing."""
         ...
 
+    @property
+    def backlog_bytes(self) -> int:
+        """Of records that the other side is not known to hold."""
+        ...
+
     def put(self, record: Record) -> Record:
         """Share a record. Returns it as the other side will hold it: compute on with that."""
         ...
@@ -50,6 +55,7 @@ class PlainChannel:
     """One of two joined ends in one process: records pass as they are, at the next `receive`. Made by `plain_pair`."""
 
     profile = EXACT
+    backlog_bytes = 0
 
     def __init__(self) -> None:
         self._arrived: list[Record] = []
@@ -115,6 +121,11 @@ class CodedChannel:
     def keyframe_gap_ns(self) -> int:
         """How long after the last keyframe the link can take another, unless it is pressing."""
         return self._pacer.keyframe_gap_ns(self.endpoint.backlog_bytes, self.endpoint.throughput_bytes_s)
+
+    @property
+    def backlog_bytes(self) -> int:
+        """Of records that the other side is not known to hold."""
+        return self.endpoint.backlog_bytes
 
     @property
     def stats(self) -> SyncStats:

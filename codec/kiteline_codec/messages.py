@@ -16,6 +16,8 @@ from kiteline_codec.rows import MAX_KEYFRAME_ID, read_columns, read_points, writ
 from kiteline_codec.schema import (
     Births,
     Camera,
+    Copied,
+    Copy,
     Culled,
     Depths,
     Found,
@@ -42,6 +44,7 @@ TILE_CELLS = 32  # along each side
 _TILE_BITS = 24  # of a column or row number
 _TILE_OFFSET = 1 << _TILE_BITS - 1
 _MAX_SIZE_PX = 1 << 14
+_MAX_SUBMAP_ID = (1 << 32) - 1
 
 
 def key(record: Record) -> Key:
@@ -146,25 +149,25 @@ def _read_head(source: Reader, key: Key) -> Head:
     return Head(KeyframeId(key.id), t_ns, parent, t_p_k, source.varint(MAX_KEYPOINTS))
 
 
-def _write_births(out: Writer, record: Births) -> None:
+def _write_described(out: Writer, kind: Kind, record: Births | Copied) -> None:
     descriptor = np.ascontiguousarray(record.descriptor, np.uint8)
     if descriptor.shape != (len(record.index), DESCRIPTOR_BYTES):
         raise ValueError(f"descriptors are {descriptor.shape}, expected {(len(record.index), DESCRIPTOR_BYTES)}")
-    write_columns(out, Kind.BIRTHS, record)
+    write_columns(out, kind, record)
     if descriptor.any():
         narrow = descriptors.is_narrow(descriptor).all()
         out.raw((descriptors.packed(descriptor) if narrow else descriptor).tobytes())
 
 
-def _read_births(source: Reader, key: Key) -> Births:
-    n, columns = read_columns(source, Kind.BIRTHS)
+def _read_described(source: Reader, kind: Kind, key: Key) -> dict[str, Any]:
+    n, columns = read_columns(source, kind)
     size = {NARROW_BYTES * n: NARROW_BYTES, 0: 0}.get(source.left, DESCRIPTOR_BYTES)
     raw = np.frombuffer(source.raw(size * n), np.uint8).reshape(n, size)
     if size < DESCRIPTOR_BYTES:
         raw = descriptors.unpacked(raw) if size else np.zeros((n, DESCRIPTOR_BYTES), np.uint8)
     if n and size and (not raw.any() or (size == DESCRIPTOR_BYTES and descriptors.is_narrow(raw).all())):
         raise WireError("descriptors are written in the fewest bytes that hold them")
-    return Births(keyframe=KeyframeId(key.id), part=key.part, descriptor=raw, **columns)
+    return {"keyframe": KeyframeId(key.id), "part": key.part, "descriptor": raw, **columns}
 
 
 def _write_sightings(out: Writer, record: Sightings) -> None:
@@ -198,6 +201,16 @@ def _read_culled(source: Reader, key: Key) -> Culled:
     if too > 1:
         raise WireError(f"keyframe_too is 0 or 1, found {too}")
     return Culled(keyframe=KeyframeId(key.id), keyframe_too=too, **columns)
+
+
+def _write_copy(out: Writer, record: Copy) -> None:
+    out.varint(record.submap)
+    _write_pose(out, record.T_m_k)
+
+
+def _read_copy(source: Reader, key: Key) -> Copy:
+    submap = SubmapId(source.varint(_MAX_SUBMAP_ID))
+    return Copy(KeyframeId(key.id), submap, _read_pose(source))
 
 
 def _tile_id(record: Tile) -> int:
@@ -261,10 +274,14 @@ _TABLE = (
     _Coder(Kind.CAMERA, Camera, 63, 1, _of_agent, _write_camera, _read_camera),
     _Coder(Kind.LIVE, Live, 63, 1, _of_agent, _write_live, _read_live),
     _Coder(Kind.HEAD, Head, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_head, _read_head),
-    _Coder(Kind.BIRTHS, Births, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_births, _read_births),
+    _Coder(
+        Kind.BIRTHS, Births, MAX_KEYFRAME_ID, MAX_PARTS, _of_part,
+        lambda out, r: _write_described(out, Kind.BIRTHS, r),
+        lambda source, key: Births(**_read_described(source, Kind.BIRTHS, key)),
+    ),
     _Coder(Kind.SIGHTINGS, Sightings, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_sightings, _read_sightings),
     _Coder(
-        Kind.LEVEL, Level, (1 << 32) - 1, 1, lambda r: (int(r.submap),),
+        Kind.LEVEL, Level, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
         lambda out, r: _write_pose(out, r.T_l_m),
         lambda source, key: Level(SubmapId(key.id), _read_pose(source)),
     ),
@@ -286,11 +303,17 @@ _TABLE = (
     ),
     _Coder(Kind.CULLED, Culled, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_culled, _read_culled),
     _Coder(
-        Kind.PLACEMENT, Placement, (1 << 32) - 1, 1, lambda r: (int(r.submap),),
+        Kind.PLACEMENT, Placement, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
         lambda out, r: _write_pose(out, r.T_w_m),
         lambda source, key: Placement(SubmapId(key.id), _read_pose(source)),
     ),
     _Coder(Kind.TILE, Tile, (1 << 2 * _TILE_BITS) - 1, 1, lambda r: (_tile_id(r),), _write_tile, _read_tile),
+    _Coder(Kind.COPY, Copy, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_copy, _read_copy),
+    _Coder(
+        Kind.COPIED, Copied, MAX_KEYFRAME_ID, MAX_PARTS, _of_part,
+        lambda out, r: _write_described(out, Kind.COPIED, r),
+        lambda source, key: Copied(**_read_described(source, Kind.COPIED, key)),
+    ),
 )  # fmt: skip
 _CODERS: dict[int, _Coder] = {int(c.kind): c for c in _TABLE}
 _KIND_OF: dict[type, int] = {c.record: int(c.kind) for c in _TABLE}

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec import quantise
-from kiteline_codec.schema import Births, Sightings
-from kiteline_codec.sections import split_births, split_sightings, take
+from kiteline_codec.schema import Births, Copied, Sightings
+from kiteline_codec.sections import split_births, split_copied, split_sightings, take
 from kiteline_core.descriptors import narrowed
 
 F32 = NDArray[np.float32]
@@ -42,6 +42,8 @@ class Profile:
     packet_bytes: int = 1200  # largest packet: fits an Ethernet frame inside any tunnel
     overhead_bytes: int = 28  # a packet costs on the wire beyond its own bytes: IPv4 and UDP
     heartbeat_ns: int = 1_000_000_000  # longest silence
+    copied: int = 96  # points of a copied keyframe: with its neighbours' they cover what it saw
+    copies_backlog_bytes: int = 8_000  # waiting for the link, above which no further keyframe is copied
 
     def choose(self, births: Births, strength: F64, sightings: Sightings) -> tuple[list[Births], list[Sightings]]:
         """The sections to share, best first. births: their first `births` rows are the best ones. strength: (n,)."""
@@ -74,6 +76,14 @@ class Profile:
             parts.append(replace(part, part=len(parts)))
         return parts, split_sightings(seen, np.zeros(len(seen.index)), self.sightings_bytes)
 
+    def copies(self, points: Copied, strength: F64) -> list[Copied]:
+        """The sections of a copied keyframe, best first. strength: (n,)."""
+        best = np.sort(np.argsort(-strength, kind="stable")[: self.copied])
+        chosen = take(points, best)
+        if self.narrow:
+            chosen = replace(chosen, descriptor=narrowed(chosen.descriptor))
+        return split_copied(chosen, strength[best], self.births_bytes)
+
 
 WIFI = Profile()
 RADIO = Profile(
@@ -94,6 +104,8 @@ RADIO = Profile(
     blank_bytes=11,
     sightings_room_bytes=220,
     packet_bytes=220,  # a quarter of a second at 1000 B/s: a pose waits no longer
+    copied=40,  # a kilobyte: two seconds of the whole link
+    copies_backlog_bytes=300,  # next to nothing: what waits there is of more use
     overhead_bytes=7,  # two zeros, COBS and CRC-32 of a frame on a serial line
 )
 EXACT = Profile(name="exact", pixel_step=1, depth_step=1, live_gap_ns=0)  # nothing but the codes' own rounding

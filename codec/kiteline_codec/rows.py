@@ -55,6 +55,7 @@ _COLUMNS: dict[Kind, tuple[str, ...]] = {
     Kind.FOUND: ("index",),
     Kind.REMOVED: ("index",),
     Kind.CULLED: ("index",),
+    Kind.COPIED: ("index", "uv", "inv_depth", "octave", "angle"),
 }
 
 

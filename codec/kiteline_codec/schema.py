@@ -44,6 +44,8 @@ class Kind(IntEnum):
     CULLED = 20
     PLACEMENT = 21
     TILE = 22
+    COPY = 23
+    COPIED = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +186,50 @@ class Tile:
     cells: NDArray[np.int8]
 
 
-Record = Camera | Live | Head | Births | Sightings | Level | Pose | Depths | Found | Removed | Culled | Placement | Tile
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """A keyframe that its reader does not have, another agent's or one that it forgot. T_m_k: (4,4) camera in the
+    reader's `submap`.
+    """
+
+    keyframe: KeyframeId
+    submap: SubmapId
+    T_m_k: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Copied:
+    """Points that were born in a copied keyframe, where the base has them. index: (n,) keypoints, increasing within a
+    part. uv: (n,2) px as the reader's own camera would see them from the keyframe. The rest as in Births.
+    """
+
+    keyframe: KeyframeId
+    part: int
+    index: U16
+    uv: F32
+    inv_depth: F32
+    octave: U8
+    angle: U8
+    descriptor: U8
+
+
+Record = (
+    Camera
+    | Live
+    | Head
+    | Births
+    | Sightings
+    | Level
+    | Pose
+    | Depths
+    | Found
+    | Removed
+    | Culled
+    | Placement
+    | Tile
+    | Copy
+    | Copied
+)
 
 
 class Key(NamedTuple):

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec import messages
-from kiteline_codec.schema import Births, Sightings
+from kiteline_codec.schema import Births, Copied, Sightings
 
 F64 = NDArray[np.float64]
 
 SECTION_BYTES = 1000  # leaves room for headers and a live pose in a packet of 1200 bytes
 
-_Section = TypeVar("_Section", Births, Sightings)
+_Section = TypeVar("_Section", Births, Sightings, Copied)
 
 
 def split_births(births: Births, value: F64, section_bytes: int = SECTION_BYTES) -> list[Births]:
@@ -33,6 +33,11 @@ def split_sightings(sightings: Sightings, value: F64, section_bytes: int = SECTI
     Codes are shortest where the order of indices is that of point ids. Raises ValueError as `split_births` does.
     """
     return _split(sightings, value, section_bytes)
+
+
+def split_copied(copied: Copied, value: F64, section_bytes: int = SECTION_BYTES) -> list[Copied]:
+    """Points of a copied keyframe (n rows) as parts 0, 1, … by falling value (n,), as `split_births` does."""
+    return _split(copied, value, section_bytes)
 
 
 def _split(record: _Section, value: F64, section_bytes: int) -> list[_Section]:

@@ -45,6 +45,8 @@ _RANKS = {
     Kind.HEAD: 2,
     Kind.BIRTHS: 3,
     Kind.SIGHTINGS: 4,  # after the births, so that the next keyframe's sightings may build upon them
+    Kind.COPY: 5,
+    Kind.COPIED: 5,
     Kind.TILE: 6,
 }
 _FIRST_PARTS = 4  # births: what makes a keyframe useful where a thin link has them short

@@ -18,6 +18,8 @@ from kiteline_codec import messages, sections
 from kiteline_codec.schema import (
     Births,
     Camera,
+    Copied,
+    Copy,
     Culled,
     Depths,
     Found,
@@ -73,6 +75,11 @@ def some_records(seed: int, n: int) -> list[Record]:
         Culled(keyframe, index, int(rng.integers(2))),
         Placement(submap, pose),
         Tile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
+        Copy(keyframe, submap_id(2, 1, 7), pose),
+        Copied(
+            keyframe, 3, index, uv, inv_depth, octave, rng.integers(0, 256, n).astype(np.uint8),
+            rng.integers(0, 256, (n, 32)).astype(np.uint8),
+        ),
     ]  # fmt: skip
 
 
@@ -161,7 +168,7 @@ def test_errors_say_what_was_expected() -> None:
     assert isinstance(births, Births)
     with pytest.raises(ValueError, match="descriptors"):
         messages.encode(replace(births, descriptor=births.descriptor[:2]))
-    tile = some_records(0, 1)[-1]
+    tile = next(r for r in some_records(0, 1) if isinstance(r, Tile))
     code = messages.encode(tile)
     with pytest.raises(WireError, match="tile"):
         messages.decode(messages.key(tile), code[:-3])

@@ -108,6 +108,9 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
     elif kind in (6, 16, 21):
         out[{6: "T_l_m", 16: "T_m_k", 21: "T_w_m"}[kind]] = s.pose()
+    elif kind == 23:
+        out["submap"] = s.varint()
+        out["T_m_k"] = s.pose()
     elif kind == 22:
         out["cell_m"] = struct.unpack("<f", s.raw(4))[0]
         inflated = zlib.decompress(s.raw(len(data) - 4), -15)
@@ -119,6 +122,7 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
             4: ("index", "u", "v", "inv_depth", "octave", "angle"),
             5: ("index", "u", "v", "inv_depth", "octave"),
             17: ("index", "inv_depth", "du", "dv"),
+            24: ("index", "u", "v", "inv_depth", "octave", "angle"),
         }.get(kind, ("index",))
         columns = dict(zip(names, s.columns(len(names), n), strict=True))
         out["index"] = columns["index"]
@@ -131,7 +135,7 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
             out["offset"] = [[u / 32, v / 32] for u, v in zip(columns["du"], columns["dv"], strict=True)]
         if "inv_depth" in columns:
             out["inv_depth"] = [inverse_depth(c) for c in columns["inv_depth"]]
-        if kind == 4:
+        if kind in (4, 24):
             out["descriptor"] = np.frombuffer(s.raw(32 * n), np.uint8).reshape(n, 32).tolist()
         if kind in (5, 18):
             out["point"] = points(s, n)

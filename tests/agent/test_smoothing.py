@@ -1,0 +1,48 @@
+"""Corrections reach the live pose at once, or no faster than asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_agent.config import SmoothingConfig
+from kiteline_agent.smoothing import Smoothing
+from kiteline_core import se3
+
+TICK_NS = 50_000_000
+
+
+def test_off_is_at_once() -> None:
+    smoothing = Smoothing(SmoothingConfig())
+    assert not smoothing.on
+    for n in range(3):
+        T = se3.exp(np.array([n, 0.0, 0.0, 0.0, 0.0, 0.1 * n]))
+        assert np.array_equal(smoothing.follow(T, np.zeros(3), n * TICK_NS), T)
+
+
+@given(st.integers(0, 1 << 30))
+def test_it_keeps_its_pace_and_arrives(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    smoothing = Smoothing(SmoothingConfig(max_m_s=0.5, max_rad_s=0.2))
+    here = rng.normal(0.0, 10.0, 3)
+    told = smoothing.follow(np.eye(4), here, 0)
+    turn = se3.exp(np.concatenate([np.zeros(3), rng.normal(0.0, 0.02, 3)]))
+    shift = se3.from_rt(np.eye(3), rng.uniform(-0.5, 0.5, 3))
+    # About the vehicle, so that the way is what was drawn.
+    about = se3.from_rt(np.eye(3), here) @ turn @ se3.from_rt(np.eye(3), -here)
+    goal = shift @ about
+    for n in range(1, 200):
+        last, told = told, smoothing.follow(goal, here, n * TICK_NS)
+        moved = np.linalg.norm(se3.transform(told, here[None]) - se3.transform(last, here[None]))
+        turned = np.linalg.norm(se3.so3_log(told[:3, :3] @ last[:3, :3].T))
+        assert moved <= 0.5 * 0.05 + 1e-9
+        assert turned <= 0.2 * 0.05 + 1e-9
+    assert np.allclose(told, goal, atol=1e-9)
+
+
+def test_another_place_is_taken_at_once() -> None:
+    smoothing = Smoothing(SmoothingConfig(max_m_s=0.5, max_rad_s=0.2))
+    smoothing.follow(np.eye(4), np.zeros(3), 0)
+    far = se3.from_rt(np.eye(3), np.array([9.0, 0.0, 0.0]))
+    assert np.array_equal(smoothing.follow(far, np.zeros(3), TICK_NS), far)

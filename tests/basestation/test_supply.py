@@ -1,0 +1,145 @@
+"""What an agent is lent: near keyframes that it lacks, of those with whom it shares, where the map has them now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.config import BaseConfig, SupplyConfig
+from kiteline_basestation.intake import Intake
+from kiteline_basestation.supply import Supply
+from kiteline_codec.channel import plain_pair
+from kiteline_codec.profiles import RADIO
+from kiteline_codec.schema import Camera, Copied, Copy, Key, Live, Record
+from kiteline_core import se3
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.sparse_map import SparseMap
+
+MakeFlight = Callable[..., Any]
+SECOND_NS = 1_000_000_000
+
+
+class Base:
+    """A map of some flights, with a supply for the first one's agent."""
+
+    def __init__(self, *flights: Any, share: str = "all", **supply: Any) -> None:
+        self.map = SparseMap()
+        intake = Intake(BaseConfig().intake, self.map)
+        for flight in flights:
+            intake.take(flight.agent, (Camera(flight.agent, flight.camera), *flight.all_records()), 0)
+        self.agent = flights[0].agent
+        config = replace(SupplyConfig(), **supply)
+        self.supply = Supply(config, replace(BaseConfig().loops, share=share), self.map)
+        self.here, self.there = plain_pair()
+        self.heard: list[Record] = []
+        self.taken_back: list[Key] = []
+        self.now_ns = 0
+
+    def serve(self, keyframe: KeyframeId, turns: int = 1) -> list[KeyframeId]:
+        """So many looks while the agent is at a keyframe; what it then holds."""
+        for _ in range(turns):
+            self.now_ns += SECOND_NS
+            live = Live(self.agent, self.now_ns, keyframe, np.eye(4), 100)
+            self.supply.serve(self.agent, live, self.here, self.now_ns)
+            self.heard += self.there.receive((), 0)
+            self.taken_back += self.there.take_removed()
+        return self.supply.lent(self.agent)
+
+
+def test_own_keyframes_come_back_where_they_are_seen_again(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=80, turns=1.25, points=1500)
+    base = Base(flight, remembered=20)
+    lent = base.serve(flight.keyframes[-1], turns=6)
+    assert lent
+    numbers = [flight.keyframes.index(k) for k in lent]
+    assert max(numbers) < 60, "the agent remembers the newest twenty itself"
+    there = [n for n in numbers if 4 <= n <= 24]  # a whole turn before the last keyframe is number 15
+    assert len(there) > 0.7 * len(numbers)
+    copies = {r.keyframe: r for r in base.heard if isinstance(r, Copy)}
+    assert set(copies) == set(lent)
+    for keyframe, copy in copies.items():
+        assert copy.submap == submap_of_keyframe(keyframe)
+        assert np.allclose(copy.T_m_k, base.map.pose(keyframe))
+
+
+def test_points_are_said_as_the_readers_camera_would_see_them(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=1.2, points=1500)
+    base = Base(flight, remembered=10)
+    camera = replace(flight.camera, fx=300.0, fy=310.0, cx=300.0, cy=200.0)
+    base.map.cameras[flight.agent] = camera  # the reader has got another camera since
+    base.serve(flight.keyframes[-1])
+    parts = [r for r in base.heard if isinstance(r, Copied)]
+    assert parts
+    for part in parts:
+        points = base.map.slots_of(part.keyframe)[part.index]
+        xyz, known = base.map.positions(points)
+        assert known.all()
+        T = base.map.world_pose(part.keyframe)
+        assert T is not None
+        local = se3.transform(se3.inverse(T), xyz)
+        assert np.allclose(part.inv_depth, 1.0 / local[:, 2], rtol=1e-5)
+        uv = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        assert np.allclose(part.uv, uv, atol=0.01)
+
+
+def test_the_number_is_bounded_and_the_farthest_go_back(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=80, turns=1.0, points=1500)
+    base = Base(flight, copies=5, remembered=1)
+    first = base.serve(flight.keyframes[10], turns=4)
+    assert len(first) == 5
+    second = base.serve(flight.keyframes[50], turns=4)  # the other side of the room
+    assert len(second) == 5
+    assert not set(first) & set(second)
+    back = {key.id for key in base.taken_back}
+    assert back == set(first)
+
+
+@pytest.mark.parametrize(("share", "expected"), [("all", True), ("0 1", True), ("none", False), ("1 2", False)])
+def test_only_who_shares_lends(make_flight: MakeFlight, share: str, expected: bool) -> None:
+    mine = make_flight(keyframes=12, turns=0.2, points=1500)
+    theirs = make_flight(keyframes=12, turns=0.2, agent=1, variant=1, points=1500)
+    base = Base(mine, theirs, share=share)
+    a, b = (submap_of_keyframe(f.keyframes[0]) for f in (mine, theirs))
+    assert not base.serve(mine.keyframes[-1]), "two maps, of which nobody knows how they lie"
+    base.map.islands[b] = a
+    lent = base.serve(mine.keyframes[-1])
+    assert bool(lent) == expected
+    assert all(agent_of_keyframe(k) == 1 for k in lent)
+
+
+def test_a_copy_moves_with_the_map_and_leaves_with_it(make_flight: MakeFlight) -> None:
+    mine = make_flight(keyframes=12, turns=0.2, points=1500)
+    theirs = make_flight(keyframes=12, turns=0.2, agent=1, variant=1, points=1500)
+    base = Base(mine, theirs)
+    a, b = (submap_of_keyframe(f.keyframes[0]) for f in (mine, theirs))
+    base.map.islands[b] = a
+    lent = base.serve(mine.keyframes[-1], turns=2)
+    base.heard.clear()
+    base.serve(mine.keyframes[-1])
+    assert not base.heard, "nothing moved"
+    base.map.move_submap(b, se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    base.serve(mine.keyframes[-1])
+    moved = {r.keyframe for r in base.heard if isinstance(r, Copy)}
+    assert moved == set(lent)
+    assert not any(isinstance(r, Copied) for r in base.heard if r.keyframe in lent)  # type: ignore[union-attr]
+    del base.map.islands[b]  # the merge is taken back
+    assert not base.serve(mine.keyframes[-1])
+    assert {key.id for key in base.taken_back} == set(lent)
+
+
+def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=1.2, points=1500)
+    base = Base(flight, remembered=10)
+    base.here.profile = RADIO  # type: ignore[misc]
+    base.serve(flight.keyframes[-1])
+    for keyframe in base.supply.lent(flight.agent):
+        parts = [r for r in base.heard if isinstance(r, Copied) and r.keyframe == keyframe]
+        assert 0 < sum(len(p.index) for p in parts) <= RADIO.copied
+    base.here.backlog_bytes = 5_000  # type: ignore[misc]
+    held = base.supply.lent(flight.agent)
+    base.serve(flight.keyframes[5], turns=3)
+    assert set(base.supply.lent(flight.agent)) <= set(held), "nothing new while corrections wait"
