@@ -188,7 +188,11 @@ class Agent:
         # Coarse images are for a track that holds: what is lost or begins needs all there is.
         first = self._config.pyramid.first if self._submaps.any and self._failures == 0 else 0
         left = rectified(frame.left, self._rectifier, 0, levels, first)
-        right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels, first)
+        right = (
+            None
+            if frame.right is None
+            else RightEye(frame.right, self._rectifier, levels, first, self.map.disparity_offset_px)
+        )
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
         self.work.frames = 1
         share = 4 if first else 1

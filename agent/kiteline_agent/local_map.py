@@ -67,6 +67,8 @@ class LocalMap:
         self.shared = np.zeros(k, np.int64)  # of each slot's births: the first so many are known to the base
         self.usable = np.zeros((k, b), np.bool_)
         self.seed = np.zeros((k, b), np.bool_)  # a bearing that waits for a depth from motion
+        self.measured = np.zeros((k, b), np.bool_)  # the depth is the pair's own, not the base's nor motion's
+        self.disparity_offset_px = 0.0  # what the pair's disparities are too large by, as far as the base knows
         self.bearing = np.zeros((k, b, 2))
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
@@ -129,6 +131,8 @@ class LocalMap:
         self.bearing[slot, :n] = self._bearings(uv[:n])
         self.rho[slot, :n] = np.where(rho[:n] > 0.0, rho[:n], 1.0 / _SEED_DEPTH_M)
         self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, sigma_rho[:n], 0.0)  # 0: not planted
+        self.measured[slot] = False
+        self.measured[slot, :n] = rho[:n] > 0.0
         self.seed[slot] = False
         self.seed[slot, :n] = rho[:n] <= 0.0
         self.octave[rows] = octave[:n]
@@ -245,9 +249,17 @@ class LocalMap:
         never = ~self.usable[slot, index] & (self.tried[slot * self.births + index] == 0)
         fresh = never | self.seed[slot, index]
         self.rho[slot, index] = record.inv_depth[keep]
+        self.measured[slot, index] = False
         self.sigma_rho[slot, index] = self._filtering.refined_sigma_px / self.camera.bf
         self.bearing[slot, index] = self._bearings(self.uv[slot, index] + record.offset[keep])
         self.ripen(slot * self.births + index[fresh])  # points that only the base could place
+
+    def calibrate(self, disparity_offset_px: float) -> None:
+        """The pair's disparities are too large by so much: depths that it measured follow."""
+        change = (disparity_offset_px - self.disparity_offset_px) / self.camera.bf
+        self.disparity_offset_px = disparity_offset_px
+        least = self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
+        self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, least)
 
     def _apply_found(self, slot: int, record: Found) -> None:
         """A birth that shows an older point leaves, where the older one is remembered."""

@@ -27,13 +27,17 @@ def rectified(image: U8, rectifier: Rectifier, eye: int, levels: int, first: int
 
 
 class RightEye:
-    """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's."""
+    """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's.
 
-    def __init__(self, image: U8, rectifier: Rectifier, levels: int, first: int) -> None:
+    offset_px: what disparities are measured too large by, as far as is known; it is taken off.
+    """
+
+    def __init__(self, image: U8, rectifier: Rectifier, levels: int, first: int, offset_px: float = 0.0) -> None:
         rectifier.check_size(image)
         self._image = image
         self._rectifier = rectifier
         self._levels, self._first = levels, first
+        self.offset_px = offset_px
         self._raw: Pyramid | None = None
         self._whole: Pyramid | None = None
 
@@ -47,7 +51,7 @@ class RightEye:
         self, left: Pyramid, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig, search_px: float,
         disparity: F64, found: NDArray[np.bool_],
     ) -> None:  # fmt: skip
-        """stereo_kernels.refine_rows, on the whole rectified image where there is one already."""
+        """stereo_kernels.refine_rows, on the whole rectified image where there is one already; of true disparities."""
         grid = self._rectifier.right_grid
         if self._whole is not None or grid is None:
             right, grid = self.whole(), _RECTIFIED
@@ -55,6 +59,9 @@ class RightEye:
             if self._raw is None:
                 self._raw = build_pyramid(self._image, self._levels)
             right = self._raw
+        wanted = disparity >= 0.0
+        disparity[wanted] = np.maximum(disparity[wanted] + self.offset_px, 0.0)
         stereo_kernels.refine_rows(
             left, right, grid, uv, octave, sure, config.iterations, search_px, config.min_ncc, disparity, found
         )
+        disparity[wanted] = np.maximum(disparity[wanted] - self.offset_px, 0.0)
