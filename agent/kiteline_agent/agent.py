@@ -31,6 +31,7 @@ from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_agent.window import Window, corners_of, with_depths, yields
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import (
+    Calibration,
     Camera,
     Copied,
     Copy,
@@ -492,6 +493,9 @@ class Agent:
                 self._placements[record.submap] = record.T_w_m
             elif isinstance(record, Copy | Copied):
                 self.window.take(record)
+            elif isinstance(record, Calibration) and self._camera.stereo:
+                self.map.calibrate(record.disparity_px)
+                self._events.append(f"disparities are {record.disparity_px:+.3f} px too large")
             elif isinstance(record, Tile):
                 self.tiles[record.column, record.row] = record
         if not touched:

@@ -20,7 +20,7 @@ from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
-from kiteline_codec.schema import Live, Placement, Record
+from kiteline_codec.schema import Calibration, Live, Placement, Record
 from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import (
@@ -98,6 +98,7 @@ class Mapper:
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
+        self._told_px: dict[AgentId, float] = {}  # offsets of disparities as agents have them
         self._calibrate_soon = False
         self._rounds = 0  # looks since the last regular one
         self._calibrate_at = 2 * self.config.disparity.every  # keyframes, when offsets of disparities are looked at
@@ -129,6 +130,7 @@ class Mapper:
             self.counts.keyframes += 1
         self._go_on_with_atlas()
         self._calibrate()
+        self._tell_calibrations()
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.atlas is not None:
             jobs += self.atlas.jobs()
@@ -338,6 +340,13 @@ class Mapper:
             elif found.sigma_px < config.settled_px and agent not in self.map.disparity_known:
                 self.map.disparity_known.add(agent)
                 self.atlas.bundle_all(island)
+
+    def _tell_calibrations(self) -> None:
+        """Agents track better on disparities without the offset that was found."""
+        for agent, offset_px in sorted(self.map.disparity_offset_px.items()):
+            if self._told_px.get(agent) != offset_px:
+                self._told_px[agent] = offset_px
+                self._publisher.send(agent, Calibration(agent, offset_px))
 
     def _place_island(self, island: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place."""

@@ -15,6 +15,7 @@ from kiteline_codec.packing import Reader, Writer, unzigzag, zigzag
 from kiteline_codec.rows import MAX_KEYFRAME_ID, read_columns, read_points, write_columns, write_points
 from kiteline_codec.schema import (
     Births,
+    Calibration,
     Camera,
     Copied,
     Copy,
@@ -127,6 +128,15 @@ def _read_live(source: Reader, key: Key) -> Live:
     if quality < -1:
         raise WireError(f"quality is -1, 0 or 1..100, found {quality}")
     return Live(AgentId(key.id), t_ns, keyframe, t_k_c, quality)
+
+
+def _write_calibration(out: Writer, record: Calibration) -> None:
+    limit = quantise.CALIBRATION_CODES // 2
+    out.signed(min(max(round(record.disparity_px * quantise.CALIBRATION_STEPS), -limit), limit))
+
+
+def _read_calibration(source: Reader, key: Key) -> Calibration:
+    return Calibration(AgentId(key.id), source.signed(quantise.CALIBRATION_CODES // 2) / quantise.CALIBRATION_STEPS)
 
 
 def _write_head(out: Writer, record: Head) -> None:
@@ -307,6 +317,7 @@ _TABLE = (
         lambda out, r: _write_pose(out, r.T_w_m),
         lambda source, key: Placement(SubmapId(key.id), _read_pose(source)),
     ),
+    _Coder(Kind.CALIBRATION, Calibration, 63, 1, _of_agent, _write_calibration, _read_calibration),
     _Coder(Kind.TILE, Tile, (1 << 2 * _TILE_BITS) - 1, 1, lambda r: (_tile_id(r),), _write_tile, _read_tile),
     _Coder(Kind.COPY, Copy, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_copy, _read_copy),
     _Coder(

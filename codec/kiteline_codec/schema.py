@@ -46,6 +46,7 @@ class Kind(IntEnum):
     TILE = 22
     COPY = 23
     COPIED = 24
+    CALIBRATION = 25
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +214,14 @@ class Copied:
     descriptor: U8
 
 
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What the base found of an agent's cameras. disparity_px: what its disparities are too large by."""
+
+    agent: AgentId
+    disparity_px: float
+
+
 Record = (
     Camera
     | Live
@@ -229,6 +238,7 @@ Record = (
     | Tile
     | Copy
     | Copied
+    | Calibration
 )
 
 

@@ -42,6 +42,7 @@ _RANKS = {
     Kind.CULLED: 1,
     Kind.PLACEMENT: 1,
     Kind.LEVEL: 1,
+    Kind.CALIBRATION: 1,
     Kind.HEAD: 2,
     Kind.BIRTHS: 3,
     Kind.SIGHTINGS: 4,  # after the births, so that the next keyframe's sightings may build upon them

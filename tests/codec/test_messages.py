@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from kiteline_codec import messages, sections
 from kiteline_codec.schema import (
     Births,
+    Calibration,
     Camera,
     Copied,
     Copy,
@@ -74,6 +75,7 @@ def some_records(seed: int, n: int) -> list[Record]:
         Removed(keyframe, index),
         Culled(keyframe, index, int(rng.integers(2))),
         Placement(submap, pose),
+        Calibration(AgentId(3), -0.0703125),
         Tile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
         Copy(keyframe, submap_id(2, 1, 7), pose),
         Copied(

@@ -1,0 +1,45 @@
+"""What the base finds of a pair's disparities: depths that the pair measured follow, what is shared stays raw."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
+from kiteline_agent.local_map import LocalMap
+from kiteline_codec.schema import Depths, Head
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+
+CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 376.0, 240.0, 0.1, True, np.eye(4))
+FIRST = keyframe_id(submap_id(AgentId(0), 0, 0), 0)
+
+
+def held_map(disparity: list[float]) -> LocalMap:
+    held = LocalMap(CAMERA, LocalMapConfig(), DepthFilterConfig())
+    n = len(disparity)
+    held.add(
+        Head(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0), np.array(disparity) / CAMERA.bf,
+        np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8),
+        np.zeros((n, 3, 21, 21), np.uint8), 0,
+    )  # fmt: skip
+    held.share(FIRST, n)
+    return held
+
+
+def test_measured_depths_follow_and_others_stay() -> None:
+    held = held_map([10.0, 8.0, 0.0])  # the last is a bearing
+    one = np.array([1], np.uint16)
+    held.apply(Depths(FIRST, one, np.array([0.2], np.float32), np.zeros((1, 2), np.float32)))
+    bearing = float(held.rho[0, 2])
+    held.calibrate(0.1)
+    assert np.allclose(held.rho[0, :3], [9.9 / CAMERA.bf, 0.2, bearing], atol=1e-7)
+    held.calibrate(-0.05)  # an offset takes the place of the one before, it does not add to it
+    assert np.isclose(held.rho[0, 0], 10.05 / CAMERA.bf)
+    held.calibrate(0.0)
+    assert np.isclose(held.rho[0, 0], 10.0 / CAMERA.bf)
+
+
+def test_far_points_stay_in_front() -> None:
+    held = held_map([0.02])
+    held.calibrate(0.3)
+    assert held.rho[0, 0] > 0.0
