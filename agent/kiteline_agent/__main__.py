@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -24,8 +25,9 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import cost_ns
 from kiteline_agent.flight_log import StepLog, write_step
+from kiteline_agent.narrator import Narrator, summary
 from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json, parser
-from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
+from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm
 from kiteline_codec import warm as codec_warm
@@ -121,7 +123,7 @@ class Onboard:
         self._told_cpu_ns = 0  # what the last frame cost: modelled in lock-step, measured in a live flight
         self._live_clock = False
         self._core = VirtualCpu(spec.cpu_percent)
-        self.estimate: Estimate | None = None  # of the last frame
+        self.output: StepOutput | None = None  # of the last step
 
     def _open(self, path: Path) -> TextIO:
         return self._files.enter_context(path.open("w", buffering=1))
@@ -178,7 +180,7 @@ class Onboard:
         """One step of the agent, logged and counted; the packets that leave for the wire."""
         begin_ns = time.process_time_ns()
         step_input = StepInput(frame, imu, tuple(packets), self._told_cpu_ns)
-        output = self.agent.step(step_input, now_ns)
+        self.output = output = self.agent.step(step_input, now_ns)
         if self._log is not None:
             write_step(self._log, step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
@@ -196,7 +198,6 @@ class Onboard:
         return sent
 
     def _record(self, output: StepOutput) -> None:
-        self.estimate = output.estimate
         self.tally.count(output.estimate)
         if output.estimate is not None and self._live is not None and self._odometry is not None:
             self._live.write(live_line(output.estimate))
@@ -343,6 +344,9 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
         if parent is not None:
             parent.tell("ready", frames=source.frame_count)
         process.notify("READY=1")
+        narrator = Narrator()
+        if parent is None:
+            _tell([f"flying {source.name}, {_link_words(spec)}"])
         begin_ns = clock.now_ns()
         onboard.begin_at(begin_ns)
         while not stop and onboard.next_ns is not None:
@@ -358,15 +362,32 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
                 frame, imu = onboard.camera.take()
             for packet in onboard.step(frame, imu, link.receive(), now_ns):
                 link.send(packet)
-            if frame is not None and sink is not None and onboard.estimate is not None:
-                e = onboard.estimate
+            e = onboard.output.estimate if onboard.output is not None else None
+            if sink is not None and e is not None:
                 sink.push(PoseSample(captured_ns, e.T_o_b, e.tracked, e.quality, spec.boot, e.cov_o), clock.now_ns())
             process.notify("WATCHDOG=1")
-            if parent is not None and onboard.tally.frames % _PROGRESS_FRAMES == 0:
+            if parent is None:
+                _tell(narrator.lines(onboard.output, onboard.tally, now_ns - begin_ns) if onboard.output else ())
+            elif onboard.tally.frames % _PROGRESS_FRAMES == 0:
                 parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
+        if parent is None:
+            _tell([f"over: {summary(onboard.tally)}"])
         _drain_live(onboard, link, clock, parent, stop)
         if parent is not None:
             parent.tell("result", report=onboard.report())
+
+
+def _tell(lines: Sequence[str]) -> None:
+    """Lines for whoever looks on; without anyone, the flight goes on all the same."""
+    try:
+        for line in lines:
+            print(line, file=sys.stderr, flush=True)
+    except OSError:
+        pass
+
+
+def _link_words(spec: AgentSpec) -> str:
+    return "without a link" if spec.link == "none" else f"the base at {spec.link}"
 
 
 def _sealed(spec: AgentSpec, link: ByteLink) -> ByteLink:
