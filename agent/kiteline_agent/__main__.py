@@ -50,6 +50,7 @@ from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, Sour
 from kiteline_hw.sealed_link import SealedLink
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
+from kiteline_hw.spill_file import SpillFile
 from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_lockstep import LockstepClient
 
@@ -257,10 +258,15 @@ def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig, cha
     }
 
 
+def _spill(spec: AgentSpec) -> SpillFile | None:
+    """Where shared values wait while the link is down: beside the log, where one is kept."""
+    return SpillFile(Path(spec.folder)) if spec.log_name else None
+
+
 def fly_lockstep(spec: AgentSpec, parent: process.Parent) -> None:
     """Fly behind the base's barrier; where the base ends, go on alone."""
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
-    onboard = Onboard(spec, source, channel_for(spec), whole_process=True)
+    onboard = Onboard(spec, source, channel_for(spec, _spill(spec)), whole_process=True)
     parent.tell("ready", frames=source.frame_count)
     line = Barrier(spec.link.removeprefix("lockstep:"), spec.agent, parent)
     try:
@@ -331,7 +337,7 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
     with ExitStack() as stack:
         stack.callback(source.close)
-        onboard = Onboard(spec, source, channel_for(spec), whole_process=True)
+        onboard = Onboard(spec, source, channel_for(spec, _spill(spec)), whole_process=True)
         stack.callback(onboard.close)
         link = open_link(spec.link, "agent", spec.agent, framer=StreamFramer, required=False)
         stack.callback(link.close)

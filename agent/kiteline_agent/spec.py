@@ -11,6 +11,7 @@ from typing import Any
 
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_codec.archive import Spill
 from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_codec.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
@@ -79,12 +80,15 @@ def _config_of(path: str) -> AgentConfig:
     return configuration.apply(AgentConfig(), section, "agent")
 
 
-def channel_for(spec: AgentSpec) -> RecordChannel:
-    """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1."""
+def channel_for(spec: AgentSpec, spill: Spill | None = None) -> RecordChannel:
+    """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1.
+
+    spill: keeps what would take too much memory while the link is down.
+    """
     if spec.link == "none":
         return AloneChannel()
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
-    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link)
+    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
 
 
 def parser() -> argparse.ArgumentParser:

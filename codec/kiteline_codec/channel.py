@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from kiteline_codec import messages
+from kiteline_codec.archive import Spill
 from kiteline_codec.pacing import Pacer
 from kiteline_codec.profiles import EXACT, PROFILES, RADIO, Profile
 from kiteline_codec.schema import Head, Key, Live, Record, WireError
@@ -105,9 +106,11 @@ def plain_pair() -> tuple[PlainChannel, PlainChannel]:
 class CodedChannel:
     """Records through the codec and an endpoint, over any link that carries packets."""
 
-    def __init__(self, config: SyncConfig, session: int, profile: Profile | None = None) -> None:
-        """profile: what to share of a keyframe; None: as the link allows."""
-        self.endpoint = Endpoint(config, session, tightener=Tightener())
+    def __init__(
+        self, config: SyncConfig, session: int, profile: Profile | None = None, spill: Spill | None = None
+    ) -> None:
+        """profile: what to share of a keyframe; None: as the link allows. spill: where old values go."""
+        self.endpoint = Endpoint(config, session, tightener=Tightener(), spill=spill)
         self.undecodable = 0  # values whose code was no valid record: the other side speaks another schema
         self._removed: list[Key] = []
         self._pacer = Pacer(profile, config.budget_bytes)
@@ -139,6 +142,9 @@ class CodedChannel:
             "profile": self._pacer.profile.name,
             "budget_bytes_s": stats.budget_bytes,
             "backlog_bytes": stats.backlog_bytes,
+            "outbox_bytes": stats.resident_bytes,
+            "archived": stats.archived,
+            "given_up": stats.dropped,
             "rtt_ms": stats.rtt_ns // 1_000_000,
             "packets_sent": stats.packets_sent,
             "packets_lost": stats.lost,
@@ -199,13 +205,22 @@ class CodedChannel:
 # What a link adds to a packet: IPv4 and UDP; frames of a serial line; four pieces in MAVLink's TUNNEL.
 _LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
 _RADIOS = ("serial", "mavlink")
+_SPILLED_BYTES = 3 << 20  # of memory for values of keyframes: some two hundred of them, and more than a local map holds
+_UNSPILLED_BYTES = 12 << 20  # the same where old values are lost: ten minutes without a link
 
 
 def coded_channel(
-    session: int, budget_bytes: int = 0, profile: str = "", seal_bytes: int = 0, link: str = ""
+    session: int,
+    budget_bytes: int = 0,
+    profile: str = "",
+    seal_bytes: int = 0,
+    link: str = "",
+    spill: Spill | None = None,
+    bounded: bool = False,
 ) -> CodedChannel:
     """One end of a channel over a link. budget_bytes: on the wire in any second, 0 any number. profile: wifi, radio, or
-    "" as the link allows. seal_bytes: what sealing adds to a packet. link: its name, LINK. Raises ValueError.
+    "" as the link allows. seal_bytes: what sealing adds to a packet. link: its name, LINK. bounded: whether values of
+    keyframes may take only so much memory, and then go to `spill`. Raises ValueError.
     """
     kind = link.partition(":")[0]
     if not profile and kind in _RADIOS:
@@ -219,5 +234,6 @@ def coded_channel(
         overhead_bytes=_LINK_BYTES.get(kind, shape.overhead_bytes) + seal_bytes,
         budget_bytes=budget_bytes,
         heartbeat_ns=shape.heartbeat_ns,
+        resident_bytes=0 if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
     )
-    return CodedChannel(config, session, named)
+    return CodedChannel(config, session, named, spill)

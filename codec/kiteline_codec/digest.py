@@ -13,7 +13,7 @@ from kiteline_codec.packing import Writer
 from kiteline_codec.schema import Key
 
 DIGEST_BYTES = 16
-_MODULUS = 1 << 8 * DIGEST_BYTES
+MODULUS = 1 << 8 * DIGEST_BYTES
 
 
 def hash_value(key: Key, version: int, code: bytes) -> int:
@@ -35,11 +35,19 @@ class Digest:
 
     def add(self, key: Key, version: int, code: bytes) -> None:
         """A value joins the set."""
-        self._sum = (self._sum + hash_value(key, version, code)) % _MODULUS
+        self._sum = (self._sum + hash_value(key, version, code)) % MODULUS
 
     def discard(self, key: Key, version: int, code: bytes) -> None:
         """A value that is in the set leaves it."""
-        self._sum = (self._sum - hash_value(key, version, code)) % _MODULUS
+        self._sum = (self._sum - hash_value(key, version, code)) % MODULUS
+
+    def join(self, hashes: int) -> None:
+        """Values whose hashes have this sum join the set."""
+        self._sum = (self._sum + hashes) % MODULUS
+
+    def leave(self, hashes: int) -> None:
+        """Values whose hashes have this sum leave the set."""
+        self._sum = (self._sum - hashes) % MODULUS
 
     def bytes(self) -> bytes:
         """The digest, 16 bytes."""

@@ -7,16 +7,15 @@ newest version. Nothing is queued, so nothing grows old in a queue. Packets are 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from kiteline_codec.archive import Spill
 from kiteline_codec.budget import SlidingBudget
+from kiteline_codec.entries import Order
 from kiteline_codec.inbox import Inbox, Update
-from kiteline_codec.outbox import Known, Order, Outbox
+from kiteline_codec.outbox import Known, Outbox
 from kiteline_codec.packet import (
     CRC_BYTES,
-    MAX_HEADER_BYTES,
-    MAX_ITEM_BYTES,
     MAX_KIND,
     Header,
     Item,
@@ -26,120 +25,29 @@ from kiteline_codec.packet import (
     write_header,
 )
 from kiteline_codec.packing import Writer
-from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.schema import Key, WireError
+from kiteline_codec.sync_config import MIN_PACKET_BYTES, SyncConfig, SyncStats, default_order
 from kiteline_codec.throughput import Throughput
 from kiteline_codec.tight import BASIS_KINDS, Tightener
 
 __all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
 
-_RANKS = {
-    Kind.LIVE: 0,
-    Kind.CAMERA: 0,  # nothing can be made of keypoints without it
-    Kind.POSE: 1,
-    Kind.DEPTHS: 1,
-    Kind.FOUND: 1,
-    Kind.REMOVED: 1,
-    Kind.CULLED: 1,
-    Kind.PLACEMENT: 1,
-    Kind.LEVEL: 1,
-    Kind.CALIBRATION: 1,
-    Kind.HEAD: 2,
-    Kind.BIRTHS: 3,
-    Kind.SIGHTINGS: 4,  # after the births, so that the next keyframe's sightings may build upon them
-    Kind.COPY: 5,
-    Kind.COPIED: 5,
-    Kind.TILE: 6,
-}
-_FIRST_PARTS = 4  # births: what makes a keyframe useful where a thin link has them short
-_RANK_OTHER_PARTS = 5
-_RANK_UNKNOWN = 6
-_MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
-
-
-def default_order(key: Key) -> Order:
-    """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
-    rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
-    if key.part >= (_FIRST_PARTS if key.kind == Kind.BIRTHS else 1):
-        rank = max(rank, _RANK_OTHER_PARTS)
-    return (rank, -key.id, key.part)
-
-
-@dataclass(frozen=True, slots=True)
-class SyncConfig:
-    """How an endpoint uses its link."""
-
-    packet_bytes: int = 1200  # largest packet: fits an Ethernet frame inside any tunnel; a MAVLink tunnel wants 128
-    overhead_bytes: int = 28  # a packet costs on the wire beyond its own bytes: IPv4 and UDP
-    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
-    window_packets: int = 64  # on their way at once: what one acknowledgement can tell of
-    ack_delay_ns: int = 20_000_000  # waiting a little lets an acknowledgement ride on a packet with values
-    ack_packets: int = 16  # acknowledge at once after so many: well inside the window
-    reorder_packets: int = (
-        3  # overtaken by so many, a packet that took longer than a round trip and 2 deviations is lost (as RFC 9002)
-    )
-    first_rto_ns: int = 500_000_000  # patience before any round trip has been measured
-    min_rto_ns: int = 100_000_000  # an idle process may take so long to answer
-    max_rto_ns: int = 2_000_000_000  # a link that comes back is found again within this time
-    hello_ns: int = 250_000_000  # between greetings while the peer is unknown
-    heartbeat_ns: int = 1_000_000_000  # longest silence while the peer is known
-    oldest_every: int = 8  # every eighth packet begins with the value that has waited longest, so that none starves
-    max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
-    max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
-    max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
-    order: Callable[[Key], Order] = default_order
-
-    def __post_init__(self) -> None:
-        if not _MIN_PACKET_BYTES <= self.packet_bytes <= 1 << 16:
-            raise ValueError(f"packet_bytes is {self.packet_bytes}, expected {_MIN_PACKET_BYTES}..65536")
-        least = 2 * (_MIN_PACKET_BYTES + self.overhead_bytes)
-        if self.budget_bytes and self.budget_bytes < least:
-            raise ValueError(f"budget_bytes is {self.budget_bytes}, expected 0 (unlimited) or at least {least}")
-
-    @property
-    def filled_bytes(self) -> int:
-        """How long packets are made: within a tight budget no longer than a quarter of it, or the pose would wait."""
-        if not self.budget_bytes:
-            return self.packet_bytes
-        return max(_MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 4 - self.overhead_bytes))
-
-    @property
-    def burst_bytes(self) -> int:
-        """How many bytes may leave at once: a packet, and what adds up between two frames at 10 Hz."""
-        return max(self.filled_bytes + self.overhead_bytes, self.budget_bytes // 8)
-
-
-@dataclass(frozen=True, slots=True)
-class SyncStats:
-    """Numbers of an endpoint since its start. Bytes are those on the wire, overhead included."""
-
-    bytes_sent: int
-    packets_sent: int
-    bytes_received: int
-    packets_received: int
-    lost: int  # packets taken for lost
-    duplicates: int  # packets received again, or too late
-    rejected: int
-    reasons: tuple[tuple[str, int], ...]  # why packets were rejected, how many
-    rtt_ns: int  # smoothed round trip; 0 before the first
-    dirty: int  # values that the peer is not known to hold
-    in_flight: int  # packets
-    values: int  # that the peer's session wrote
-    legacy: int  # that earlier sessions of the peer wrote and its present one has not replaced
-    peer_session: int  # 0: no peer has been heard
-    restarts: int  # of the peer, noticed
-    mismatches: int  # digests that differed: a defect, mended by sending everything again
-    backlog_bytes: int = 0  # of values that the peer is not known to hold
-    throughput_bytes_s: int = 0  # what the link delivered lately while values waited; 0: nothing had to wait
-    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
-
 
 class Endpoint:
     """One end of a relation between two sessions. Pure: time and packets are handed in, packets are handed out."""
 
-    def __init__(self, config: SyncConfig, session: int, name: str = "", tightener: Tightener | None = None) -> None:
+    def __init__(
+        self,
+        config: SyncConfig,
+        session: int,
+        name: str = "",
+        tightener: Tightener | None = None,
+        spill: Spill | None = None,
+    ) -> None:
         """A session number must be above 0 and larger than that of any earlier endpoint in this place.
 
-        tightener: makes values shorter on the wire. Both ends of a relation have one, or none.
+        tightener: makes values shorter on the wire. Both ends of a relation have one, or none. spill: where values of
+        keyframes go beyond `resident_bytes`; without one those that the peer holds are forgotten, others given up.
         """
         if not 0 < session < 1 << 56:
             raise ValueError(f"session is {session}, expected 1..2^56-1")
@@ -147,7 +55,10 @@ class Endpoint:
         self.session = session
         self.name = name
         self._tightener = tightener
-        self._out = Outbox(config.filled_bytes, config.oldest_every, self._shrink if tightener else None, BASIS_KINDS)
+        self._out = Outbox(
+            config.order, config.oldest_every, self._shrink if tightener else None, BASIS_KINDS, config.resident_bytes,
+            spill,
+        )  # fmt: skip
         self._in = Inbox()
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self._peer = 0
@@ -228,11 +139,13 @@ class Endpoint:
     def stats(self) -> SyncStats:
         """A snapshot of the numbers."""
         reasons = tuple(sorted(self._reasons.items()))
+        out, flights = self._out, self._out.flights
         return SyncStats(
-            self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, self._out.lost,
-            self._duplicates, sum(n for _, n in reasons), reasons, self._rtt_ns, self._out.pending,
-            self._out.in_flight, len(self._in.values), len(self._legacy), self._peer, self._restarts, self._mismatches,
-            self.backlog_bytes, self.throughput_bytes_s or 0, self.config.budget_bytes,
+            self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, flights.lost,
+            self._duplicates, sum(n for _, n in reasons), reasons, self._rtt_ns, out.pending, flights.in_flight,
+            len(self._in.values), len(self._legacy), self._peer, self._restarts, self._mismatches, self.backlog_bytes,
+            out.resident_bytes, out.archive.values, out.dropped, self.throughput_bytes_s or 0,
+            self.config.budget_bytes,
         )  # fmt: skip
 
     @property
@@ -341,9 +254,9 @@ class Endpoint:
 
     def _take_control(self, header: Header, now_ns: int) -> None:
         if header.ack is not None:
-            before = self._out.acked_bytes
+            before = self._out.flights.acked_bytes
             sent_ns, number = self._out.acknowledge(*header.ack)
-            self._throughput.acked(self._out.acked_bytes - before, now_ns)
+            self._throughput.acked(self._out.flights.acked_bytes - before, now_ns)
             if number:
                 self._measure(now_ns - sent_ns)
                 self._backoff = 0
@@ -357,7 +270,7 @@ class Endpoint:
         if header.resync is not None and header.resync <= self._out.newest:
             if header.resync > self._last_void:
                 self._last_void = self._out.renumber()
-                self._reset = (self._last_void, self._out.next_number)
+                self._reset = (self._last_void, self._out.flights.next_number)
                 self._peer_verified = -1
 
     def _void(self, reset: int | None) -> list[Update]:
@@ -410,7 +323,11 @@ class Endpoint:
         if self._out.give_up(now_ns - self._rto_ns):
             self._backoff = min(self._backoff + 1, 6)
         left = self._budget.left(now_ns) - c.overhead_bytes
-        if self._peer and self._out.window_open(max(1, c.window_packets >> self._backoff)) and self._out.has_work():
+        if (
+            self._peer
+            and self._out.flights.window_open(max(1, c.window_packets >> self._backoff))
+            and self._out.has_work()
+        ):
             if left < c.filled_bytes:
                 return None
             return self._packet(now_ns, values=True, digest=False)
@@ -419,7 +336,7 @@ class Endpoint:
         digest = self._digest_due(now_ns)
         if not (owed or digest or silent_ns >= (c.heartbeat_ns if self._peer else c.hello_ns)):
             return None
-        if left < _MIN_PACKET_BYTES:
+        if left < MIN_PACKET_BYTES:
             return None
         return self._packet(now_ns, values=False, digest=digest)
 
@@ -442,7 +359,7 @@ class Endpoint:
             self._verified if self._verified >= 0 else None,
             self._resync if self._resync >= 0 else None,
             self._reset[0] if self._reset is not None else None,
-            (out.next_number, watermark) if values else None,
+            (out.flights.next_number, watermark) if values else None,
         )
         data = Writer()
         write_header(data, header)

@@ -20,6 +20,7 @@ from kiteline_basestation.spec import BaseSpec
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_hw.lockstep_messages import Down, Phase
 from kiteline_hw.ports import FrameSource, LinkError
+from kiteline_hw.spill_file import SpillFile
 from kiteline_lab.children import Crew, Event, ended_by
 from kiteline_lab.progress import Progress
 
@@ -69,7 +70,9 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
         if mode == "monolith":
             ours[spec.agent], theirs[spec.agent] = plain_pair()
         elif mode == "local":
-            ours[spec.agent] = coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile)
+            ours[spec.agent] = coded_channel(
+                spec.boot + 1, spec.up_bytes_s, spec.profile, spill=SpillFile(Path(spec.folder)), bounded=True
+            )
         else:
             ours[spec.agent] = AloneChannel()
     with contextlib.ExitStack() as stack:

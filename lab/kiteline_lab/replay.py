@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -37,6 +38,7 @@ from kiteline_hw.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader,
 from kiteline_hw.mcap_mend import MENDED
 from kiteline_hw.ports import SourceError
 from kiteline_hw.rig_json import rig_from_json
+from kiteline_hw.spill_file import SpillFile
 from kiteline_hw.words import shipped_words
 from kiteline_lab.progress import Progress
 
@@ -103,7 +105,8 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
         raise SourceError("this is a monolith's log: what its base handed over was no packet, and is not in it")
     channel: RecordChannel = AloneChannel()
     if kind == "CodedChannel":
-        channel = _channel(spec, spec["boot"] + 1, spec["up_bytes_s"])
+        spill = SpillFile(Path(tempfile.gettempdir())) if spec["log_name"] else None
+        channel = _channel(spec, spec["boot"] + 1, spec["up_bytes_s"], spill, bounded=True)
     agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_words())
     out = Replayed()
     for step in steps(log):
@@ -144,11 +147,13 @@ def _imu(step: Step) -> ImuBatch:
     return batches[0].imu()
 
 
-def _channel(spec: dict[str, Any], session: int, budget_bytes: int) -> RecordChannel:
+def _channel(
+    spec: dict[str, Any], session: int, budget_bytes: int, spill: SpillFile | None = None, bounded: bool = False
+) -> RecordChannel:
     """One end of the codec as it was in flight."""
     link = spec.get("link", "")
     sealed = seal_bytes(suite_for(link + ":")) if spec.get("key") else 0
-    return coded_channel(session, budget_bytes, spec.get("profile", ""), sealed, link)
+    return coded_channel(session, budget_bytes, spec.get("profile", ""), sealed, link, spill, bounded)
 
 
 def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first: bool = True) -> Replayed:
@@ -194,7 +199,8 @@ def _compare_packets(out: Replayed, step: Step, topic: str, made: tuple[bytes, .
 def _spec(log: LogReader) -> dict[str, Any]:
     known: dict[str, Any] = {}
     if log.metadata.get("role") == "agent":
-        known = {"up_bytes_s": AgentSpec.__dataclass_fields__["up_bytes_s"].default}
+        fields = AgentSpec.__dataclass_fields__
+        known = {name: fields[name].default for name in ("up_bytes_s", "log_name")}
     elif log.metadata.get("role") == "base":
         known = {"down_bytes_s": BaseSpec.__dataclass_fields__["down_bytes_s"].default}
     else:

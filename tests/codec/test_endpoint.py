@@ -359,7 +359,7 @@ def test_memory_is_bounded_while_there_is_no_peer() -> None:
         a.poll(i * MS)
     out = a._out
     assert len(out) == 1
-    assert max(len(out._queue), len(out._oldest), len(out._versions), len(out._flights)) <= 70
+    assert max(len(out._waiting), len(out.flights)) <= 70
 
 
 def test_a_peer_that_sends_too_much_is_refused() -> None:

@@ -1,0 +1,35 @@
+"""Bytes that wait on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kiteline_hw.spill_file import SpillFile
+
+
+def test_what_was_put_is_there_and_leaves_no_file(tmp_path: Path) -> None:
+    spill = SpillFile(tmp_path / "agent0")
+    places = [spill.put(bytes([i]) * (100 * i)) for i in range(5)]
+    for i, where in reversed(list(enumerate(places))):
+        assert where is not None
+        assert spill.get(where, 100 * i) == bytes([i]) * (100 * i)
+    assert list((tmp_path / "agent0").iterdir()) == []
+    assert spill.get(10**6, 4) is None
+    assert spill.failures == 1
+    spill.close()
+    spill.close()
+    assert spill.put(b"late") is None
+    assert spill.get(0, 0) is None
+
+
+def test_a_folder_that_takes_no_files_is_no_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    spill = SpillFile(tmp_path / "file" / "agent0")
+    assert spill.put(b"x") is None
+    assert spill.failures == 1
+    full = SpillFile(tmp_path)
+    full._file = (tmp_path / "read_only").open("wb", buffering=0)
+    full._file.close()
+    full._file = (tmp_path / "read_only").open("rb", buffering=0)
+    assert full.put(b"x") is None
+    assert full.failures == 1
