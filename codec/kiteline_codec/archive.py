@@ -61,7 +61,7 @@ class _Page:
 
 
 class Archive:
-    """Pages by id. `spill`: where codes go; without one only pages that the peer holds are taken, and forgotten."""
+    """Pages by id. spill: where codes go; without one, or where it fails, only pages that the peer holds are taken."""
 
     def __init__(self, spill: Spill | None) -> None:
         self._spill = spill
@@ -93,14 +93,14 @@ class Archive:
         return page is not None and page.where != _NOWHERE
 
     def put(self, id_: int, rows: Iterable[Row], hashes: int) -> bool:
-        """Take over the values of an id, codes included. Returns False where they cannot be kept: they stay outside."""
+        """Take over the values of an id. Returns False where codes that the peer lacks cannot be kept."""
         rows = sorted(rows, key=lambda r: (r.kind, r.part))
         dirty = [r.version for r in rows if not r.clean]
-        if self._spill is None and dirty:
-            return False
-        where = _NOWHERE if self._spill is None else self._write(self._spill, id_, rows)
+        where = None if self._spill is None else self._write(self._spill, id_, rows)
         if where is None:
-            return False
+            if dirty:
+                return False
+            where = _NOWHERE
         packed = b"".join(
             _ROW.pack(r.kind, r.part, r.version, r.size, r.clean * _CLEAN | r.sent * _SENT | r.plain * _PLAIN)
             for r in rows

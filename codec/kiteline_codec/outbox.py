@@ -75,7 +75,7 @@ class Outbox:
         return not self.pending
 
     def codes(self) -> dict[Key, bytes]:
-        """The newest code of each value that was not removed, by key, as far as they are kept."""
+        """The newest code of each value that was not removed, as far as they are kept."""
         for id_ in [i for i in self.archive if self.archive.readable(i)]:
             self._fetch(id_)
         return {key: entry.code for key, entry in self._entries.items() if entry.code is not None}
@@ -287,12 +287,15 @@ class Outbox:
 
     def _top(self) -> Key | None:
         key = self._waiting.top()
-        for _ in range(_FETCHED if key is None else 0):
+        if key is not None or self.archive.newest_dirty() is None:
+            return key
+        if self.resident_bytes > self._limit_bytes:
+            self._make_room()
+        for _ in range(_FETCHED):
             id_ = self.archive.newest_dirty()
-            if id_ is None:
-                break
-            self._fetch(id_)
-        return self._waiting.top() if key is None else key
+            if id_ is not None:
+                self._fetch(id_)
+        return self._waiting.top()
 
     def _oldest(self) -> Key | None:
         """The value that has waited longest, or one of the archive: what went there waits longer than what is here."""

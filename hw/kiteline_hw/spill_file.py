@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
-from typing import IO
+
+_CLOSED = -1
 
 
 class SpillFile:
@@ -13,23 +15,20 @@ class SpillFile:
     def __init__(self, folder: Path) -> None:
         self.failures = 0
         self._size = 0
-        self._file: IO[bytes] | None = None
+        self._file = _CLOSED
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 - closed by `close`, or with the process
+            self._file, name = tempfile.mkstemp(dir=folder)
+            os.unlink(name)
         except OSError:
             self.failures += 1
 
     def put(self, data: bytes) -> int | None:
         """Keep bytes. Returns where they stand; None when the disk does not take them."""
-        if self._file is None:
-            return None
         where = self._size
         try:
-            self._file.seek(where)
-            if self._file.write(data) != len(data):
-                self.failures += 1
-                return None
+            if self._file == _CLOSED or os.pwrite(self._file, data, where) != len(data):
+                raise OSError
         except OSError:
             self.failures += 1
             return None
@@ -38,20 +37,20 @@ class SpillFile:
 
     def get(self, where: int, n_bytes: int) -> bytes | None:
         """The bytes that stand there; None when the disk does not give them."""
-        if self._file is None:
-            return None
         try:
-            self._file.seek(where)
-            data = self._file.read(n_bytes)
+            data = os.pread(self._file, n_bytes, where) if self._file != _CLOSED else b""
         except OSError:
             data = b""
-        if len(data) == n_bytes:
+        if self._file != _CLOSED and len(data) == n_bytes:
             return data
         self.failures += 1
         return None
 
     def close(self) -> None:
         """Give the disk back. May be called twice."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        if self._file != _CLOSED:
+            os.close(self._file)
+            self._file = _CLOSED
+
+    def __del__(self) -> None:
+        self.close()

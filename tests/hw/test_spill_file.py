@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from kiteline_hw.spill_file import SpillFile
@@ -26,10 +27,10 @@ def test_a_folder_that_takes_no_files_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     spill = SpillFile(tmp_path / "file" / "agent0")
     assert spill.put(b"x") is None
-    assert spill.failures == 1
-    full = SpillFile(tmp_path)
-    full._file = (tmp_path / "read_only").open("wb", buffering=0)
-    full._file.close()
-    full._file = (tmp_path / "read_only").open("rb", buffering=0)
-    assert full.put(b"x") is None
-    assert full.failures == 1
+    assert spill.failures == 2
+    gone = SpillFile(tmp_path)
+    os.close(gone._file)
+    assert gone.put(b"x") is None
+    assert gone.get(0, 1) is None
+    assert gone.failures == 2
+    gone._file = -1
