@@ -3,6 +3,9 @@
 Inverse-compositional Lucas-Kanade over position, invariant to gain and offset of brightness (S. Baker, I. Matthews,
 "Lucas-Kanade 20 years on", 2004): the template's gradients are made orthogonal to the template and to a constant, so
 both drop out of the normal equations. Templates are warped by the affine map that the predicted pose gives.
+
+All sums over patches are sums of integers (values to 1/16 of a grey level, positions to 1/128 px): they come out the
+same in any order, so that the compiler may make vectors of them.
 """
 
 from __future__ import annotations
@@ -15,6 +18,9 @@ PATCH_RADIUS = 4  # a patch is 9x9 px of the level at which it is compared
 PATCH = 2 * PATCH_RADIUS + 1
 TEMPLATE_RADIUS = 10  # a template is 21x21 px: room for a 9x9 patch turned by 45 degrees and scaled by 1.5
 TEMPLATE = 2 * TEMPLATE_RADIUS + 1
+STRIDE = 16  # of a patch's rows, 9 pixels and as many others as fill whole vectors
+LANES = PATCH * STRIDE
+GREY = 16  # steps a grey level: patches are integers, whose sums are exact in any order and so become vectors
 TEMPLATE_LEVELS = 3  # octave of the corner, and two coarser ones for convergence
 
 
@@ -81,75 +87,107 @@ def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-de
 
 
 @njit
-def warp_template(template, w00, w01, w10, w11, reference, gx, gy):  # type: ignore[no-untyped-def]
-    """Sample the warped template and its gradients. Returns False where the warp leaves the template."""
+def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-untyped-def]
+    """Sample the warped template. Returns False where the warp leaves it.
+
+    template: (21,21) uint8. reference: (11,STRIDE) int16 in 1/GREY grey levels, out. In 1/128 px.
+    """
     n = PATCH + 2
     reach = (PATCH_RADIUS + 1.0) * (abs(w00) + abs(w01))
     reach = max(reach, (PATCH_RADIUS + 1.0) * (abs(w10) + abs(w11)))
-    if reach >= TEMPLATE_RADIUS - 0.001:
+    if reach >= TEMPLATE_RADIUS - 0.01:
         return False
+    half = PATCH_RADIUS + 1
+    step_x = int(w00 * 65536.0)
+    step_y = int(w10 * 65536.0)
     for r in range(n):
-        dy = r - PATCH_RADIUS - 1.0
+        x = int((TEMPLATE_RADIUS - half * w00 + (r - half) * w01) * 65536.0) + 256
+        y = int((TEMPLATE_RADIUS - half * w10 + (r - half) * w11) * 65536.0) + 256
         for c in range(n):
-            dx = c - PATCH_RADIUS - 1.0
-            reference[r, c] = sample(
-                template, TEMPLATE_RADIUS + w00 * dx + w01 * dy, TEMPLATE_RADIUS + w10 * dx + w11 * dy
-            )
-    for r in range(PATCH):
-        for c in range(PATCH):
-            gx[r, c] = 0.5 * (reference[r + 1, c + 2] - reference[r + 1, c])
-            gy[r, c] = 0.5 * (reference[r + 2, c + 1] - reference[r, c + 1])
+            x0 = np.uint64(x >> 16)
+            y0 = np.uint64(y >> 16)
+            fx = (x >> 9) & 127
+            fy = (y >> 9) & 127
+            a = int(template[y0, x0])
+            b = int(template[y0 + np.uint64(1), x0])
+            top = (a << 7) + fx * (int(template[y0, x0 + np.uint64(1)]) - a)
+            bottom = (b << 7) + fx * (int(template[y0 + np.uint64(1), x0 + np.uint64(1)]) - b)
+            reference[r, c] = ((top << 7) + fy * (bottom - top) + 512) >> 10
+            x += step_x
+            y += step_y
     return True
 
 
 @njit
-def _prepare(reference, gx, gy, t0):  # type: ignore[no-untyped-def]
-    """Zero-mean template t0 and gradients orthogonal to it and to a constant. Returns (sum t0^2, h00, h01, h11)."""
-    count = PATCH * PATCH
-    mean = 0.0
-    mx = 0.0
-    my = 0.0
-    for r in range(PATCH):
-        for c in range(PATCH):
-            mean += reference[r + 1, c + 1]
-            mx += gx[r, c]
-            my += gy[r, c]
-    mean /= count
-    mx /= count
-    my /= count
-    tt = 1e-9
-    tx = 0.0
-    ty = 0.0
-    for r in range(PATCH):
-        for c in range(PATCH):
-            t = reference[r + 1, c + 1] - mean
-            t0[r, c] = t
-            gx[r, c] -= mx
-            gy[r, c] -= my
-            tt += t * t
-            tx += t * gx[r, c]
-            ty += t * gy[r, c]
-    h00 = 0.0
-    h01 = 0.0
-    h11 = 0.0
-    for r in range(PATCH):
-        for c in range(PATCH):
-            a = gx[r, c] - tx / tt * t0[r, c]
-            b = gy[r, c] - ty / tt * t0[r, c]
-            gx[r, c] = a
-            gy[r, c] = b
-            h00 += a * a
-            h01 += a * b
-            h11 += b * b
-    return tt, h00, h01, h11
+def _spread_out(reference, patches):  # type: ignore[no-untyped-def]
+    """The template (row 1 of patches) and its gradients along x (2) and y (3), twice in the same unit."""
+    grey = reference.reshape(-1)
+    for k in range(LANES - 2):
+        j = np.uint64(k)
+        used = patches[4, j]
+        patches[1, j] = grey[np.uint64(k + STRIDE + 1)] * used
+        patches[2, j] = (grey[np.uint64(k + STRIDE + 2)] - grey[np.uint64(k + STRIDE)]) * used
+        patches[3, j] = (grey[np.uint64(k + 2 * STRIDE + 1)] - grey[np.uint64(k + 1)]) * used
 
 
 @njit
-def _iterate(image, t0, gx, gy, tt, h00, h01, h11, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
-    """Move (x, y) until the patch there looks like t0. Returns (x, y, ncc, whether it stayed inside)."""
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    """Sum of products of two rows (LANES,) int16; 81 products of 12 and 13 bits fit into 31."""
+    total = np.int32(0)
+    for k in range(LANES):
+        j = np.uint64(k)
+        total = np.int32(total + np.int32(a[j]) * np.int32(b[j]))
+    return total
+
+
+@njit
+def _look(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
+    """The patch around (x, y) of an image, in 1/GREY grey levels, in 1/128 px.
+
+    raw: (PATCH + 1, STRIDE) uint8. across: as many int16, for the rows interpolated along x. seen: (LANES,) int16, out.
+    Beside a patch's 9 columns stands anything.
+    """
+    x0 = int(x)
+    y0 = int(y)
+    fx = np.int32((x - x0) * 128.0 + 0.5)
+    fy = np.int32((y - y0) * 128.0 + 0.5)
+    for r in range(PATCH + 1):
+        row = np.uint64(y0 + r - PATCH_RADIUS)
+        for c in range(PATCH + 1):
+            raw[r * STRIDE + c] = image[row, np.uint64(x0 + c - PATCH_RADIUS)]
+    for k in range(LANES + STRIDE - 1):
+        j = np.uint64(k)
+        a = np.int32(raw[j])
+        across[j] = np.int16((a << 7) + fx * (np.int32(raw[np.uint64(k + 1)]) - a))
+    for k in range(LANES - 1):
+        j = np.uint64(k)
+        a = np.int32(across[j])
+        seen[j] = np.int32((a << 7) + (np.int32(across[np.uint64(k + STRIDE)]) - a) * fy + 512) >> 10
+
+
+@njit
+def _settle(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
+    """Move (x, y) until the patch there looks like the template. Returns (x, y, ncc, whether it stayed inside).
+
+    patches: (5, LANES) int16: the patch as seen (filled here), the template, its gradients, see _spread_out, and ones.
+    The gradients that count are those made orthogonal to the template and to a constant: their sums follow from the
+    sums over the plain ones, which are exact.
+    """
     h, w = image.shape
+    seen, t, gx, gy, ones = patches[0], patches[1], patches[2], patches[3], patches[4]
+    count = float(PATCH * PATCH)
+    mean = _dot(t, ones) / count
+    mean_x = _dot(gx, ones) / count
+    mean_y = _dot(gy, ones) / count
+    tt = _dot(t, t) - count * mean * mean + 1e-9
+    share_x = (_dot(t, gx) - count * mean * mean_x) / tt
+    share_y = (_dot(t, gy) - count * mean * mean_y) / tt
+    h00 = _dot(gx, gx) - count * mean_x * mean_x - share_x * share_x * tt
+    h01 = _dot(gx, gy) - count * mean_x * mean_y - share_x * share_y * tt
+    h11 = _dot(gy, gy) - count * mean_y * mean_y - share_y * share_y * tt
     det = h00 * h11 - h01 * h01
-    if det < 1e-3 * (h00 + h11) ** 2 * 0.25 or h00 + h11 < 1.0:
+    # The gradients are twice the slope: hence 2 GREY to the square, and a factor 2 in each step.
+    if det < 1e-3 * (h00 + h11) ** 2 * 0.25 or h00 + h11 < 4.0 * GREY * GREY:
         return x, y, 0.0, False
     start_x = x
     start_y = y
@@ -158,43 +196,22 @@ def _iterate(image, t0, gx, gy, tt, h00, h01, h11, x, y, iterations, max_step): 
     for k in range(iterations + 1):
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             return x, y, 0.0, False
-        x0 = int(x)
-        y0 = int(y)
-        fx = x - x0
-        fy = y - y0
-        w00 = (1.0 - fx) * (1.0 - fy)
-        w01 = fx * (1.0 - fy)
-        w10 = (1.0 - fx) * fy
-        w11 = fx * fy
-        si = 0.0
-        sii = 0.0
-        st = 0.0
-        sx = 0.0
-        sy = 0.0
-        for r in range(PATCH):
-            row = y0 + r - PATCH_RADIUS
-            for c in range(PATCH):
-                col = x0 + c - PATCH_RADIUS
-                v = (
-                    w00 * image[row, col]
-                    + w01 * image[row, col + 1]
-                    + w10 * image[row + 1, col]
-                    + w11 * image[row + 1, col + 1]
-                )
-                si += v
-                sii += v * v
-                st += v * t0[r, c]
-                sx += v * gx[r, c]
-                sy += v * gy[r, c]
-        spread = sii - si * si / (PATCH * PATCH)
-        ncc = st / np.sqrt(tt * max(spread, 1e-9))
+        _look(image, x, y, raw, across, seen)
+        total = float(_dot(seen, ones))
+        st = _dot(seen, t) - mean * total
         gain = st / tt
         if gain < 0.1:
-            return x, y, ncc, False
+            return x, y, 0.0, False
         if converged or k == iterations:
+            for j in range(LANES):
+                seen[j] *= ones[j]
+            spread = _dot(seen, seen) - total * total / count
+            ncc = st / np.sqrt(tt * max(spread, 1e-9))
             break
-        dx = -(h11 * sx - h01 * sy) / (det * gain)
-        dy = -(h00 * sy - h01 * sx) / (det * gain)
+        sx = _dot(seen, gx) - mean_x * total - share_x * st
+        sy = _dot(seen, gy) - mean_y * total - share_y * st
+        dx = -2.0 * (h11 * sx - h01 * sy) / (det * gain)
+        dy = -2.0 * (h00 * sy - h01 * sx) / (det * gain)
         norm = np.sqrt(dx * dx + dy * dy)
         if norm > 2.0:  # beyond the patch's linear range: go only part of the way
             dx *= 2.0 / norm
@@ -218,10 +235,11 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
     max_step_px: how far a level may move the patch, in px of that level. found: (n,) bool out. ncc: (n,) float64 out.
     """
     levels = len(pyramid)
-    reference = np.empty((PATCH + 2, PATCH + 2))
-    gx = np.empty((PATCH, PATCH))
-    gy = np.empty((PATCH, PATCH))
-    t0 = np.empty((PATCH, PATCH))
+    reference = np.zeros((PATCH + 2, STRIDE), np.int16)
+    raw = np.zeros(LANES + STRIDE, np.uint8)
+    across = np.zeros(LANES + STRIDE, np.int16)
+    patches = np.zeros((5, LANES), np.int16)
+    patches[4].reshape(PATCH, STRIDE)[:, :PATCH] = 1
     for i in range(rows.shape[0]):
         found[i] = False
         ncc[i] = 0.0
@@ -245,16 +263,12 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
                 -warp[i, 1, 0] * ratio,
                 warp[i, 0, 0] * ratio,
                 reference,
-                gx,
-                gy,
             )
             if not inside:
                 continue
-            tt, h00, h01, h11 = _prepare(reference, gx, gy, t0)
+            _spread_out(reference, patches)
             s = float(1 << level)
-            px, py, score, ok = _iterate(
-                pyramid[level], t0, gx, gy, tt, h00, h01, h11, x / s, y / s, iterations, max_step_px
-            )
+            px, py, score, ok = _settle(pyramid[level], patches, raw, across, x / s, y / s, iterations, max_step_px)
             if ok and (score >= min_ncc or j > last):
                 if score > 0.5:
                     x = px * s

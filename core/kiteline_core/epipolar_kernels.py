@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core.alignment_kernels import PATCH, PATCH_RADIUS, TEMPLATE_LEVELS, warp_template
+from kiteline_core.alignment_kernels import GREY, PATCH, PATCH_RADIUS, STRIDE, TEMPLATE_LEVELS, warp_template
 from kiteline_core.jit import njit
 
 
@@ -21,9 +21,7 @@ def search_segments(  # type: ignore[no-untyped-def]
     uv: (n,2) float64 level-0 px out. found: (n,) int8 out: 1 found, 0 nothing alike, -1 not sure which, or out of view.
     """
     levels = len(pyramid)
-    reference = np.empty((PATCH + 2, PATCH + 2))
-    gx = np.empty((PATCH, PATCH))
-    gy = np.empty((PATCH, PATCH))
+    reference = np.empty((PATCH + 2, STRIDE), np.int16)
     t0 = np.empty((PATCH, PATCH))
     score = np.empty(max_steps + 1)
     count = float(PATCH * PATCH)
@@ -51,15 +49,13 @@ def search_segments(  # type: ignore[no-untyped-def]
             -warp[i, 1, 0] * ratio,
             warp[i, 0, 0] * ratio,
             reference,
-            gx,
-            gy,
         )
         if not inside:
             continue
         mean = 0.0
         for r in range(PATCH):
             for c in range(PATCH):
-                t0[r, c] = reference[r + 1, c + 1]
+                t0[r, c] = reference[r + 1, c + 1] / GREY
                 mean += t0[r, c]
         mean /= count
         tt = 1e-9

@@ -109,3 +109,62 @@ def test_templates_are_cut_as_one_would_by_hand() -> None:
             above = image[np.ix_(top, left)] * (1 - fx) + image[np.ix_(top, left + 1)] * fx
             below = image[np.ix_(top + 1, left)] * (1 - fx) + image[np.ix_(top + 1, left + 1)] * fx
             np.testing.assert_allclose(templates[i, j], above * (1 - fy) + below * fy, atol=0.501)
+
+
+def bilinear(image: NDArray[np.uint8], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    grey = image.astype(np.float64)
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = x - left, y - top
+    above = grey[top, left] * (1 - fx) + grey[top, left + 1] * fx
+    below = grey[top + 1, left] * (1 - fx) + grey[top + 1, left + 1] * fx
+    return np.asarray(above * (1 - fy) + below * fy)
+
+
+def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
+    image = warped(texture(5), np.eye(2, 3))
+    template = np.ascontiguousarray(image[100:121, 130:151])
+    w = np.array([[1.1, -0.2], [0.15, 0.9]])
+    reference = np.zeros((kernels.PATCH + 2, kernels.STRIDE), np.int16)
+    assert kernels.warp_template(template, *w.ravel(), reference)
+    dx, dy = np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0))
+    plain = bilinear(template, 10 + w[0, 0] * dx + w[0, 1] * dy, 10 + w[1, 0] * dx + w[1, 1] * dy)
+    steepest = np.abs(np.diff(plain)).max()
+    np.testing.assert_allclose(reference[:, : kernels.PATCH + 2] / kernels.GREY, plain, atol=0.04 + steepest / 128)
+    assert not kernels.warp_template(template, 1.5, 0.6, -0.6, 1.5, reference)
+
+    patches = np.zeros((5, kernels.LANES), np.int16)
+    inside = np.zeros((kernels.PATCH, kernels.STRIDE), np.bool_)
+    inside[:, : kernels.PATCH] = True
+    patches[4] = inside.ravel()
+    kernels._spread_out(reference, patches)
+    grey = reference[:, : kernels.PATCH + 2].astype(np.int64)
+    for row, wanted in (
+        (1, grey[1:-1, 1:-1]),
+        (2, grey[1:-1, 2:] - grey[1:-1, :-2]),
+        (3, grey[2:, 1:-1] - grey[:-2, 1:-1]),
+    ):
+        np.testing.assert_array_equal(patches[row].reshape(inside.shape)[:, : kernels.PATCH], wanted)
+        assert not patches[row].reshape(inside.shape)[~inside].any()
+    assert kernels._dot(patches[2], patches[1]) == (grey[1:-1, 1:-1] * (grey[1:-1, 2:] - grey[1:-1, :-2])).sum()
+
+    raw, across = np.zeros(kernels.LANES + kernels.STRIDE, np.uint8), np.zeros(kernels.LANES + kernels.STRIDE, np.int16)
+    for x, y in ((100.0, 90.0), (47.31, 60.78), (4.0, 4.99), (314.9, 234.9)):
+        kernels._look(image, x, y, raw, across, patches[0])
+        dx, dy = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0))
+        seen = patches[0].reshape(inside.shape)[:, : kernels.PATCH] / kernels.GREY
+        np.testing.assert_allclose(seen, bilinear(image, x + dx, y + dy), atol=0.04 + 40.0 / 256)
+
+
+def test_the_greatest_contrast_does_not_overflow() -> None:
+    image = np.zeros((64, 64), np.uint8)
+    image[:, 32:] = 255
+    image[32:] = 255 - image[32:]
+    pyramid = build_pyramid(image, 4)
+    uv, octave = np.array([[32.0, 32.0]]), np.zeros(1, np.uint8)
+    templates = np.empty((1, kernels.TEMPLATE_LEVELS, kernels.TEMPLATE, kernels.TEMPLATE), np.uint8)
+    kernels.cut_templates(pyramid, uv, octave, templates)
+    out, found, ncc = uv + 0.7, np.zeros(1, np.bool_), np.zeros(1)
+    kernels.align(
+        pyramid, templates, np.zeros(1, np.int64), octave, np.eye(2)[None], out, 0, 0, 8, 3.0, 0.8, found, ncc
+    )
+    assert found[0] and abs(out - uv).max() < 0.05 and ncc[0] > 0.99
