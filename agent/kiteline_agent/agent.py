@@ -192,7 +192,7 @@ class Agent:
         right = (
             None
             if frame.right is None
-            else RightEye(frame.right, self._rectifier, levels, first, self.map.disparity_offset_px)
+            else RightEye(frame.right, self._rectifier, levels, self.map.disparity_offset_px)
         )
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
         self.work.frames = 1
@@ -348,7 +348,7 @@ class Agent:
         """What follows every keyframe: it is booked, and its place remembered."""
         self._governor.note(extra)
         if view.right is not None and self._rectifier.bends:
-            self.work.rectified_px += view.left[view.first].size
+            self.work.rectified_px += view.left[1].size
         self._recovery.remember(self._reference.keyframe)
         self._certainty.remember(self._reference.keyframe)
 

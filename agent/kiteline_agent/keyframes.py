@@ -119,7 +119,7 @@ def new_points(view: View, taken: F64, camera: RectifiedCamera, config: AgentCon
         stereo = config.stereo
         widest = min(camera.bf / stereo.min_depth_m, 0.45 * camera.width)
         stereo_kernels.search_rows(
-            view.left, view.right.whole(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
+            view.left, view.right.coarse(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
         )
         found = np.zeros(len(disparity), np.bool_)
         view.right.refine(view.left, corners.uv, corners.octave, found.copy(), stereo, _SEARCH_PX, disparity, found)

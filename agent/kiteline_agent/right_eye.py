@@ -32,36 +32,41 @@ class RightEye:
     offset_px: what disparities are measured too large by, as far as is known; it is taken off.
     """
 
-    def __init__(self, image: U8, rectifier: Rectifier, levels: int, first: int, offset_px: float = 0.0) -> None:
+    def __init__(self, image: U8, rectifier: Rectifier, levels: int, offset_px: float = 0.0) -> None:
         rectifier.check_size(image)
         self._image = image
         self._rectifier = rectifier
-        self._levels, self._first = levels, first
+        self._levels = levels
         self.offset_px = offset_px
         self._raw: Pyramid | None = None
-        self._whole: Pyramid | None = None
+        self._coarse: Pyramid | None = None
 
-    def whole(self) -> Pyramid:
-        """The pyramid of the rectified image."""
-        if self._whole is None:
-            self._whole = rectified(self._image, self._rectifier, 1, self._levels, self._first)
-        return self._whole
+    def coarse(self) -> Pyramid:
+        """The pyramid of the rectified image, in which level 0 may be blank."""
+        if self._coarse is None:
+            raw = self._pyramid()
+            self._coarse = raw
+            if self._rectifier.bends:
+                half = self._rectifier.halved(1, raw[1])
+                self._coarse = (self._rectifier.blank, *build_pyramid(half, self._levels - 1))
+        return self._coarse
 
     def refine(
         self, left: Pyramid, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig, search_px: float,
         disparity: F64, found: NDArray[np.bool_],
     ) -> None:  # fmt: skip
-        """stereo_kernels.refine_rows, on the whole rectified image where there is one already; of true disparities."""
+        """stereo_kernels.refine_rows, of true disparities; only what is looked at is rectified."""
         grid = self._rectifier.right_grid
-        if self._whole is not None or grid is None:
-            right, grid = self.whole(), _RECTIFIED
-        else:
-            if self._raw is None:
-                self._raw = build_pyramid(self._image, self._levels)
-            right = self._raw
         wanted = disparity >= 0.0
         disparity[wanted] = np.maximum(disparity[wanted] + self.offset_px, 0.0)
         stereo_kernels.refine_rows(
-            left, right, grid, uv, octave, sure, config.iterations, search_px, config.min_ncc, disparity, found
-        )
+            left, self._pyramid(), _RECTIFIED if grid is None else grid, uv, octave, sure, config.iterations, search_px,
+            config.min_ncc, disparity, found,
+        )  # fmt: skip
         disparity[wanted] = np.maximum(disparity[wanted] - self.offset_px, 0.0)
+
+    def _pyramid(self) -> Pyramid:
+        """Of the image as the lens made it."""
+        if self._raw is None:
+            self._raw = build_pyramid(self._image, self._levels)
+        return self._raw

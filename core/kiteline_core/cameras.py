@@ -100,6 +100,7 @@ class Rectifier:
         left = rig.left
         self._size = (left.width, left.height)
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and matrix behind its maps
         self._depth_map: NDArray[np.int16] | None = None
         self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self.blank = np.zeros((left.height, left.width), np.uint8)
@@ -130,7 +131,7 @@ class Rectifier:
             return
         r_left, r_right, new = _stereo_rotations(rig)
         self._maps[0] = _undistortion_maps(left, r_left, new)
-        self._maps[1] = _undistortion_maps(rig.right, r_right, new)
+        self._right = (rig.right, r_right, new)
         self.right_grid = _grid(rig.right, r_right, new)
         # A point of the raw left camera is turned by r_left into the rectified one.
         t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
@@ -158,12 +159,15 @@ class Rectifier:
     def half(self, eye: int, image: U8) -> U8:
         """Level 1 of the rectified image's pyramid ((h+1)//2, (w+1)//2), from level 1 of the raw one's."""
         self.check_size(image)
-        maps = self._maps[eye]
-        small = np.asarray(cv2.pyrDown(image), np.uint8)
-        if maps is None:
-            return small
+        return self.halved(eye, np.asarray(cv2.pyrDown(image), np.uint8))
+
+    def halved(self, eye: int, small: U8) -> U8:
+        """The same from level 1 ((h+1)//2, (w+1)//2) of a raw image's pyramid."""
         halves = self._halves[eye]
         if halves is None:
+            maps = self._whole(eye)
+            if maps is None:
+                return small
             x, y = cv2.convertMaps(maps[0][::2, ::2], maps[1][::2, ::2], cv2.CV_32FC1)
             fixed = cv2.convertMaps(0.5 * x, 0.5 * y, cv2.CV_16SC2)
             halves = self._halves[eye] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
@@ -202,10 +206,18 @@ class Rectifier:
 
     def _apply(self, eye: int, image: U8) -> U8:
         self.check_size(image)
+        if eye == 1:
+            self._maps[1] = self._whole(1)
         maps = self._maps[eye]
         if maps is None:
             return image
         return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR), np.uint8)
+
+    def _whole(self, eye: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
+        """The maps of an eye. Those of the right one are kept only once a whole right image was asked for."""
+        if self._maps[eye] is None and eye == 1 and self._right is not None:
+            return _undistortion_maps(*self._right)
+        return self._maps[eye]
 
 
 def _is_rectified(rig: CameraRig) -> bool:
