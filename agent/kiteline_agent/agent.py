@@ -28,7 +28,7 @@ from kiteline_agent.smoothing import Smoothing
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.submaps import Submaps
 from kiteline_agent.tracker import Track, Tracker, View
-from kiteline_agent.window import Window, corners_of, with_depths, yields
+from kiteline_agent.window import Window, corners_of, with_depths
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import (
     Calibration,
@@ -332,7 +332,7 @@ class Agent:
         self._maker.begin_with(fresh if met is None else with_depths(fresh, met))
         if met is None:
             return
-        goal = yields(self._pose.T_c_m, met, limits, self._camera.fx)
+        goal = self.window.yields(self._pose.T_c_m, met)
         if goal is not None:
             self._move_map(se3.inverse(goal))
 

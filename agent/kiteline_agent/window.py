@@ -45,14 +45,18 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Met:
-    """Lent points that corners met. T_c_m: (4,4) by them alone. corner: (n,) indices of corners. rho: (n,) 1/m of the
-    lent points along the corners' bearings. depth_m: (n,). foreseen: how many points should have been in view.
+    """Lent points that corners met. T_c_m: (4,4) by them alone. corner: (n,) indices of corners. depth_m: (n,) in the
+    camera. xyz, ray, observed, sigma_px: (n,3), (n,3), (n,3), (n,) as in `optimise_pose`. foreseen: how many points
+    should have been in view.
     """
 
     T_c_m: F64
     corner: I64
-    rho: F64
     depth_m: F64
+    xyz: F64
+    ray: F64
+    observed: F64
+    sigma_px: F64
     foreseen: int
 
 
@@ -197,7 +201,29 @@ class Window:
             return None
         T = se3.orthonormalise(T)
         depth = se3.transform(T, xyz[inlier])[:, 2]
-        return Met(T, found.b[inlier].astype(np.int64), 1.0 / depth, depth, len(around.rows))
+        return Met(
+            T, found.b[inlier].astype(np.int64), depth, xyz[inlier], ray[inlier], observed[inlier], sigma_px[inlier],
+            len(around.rows),
+        )  # fmt: skip
+
+    def yields(self, T_c_m: F64, met: Met) -> F64 | None:
+        """T_c_m (4,4) as far towards where the copies say that it is as they know better than the track does; None
+        where they are few, or far from it.
+        """
+        config, n = self._config, len(met.corner)
+        if n < config.min_hold:
+            return None
+        doubt = np.repeat([config.doubt_depth * float(np.median(met.depth_m)), config.doubt_rad], 3)
+        T = T_c_m.copy()
+        optimise_pose(
+            T, met.xyz, met.ray, met.observed, met.sigma_px, self._intrinsics, T_c_m, doubt**-2.0, 1, 4,
+            self._ransac.chi2, np.ones(n, np.bool_), np.zeros((6, 6)),
+        )  # fmt: skip
+        before, after = (se3.transform(pose, met.xyz) for pose in (T_c_m, T))
+        if not np.isfinite(T).all() or after[:, 2].min() <= 0.0:
+            return None
+        moved_px = self._camera.fx * np.linalg.norm(after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:], axis=1)
+        return se3.orthonormalise(T) if float(np.median(moved_px)) <= config.hold_px else None
 
     def _around(self, T_c_m: F64, submap: SubmapId, margin_px: float) -> _Around:
         slots = np.flatnonzero(self._submap == submap)
@@ -272,16 +298,5 @@ def corners_of(points: NewPoints) -> Seen:
 def with_depths(points: NewPoints, met: Met) -> NewPoints:
     """The same points; those that met lent ones know their depths."""
     rho = np.zeros(len(points.uv))
-    rho[met.corner] = met.rho
+    rho[met.corner] = 1.0 / met.depth_m
     return replace(points, lent_rho=rho)
-
-
-def yields(T_c_m: F64, met: Met, config: WindowConfig, fx: float) -> F64 | None:
-    """T_c_m (4,4) a little nearer to where the copies say that it is; None where they are few, or far from it."""
-    if len(met.corner) < config.min_hold:
-        return None
-    step = se3.log(se3.orthonormalise(met.T_c_m @ se3.inverse(T_c_m)))
-    px = fx * (float(np.linalg.norm(step[:3])) / float(np.median(met.depth_m)) + float(np.linalg.norm(step[3:])))
-    if px > config.hold_px:
-        return None
-    return se3.orthonormalise(se3.exp(config.gain * step) @ T_c_m)

@@ -6,7 +6,16 @@ import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
 from kiteline_codec.schema import Births, Camera, Head, Level, Live, Record, Sightings
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import (
+    NO_KEYFRAME,
+    SEQUENCE_BITS,
+    SUBMAP_BITS,
+    AgentId,
+    KeyframeId,
+    SubmapId,
+    agent_of_keyframe,
+    submap_of_keyframe,
+)
 from kiteline_core.map_tables import NO_POSE
 from kiteline_core.sparse_map import SparseMap
 
@@ -39,7 +48,7 @@ class Intake:
                 self._map.set_camera(record.agent, record.camera)
             elif isinstance(record, Live):
                 held = self.live.get(record.agent)
-                if held is None or record.t_ns >= held.t_ns:
+                if held is None or _age(record) >= _age(held):
                     self.live[record.agent] = record
                     submap = submap_of_keyframe(record.keyframe)
                     self.last_of[submap] = record
@@ -129,3 +138,8 @@ class Intake:
                 table, row = self._map.keyframes, self._map.rows[keyframes[0]]
                 if table.parent[row] != NO_KEYFRAME:
                     self._map.set_pose(keyframes[0], _LEVEL)
+
+
+def _age(live: Live) -> tuple[int, int]:
+    """What tells the newer of two poses: an agent that started again may have a clock that did so too."""
+    return live.keyframe >> SEQUENCE_BITS + SUBMAP_BITS, live.t_ns

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from kiteline_basestation.station import Station
+from kiteline_basestation.supply import is_copy
 from kiteline_codec import messages
 from kiteline_codec.schema import Key, WireError
 from kiteline_core.ids import AgentId
@@ -76,6 +77,7 @@ def restore(station: Station, kept: bytes, now_ns: int) -> None:
         station.mapper.restore(agent, received, (), now_ns)
     for agent, codes in agents.items():  # what is ours may tell of points of several agents
         channel = station.join(agent)
-        own = tuple(channel.put(messages.decode(key, codes.own[key])) for key in sorted(codes.own))
+        lasting = [key for key in sorted(codes.own) if not is_copy(key)]  # what was lent is lent anew
+        own = tuple(channel.put(messages.decode(key, codes.own[key])) for key in lasting)
         station.mapper.restore(agent, (), own, now_ns)
     station.mapper.rejoin()

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.window import Seen, Window, yields
+from kiteline_agent.window import Seen, Window
 from kiteline_codec.schema import Copied, Copy, Key, Kind
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
@@ -83,7 +83,7 @@ def world() -> World:
     return World(points, rng.integers(0, 256, (n, 32), dtype=np.uint8))
 
 
-def window(**limits: int) -> Window:
+def window(**limits: float) -> Window:
     config = AgentConfig()
     return Window(CAMERA, replace(config.window, **limits), config.matching, config.ransac, shipped_words())
 
@@ -109,15 +109,18 @@ def test_corners_meet_lent_points_and_say_where_the_camera_is(world: World) -> N
     assert np.linalg.norm(error[3:]) < 0.001
     assert np.all(met.corner < len(seen.uv) // 2), "a corner of noise"
     truth = CAMERA.bf / seen.disparity[met.corner]
-    assert np.median(np.abs(1.0 / met.rho - truth) / truth) < 0.01
-    # A keyframe yields a share of the way, and not at all to few points or over a long way.
-    config = AgentConfig().window
-    goal = yields(se3.inverse(guess), met, config, CAMERA.fx)
-    assert goal is not None
-    before, after = (float(np.linalg.norm(se3.log(T @ true)[:3])) for T in (se3.inverse(guess), goal))
-    assert after == pytest.approx((1.0 - config.gain) * before, rel=0.4)
-    assert yields(se3.inverse(guess), met, replace(config, min_hold=1000), CAMERA.fx) is None
-    assert yields(se3.inverse(guess), met, replace(config, hold_px=0.1), CAMERA.fx) is None
+    assert np.median(np.abs(met.depth_m - truth) / truth) < 0.01
+    # A keyframe yields as far as it is in doubt, and not at all to few points or over a long way.
+    errors = [float(np.linalg.norm(se3.log(se3.inverse(guess) @ true)[:3]))]
+    for doubt in (1e-5, 5e-4, 1.0):
+        goal = window(doubt_depth=doubt, doubt_rad=0.5 * doubt).yields(se3.inverse(guess), met)
+        assert goal is not None
+        errors.append(float(np.linalg.norm(se3.log(goal @ true)[:3])))
+    assert errors[1] > 0.9 * errors[0]
+    assert 0.2 * errors[0] < errors[2] < 0.9 * errors[0]
+    assert errors[3] < 0.5 * errors[0]
+    assert window(min_hold=1000).yields(se3.inverse(guess), met) is None
+    assert window(hold_px=0.01).yields(se3.inverse(guess), met) is None
 
 
 def test_copies_of_another_submap_are_not_met(world: World) -> None:

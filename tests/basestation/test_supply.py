@@ -11,12 +11,16 @@ import pytest
 
 from kiteline_basestation.config import BaseConfig, SupplyConfig
 from kiteline_basestation.intake import Intake
+from kiteline_basestation.station import Station
+from kiteline_basestation.store import Codes, pack, restore
 from kiteline_basestation.supply import Supply
-from kiteline_codec.channel import plain_pair
+from kiteline_codec import messages
+from kiteline_codec.channel import CodedChannel, plain_pair
 from kiteline_codec.profiles import RADIO
-from kiteline_codec.schema import Camera, Copied, Copy, Key, Live, Record
+from kiteline_codec.schema import Camera, Copied, Copy, Key, Live, Placement, Record
+from kiteline_codec.sync import SyncConfig
 from kiteline_core import se3
-from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.sparse_map import SparseMap
 
 MakeFlight = Callable[..., Any]
@@ -143,3 +147,27 @@ def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
     held = base.supply.lent(flight.agent)
     base.serve(flight.keyframes[5], turns=3)
     assert set(base.supply.lent(flight.agent)) <= set(held), "nothing new while corrections wait"
+
+
+def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=1.2, points=1500)
+    base = Base(flight, remembered=10)
+    base.serve(flight.keyframes[-1])
+    lent = [r for r in base.heard if isinstance(r, Copy | Copied)]
+    assert lent
+    submap = submap_of_keyframe(flight.keyframes[0])
+    own = {messages.key(r): messages.encode(r) for r in [Placement(submap, np.eye(4)), *lent]}
+    station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 2))
+    restore(station, pack({flight.agent: Codes({}, own)}), 0)
+    channel = station.channels[flight.agent]
+    assert isinstance(channel, CodedChannel)
+    assert list(channel.endpoint.own_values()) == [messages.key(Placement(submap, np.eye(4)))]
+
+
+def test_an_agent_that_starts_again_is_heard_whatever_its_clock_says() -> None:
+    intake = Intake(BaseConfig().intake, SparseMap())
+    agent = AgentId(2)
+    old, new = (keyframe_id(submap_id(agent, boot, 0), 0) for boot in (4, 5))
+    for keyframe, t_ns in ((old, 900), (old, 800), (new, 5), (old, 950)):
+        intake.take(agent, (Live(agent, t_ns, keyframe, np.eye(4), 80),), 0)
+    assert (intake.live[agent].keyframe, intake.live[agent].t_ns) == (new, 5)
