@@ -43,10 +43,8 @@ from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
 from kiteline_hw.key_store import read_keys
 from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
-from kiteline_hw.mavlink_frames import mounting
-from kiteline_hw.mavlink_out import MavlinkPoseSink
 from kiteline_hw.mcap_log import LogWriter
-from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, SourceError
+from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, PoseSink, SourceError
 from kiteline_hw.sealed_link import SealedLink
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
@@ -425,10 +423,13 @@ def _drain_live(
         process.notify("WATCHDOG=1")
 
 
-def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stack: ExitStack) -> MavlinkPoseSink | None:
+def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stack: ExitStack) -> PoseSink | None:
     """Where poses for the flight controller go, if anywhere. Raises LinkError."""
     if not spec.mavlink:
         return None
+    from kiteline_hw.mavlink_frames import mounting  # the dialect takes 5 MiB: only where it is spoken
+    from kiteline_hw.mavlink_out import MavlinkPoseSink
+
     axes = spec.axes or ("flu" if source.rig.has_body else "rdf")
     try:
         return stack.enter_context(MavlinkPoseSink(spec.mavlink, mounting(axes), clock, required=False))

@@ -12,12 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from hashlib import blake2b, blake2s
-
-from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from typing import TYPE_CHECKING
 
 from kiteline_codec.packing import Reader, Writer
 from kiteline_codec.schema import WireError
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 KEY_BYTES = 32
 WINDOW_PACKETS = 1024  # packets behind the newest that may still come: more than any link reorders
@@ -74,6 +75,13 @@ def _tag(key: bytes, data: bytes) -> bytes:
     return blake2s(data, key=key, digest_size=8, person=b"kiteline").digest()
 
 
+def _cipher(key: bytes) -> ChaCha20Poly1305:
+    """The library is loaded when it is needed: it takes 6 MiB."""
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+    return ChaCha20Poly1305(key)
+
+
 class Sealer:
     """Seals the packets of one start of one writer."""
 
@@ -100,7 +108,7 @@ class Sealer:
         if self._suite == Suite.TAGGED:
             return data + packet + _tag(self._key, data + packet)
         nonce = _nonce(self._first, self._boot, self._counter)
-        return data + ChaCha20Poly1305(self._key).encrypt(nonce, packet, data)
+        return data + _cipher(self._key).encrypt(nonce, packet, data)
 
 
 @dataclass(slots=True)
@@ -197,8 +205,10 @@ class Opener:
             packet = body[: -_TAG_BYTES[suite]]
             sound = hmac.compare_digest(_tag(key, head + packet), body[-_TAG_BYTES[suite] :])
             return packet if sound else None
+        from cryptography.exceptions import InvalidTag
+
         try:
-            return ChaCha20Poly1305(key).decrypt(nonce, body, head)
+            return _cipher(key).decrypt(nonce, body, head)
         except InvalidTag:
             return None
 

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar
 
-import numba
 
+def _numba_alone() -> ModuleType:
+    """numba without scipy, which it imports where it can: 10 MiB for linear algebra that no kernel uses."""
+    hidden = "scipy" not in sys.modules
+    if hidden:
+        sys.modules["scipy"] = None  # type: ignore[assignment]  # so that importing it fails
+    try:
+        import numba
+    finally:
+        if hidden:
+            del sys.modules["scipy"]
+    return numba
+
+
+_numba = _numba_alone()
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def njit(function: F) -> F:
     """Compile a kernel: arrays in, caller's arrays out; no parallel, no fastmath, no objects."""
-    compiled: F = numba.njit(cache=True, nogil=True)(function)
+    compiled: F = _numba.njit(cache=True, nogil=True)(function)
     return compiled

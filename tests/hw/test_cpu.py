@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 
 from kiteline_hw.clock import ManualClock, MonotonicClock
-from kiteline_hw.cpu import CpuQuota, QuotaError, children_cpu_ns, peak_rss_mib, process_cpu_ns, rss_mib
+from kiteline_hw.cpu import (
+    CpuQuota,
+    QuotaError,
+    children_cpu_ns,
+    clean_mappings,
+    peak_rss_mib,
+    process_cpu_ns,
+    rss_mib,
+)
 
 SPIN = "import time; e = time.process_time() + {}\nwhile time.process_time() < e: pass"
 
@@ -81,3 +89,35 @@ def test_reasons_why_not(tmp_path: Path) -> None:
     for percent in (0.0, -1.0, float("nan"), 1.0, 1e9):
         with pytest.raises(ValueError, match="expected 2 to 100 per core"):
             CpuQuota(percent)
+
+
+def test_memory_that_only_the_start_needed_is_given_back() -> None:
+    code = (
+        "import cv2, numpy as np\nfrom kiteline_hw.cpu import release_memory, rss_mib\n"
+        "image = np.arange(40000, dtype=np.uint8).reshape(200, 200)\nwanted = cv2.GaussianBlur(image, (5, 5), 1.0)\n"
+        "before = rss_mib()\nrelease_memory()\nprint(before - rss_mib())\n"
+        "assert (cv2.GaussianBlur(image, (5, 5), 1.0) == wanted).all()\nimport zlib, decimal\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    if Path("/proc/self/smaps").exists():
+        assert float(done.stdout) > 10.0
+
+
+def test_only_unchanged_pages_of_files_are_dropped() -> None:
+    def mapping(first: int, mode: str, name: str, **sizes: int) -> str:
+        head = f"{first:x}-{first + 0x1000:x} {mode} 00000000 fe:00 7 {name}\n"
+        known = {"Rss": 4, "Shared_Dirty": 0, "Private_Dirty": 0, "Anonymous": 0, **sizes}
+        return head + "".join(f"{key}: {value} kB\n" for key, value in known.items()) + "VmFlags: rd mr mw me\n"
+
+    smaps = "".join(
+        (
+            mapping(0x10000, "r-xp", "/lib/code.so"),
+            mapping(0x20000, "r--p", "/lib/code.so", Private_Dirty=4, Anonymous=4),
+            mapping(0x30000, "rw-p", "/lib/code.so"),
+            mapping(0x40000, "r-xp", ""),
+            mapping(0x50000, "r-xp", "[vdso]"),
+            mapping(0x60000, "r--p", "/a folder/data (1).so"),
+        )
+    )
+    assert clean_mappings(smaps) == [(0x10000, 0x11000), (0x60000, 0x61000)]
