@@ -189,11 +189,7 @@ class Agent:
         # Coarse images are for a track that holds: what is lost or begins needs all there is.
         first = self._config.pyramid.first if self._submaps.any and self._failures == 0 else 0
         left = rectified(frame.left, self._rectifier, 0, levels, first)
-        right = (
-            None
-            if frame.right is None
-            else RightEye(frame.right, self._rectifier, levels, self.map.disparity_offset_px)
-        )
+        right = None if frame.right is None else RightEye(frame.right, self._rectifier, levels, self.map.offset_px)
         depth = None if frame.depth_m is None else self._rectifier.depth(frame.depth_m)
         self.work.frames = 1
         share = 4 if first else 1
@@ -495,7 +491,7 @@ class Agent:
                 self.window.take(record)
             elif isinstance(record, Calibration) and self._camera.stereo:
                 self.map.calibrate(record.disparity_px)
-                self._events.append(f"disparities are {record.disparity_px:+.3f} px too large")
+                self._events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
             elif isinstance(record, Tile):
                 self.tiles[record.column, record.row] = record
         if not touched:

@@ -94,7 +94,7 @@ class KeyframeMaker:
             uv[agreed.index], rho[agreed.index] = agreed.uv, agreed.inv_depth
         for section in sections[1]:
             self._channel.put(section)
-        rho = np.where(rho > 0.0, np.maximum(rho - self._map.disparity_offset_px / self._camera.bf, _LEAST_RHO), 0.0)
+        rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _LEAST_RHO), 0.0)
         T_m_k = self._placed(shared_head)
         lent_rho = np.zeros(len(order)) if fresh.lent_rho is None else fresh.lent_rho[order]
         self._remember(view, shared_head, T_m_k, uv, rho, lent_rho, births, frame_number)
@@ -109,7 +109,7 @@ class KeyframeMaker:
             0,
             np.arange(n, dtype=np.uint16),
             fresh.uv[order].astype(np.float32),
-            self._as_measured(disparity),
+            self._as_measured(disparity, fresh.uv[order]),
             fresh.octave[order],
             fresh.angle[order],
             fresh.descriptor[order],
@@ -122,14 +122,14 @@ class KeyframeMaker:
             0,
             np.arange(first, first + len(rows), dtype=np.uint16),
             seen[:, :2].astype(np.float32),
-            self._as_measured(seen[:, 2]),
+            self._as_measured(seen[:, 2], seen[:, :2]),
             self._map.octave[rows],
             self._map.point_ids(rows),
         )
 
-    def _as_measured(self, disparity: F64) -> NDArray[np.float32]:
+    def _as_measured(self, disparity: F64, uv: F64) -> NDArray[np.float32]:
         """Inverse depths (n,) 1/m to be shared, 0 for none: as the pair measures, for the base to judge its offset."""
-        raw = disparity + self._map.disparity_offset_px
+        raw = disparity + self._map.offset_px(uv)
         return np.where((disparity > 0.0) & (raw > 0.0), raw / self._camera.bf, 0.0).astype(np.float32)
 
     def _placed(self, head: Head) -> F64:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from kiteline_agent import local_map_kernels as kernels
 from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_codec.schema import Culled, Depths, Found, Head, Pose, Removed
+from kiteline_core import disparity_offset
 from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -68,7 +69,7 @@ class LocalMap:
         self.usable = np.zeros((k, b), np.bool_)
         self.seed = np.zeros((k, b), np.bool_)  # a bearing that waits for a depth from motion
         self.measured = np.zeros((k, b), np.bool_)  # the depth is the pair's own, not the base's nor motion's
-        self.disparity_offset_px = 0.0  # what the pair's disparities are too large by, as far as the base knows
+        self.disparity_offset = disparity_offset.none()  # of the pair's disparities, as far as the base knows
         self.bearing = np.zeros((k, b, 2))
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
@@ -254,10 +255,15 @@ class LocalMap:
         self.bearing[slot, index] = self._bearings(self.uv[slot, index] + record.offset[keep])
         self.ripen(slot * self.births + index[fresh])  # points that only the base could place
 
-    def calibrate(self, disparity_offset_px: float) -> None:
-        """The pair's disparities are too large by so much: depths that it measured follow."""
-        change = (disparity_offset_px - self.disparity_offset_px) / self.camera.bf
-        self.disparity_offset_px = disparity_offset_px
+    def offset_px(self, uv: F64) -> F64:
+        """What the pair's disparities at pixels (n,2) are too large by (n,)."""
+        return np.asarray(disparity_offset.terms(self._bearings(uv)) @ self.disparity_offset)
+
+    def calibrate(self, offset: F64) -> None:
+        """The pair's disparities are too large by an offset (5,) px (`disparity_offset`): depths it measured follow."""
+        at = disparity_offset.terms(self.bearing[self.measured])
+        change = at @ (offset - self.disparity_offset) / self.camera.bf
+        self.disparity_offset = np.array(offset)
         least = self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
         self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, least)
 

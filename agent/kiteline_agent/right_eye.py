@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,15 +31,17 @@ def rectified(image: U8, rectifier: Rectifier, eye: int, levels: int, first: int
 class RightEye:
     """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's.
 
-    offset_px: what disparities are measured too large by, as far as is known; it is taken off.
+    offset_px: what disparities at pixels (n,2) are measured too large by (n,), as far as is known; it is taken off.
     """
 
-    def __init__(self, image: U8, rectifier: Rectifier, levels: int, offset_px: float = 0.0) -> None:
+    def __init__(
+        self, image: U8, rectifier: Rectifier, levels: int, offset_px: Callable[[F64], F64] | None = None
+    ) -> None:  # fmt: skip
         rectifier.check_size(image)
         self._image = image
         self._rectifier = rectifier
         self._levels = levels
-        self.offset_px = offset_px
+        self._offset_px = offset_px
         self._raw: Pyramid | None = None
         self._coarse: Pyramid | None = None
 
@@ -58,12 +62,13 @@ class RightEye:
         """stereo_kernels.refine_rows, of true disparities; only what is looked at is rectified."""
         grid = self._rectifier.right_grid
         wanted = disparity >= 0.0
-        disparity[wanted] = np.maximum(disparity[wanted] + self.offset_px, 0.0)
+        off = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
+        disparity[wanted] = np.maximum(disparity[wanted] + off[wanted], 0.0)
         stereo_kernels.refine_rows(
             left, self._pyramid(), _RECTIFIED if grid is None else grid, uv, octave, sure, config.iterations, search_px,
             config.min_ncc, disparity, found,
         )  # fmt: skip
-        disparity[wanted] = np.maximum(disparity[wanted] - self.offset_px, 0.0)
+        disparity[wanted] = np.maximum(disparity[wanted] - off[wanted], 0.0)
 
     def _pyramid(self) -> Pyramid:
         """Of the image as the lens made it."""

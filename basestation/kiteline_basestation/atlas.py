@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation import refind
+from kiteline_basestation import disparity, refind
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.correction import graph_of, keyframes_of, move_keyframes
 from kiteline_basestation.covisibility import Window, covisible_keyframes, window
@@ -26,7 +26,7 @@ from kiteline_basestation.refinement import apply_bundle
 from kiteline_codec.schema import Kind
 from kiteline_core import se3
 from kiteline_core.bundle import BundleConfig, BundleResult
-from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.ids import SEQUENCE_BITS, AgentId, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH
 from kiteline_core.place_index import Vocabulary
 from kiteline_core.sparse_map import SparseMap
@@ -67,7 +67,7 @@ class Atlas:
         self._graph_due: set[SubmapId] = set()
         self._full_due: set[SubmapId] = set()
         self._graphs: dict[int, SubmapId] = {}  # open jobs
-        self._fulls: dict[int, tuple[SubmapId, Window]] = {}
+        self._fulls: dict[int, tuple[SubmapId, Window, tuple[AgentId, ...]]] = {}  # whose disparities are found, too
         self._revisit: list[KeyframeId] = []  # keyframes of merged maps that have not looked around in the other yet
 
     @property
@@ -83,7 +83,7 @@ class Atlas:
     def busy_with(self, island: SubmapId) -> bool:
         """Whether a correction of a map is under way."""
         due = island in self._graph_due or island in self._full_due or island in self._graphs.values()
-        return due or any(i == island for i, _ in self._fulls.values())
+        return due or any(i == island for i, _, _ in self._fulls.values())
 
     def fits(self, island: SubmapId) -> bool:
         """Whether one bundle can hold a whole map."""
@@ -122,6 +122,8 @@ class Atlas:
         for keyframe in now:
             refind.refind(self._map, keyframe, self._config.refind, self._publisher)
             self._ask(keyframe)
+        if now and not self._revisit:
+            self._full_due.add(self._map.island_of(submap_of_keyframe(now[-1])))  # with all that they have in common
         return now
 
     def jobs(self) -> list[Job]:
@@ -137,9 +139,14 @@ class Atlas:
         for island in sorted(self._full_due - set(self._graphs.values())):
             part = self._whole(island)
             if part is not None:
-                problem = BundleInputs(part.problem, self._full_config())
-                job = Job(self._next_job(), "full", problem)
-                self._fulls[job.id] = (island, part)
+                agents: tuple[AgentId, ...] = ()
+                if self.fits(island):
+                    problem, agents = disparity.with_border(
+                        self._map, part.slots, part.problem, self._config.disparity
+                    )  # fmt: skip
+                    part = replace(part, problem=problem)
+                job = Job(self._next_job(), "full", BundleInputs(part.problem, self._full_config()))
+                self._fulls[job.id] = (island, part, agents)
                 out.append(job)
             self._full_due.discard(island)
         return out
@@ -152,8 +159,9 @@ class Atlas:
                 self._bend(island, done.result)
             return True
         if isinstance(done.result, BundleResult) and done.id in self._fulls:
-            island, part = self._fulls.pop(done.id)
-            self._settle(island, part, done.result)
+            island, part, agents = self._fulls.pop(done.id)
+            if self._settle(island, part, done.result):
+                disparity.take(self._map, agents, part.problem, done.result, self._config.disparity)
             return True
         return False
 
@@ -210,7 +218,7 @@ class Atlas:
     def _void(self, island: SubmapId) -> None:
         """What is under way in a map is out of date."""
         self._graphs = {job: i for job, i in self._graphs.items() if i != island}
-        self._fulls = {job: (i, part) for job, (i, part) in self._fulls.items() if i != island}
+        self._fulls = {job: full for job, full in self._fulls.items() if full[0] != island}
 
     def _needs_graph(self, finding: Finding) -> bool:
         """Whether fusing points and bundling would not do: the correction reaches further than they look."""
@@ -289,12 +297,12 @@ class Atlas:
         config = self._config.graph
         return replace(self._config.bundle, robust_trials=config.robust_trials, final_trials=config.final_trials)
 
-    def _settle(self, island: SubmapId, part: Window, result: BundleResult) -> None:
-        """Take a full bundle in; what came meanwhile moves along the spanning tree."""
+    def _settle(self, island: SubmapId, part: Window, result: BundleResult) -> bool:
+        """Take a full bundle in; what came meanwhile moves along the spanning tree. Returns whether it was taken."""
         if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
-            return
+            return False
         if self._contradicted(island, part, result):
-            return
+            return False
         rows = part.rows[part.problem.free]
         poses = np.linalg.inv(result.T_c_m[part.problem.free])
         keyframes = self._map.keyframes.id[rows].tolist()
@@ -307,6 +315,7 @@ class Atlas:
         move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
         apply_bundle(self._map, part, result, self._publisher, self._config.cull, self._config.publish)
         self.moved.add(island)
+        return True
 
     # -- second thoughts ---------------------------------------------------------------------------------------------
 

@@ -148,17 +148,14 @@ class GraphConfig:
 
 @dataclass(frozen=True, slots=True)
 class DisparityConfig:
-    """The constant error of an agent's disparities, found from its motion."""
+    """What an agent's disparities are off by, found by bundles of a whole map."""
 
-    every: int = 12  # keyframes between two looks
-    rounds: int = 3  # further looks after each, while bundles of the whole map still show more
-    min_seen: int = 4  # observations with depth of a point that is used
-    min_points: int = 300
-    min_range: float = 1.8  # ratio of near to far disparities (90 to 10 %): less says nothing of an offset
-    least_px: float = 0.008  # smaller offsets stay: the estimate is no better
-    deviations: float = 3.0  # by which an offset must stand out
-    settled_px: float = 0.005  # deviation of the estimate below which an offset is known
-    most_px: float = 0.5  # more is no calibration error, but something else
+    first: int = 12  # keyframes after which such a bundle is first asked for
+    growth: float = 1.25  # of the number of keyframes from one to the next: each knows the map better
+    prior_px: float = 0.1  # one deviation of a constant offset: what calibrations are good to
+    prior_rad: float = 3e-4  # of the turn of a right camera (times the focal length: px where x or y is 1)
+    inflation: float = 3.0  # of deviations of what is found: the lens bends what motion tells of depths, too
+    settled_px: float = 0.03  # deviation of the offset below which it is known
 
 
 @dataclass(frozen=True, slots=True)

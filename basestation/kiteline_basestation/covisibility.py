@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import MeasurementConfig, WindowConfig
+from kiteline_basestation.disparity import offsets
 from kiteline_core.bundle import BundleProblem
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH, NO_POSE
@@ -114,19 +115,17 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     table = sparse_map.keypoints
     rows = table.row[slots]
     deep = np.zeros(len(sparse_map), bool)
-    offset = np.zeros(len(sparse_map))
     sigma = np.full(len(sparse_map), config.sigma_disparity_px)
     for row in np.unique(rows).tolist():
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
-        offset[row] = sparse_map.disparity_offset_px.get(agent, 0.0)
         if agent in sparse_map.disparity_known:
             sigma[row] = config.sigma_settled_px
         deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & deep[rows]
     measured = np.empty((len(slots), 3))
     measured[:, :2] = table.uv[slots]
-    disparity = sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots] - offset[rows]
+    disparity = sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots] - offsets(sparse_map, slots)
     measured[:, 2] = np.where(ranged, np.maximum(disparity, 0.0), -1.0)
     octave = table.octave[slots].astype(np.float64)
     aligned = config.sigma_growth**octave

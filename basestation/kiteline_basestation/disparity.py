@@ -1,73 +1,85 @@
-"""How far an agent's disparities are off as a whole, from motion: its calibration is good to a tenth of a pixel or so.
+"""What an agent's disparities are off by: its calibration is good to a tenth of a pixel or so.
 
-Depths follow from motion up to one scale. A constant error of the disparity spoils that scale, and then near and far
-points cannot both agree with what stereo measured: disparity = (1 + scale error) bf / z + offset, a straight line.
+Depths follow from motion up to a scale. An error of the disparities spoils that scale, and then near and far points,
+points here and there in the image, cannot all agree with what stereo measured. So bundles of a whole map find the
+error (`disparity_offset`) along with all else.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import DisparityConfig
-from kiteline_core.ids import SEQUENCE_BITS, AgentId, agent_of_submap
+from kiteline_core.bundle import Border, BundleProblem, BundleResult
+from kiteline_core.disparity_offset import TERMS, none, terms
+from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS, AgentId
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class Offset:
-    """What remains of an agent's offset, and one deviation of it, both px. points: from how many."""
-
-    value_px: float
-    sigma_px: float
-    points: int
+def at_keypoints(sparse_map: SparseMap, slots: I32) -> F64:
+    """The terms (n,5) of an offset at keypoints."""
+    camera = sparse_map.keyframes.camera[sparse_map.keypoints.row[slots]]
+    return terms((sparse_map.keypoints.uv[slots] - camera[:, 2:4]) / np.maximum(camera[:, :2], 1e-9))
 
 
-def estimate(sparse_map: SparseMap, agent: AgentId, applied_px: float, config: DisparityConfig) -> Offset | None:
-    """The offset that the present map still shows, one residual a point; None where points tell too little.
+def offsets(sparse_map: SparseMap, slots: I32) -> F64:
+    """What the disparities of keypoints (n,) are too large by in px, as far as that is known."""
+    out = np.zeros(len(slots))
+    agents = _agents(sparse_map, slots)
+    for agent, offset in sparse_map.disparity_offset_px.items():
+        own = agents == agent
+        out[own] = at_keypoints(sparse_map, slots[own]) @ offset
+    return out
 
-    applied_px: what is already taken off the agent's disparities.
+
+def with_border(
+    sparse_map: SparseMap, slots: I32, problem: BundleProblem, config: DisparityConfig
+) -> tuple[BundleProblem, tuple[AgentId, ...]]:  # fmt: skip
+    """A problem in which the offsets of all its agents' disparities are unknown too, and these agents, in order.
+
+    slots: (m,) the problem's observations.
     """
     table = sparse_map.keypoints
-    points = sparse_map.roots()
-    xyz, known = sparse_map.positions(points)
-    points, xyz = points[known], xyz[known]
-    starts, slots = sparse_map.observations(points)
-    which = np.repeat(np.arange(len(points)), np.diff(starts))
     rows = table.row[slots]
-    submap = sparse_map.keyframes.id[rows] >> SEQUENCE_BITS
-    mine = np.isin(submap, [s for s in sparse_map.submaps if agent_of_submap(s) == agent])
-    keep = mine & (table.inv_depth[slots] > 0)
-    which, rows, slots = which[keep], rows[keep], slots[keep]
-    T = sparse_map.keyframes.T_w_k[rows]
-    depth = np.einsum("ni,ni->n", T[:, :3, 2], xyz[which] - T[:, :3, 3])
-    bf = sparse_map.keyframes.camera[rows, 4]
-    foreseen = bf / np.maximum(depth, 0.05)
-    residual = bf * table.inv_depth[slots] - applied_px - foreseen
-    seen = np.bincount(which, minlength=len(points))
-    good = seen >= config.min_seen
-    if int(np.count_nonzero(good)) < config.min_points:
-        return None
-    x = np.bincount(which, foreseen, len(points))[good] / seen[good]
-    y = np.bincount(which, residual, len(points))[good] / seen[good]
-    if float(np.percentile(x, 90)) < config.min_range * float(np.percentile(x, 10)):
-        return None
-    return _intercept(x, y)
+    ranged = problem.measured[:, 2] >= 0
+    of = _agents(sparse_map, slots)
+    agents = tuple(AgentId(a) for a in np.unique(of[ranged]).tolist())
+    if not agents:
+        return problem, ()
+    group = np.where(ranged, np.searchsorted(np.array(agents), of), -1).astype(np.int32)
+    measured = problem.measured.copy()
+    measured[ranged, 2] = (sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots])[ranged]
+    focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
+    sigma = np.array([config.prior_px, *[config.prior_rad * focal] * (TERMS - 1)])
+    start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
+    border = Border(group, at_keypoints(sparse_map, slots), start, sigma / config.inflation)
+    return replace(problem, measured=measured, border=border), agents
 
 
-def _intercept(x: F64, y: F64) -> Offset:
-    """Straight line through points with outliers: Huber's weights, at 1.5 deviations by the median."""
-    design = np.column_stack([np.ones_like(x), x])
-    weight = np.ones_like(x)
-    for _ in range(8):
-        normal = design.T @ (weight[:, None] * design)
-        line = np.linalg.solve(normal, design.T @ (weight * y))
-        error = np.abs(y - design @ line)
-        spread = 1.4826 * float(np.median(error)) + 1e-9
-        weight = np.minimum(1.0, 1.5 * spread / np.maximum(error, 1e-12))
-    deviation = spread * np.sqrt(float(np.linalg.inv(design.T @ design)[0, 0]))
-    return Offset(float(line[0]), deviation, len(x))
+def take(
+    sparse_map: SparseMap, agents: tuple[AgentId, ...], problem: BundleProblem, result: BundleResult,
+    config: DisparityConfig,
+) -> None:  # fmt: skip
+    """Remember what a bundle found of its agents' disparities. Agents whose offset is known well are trusted more."""
+    border = problem.border
+    if border is None or not (np.isfinite(result.offset).all() and np.isfinite(result.offset_cov).all()):
+        return
+    for g, agent in enumerate(agents):
+        sparse_map.disparity_offset_px[agent] = result.offset[g].copy()
+        at = border.terms[border.group == g]
+        cov = result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
+        sigma_px = config.inflation * float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", at, cov, at))))
+        if sigma_px < config.settled_px:
+            sparse_map.disparity_known.add(agent)
+
+
+def _agents(sparse_map: SparseMap, slots: I32) -> I64:
+    ids = sparse_map.keyframes.id[sparse_map.keypoints.row[slots]]
+    return np.asarray(ids >> (SEQUENCE_BITS + SUBMAP_BITS + BOOT_BITS))

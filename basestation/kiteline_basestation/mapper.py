@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation import culling, disparity, newpoints, refind
+from kiteline_basestation import culling, newpoints, refind
 from kiteline_basestation.atlas import Atlas
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.covisibility import Window, local_window
@@ -98,10 +98,8 @@ class Mapper:
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
-        self._told_px: dict[AgentId, float] = {}  # offsets of disparities as agents have them
-        self._calibrate_soon = False
-        self._rounds = 0  # looks since the last regular one
-        self._calibrate_at = 2 * self.config.disparity.every  # keyframes, when offsets of disparities are looked at
+        self._told: dict[AgentId, F64] = {}  # offsets of disparities as agents have them
+        self._calibrate_at = self.config.disparity.first  # keyframes, when offsets of disparities are next looked at
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
         self.atlas: Atlas | None = None
@@ -275,8 +273,6 @@ class Mapper:
 
     def _finish(self, done: JobDone) -> None:
         if self.atlas is not None and self.atlas.finish(done):
-            if isinstance(done.result, BundleResult) and self._rounds < self.config.disparity.rounds:
-                self._calibrate_soon = True  # a bundle of the whole map may show more
             return
         if isinstance(done.result, BundleResult):
             opened = self._windows.pop(done.id, None)
@@ -315,38 +311,20 @@ class Mapper:
         self.atlas.moved.clear()
 
     def _calibrate(self) -> None:
-        """Now and then, see whether an agent's disparities are off as a whole; if so, its map is bundled anew."""
-        config = self.config.disparity
-        due = self.counts.keyframes >= self._calibrate_at
-        if self.atlas is None or not (due or self._calibrate_soon):
+        """Now and then, bundle whole maps, in which the offsets of disparities show."""
+        if self.atlas is None or self.counts.keyframes < self._calibrate_at:
             return
-        self._rounds = 0 if due else self._rounds + 1
-        if due:
-            self._calibrate_at = self.counts.keyframes + config.every
-        self._calibrate_soon = False
-        for agent in sorted(self.map.measures_depth):
-            island = self.map.island_of(
-                max(s for s, ks in self.map.submaps.items() if agent_of_keyframe(ks[0]) == agent)
-            )
-            if self.atlas.busy_with(island) or not self.atlas.fits(island):
-                continue
-            applied = self.map.disparity_offset_px.get(agent, 0.0)
-            found = disparity.estimate(self.map, agent, applied, config)
-            if found is None or abs(applied + found.value_px) > config.most_px:
-                continue
-            if abs(found.value_px) > max(config.least_px, config.deviations * found.sigma_px):
-                self.map.disparity_offset_px[agent] = applied + found.value_px
-                self.atlas.bundle_all(island)
-            elif found.sigma_px < config.settled_px and agent not in self.map.disparity_known:
-                self.map.disparity_known.add(agent)
+        self._calibrate_at = round(self._calibrate_at * self.config.disparity.growth)
+        for island in sorted({self.map.island_of(s) for s in self.map.submaps}):
+            if self.atlas.fits(island) and not self.atlas.busy_with(island):
                 self.atlas.bundle_all(island)
 
     def _tell_calibrations(self) -> None:
         """Agents track better on disparities without the offset that was found."""
-        for agent, offset_px in sorted(self.map.disparity_offset_px.items()):
-            if self._told_px.get(agent) != offset_px:
-                self._told_px[agent] = offset_px
-                self._publisher.send(agent, Calibration(agent, offset_px))
+        for agent, offset in sorted(self.map.disparity_offset_px.items(), key=lambda item: item[0]):
+            if not np.array_equal(self._told.get(agent, 0.0), offset):
+                self._told[agent] = offset
+                self._publisher.send(agent, Calibration(agent, offset))
 
     def _place_island(self, island: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place."""

@@ -35,7 +35,7 @@ from kiteline_codec.schema import (
     Tile,
     WireError,
 )
-from kiteline_core import descriptors
+from kiteline_core import descriptors, disparity_offset
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.descriptors import DESCRIPTOR_BYTES, NARROW_BYTES
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
@@ -132,11 +132,13 @@ def _read_live(source: Reader, key: Key) -> Live:
 
 def _write_calibration(out: Writer, record: Calibration) -> None:
     limit = quantise.CALIBRATION_CODES // 2
-    out.signed(min(max(round(record.disparity_px * quantise.CALIBRATION_STEPS), -limit), limit))
+    for value in record.disparity_px.tolist():
+        out.signed(min(max(round(value * quantise.CALIBRATION_STEPS), -limit), limit))
 
 
 def _read_calibration(source: Reader, key: Key) -> Calibration:
-    return Calibration(AgentId(key.id), source.signed(quantise.CALIBRATION_CODES // 2) / quantise.CALIBRATION_STEPS)
+    codes = [source.signed(quantise.CALIBRATION_CODES // 2) for _ in range(disparity_offset.TERMS)]
+    return Calibration(AgentId(key.id), np.array(codes, np.float64) / quantise.CALIBRATION_STEPS)
 
 
 def _write_head(out: Writer, record: Head) -> None:

@@ -25,7 +25,7 @@ OFFSET_STEPS = 32  # per px: error <= 1/64 px, finer than keypoints since the ba
 OFFSET_CODES = 1 << 12  # +-128 px: an offset beyond that is another point
 
 CALIBRATION_STEPS = 1024  # per px: a tenth of what an offset can be known to
-CALIBRATION_CODES = 1 << 14  # +-8 px; real ones are below half a pixel
+CALIBRATION_CODES = 1 << 14  # +-8 px; real ones are below two pixels, half a pixel in the middle
 
 DEPTH_SCALE = 2.0**-7  # 1/m: nearly linear below (farther than 128 m), nearly logarithmic above
 DEPTH_MANTISSA = 1 << 10  # steps an octave: error <= 2^-11 (x + 2^-7) 1/m

@@ -216,10 +216,12 @@ class Copied:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What the base found of an agent's cameras. disparity_px: what its disparities are too large by."""
+    """What the base found of an agent's cameras. disparity_px: (5,) what its disparities are too large by, as factors
+    of 1, x, y, x^2, x y in normalised image coordinates (`kiteline_core.disparity_offset`).
+    """
 
     agent: AgentId
-    disparity_px: float
+    disparity_px: F64
 
 
 Record = (

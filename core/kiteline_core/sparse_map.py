@@ -66,7 +66,7 @@ class SparseMap:
         self.islands: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
-        self.disparity_offset_px: dict[AgentId, float] = {}  # what an agent's disparities are too large by
+        self.disparity_offset_px: dict[AgentId, F64] = {}  # what an agent's disparities are too large by, see the base
         self.disparity_known: set[AgentId] = set()  # agents whose offset is known well
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots that name a point of a keyframe that is not here yet

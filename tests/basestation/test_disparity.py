@@ -1,4 +1,4 @@
-"""A constant error of all disparities is found from motion, and taken off."""
+"""What all disparities are off by is found by bundles of the whole map, and taken off."""
 
 from __future__ import annotations
 
@@ -8,49 +8,60 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from kiteline_basestation.config import BaseConfig, DisparityConfig
-from kiteline_basestation.disparity import _intercept, estimate
+from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import Births, Camera, Record, Sightings
+from kiteline_core.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 
+F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
-BF = 420.0 * 0.11
+FOCAL, CX, CY = 420.0, 376.0, 240.0
+BF = FOCAL * 0.11
+TURNED = FOCAL * np.array([0.0, 0.0, 8e-4, 0.0, 0.0]) + [0.02, 0.0, 0.0, 0.0, 0.0]  # a right camera rolled by 0.8 mrad
+NONE = none()
+CONSTANT = np.array([0.12, 0.0, 0.0, 0.0, 0.0])
 
 
-def shifted(record: Record, offset_px: float) -> Record:
+def shifted(record: Record, offset: F64) -> Record:
     if isinstance(record, Births | Sightings):
+        by = terms((record.uv - [CX, CY]) / FOCAL) @ offset
         deep = record.inv_depth > 0
-        return replace(record, inv_depth=np.where(deep, record.inv_depth + offset_px / BF, 0.0).astype(np.float32))
+        return replace(record, inv_depth=np.where(deep, record.inv_depth + by / BF, 0.0).astype(np.float32))
     return record
 
 
-@pytest.mark.parametrize("offset_px", [0.0, 0.12, -0.1])
-def test_an_offset_is_found_and_the_scale_comes_right(
-    make_flight: MakeFlight, words: Any, ring: Any, offset_px: float
-) -> None:  # fmt: skip
-    flight = make_flight(keyframes=60, turns=0.3, scene=ring, drift_m=0.001, noise_px=0.2)
-    mapper = Mapper(BaseConfig(), words)
+def fly(mapper: Mapper, flight: Any, offset: F64) -> None:
     done: tuple[JobDone, ...] = ()
-    for n in range(90):
+    for n in range(len(flight.records) + 30):
         records = flight.records[n] if n < len(flight.records) else []
         first = [Camera(flight.agent, flight.camera)] if n == 0 else []
-        given = tuple(first) + tuple(shifted(r, offset_px) for r in records)
+        given = tuple(first) + tuple(shifted(r, offset) for r in records)
         output = mapper.step(MapperInput(((flight.agent, given),), done), n * 250_000_000)
         done = tuple(run_job(job) for job in output.jobs)
-    applied = mapper.map.disparity_offset_px.get(AgentId(0), 0.0)
-    assert abs(applied - offset_px) < 0.045
-    left = estimate(mapper.map, AgentId(0), applied, DisparityConfig(min_points=100))
-    assert left is not None and abs(left.value_px) < 0.07
 
 
-def test_the_line_is_found_among_outliers() -> None:
-    rng = np.random.default_rng(1)
-    x = rng.uniform(3, 20, 800)
-    y = 0.07 - 0.006 * x + rng.normal(0, 0.05, 800)
-    y[:80] += rng.uniform(1, 4, 80)
-    found = _intercept(x, y)
-    assert abs(found.value_px - 0.07) < 4 * found.sigma_px + 0.01
-    assert found.sigma_px < 0.01
+@pytest.mark.parametrize("offset", [NONE, CONSTANT, -CONSTANT, TURNED])
+def test_an_offset_is_found(
+    make_flight: MakeFlight, words: Any, offset: F64
+) -> None:  # fmt: skip
+    flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    exact = replace(BaseConfig().disparity, inflation=1.0)  # the lens of this flight is known exactly
+    mapper = Mapper(replace(BaseConfig(), disparity=exact), words)
+    fly(mapper, flight, offset)
+    left = offset - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
+    corners = np.array([[x, y] for x in (-0.7, 0.0, 0.7) for y in (-0.45, 0.0, 0.45)])
+    assert np.sqrt(np.mean(np.square(terms(corners) @ left))) < 0.045
+    error = [np.linalg.norm(mapper.map.pose(k)[:3, 3] - t[:3, 3]) for k, t in zip(flight.keyframes, flight.true_T_m_k)]
+    assert np.sqrt(np.mean(np.square(error))) < 0.01
+
+
+def test_a_short_look_changes_little(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=14, turns=0.1, drift_m=0.001)
+    mapper = Mapper(BaseConfig(), words)
+    fly(mapper, flight, NONE)
+    assert np.all(np.abs(mapper.map.disparity_offset_px[AgentId(0)]) < 0.06)
+    assert AgentId(0) not in mapper.map.disparity_known

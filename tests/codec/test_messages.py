@@ -75,7 +75,7 @@ def some_records(seed: int, n: int) -> list[Record]:
         Removed(keyframe, index),
         Culled(keyframe, index, int(rng.integers(2))),
         Placement(submap, pose),
-        Calibration(AgentId(3), -0.0703125),
+        Calibration(AgentId(3), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0),
         Tile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
         Copy(keyframe, submap_id(2, 1, 7), pose),
         Copied(

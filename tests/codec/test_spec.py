@@ -112,7 +112,7 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["submap"] = s.varint()
         out["T_m_k"] = s.pose()
     elif kind == 25:
-        out["disparity_px"] = s.signed() / 1024
+        out["disparity_px"] = [s.signed() / 1024 for _ in range(5)]
     elif kind == 22:
         out["cell_m"] = struct.unpack("<f", s.raw(4))[0]
         inflated = zlib.decompress(s.raw(len(data) - 4), -15)

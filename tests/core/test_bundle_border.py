@@ -1,0 +1,110 @@
+"""Offsets of disparities as unknowns of a bundle, against an independent solver and dense algebra."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from kiteline_core import se3
+from kiteline_core.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
+
+F64 = NDArray[np.float64]
+LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
+TRUE = np.array([[0.3, -0.4], [-0.2, 0.0]])  # px: constant, and by the x of the image; of two agents
+EASY = BundleConfig(robust_trials=60, final_trials=0, stop=0.0, chi2_mono=1e9, chi2_stereo=1e9)
+
+
+def passage(sigma: float = 10.0, seed: int = 4) -> BundleProblem:
+    """Six cameras that pass a cloud sideways, the last three another agent's; the first two stay."""
+    rng = np.random.default_rng(seed)
+    world = np.stack([rng.uniform(-4, 7, 90), rng.uniform(-3, 3, 90), rng.uniform(3, 12, 90)], 1)
+    truth = np.stack([se3.inverse(se3.exp(np.array([0.6 * i, 0.1 * i, 0, 0, 0.03 * i, 0]))) for i in range(6)])
+    camera, rows, group, terms, starts = [], [], [], [], [0]
+    for p in world:
+        for c, T in enumerate(truth):
+            x, y, z = se3.transform(T, p[None])[0]
+            u, v = LENS[0] * x / z + LENS[2], LENS[1] * y / z + LENS[3]
+            if not (0 < u < 640 and 0 < v < 480):
+                continue
+            term = np.array([1.0, x / z])
+            noise = rng.normal(0, 0.2, 3)
+            off = term @ TRUE[c // 3] if rng.random() < 0.8 else None
+            camera.append(c)
+            rows.append([u + noise[0], v + noise[1], -1.0 if off is None else max(LENS[4] / z + off + noise[2], 0.1)])
+            group.append(-1 if off is None else c // 3)
+            terms.append(term)
+        starts.append(len(rows))
+    seen = np.diff(starts) >= 2
+    keep = np.repeat(seen, np.diff(starts))
+    free = np.arange(6) >= 2
+    start = np.stack([se3.exp(rng.normal(0, 0.01, 6)) @ T if f else T for T, f in zip(truth, free)])
+    return BundleProblem(
+        start, np.tile(LENS, (6, 1)), free, world[seen] + rng.normal(0, 0.05, (int(seen.sum()), 3)),
+        np.concatenate([[0], np.cumsum(np.diff(starts)[seen])]).astype(np.int32), np.array(camera, np.int32)[keep],
+        np.array(rows)[keep], np.full((int(keep.sum()), 2), 0.2),
+        Border(np.array(group, np.int32)[keep], np.array(terms)[keep], np.zeros((2, 2)), np.full(2, sigma)),
+    )  # fmt: skip
+
+
+def residuals(problem: BundleProblem, poses: F64, points: F64, c: F64) -> F64:
+    assert problem.border is not None
+    which = np.repeat(np.arange(len(points)), np.diff(problem.starts))
+    q = np.einsum("nij,nj->ni", poses[problem.camera][:, :3, :3], points[which]) + poses[problem.camera][:, :3, 3]
+    off = np.where(problem.border.group >= 0, np.sum(problem.border.terms * c[problem.border.group], axis=1), 0.0)
+    r = np.stack([LENS[0] * q[:, 0] / q[:, 2] + LENS[2], LENS[1] * q[:, 1] / q[:, 2] + LENS[3], LENS[4] / q[:, 2]], 1)
+    r -= problem.measured - np.stack([0 * off, 0 * off, off], 1)
+    r[problem.measured[:, 2] < 0, 2] = 0.0
+    return np.concatenate([(r / problem.sigma[:, [0, 0, 1]]).ravel(), (c / problem.border.sigma).ravel()])
+
+
+def solved(problem: BundleProblem) -> tuple[float, F64, F64]:
+    """Cost, offsets and their covariance by an independent solver over all unknowns."""
+    f = int(problem.free.sum())
+
+    def unpacked(x: F64) -> tuple[F64, F64, F64]:
+        poses = problem.T_c_m.copy()
+        poses[problem.free] = [se3.exp(d) @ T for d, T in zip(x[: 6 * f].reshape(f, 6), poses[problem.free])]
+        return poses, x[6 * f : -4].reshape(-1, 3), x[-4:].reshape(2, 2)
+
+    start = np.concatenate([np.zeros(6 * f), problem.points.ravel(), np.zeros(4)])
+    found = least_squares(lambda x: residuals(problem, *unpacked(x)), start, xtol=1e-14, ftol=1e-14, gtol=1e-10)
+    cov = np.linalg.inv(found.jac.T @ found.jac)[-4:, -4:]
+    return 2.0 * float(found.cost), found.x[-4:].reshape(2, 2), cov
+
+
+@pytest.mark.parametrize("sigma", [10.0, 0.05])
+def test_offsets_and_their_covariance_are_those_of_an_independent_solver(sigma: float) -> None:
+    problem = passage(sigma)
+    ours = bundle(problem, EASY)
+    cost, offset, cov = solved(problem)
+    assert ours.final_cost == pytest.approx(cost, rel=1e-6)
+    assert np.allclose(ours.offset, offset, atol=1e-4)
+    assert np.allclose(ours.offset_cov, cov, rtol=2e-2, atol=1e-8)
+
+
+def test_offsets_are_found_within_their_covariance() -> None:
+    wrong: list[F64] = []
+    for seed in range(12):
+        ours = bundle(passage(seed=seed), BundleConfig(robust_trials=15, final_trials=10))
+        error = (ours.offset - TRUE).ravel()
+        wrong.append(error @ np.linalg.solve(ours.offset_cov, error))
+    assert 2.0 < np.mean(wrong) < 8.0  # of 4 unknowns
+
+
+def test_where_it_begins_does_not_matter_and_no_border_is_as_before() -> None:
+    problem = passage()
+    assert problem.border is not None
+    far = replace(problem, border=replace(problem.border, start=TRUE + 0.3))
+    a, b = bundle(problem, EASY), bundle(far, EASY)
+    assert np.allclose(a.offset, b.offset, atol=1e-5)
+    plain = bundle(replace(problem, border=None), BundleConfig())
+    assert plain.offset.size == 0
+
+    def key(result: BundleResult) -> bytes:
+        return result.T_c_m.tobytes() + result.points.tobytes() + result.offset.tobytes()
+
+    assert key(bundle(problem, EASY)) == key(a)
