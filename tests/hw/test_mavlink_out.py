@@ -13,7 +13,8 @@ import pytest
 
 from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.mavlink_frames import mounting
-from kiteline_hw.mavlink_out import MavlinkPoseSink, MavlinkUrl, parse_mavlink_url
+from kiteline_hw.mavlink_out import MavlinkPoseSink
+from kiteline_hw.mavlink_wire import MavlinkUrl, parse_mavlink_url
 from kiteline_hw.ports import LinkError, PoseSample
 from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.sim.serial_pair import SerialPair
