@@ -13,7 +13,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
 from kiteline_agent.glimpse import Glimpse
-from kiteline_agent.governor import LADDER, Extra, Governor, governed
+from kiteline_agent.governor import FULL, Extra, Governor, governed
 from kiteline_agent.inertial import level_rotation
 from kiteline_agent.inertial_tracker import InertialTracker
 from kiteline_agent.keyframe_maker import KeyframeMaker
@@ -96,6 +96,7 @@ class Agent:
         )
         self._full_config = config  # before the governor saves on it
         self._governor = Governor(config.governor)
+        self._effort = FULL
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
         self._motion_depth = DepthFromMotion(self.map, config, self.work)
         self._mono = MonoStart(self._camera, config) if one_eye else None
@@ -173,11 +174,12 @@ class Agent:
         """Whether the frame is tracked, at the effort on which the governor decides; its samples are kept anyhow."""
         if step_input.imu is not None:
             self._held_imu.append(step_input.imu)
-        decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=self._failures > 0)
+        carried = self._inertial is not None and self._inertial.running
+        decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=self._failures > 0, carried=carried)
         self._events.extend(decision.events)
-        if decision.changed:
-            points = self._config.align.points
-            self._config = governed(self._full_config, LADDER[decision.level])
+        if decision.effort != self._effort:
+            self._effort, points = decision.effort, self._config.align.points
+            self._config = governed(self._full_config, decision.effort)
             self._tracker.configure(self._config)
             self._maker.configure(self._config)
             self.map.searched = self._config.local_map.searched
@@ -232,6 +234,7 @@ class Agent:
         self._bridged = False
         if self._inertial is None:
             return track
+        self.work.fused = 1
         seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
         state = self._inertial.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen)
         if state is None:
@@ -304,7 +307,7 @@ class Agent:
         wish = self._reference.asks(track, t_ns, self._frame_number, self._config, self._channel.keyframe_gap_ns())
         if wish is None:
             return
-        if not wish.urgent and not self._governor.may(Extra.KEYFRAME):
+        if not self._governor.may(Extra.KEYFRAME, urgent=wish.urgent):
             self._events.append("governor: keyframe put off")
         elif not wish.waits:
             self._events.append(f"keyframe: {wish.why}")

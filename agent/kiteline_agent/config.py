@@ -206,17 +206,22 @@ class GovernorConfig:
 
     cpu_percent: float = 0.0  # of one core, over any window; 0: no budget
     window_s: float = 1.0  # s in which the budget has to hold
-    margin: float = 0.96  # share of the budget that is planned with: the rest is for what was not foreseen
-    tight: float = 0.94  # share of the budget above which effort falls
+    margin: float = 0.97  # share of the budget that is planned with: the rest is for what was not foreseen
+    tight: float = 0.95  # share of the budget above which effort falls
+    fill: float = 0.92  # share up to which frames are let through between two rows
     comfort: float = 0.86  # share below which the next better effort would have to stay, so that effort rises
     grace_s: float = 2.0  # s at the start that are not booked: a map has to be begun
     down_s: float = 0.25  # s between two falls: the expectations need time to show the first one
     up_s: float = 1.5  # s of comfort before a rise
-    max_skips: int = 6  # frames in a row; after more, a track is hard to find again
-    doubt: float = 0.15  # how much dearer than expected a frame may be
+    max_gap_s: float = 0.35  # s between tracked frames; after more, a track is hard to find again
+    carried_gap_s: float = 0.8  # the same with an IMU, whose prediction counts as tracking for 1 s
+    doubt: float = 0.1  # how much dearer than expected a frame may be
     learning: float = 0.15  # gain of the expectations of frames
-    slow_learning: float = 0.03  # gain of the expected share of keyframes
-    first_share: float = 0.12  # of keyframes among frames, before it was seen
+    keyframe_memory_s: float = 2.0  # s over which keyframes are counted
+    first_keyframes: float = 2.0  # in a second, before it was seen
+    first_frame_ms: float = 3.5  # of a tracked frame at full effort, before it was seen: 752x480 on a laptop
+    first_period_s: float = 0.05  # between frames, before it was seen
+    settling_s: float = 1.0  # s at the start in which effort follows the load without hysteresis
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ class Work:
     stereo_points: int = 0
     posed_points: int = 0
     inertial_samples: int = 0
+    fused: int = 0
     keyframes: int = 0
     detected_px: int = 0
     births: int = 0
@@ -41,7 +42,8 @@ PRICES_NS: dict[str, float] = {
     "alignments": 1_900,  # a template aligned at one level
     "stereo_points": 900,  # a row looked along
     "posed_points": 1_200,  # a point in the motion-only optimisation
-    "inertial_samples": 15_000,  # preintegration and its share of the smoother
+    "inertial_samples": 3_000,  # preintegration
+    "fused": 120_000,  # a frame in the smoother
     "keyframes": 700_000,  # coding and bookkeeping
     "detected_px": 7,  # a pixel of the image searched for corners
     "births": 24_000,  # row search, descriptor, template, code

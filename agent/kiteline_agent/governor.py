@@ -1,9 +1,10 @@
 """The CPU governor: holds the agent's CPU time under a share of one core, at the least loss of accuracy.
 
-A closed loop on the CPU time that is handed in with each frame. Two things are steered: an effort, one row of LADDER
-(how many points, how much stereo, how many keyframes), and, on the last row only, which frames are tracked at all.
-Quality follows the expected load, with hysteresis; frames are let through evenly, as many as the budget bears; and
-over both stands a sum over the last second that is overdrawn only to keep the vehicle from being lost.
+A closed loop on the CPU time that is handed in with each frame. What is steered is an effort, one row of a ladder: how
+many points, how much stereo, how fine the images, how many keyframes, and every which frame is tracked. The rows stand
+in the order of what they cost in accuracy (docs/decisions/governor-ladder.md). Effort follows the expected load, with
+hysteresis; on the last row frames are let through evenly, as many as the budget bears; and over all stands a sum over
+the last second that is overdrawn only to keep the vehicle from being lost.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from kiteline_agent.config import AgentConfig, GovernorConfig
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much work a frame may be. Factors on the configuration's own numbers, except levels."""
+    """How much work a frame may be. Factors on the configuration's own numbers, except levels and every."""
 
     points: float  # of the fine and the coarse pass, and of the inliers that are wanted
     corners: float  # a keyframe's births
@@ -26,18 +27,36 @@ class Effort:
     first: int  # finest pyramid level that is made
     keyframes: float  # motion until the next keyframe
     slots: float  # keyframes whose points are looked for
-    cost: float  # of a frame relative to the first row: a start, until it was measured
+    every: int  # which frame is tracked: 1 all, 2 every other one
+    frame_cost: float  # of a tracked frame relative to the first row: a start, until it was measured
+    keyframe_cost: float  # the same of what a keyframe adds
 
 
-LADDER = (
-    Effort(1.00, 1.00, 1.00, 1, 0, 1.0, 1.00, 1.00),
-    Effort(0.80, 0.80, 0.80, 1, 0, 1.1, 1.00, 0.90),
-    Effort(0.65, 0.65, 0.60, 0, 0, 1.2, 1.00, 0.73),
-    Effort(0.80, 0.70, 0.60, 1, 1, 1.2, 1.00, 0.60),
-    Effort(0.60, 0.60, 0.50, 1, 1, 1.4, 0.75, 0.51),
-    Effort(0.45, 0.45, 0.35, 0, 1, 1.5, 0.50, 0.41),
-    Effort(0.35, 0.40, 0.30, 0, 1, 1.6, 0.50, 0.36),
-)  # from the best to the cheapest
+FULL = Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 1, 1.00, 1.00)
+# Rows from the best to the cheapest. The two ladders have as many, of about equal cost: at the same level one takes
+# over from the other.
+CARRIED = (
+    FULL,
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.85, 1.00),
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.85, 1.00),
+    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 3, 0.76, 0.85),
+    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 4, 0.76, 0.85),
+    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 4, 0.65, 0.55),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.42, 0.45),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 0.5, 6, 0.42, 0.45),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 8, 0.34, 0.35),
+)  # an IMU carries the pose over skipped frames: frames before points
+ALONE = (
+    FULL,
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.85, 1.00),
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.85, 1.00),
+    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.65, 0.55),
+    Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.48, 0.50),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.42, 0.45),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.42, 0.45),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.42, 0.45),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.34, 0.35),
+)  # images alone: a turn between two frames has to be followed
 
 
 class Extra(Enum):
@@ -48,7 +67,8 @@ class Extra(Enum):
     SUBMAP = "submap"  # a first keyframe
 
 
-_LONGER = 1.01  # growth of the expected period a frame, should the camera become slower
+_LONGER = 1.03  # growth of the expected period a frame, should the camera be slower than thought
+_FIRST_LONGER = 2.5  # the same between the first two frames; more, and the core was busy with the first
 _GUESS = 3.0  # usual frames that something dear costs, before it was seen
 _OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
 _LEAST = 0.2  # of the budget is for frames, whatever keyframes cost
@@ -56,13 +76,12 @@ _LEAST = 0.2  # of the budget is for frames, whatever keyframes cost
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What to do with a frame. track: whether it is tracked at all. level: row of LADDER. changed: level is new.
-    events: what was decided, in words for the log.
+    """What to do with a frame. track: whether it is tracked at all. effort: at which. events: what was decided, in
+    words for the log.
     """
 
     track: bool
-    level: int
-    changed: bool
+    effort: Effort
     events: tuple[str, ...]
 
 
@@ -101,62 +120,82 @@ class Governor:
     def __init__(self, config: GovernorConfig) -> None:
         self._config = config
         self.level = 0
+        self._ladder = ALONE
         self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # a window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
-        self._turn = 0.0  # grows by the share of frames that can be tracked; at 1 it is a frame's turn
+        self._turn = 1.0  # grows by the share of frames that are tracked; at 1 it is a frame's turn
         self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
+        self._idle_ns = 0.0  # what a frame costs that is not tracked
         self._extra_ns = dict.fromkeys(Extra, 0.0)  # what each adds to a frame
-        self._keyframe_share = config.first_share  # of the tracked frames
-        self._period_ns = 0.0  # between frames
+        self._keyframes_s = config.first_keyframes  # in a second
+        self._made = 0  # keyframes since the last frame
+        self._period_ns = config.first_period_s * 1e9  # between frames
         self._first_t_ns = 0
         self._last_t_ns: int | None = None
+        self._tracked_t_ns = 0  # of the last frame that was tracked
         self._last_tracked = False
         self._last_extra: Extra | None = None  # of the last frame
+        self._waiting: Extra | None = None  # what there was no room for
         self._calm_since_ns = 0
         self._level_since_ns = 0
-        self._skipped = 0  # frames in a row
+        self._gap_s = config.max_gap_s  # most that may lie between two tracked frames
+        self._measured = False  # until then frames are expected to cost what they do elsewhere
+        if self.on:  # a map begins with dear frames: not at an effort that cannot be borne
+            self._frame_ns = config.first_frame_ms * 1e6
+            self._climb_to(ALONE, self._bearable(0))
 
     @property
     def on(self) -> bool:
         """Whether there is a budget."""
         return self._budget_ns > 0.0
 
-    def frame(self, t_ns: int, last_cpu_ns: int, *, lost: bool = False) -> Decision:
+    @property
+    def _row(self) -> Effort:
+        return self._ladder[self.level]
+
+    def frame(self, t_ns: int, last_cpu_ns: int, *, lost: bool = False, carried: bool = False) -> Decision:
         """Decide about the frame at t_ns. last_cpu_ns: what the frame before cost, whether it was tracked or not.
 
-        lost: there is no track that a skipped frame could endanger.
+        lost: there is no track that a skipped frame could endanger. carried: an IMU bridges skipped frames.
         """
         if not self.on:
-            return Decision(True, 0, False, ())
+            return Decision(True, FULL, ())
         self._learn(last_cpu_ns)
         self._advance(t_ns)
-        before, pace = self.level, self._pace()
+        before, load = self.level, self._load(self.level)
         events: list[str] = []
+        self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
+        self._climb_to(CARRIED if carried else ALONE, self.level)
         self._steer(t_ns)
-        track = self._affordable(lost)
-        if not track and self.level < len(LADDER) - 1:
-            self._set_level(t_ns, self.level + 1)  # quality before frames
-            track = self.level < len(LADDER) - 1 or self._affordable(lost)
-        track = self._its_turn() and track
-        if not track and not lost and self._skipped >= self._config.max_skips:
+        track = self._its_turn(lost) and self._affordable(lost)
+        if not track and not lost and t_ns + self._period_ns - self._tracked_t_ns > self._gap_s * 1e9:
             track = True  # frames before tracking
-            events.append("governor: over budget, or the track would be lost")
+            if not self._affordable(lost):
+                events.append("governor: over budget, or the track would be lost")
         if self.level != before:
-            share = 100.0 * pace
-            events.insert(0, f"governor: effort {before} -> {self.level}, every frame took {share:.0f} % of the budget")
+            events.insert(0, f"governor: effort {before} -> {self.level}, the load was {100.0 * load:.0f} % of it")
         if track:
-            self._skipped = 0
+            self._turn = max(self._turn - 1.0, 0.0)
+            self._tracked_t_ns = t_ns
         else:
-            self._skipped += 1
             events.append("governor: frame skipped")
         self._last_t_ns, self._last_tracked, self._last_extra = t_ns, track, None
-        return Decision(track, self.level, self.level != before, tuple(events))
+        return Decision(track, self._row, tuple(events))
 
-    def may(self, extra: Extra) -> bool:
-        """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it."""
-        if self.on and not self._room_for(extra):
-            return False
+    def may(self, extra: Extra, *, urgent: bool = False) -> bool:
+        """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it.
+
+        urgent: without it the track may be lost; that is prevented over budget where no IMU bridges the loss.
+        """
+        if self.on and not (urgent and self._ladder is ALONE):
+            waiting, self._waiting = self._waiting, None
+            if waiting is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
+                self._waiting = waiting
+                return False
+            if not self._room_for(extra):
+                self._waiting = extra
+                return False
         self.note(extra)
         return True
 
@@ -171,22 +210,22 @@ class Governor:
         if self._last_t_ns >= self._first_t_ns + self._config.grace_s * 1e9:
             self._spent.append((self._last_t_ns, cpu_ns))
             self._window_ns += cpu_ns
-        if not self._last_tracked:
-            return
         gain = self._config.learning
-        made = float(self._last_extra is Extra.KEYFRAME)
-        self._keyframe_share += (made - self._keyframe_share) * self._config.slow_learning
+        if not self._last_tracked:
+            self._idle_ns += (cpu_ns - self._idle_ns) * (gain if self._idle_ns else 1.0)
+            return
         if self._last_extra is not None:
             known_ns = self._extra_ns[self._last_extra]
             more_ns = max(cpu_ns - self._frame_ns, 0.0)
             self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * gain if known_ns else 1.0)
-        elif self._frame_ns:
+            self._made += self._last_extra is Extra.KEYFRAME
+        elif self._measured:
             cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # a frame that was lost and found says little
             # Quicker to believe that frames are dear than that they are cheap.
             up = 2.0 * gain if cpu_ns > self._frame_ns else gain
             self._frame_ns += (cpu_ns - self._frame_ns) * min(up, 1.0)
         else:
-            self._frame_ns = float(cpu_ns)
+            self._frame_ns, self._measured = float(cpu_ns), True
 
     def _advance(self, t_ns: int) -> None:
         """Move the window to a new time."""
@@ -194,66 +233,98 @@ class Governor:
         while self._spent and self._spent[0][0] <= t_ns - window_ns:
             self._window_ns -= self._spent.popleft()[1]
         if self._last_t_ns is None:
-            self._first_t_ns = self._level_since_ns = self._calm_since_ns = t_ns
+            self._first_t_ns = self._level_since_ns = self._calm_since_ns = self._tracked_t_ns = t_ns
             return
         # Frames that a busy core passed over were not asked about: the shortest period is the camera's.
         passed_ns = float(t_ns - self._last_t_ns)
-        self._period_ns = min(passed_ns, _LONGER * self._period_ns) if self._period_ns else passed_ns
+        longer = _LONGER if self._last_t_ns > self._first_t_ns else _FIRST_LONGER
+        if passed_ns <= longer * self._period_ns:
+            self._period_ns = passed_ns
+        elif self._last_t_ns > self._first_t_ns:
+            self._period_ns *= longer
+        forgotten = min(passed_ns / (self._config.keyframe_memory_s * 1e9), 1.0)
+        self._keyframes_s += self._made / self._config.keyframe_memory_s - self._keyframes_s * forgotten
+        self._made = 0
+        self._turn += self._share() * passed_ns / self._period_ns
 
     def _affordable(self, lost: bool) -> bool:
         """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
-        if not lost:
-            cost_ns = self._frame_ns * (1.0 + self._config.doubt)
-            return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
-        return self._room_for(Extra.SEARCH)
+        if lost:
+            return self._room_for(self._waiting or Extra.SEARCH)
+        cost_ns = self._frame_ns * (1.0 + self._config.doubt)
+        return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 
     def _room_for(self, extra: Extra) -> bool:
         """Whether a frame with something dear fits; what never fits is done when little else was."""
         need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
+        if self._last_extra is not None and self._last_extra is not extra:  # done in this very frame
+            need_ns += self._extra_ns[self._last_extra] or _GUESS * self._frame_ns
+        need_ns *= 1.0 + self._config.doubt
         return self._window_ns + need_ns <= self._budget_ns or self._window_ns <= _LEAST * self._budget_ns
 
-    def _its_turn(self) -> bool:
-        """On the last row: whether the frame is one of those, evenly spread, that the budget lets through."""
-        pace = self._pace()
-        # A keyframe may come at any time.
-        bearable = self._config.margin - self._extra_ns[Extra.KEYFRAME] / self._budget_ns
-        if self.level < len(LADDER) - 1 or pace <= bearable:
-            self._turn = 0.0
-            return True
-        self._turn += max(bearable, _LEAST) / pace
-        if self._turn < 1.0:
-            return False
-        self._turn -= 1.0
-        return True
+    def _its_turn(self, lost: bool) -> bool:
+        """Whether the frame is one of those, evenly spread, that are tracked. A turn that cannot be paid for waits."""
+        self._turn = min(self._turn, 2.0)
+        return lost or self._turn >= 1.0 - 1e-6
+
+    def _share(self) -> float:
+        """Of the frames that are tracked: what the budget bears, but no more than on the next better row."""
+        most = 1.0 / self._every(max(self.level - 1, 0))
+        all_frames = self._frames(self.level) * self._every(self.level)
+        if all_frames <= 0.0:
+            return most
+        bearable = self._config.fill - self._load(self.level) + self._frames(self.level)
+        return min(most, max(bearable, _LEAST) / all_frames)
+
+    def _every(self, level: int) -> float:
+        """Which frame a row tracks; never so few that the track would be lost."""
+        most = self._gap_s * 1e9 // self._period_ns
+        return max(min(self._ladder[level].every, most), 1.0)
+
+    def _frames(self, level: int) -> float:
+        """Share of the budget that the tracked frames of a row take, without keyframes."""
+        row, now = self._ladder[level], self._row
+        frame_ns = self._frame_ns * row.frame_cost / now.frame_cost
+        return frame_ns / self._every(level) * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
+
+    def _load(self, level: int) -> float:
+        """Share of the budget that a row is expected to take: frames, keyframes (one may come at any time), the rest."""
+        if not self._frame_ns:
+            return 0.0
+        row, now = self._ladder[level], self._row
+        keyframes = max(self._keyframes_s * self._config.window_s * now.keyframes / row.keyframes, 1.0)
+        keyframe_ns = self._extra_ns[Extra.KEYFRAME] * row.keyframe_cost / now.keyframe_cost
+        idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * self._config.window_s * 1e9 / self._period_ns
+        return self._frames(level) + (keyframes * keyframe_ns + idle_ns) / self._budget_ns
 
     def _steer(self, t_ns: int) -> None:
         """Hysteresis on the load: down at once, up only after a calm while and one row a time."""
         config = self._config
-        load = self._pace()
-        settled_ns = t_ns - self._level_since_ns
-        if load > config.tight and settled_ns >= config.down_s * 1e9:
-            level = self.level
-            while level < len(LADDER) - 1 and load > config.tight:
-                load *= LADDER[level + 1].cost / LADDER[level].cost
-                level += 1
+        if t_ns - self._first_t_ns < config.settling_s * 1e9:  # nothing to hold on to yet
+            self._set_level(t_ns, self._bearable(0))
+            return
+        if self._load(self.level) > config.tight and t_ns - self._level_since_ns >= config.down_s * 1e9:
+            level = self._bearable(self.level)
             if level != self.level:
                 self._set_level(t_ns, level)
                 return
-        better = max(self.level - 1, 0)
-        if load * LADDER[better].cost / LADDER[self.level].cost > config.comfort or self._skipped:
+        if self.level == 0 or self._load(self.level - 1) > config.comfort:
             self._calm_since_ns = t_ns
-        elif self.level > 0 and t_ns - self._calm_since_ns >= config.up_s * 1e9:
-            self._set_level(t_ns, better)
+        elif t_ns - self._calm_since_ns >= config.up_s * 1e9:
+            self._set_level(t_ns, self.level - 1)
 
-    def _pace(self) -> float:
-        """Share of the budget that tracking every frame at this effort takes."""
-        if not self._period_ns or not self._frame_ns:
-            return 0.0
-        a_frame_ns = self._frame_ns + self._keyframe_share * self._extra_ns[Extra.KEYFRAME]
-        return a_frame_ns * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
+    def _bearable(self, best: int) -> int:
+        """The best row from `best` on that the budget bears, else the last one."""
+        rows = range(best, len(self._ladder))
+        return next((row for row in rows if self._load(row) <= self._config.tight), rows[-1])
 
     def _set_level(self, t_ns: int, level: int) -> None:
-        self._frame_ns *= LADDER[level].cost / LADDER[self.level].cost
-        self._extra_ns[Extra.KEYFRAME] *= LADDER[level].corners / LADDER[self.level].corners
-        self.level = level
+        self._climb_to(self._ladder, level)
         self._level_since_ns = self._calm_since_ns = t_ns
+
+    def _climb_to(self, ladder: tuple[Effort, ...], level: int) -> None:
+        """Another row: what was learned is scaled."""
+        before = self._row
+        self._ladder, self.level = ladder, level
+        self._frame_ns *= self._row.frame_cost / before.frame_cost
+        self._extra_ns[Extra.KEYFRAME] *= self._row.keyframe_cost / before.keyframe_cost
