@@ -120,7 +120,7 @@ class Governor:
     def __init__(self, config: GovernorConfig) -> None:
         self._config = config
         self.level = 0
-        self._ladder = ALONE
+        self._ladder: tuple[Effort, ...] = ALONE
         self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # a window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
@@ -288,7 +288,7 @@ class Governor:
         return frame_ns / self._every(level) * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
 
     def _load(self, level: int) -> float:
-        """Share of the budget that a row is expected to take: frames, keyframes (one may come at any time), the rest."""
+        """Share of the budget that a row is expected to take: frames, keyframes (one may always come), the rest."""
         if not self._frame_ns:
             return 0.0
         row, now = self._ladder[level], self._row

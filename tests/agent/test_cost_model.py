@@ -10,7 +10,7 @@ from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import PRICES_NS, Work, cost_ns
-from kiteline_agent.governor import LADDER, governed
+from kiteline_agent.governor import CARRIED, governed
 from kiteline_agent.step import Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
@@ -49,7 +49,7 @@ def test_a_flight_costs_what_was_counted(recording: Path) -> None:
 
 
 def test_less_effort_is_counted_as_less(recording: Path) -> None:
-    sums = [sum(costs_of(recording, governed(AgentConfig(), row))[0]) for row in (LADDER[0], LADDER[2], LADDER[-1])]
+    sums = [sum(costs_of(recording, governed(AgentConfig(), row))[0]) for row in (CARRIED[0], CARRIED[3], CARRIED[-1])]
     assert sums[0] > sums[1] > sums[2]
 
 
