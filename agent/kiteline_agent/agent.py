@@ -12,6 +12,7 @@ from kiteline_agent.certainty import Certainty
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
+from kiteline_agent.frozen import FrozenEye
 from kiteline_agent.glimpse import Glimpse
 from kiteline_agent.governor import FULL, Extra, Governor, governed
 from kiteline_agent.inertial import level_rotation
@@ -103,12 +104,14 @@ class Agent:
         self._glimpse = Glimpse(self._camera)
         self.window = Window(self._camera, config.window, config.matching, config.ransac, words)
         self._smoothing = Smoothing(config.smoothing)
-        self._recovery = Recovery(self.map, self._tracker, config, words, self.window)
+        self._recovery = Recovery(self.map, self._tracker, config, words, self.window, self._believes)
+        self._frozen = FrozenEye(self._camera)
         self._events: list[str] = []
         self._frame_number = 0
         self._last_t_ns: int | None = None
         self._failures = 0  # tries since the old map was lost that had texture in view
         self._lost = False  # the last frame had no pose
+        self._predicted: F64 = np.eye(4)  # T_m_c of this frame
         self._placements: dict[SubmapId, F64] = {}
         self.tiles: dict[tuple[int, int], Tile] = {}
         channel.put(Camera(identity.agent, self._camera))
@@ -134,14 +137,17 @@ class Agent:
         view = self._view(frame)
         # 2. Predict from the IMU or from the last motion.
         dt_s = 0.0 if self._last_t_ns is None else (frame.t_ns - self._last_t_ns) * 1e-9
-        predicted = self._predict(frame.t_ns, imu, dt_s)
+        predicted = self._predicted = self._predict(frame.t_ns, imu, dt_s)
+        self._certainty.guide(self._inertial is not None and self._inertial.running)
         # 3. Track against the local map, or begin a map.
         self._frame_number += 1
         track = None
-        if self._submaps.any:
+        frozen = self._submaps.any and self._frozen.repeats(frame.left, self._pose.T_o_m @ predicted)
+        if self._submaps.any and not frozen:
             track = self._tracker.track(view, se3.inverse(predicted), self._frame_number)
             track = self._second_look(view, track)
-        if track is not None and track.inliers >= self._config.pose.min_inliers:
+        enough = track is not None and track.inliers >= self._config.pose.min_inliers
+        if track is not None and enough and self._believes(track.T_c_m, self.submap):
             track = self._fuse(track, frame.t_ns)
             if self._lost:
                 self._land(predicted, track)
@@ -157,8 +163,8 @@ class Agent:
             # 5. Lost: the IMU carries on for a while; search the old map; with texture in view and two failed tries,
             # open a new submap.
             self._bridged = self._coast(predicted, frame.t_ns, dt_s)
-            track = self._recover(view, frame.t_ns)
-            found = track is not None or self._begin_submap(view, frame.t_ns, imu)
+            track = None if frozen else self._recover(view, frame.t_ns)
+            found = track is not None or (not frozen and self._begin_submap(view, frame.t_ns, imu))
             if found:
                 self._bridged = False
                 self._restart_inertial(frame.t_ns)
@@ -257,7 +263,7 @@ class Agent:
     def _land(self, guessed_T_m_c: F64, track: Track) -> None:
         """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
         self._pose.T_m_c = guessed_T_m_c
-        self._certainty.carry(self._pose, self._T_c_b)
+        self._certainty.carry(self._pose, self._T_c_b, self.submap)
         self._pose.move_map(se3.inverse(track.T_c_m))
 
     def _coast(self, predicted: F64, t_ns: int, dt_s: float) -> bool:
@@ -290,7 +296,7 @@ class Agent:
 
     def _accept(self, track: Track, dt_s: float) -> None:
         """Take over a measured pose and what it says of the points and of the motion."""
-        self._pose.measured(se3.inverse(track.T_c_m), dt_s)
+        self._pose.measured(se3.inverse(track.T_c_m), dt_s, repeated=self._frozen.repeated)
         self._failures = 0
         self._certainty.measured(track)
         if self._mono is not None:
@@ -371,7 +377,7 @@ class Agent:
             return False
         # 2. Set the camera into it.
         if not first:
-            self._certainty.carry(self._pose, self._T_c_b)
+            self._certainty.carry(self._pose, self._T_c_b, self.submap)
             self._pose.enter_submap()
             if self._mono is None:  # maps of one eye differ in scale: no rigid motion joins them
                 self._recovery.search_beside(self._frame_number)
@@ -410,7 +416,7 @@ class Agent:
         """Go on in a new submap whose unit is a metre."""
         assert self._inertial is not None and self._mono is not None
         self._events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
-        self._certainty.carry(self._pose, self._T_c_b)
+        self._certainty.carry(self._pose, self._T_c_b, self.submap)
         T_n_m = self._submaps.open_in_metres(view, t_ns, self._frame_number, unit_m, born)
         self._certainty.begin(self._pose.T_m_c @ self._T_c_b)
         self._note_keyframe(view, Extra.SUBMAP)
@@ -456,10 +462,16 @@ class Agent:
         self._add_keyframe(view, found.track, t_ns)
 
     def _return_to(self, found: Recovered) -> None:
-        self._certainty.carry(self._pose, self._T_c_b)
+        self._certainty.carry(self._pose, self._T_c_b, self.submap)
         self._submaps.return_to(found, self._frame_number)
-        self._certainty.measured(found.track)
+        if found.lent:
+            self._certainty.met(found.keyframe, found.T_c_m, found.track.inliers)
+        else:
+            self._certainty.measured(found.track)
         self._failures = 0
+
+    def _believes(self, T_c_m: F64, submap: SubmapId) -> bool:
+        return self._certainty.believes(T_c_m, submap, self._predicted, self._pose, self._T_c_b, self.submap)
 
     def _first_pose(self, imu: ImuBatch | None) -> F64:
         """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""
@@ -511,7 +523,11 @@ class Agent:
         T_m_b = self._pose.T_m_c @ self._T_c_b
         T_w_m = self._placements.get(self.submap)
         cov_m = self._certainty.of_map_pose(T_m_b)
-        quality = -1 if not tracked else max(1, min(100, inliers * 100 // 150)) if inliers else 50
+        cov_o = self._certainty.of_odometry(self._pose, self._T_c_b)
+        quality = self._certainty.quality(cov_m if tracked else cov_o, inliers or None)
+        carried = self._submaps.any and self._inertial is not None and self._inertial.running
+        if not tracked and (not carried or quality < self._config.certainty.flagged_below):
+            quality = -1
         keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c
         if keyframe != NO_KEYFRAME:
             self._channel.put(Live(self._identity.agent, t_ns, keyframe, T_k_c, quality))
@@ -531,6 +547,6 @@ class Agent:
             inliers,
             quality,
             cov_m,
-            self._certainty.of_odometry(self._pose, self._T_c_b),
+            cov_o,
             T_w_b if tracked else None,
         )

@@ -21,9 +21,12 @@ from kiteline_agent.local_map import LocalMap
 from kiteline_agent.pose_state import PoseState
 from kiteline_agent.tracker import Track
 from kiteline_core import se3
-from kiteline_core.ids import KeyframeId
+from kiteline_core.ids import KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
+
+_MET_PX = 1.0  # px, of a corner at full size that met a copy of another keyframe's
+_MET_DEPTH_M = 4.0  # of such corners
 
 
 class Certainty:
@@ -46,6 +49,8 @@ class Certainty:
         a = adjoint(T_b_c)
         self._extrinsic = a @ np.diag(extrinsic**2) @ a.T
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))  # of the camera in m
+        self._way: dict[SubmapId, F64] = {}  # T_o_m of the submaps that were left since all motion was last measured
+        self._guided = False  # an IMU measures all motion
         self._blind_s = 0.0
         self._blind = np.zeros((6, 6))  # [translation in m, rotation about the body's axes], since images were lost
         self._carried = np.zeros((6, 6))  # of the submap in o
@@ -57,7 +62,8 @@ class Certainty:
 
     def begin(self, T_m_b: F64) -> None:
         """A submap begins with the keyframe that follows, at T_m_b (4,4)."""
-        self._noise[:], self._shift[:], self._blind[:], self._blind_s = 0.0, 0.0, 0.0, 0.0
+        self._noise, self._shift, self._blind = np.zeros((6, 6)), np.zeros((6, SHAPES)), np.zeros((6, 6))
+        self._blind_s = 0.0
         self._T_m_b0 = T_m_b
         if self._T_o_b0 is None:
             self._T_o_b0 = T_m_b
@@ -77,7 +83,7 @@ class Certainty:
         share = seen / max(int(seen.sum()), 1)
         self._noise = a @ noise @ a.T + np.tensordot(share, self._noise_k, 1)
         self._shift = a @ inverse @ self._g
-        self._blind[:], self._blind_s = 0.0, 0.0
+        self._blind, self._blind_s = np.zeros((6, 6)), 0.0
 
     def remember(self, keyframe: KeyframeId) -> None:
         """This frame became a keyframe."""
@@ -101,8 +107,20 @@ class Certainty:
         grown = np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3)
         self._blind = self._blind + np.diag(grown)
 
-    def carry(self, pose: PoseState, T_c_b: F64) -> None:
-        """The map is about to change under the camera, the odometry frame goes on as it is."""
+    def met(self, keyframe: KeyframeId, T_c_m: F64, points: int) -> None:
+        """The pose is T_c_m (4,4) by so many points that are not in the local map, beside this keyframe."""
+        slot = self._map.slot_of(keyframe)
+        depth_m, focal_px = _MET_DEPTH_M, self._map.camera.fx
+        turn = _MET_PX / focal_px / math.sqrt(max(points, 4))
+        own = np.diag(np.repeat([turn * depth_m, turn], 3) ** 2)
+        a = adjoint(se3.inverse(T_c_m))
+        self._noise, self._shift = self._noise_k[slot] + a @ own @ a.T, self._shift_k[slot].copy()
+        self._blind, self._blind_s = np.zeros((6, 6)), 0.0
+
+    def carry(self, pose: PoseState, T_c_b: F64, submap: SubmapId) -> None:
+        """The map of this submap is about to change under the camera, the odometry frame goes on as it is."""
+        if self._guided:
+            self._way[submap] = pose.T_o_m
         T_m_b = pose.T_m_c @ T_c_b
         back = np.linalg.inv(_to_body(pose.T_o_m @ T_m_b))
         self._carried = back @ self._in_o(pose.T_o_m, T_m_b) @ back.T
@@ -133,6 +151,35 @@ class Certainty:
         T_m_b = pose.T_m_c @ T_c_b
         T_o_b0 = pose.T_o_m @ T_m_b if self._T_o_b0 is None else self._T_o_b0
         return self._in_o(pose.T_o_m, T_m_b) + self._of_extrinsic(T_o_b0, pose.T_o_m @ T_m_b)
+
+    def guide(self, guided: bool) -> None:
+        """Whether an IMU has measured the motion since the last frame."""
+        self._guided = guided
+        if not guided:
+            self._way = {}
+
+    def believes(
+        self, T_c_m: F64, submap: SubmapId, predicted_T_m_c: F64, pose: PoseState, T_c_b: F64, active: SubmapId
+    ) -> bool:
+        """Whether the camera may be at T_c_m (4,4) in a submap, by the way that an IMU measured since it was there."""
+        T_o_m = pose.T_o_m if submap == active else self._way.get(submap)
+        if T_o_m is None or not self._guided:
+            return True
+        c = self._config
+        here, there = pose.T_o_m @ predicted_T_m_c @ T_c_b, T_o_m @ se3.inverse(T_c_m) @ T_c_b
+        e = np.concatenate([there[:3, 3] - here[:3, 3], se3.so3_log(here[:3, :3].T @ there[:3, :3])])
+        cov = self.of_odometry(pose, T_c_b) + np.diag(np.repeat([c.surprise_m, c.surprise_rad], 3) ** 2)
+        return float(e @ np.linalg.solve(cov, e)) < c.surprise**2
+
+    def quality(self, cov: F64, inliers: int | None) -> int:
+        """How likely, in percent and at least 1, a pose of covariance cov (6,6) is good, as the configuration says.
+        inliers: None where images had no part in it.
+        """
+        c = self._config
+        trust = 1.0
+        if inliers is not None:
+            trust = min(max((inliers - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
+        return max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad)))
 
     def _in_m(self) -> F64:
         return np.asarray(self._noise + (self._shift * self._calibration) @ self._shift.T)

@@ -166,6 +166,12 @@ class CertaintyConfig:
     blind_rate_rad_s: float = 0.02  # likewise
     good_m: float = 0.2  # a pose counts as good within so much
     good_rad: float = 0.1745  # and so much: 10 degrees
+    few_inliers: int = 10  # from which on points speak for a pose: so many agree by chance
+    many_inliers: int = 30  # with which nothing speaks against it
+    flagged_below: int = 50  # quality below which a pose is not to be relied on: it is as likely wrong as good
+    surprise: float = 7.0  # deviations by which a place found again may differ from where the IMU says the vehicle is
+    surprise_m: float = 0.1  # deviation of that beside the covariances: maps are corrected meanwhile
+    surprise_rad: float = 0.05  # likewise
 
 
 @dataclass(frozen=True, slots=True)

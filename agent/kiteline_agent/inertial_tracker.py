@@ -38,7 +38,7 @@ class InertialConfig:
     max_gravity_error: float = 0.12  # relative, of its length as found without knowing it
     trusted_blind_s: float = 1.0  # so long the IMU alone counts as tracking
     askew_rad: float = 0.035  # a map that leans by more than two degrees is set upright
-    max_coast_s: float = 5.0  # longer without images, the position means nothing
+    max_coast_s: float = 20.0  # longer without images, a small IMU knows no more than that velocities change
     offset_memory_s: float = 60.0  # a time offset drifts slowly
     offset_start_sigma_s: float = 0.02  # cameras without a trigger line
     offset_turn_sigma_rad: float = 6e-4  # error of a visual turn between two frames

@@ -37,9 +37,11 @@ class PoseState:
             step = se3.exp(dt_s / self._step_s * se3.log(step))
         return se3.orthonormalise(self.T_m_c @ step)
 
-    def measured(self, T_m_c: F64, dt_s: float) -> None:
-        """The camera moved to T_m_c (4,4) within dt_s."""
+    def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
+        """The camera moved to T_m_c (4,4) within dt_s. repeated: by an old image, that says nothing of motion."""
         before, self.T_m_c = self.T_m_c, T_m_c
+        if repeated:
+            return
         self._step_T = se3.orthonormalise(se3.inverse(before) @ T_m_c)
         self._step_s = dt_s
         if dt_s > 0.0:

@@ -8,6 +8,7 @@ the young keyframes stay where they are, for the base to move.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,9 +48,12 @@ class Recovery:
     """Knows the places of all remembered keyframes, and searches them for a frame: a few keyframes a call, no more."""
 
     def __init__(
-        self, local_map: LocalMap, tracker: Tracker, config: AgentConfig, words: Vocabulary | None, window: Window
+        self, local_map: LocalMap, tracker: Tracker, config: AgentConfig, words: Vocabulary | None, window: Window,
+        believes: Callable[[F64, SubmapId], bool],
     ) -> None:  # fmt: skip
+        """believes: whether the vehicle can be at T_c_m (4,4) in a submap, by what else is known of its way."""
         self._map = local_map
+        self._believes = believes
         self._tracker = tracker
         self._window = window
         self._config = config
@@ -139,7 +143,7 @@ class Recovery:
             if T_c_m is None:
                 continue
             track = self._confirm(view, T_c_m, frame_number, submap_of_keyframe(keyframe))
-            if track is not None:
+            if track is not None and self._believes(track.T_c_m, submap_of_keyframe(keyframe)):
                 depth_m = float(np.median(track.depth_m[track.inlier]))
                 return Recovered(track.T_c_m, keyframe, track, depth_m)
         return self._search_window(seen, frame_number, exclude)
@@ -149,7 +153,7 @@ class Recovery:
         known = self._map.keyframe[self._map.keyframe != NO_KEYFRAME]
         submaps = {int(submap_of_keyframe(KeyframeId(k))) for k in known.tolist()} - {exclude}
         found = self._window.find(seen, submaps, frame_number)
-        if found is None:
+        if found is None or not self._believes(found[1].T_c_m, SubmapId(found[0])):
             return None
         submap, met = found
         newest = KeyframeId(max(k for k in known.tolist() if submap_of_keyframe(KeyframeId(k)) == submap))

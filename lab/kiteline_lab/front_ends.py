@@ -248,4 +248,4 @@ class OtherAgent(Agent):
     ) -> None:  # fmt: skip
         super().__init__(rig, imu, config, identity, channel, words)
         self._tracker = kind(self.map, config, self.work)
-        self._recovery = Recovery(self.map, self._tracker, config, words, self.window)
+        self._recovery = Recovery(self.map, self._tracker, config, words, self.window, self._believes)

@@ -17,7 +17,7 @@ from kiteline_agent.tracker import Track
 from kiteline_codec.schema import Head
 from kiteline_core import pose_kernels, se3
 from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
@@ -153,7 +153,7 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
         sizes.append(certainty.of_odometry(pose, np.eye(4))[0, 0])
     assert (np.diff(sizes) > 0.0).all()
     assert np.sqrt(sizes[-1]) == pytest.approx(1.0, abs=0.1)  # half of 2 m/s^2 for a second
-    certainty.carry(pose, np.eye(4))
+    certainty.carry(pose, np.eye(4), SubmapId(0))
     pose.move_map(se3.exp(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.3])))
     certainty.measured(tracked(local_map, clean, np.eye(4)))
     assert certainty.of_map_pose(np.eye(4))[0, 0] < 1e-4  # seen in the map again
