@@ -37,7 +37,7 @@ from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
-from kiteline_hw import process
+from kiteline_hw import kernel_cache, process
 from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
 from kiteline_hw.key_store import read_keys
@@ -83,6 +83,8 @@ class Onboard:
         self.cpu_ms: list[float] = []
         self.rss_mib = 0.0
         config = agent_config(spec.config, spec.cpu_percent)
+        if whole_process:
+            kernel_cache.fill("kiteline_agent.warm")
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(source.rig, config)

@@ -9,6 +9,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.step import Identity, StepInput
+from kiteline_codec import warm as codec_warm
 from kiteline_core.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.epipolar_kernels import search_segments
@@ -81,3 +82,8 @@ def _warm_one_eye(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
         np.zeros(1, np.uint8), np.eye(2)[None], place, place + 5.0, 0.7, 40, 0.7, 0.9,
         place.copy(), np.zeros(1, np.int8),
     )  # fmt: skip
+
+
+if __name__ == "__main__":
+    codec_warm.warm()
+    warm()

@@ -1,4 +1,4 @@
-"""Compile all kernels of the codec before the first packet, by sharing two small keyframes there and back."""
+"""Compile all kernels of the codec before the first packet, by sharing three small keyframes there and back."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
 _TICK_NS = 50_000_000
-_TICKS = 8  # enough for greetings, values and acknowledgements to pass
+_TICKS = 10  # enough for greetings, values and acknowledgements to pass
 
 
 def warm() -> None:
     """Run every kernel once, on the types that flights use."""
     n = 40
-    first, second = (keyframe_id(submap_id(0, 0, 0), k) for k in (0, 1))
+    first, second, third = (keyframe_id(submap_id(0, 0, 0), k) for k in range(3))
     index = np.arange(n, dtype=np.uint16)
     uv = np.linspace(20.0, 400.0, 2 * n, dtype=np.float32).reshape(n, 2)
     depth = np.linspace(0.1, 1.0, n, dtype=np.float32)
@@ -31,7 +31,12 @@ def warm() -> None:
             agent.put(Births(first, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
         if tick == 4:
             agent.put(Head(second, _TICK_NS, first, np.eye(4), n))
-            agent.put(Sightings(second, 0, index, uv + 1.0, depth, flat, point))
+            agent.put(Births(second, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
+            agent.put(Sightings(second, 0, index + np.uint16(n), uv + 1.0, depth, flat, point))
             base.put(Depths(first, index, depth, np.zeros((n, 2), np.float32)))
+        if tick == 6:  # points of two keyframes
+            both = np.where(np.arange(n) < n // 2, point, point + ((second - first) << KEYPOINT_BITS))
+            agent.put(Head(third, 2 * _TICK_NS, second, np.eye(4), n))
+            agent.put(Sightings(third, 0, index, uv + 1.0, depth, flat, both))
         base.receive(agent.poll(tick * _TICK_NS), tick * _TICK_NS)
         agent.receive(base.poll(tick * _TICK_NS), tick * _TICK_NS)

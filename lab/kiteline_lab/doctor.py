@@ -253,6 +253,8 @@ def examine() -> list[Finding]:
 
 def warm() -> list[Finding]:
     """Compile and cache the kernels of every room that is installed here."""
+    from kiteline_hw import kernel_cache
+
     findings = []
     for name in WARMING:
         room = name.split(".")[0]
@@ -261,6 +263,7 @@ def warm() -> list[Finding]:
         start_s = time.perf_counter()
         importlib.import_module(name).warm()
         findings.append(Finding(Level.OK, "warm", f"{room}: {time.perf_counter() - start_s:.1f} s"))
+    kernel_cache.mark()
     return findings
 
 

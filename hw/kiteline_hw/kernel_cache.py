@@ -1,0 +1,82 @@
+"""Whether compiled kernels are on disk, and a process of its own to compile them where they are not.
+
+A compiler that has run keeps 200 MiB that its process never gets back; and a drone flies in that process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+_KERNELS = "_kernels"  # how modules of kernels end
+_PATIENCE_S = 900.0  # s that a slow board may take to compile all
+
+
+def fill(module: str) -> bool:
+    """Unless it is known that all is compiled, let `python -m module` do so. Whether it is compiled now.
+
+    Kernels are those of the modules that are loaded. Where nothing can be written the caller compiles for itself.
+    """
+    if filled():
+        return True
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        done = subprocess.run(
+            [sys.executable, "-m", module],
+            check=False, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            timeout=_PATIENCE_S,
+        )  # fmt: skip
+        if done.returncode == 0:
+            mark()
+    return filled()
+
+
+def filled() -> bool:
+    """Whether the kernels of all modules that are loaded were compiled as they stand, for this processor."""
+    path = _path()
+    try:
+        return path is not None and _needed() <= set(path.read_text().splitlines())
+    except (OSError, ValueError):
+        return False
+
+
+def mark() -> None:
+    """They have been."""
+    path = _path()
+    if path is not None:
+        with contextlib.suppress(OSError):
+            young = path.with_name(f"{path.name}.{os.getpid()}")
+            young.write_text("\n".join(sorted(_needed())) + "\n")
+            os.replace(young, path)
+
+
+def _path() -> Path | None:
+    """Where it is noted: beside the first kernel of the first module."""
+    for _, module in _modules():
+        for value in vars(module).values():
+            folder = getattr(getattr(value, "stats", None), "cache_path", None)
+            if folder:
+                return Path(folder) / "kiteline-compiled"
+    return None
+
+
+def _needed() -> set[str]:
+    """One line a module, with all that its compiled code depends on."""
+    import llvmlite.binding as llvm
+    import numba
+
+    machine = f"{llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    compiler = hashlib.blake2b(machine.encode(), digest_size=8).hexdigest()
+    versions = f"{platform.python_version()} {numba.__version__} {compiler}"
+    about = [(name, os.stat(module.__file__)) for name, module in _modules()]
+    return {f"{name} {file.st_mtime_ns} {file.st_size} {versions}" for name, file in about}
+
+
+def _modules() -> list[tuple[str, Any]]:
+    loaded = [(name, module) for name, module in sys.modules.items() if name.endswith(_KERNELS)]
+    return sorted((name, module) for name, module in loaded if getattr(module, "__file__", None))
