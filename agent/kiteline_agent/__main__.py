@@ -20,6 +20,7 @@ from typing import Any, TextIO
 import cv2
 
 from kiteline_agent.agent import Agent
+from kiteline_agent.alone import AloneChannel
 from kiteline_agent.camera import Camera
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
@@ -30,6 +31,7 @@ from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json,
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_agent.tally import Tally, live_line, odometry_line
 from kiteline_agent.warm import warm
+from kiteline_codec import record_log
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.framing import StreamFramer
@@ -93,6 +95,8 @@ class Onboard:
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
         self.camera = Camera(source, until_ns, time.process_time_ns)
+        if spec.log_name and isinstance(channel, CodedChannel | AloneChannel):
+            channel.noting = True
         self.agent = Agent(
             source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel, shipped_words()
         )
@@ -184,6 +188,7 @@ class Onboard:
         self.output = output = self.agent.step(step_input, now_ns)
         if self._log is not None:
             write_step(self._log, step_input, output, now_ns, now_ns + self._log_shift_ns)
+            self._log_records(now_ns + self._log_shift_ns)
         if frame is not None:
             self._record(output)
             if not self._live_clock:
@@ -197,6 +202,13 @@ class Onboard:
         self.tally.bytes_down += sum(map(len, packets)) + len(packets) * self._overhead_bytes
         self._account(begin_ns, frame is not None)
         return sent
+
+    def _log_records(self, log_ns: int) -> None:
+        """What was shared, for a base that reads the log after landing: no link may have carried it."""
+        if self._log is not None and isinstance(self.channel, CodedChannel | AloneChannel):
+            for key, code in self.channel.take_noted().items():
+                record = record_log.write_record(AgentId(self.spec.agent), key, code)
+                self._log.blob(record_log.TOPIC, log_ns, record)
 
     def _record(self, output: StepOutput) -> None:
         self.tally.count(output.estimate)
@@ -285,7 +297,7 @@ def fly_lockstep(spec: AgentSpec, parent: process.Parent) -> None:
             up = onboard.turn(down)
             if onboard.tally.frames % _PROGRESS_FRAMES == 0:
                 parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
-            if 0 <= spec.await_base_at_s * 1e9 <= now_ns and line.lost:
+            if line.lost and (spec.await_bases or 0 <= spec.await_base_at_s * 1e9 <= now_ns):
                 parent.tell("awaiting_base")
                 line.meet_again()
                 up = onboard.hello()

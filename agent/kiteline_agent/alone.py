@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from kiteline_codec import messages
 from kiteline_codec.profiles import EXACT
-from kiteline_codec.schema import Key, Record
+from kiteline_codec.schema import Key, Live, Record
 
 
 class AloneChannel:
@@ -14,13 +15,24 @@ class AloneChannel:
     profile = EXACT
     backlog_bytes = 0
 
+    def __init__(self) -> None:
+        self.noting = False  # whether `take_noted` will be asked
+        self._noted: dict[Key, Record] = {}
+
     def keyframe_gap_ns(self) -> int:
         """None: there is no link."""
         return 0
 
     def put(self, record: Record) -> Record:
         """The record as it is: no code has rounded it."""
+        if self.noting and not isinstance(record, Live):
+            self._noted[messages.key(record)] = record
         return record
+
+    def take_noted(self) -> dict[Key, bytes]:
+        """The codes of what was put since the last call, live poses left out: for a log, while `noting`."""
+        noted, self._noted = self._noted, {}
+        return {key: messages.encode(record) for key, record in noted.items()}
 
     def remove(self, key: Key) -> None:
         """Nothing was shared, so nothing is taken back."""

@@ -44,6 +44,7 @@ class AgentSpec:
     axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
     kill_at_s: float = -1.0  # end like a crash at this flight time
     await_base_at_s: float = -1.0  # look for a base again at this flight time
+    await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
 
 
 def from_json(text: str) -> AgentSpec:

@@ -12,21 +12,28 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
+import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 
+from kiteline_basestation.combine import combine
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.flight_log import RESTORED, write_step
 from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.keeper import Keeper, read_imports
+from kiteline_basestation.kept import Kept, pack
+from kiteline_basestation.management import Command
 from kiteline_basestation.outputs import counts, keyframe_poses, map_files
+from kiteline_basestation.restore import Restored, restore
 from kiteline_basestation.spec import BaseSpec, base_config, from_json, parser
-from kiteline_basestation.station import Station, StationOutput
-from kiteline_basestation.store import Codes, pack, restore, unpack
+from kiteline_basestation.station import Import, Station, StationOutput
+from kiteline_basestation.store import StoreError
 from kiteline_basestation.warm import warm
 from kiteline_basestation.worker import LockstepJobs, Worker
 from kiteline_codec import warm as codec_warm
@@ -44,11 +51,13 @@ from kiteline_hw.key_store import read_keys
 from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
-from kiteline_hw.ports import LinkError, LinkHub
+from kiteline_hw.ports import LinkError, LinkHub, SourceError
 from kiteline_hw.sealed_link import SealedHub
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.words import shipped_words
+from kiteline_hw.zenoh_link import ZenohHub
 from kiteline_hw.zenoh_lockstep import LockstepServer
+from kiteline_hw.zenoh_queries import QueryServer
 
 if TYPE_CHECKING:
     from kiteline_basestation.web.status_page import StatusPage
@@ -58,7 +67,7 @@ _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the las
 _DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is still not quiet is given up
 _LIVE_WAIT_S = 0.005  # s between two looks at the links of a live base: small beside the camera's period
 _LIVE_STEP_NS = 50_000_000  # ns between two steps without news: keeps acknowledgements and heartbeats moving
-_KEEP_NS = 2_000_000_000  # ns between two copies of the shared values on disk
+_SESSION_S = 1_735_689_600  # s of Unix time at which 2025 began: sessions are counted in seconds since then
 _MEMORY_STEPS = 10  # steps between two looks at the memory
 
 
@@ -116,6 +125,8 @@ class Ground:
             self._log.flush()  # a base that dies at once leaves a log that can be read
         self._log_shift_ns = spec.start_ns
         self._wires: dict[AgentId, LinkModel] = {}
+        self.keeper: Keeper | None = None
+        self._imports: list[Import] = []
 
     def compare(self, here: Collection[int]) -> None:
         """Note whether the agents that are here hold what we hold; once they are gone, what was seen last counts."""
@@ -123,11 +134,24 @@ class Ground:
         if ends:
             self.digest_equal = all(equal for _, equal in ends)
 
-    def restore(self, kept: bytes, now_ns: int) -> None:
-        """Go on from what an earlier base kept. Raises WireError."""
-        if self._log is not None:
-            self._log.blob(RESTORED, now_ns + self._log_shift_ns, kept)
-        restore(self.station, kept, now_ns)
+    def begin(self, now_ns: int) -> Restored | None:
+        """Go on from what the store holds and from what is imported; None where there is nothing. Raises StoreError,
+        SourceError, WireError.
+        """
+        self.keeper = Keeper(Path(self.spec.store)) if self.spec.store else None
+        held = kept = Kept() if self.keeper is None else self.keeper.load()
+        maps, self._imports = read_imports(self.spec.imports, station_of_log)
+        for other in maps:
+            kept = combine(kept, other)
+        restored = None
+        if not kept.empty:
+            if self._log is not None:
+                self._log.blob(RESTORED, now_ns + self._log_shift_ns, pack(kept))
+            restored = restore(self.station, kept, now_ns)
+            kept = restored.kept
+        if self.keeper is not None:
+            self.keeper.begin(self.station, kept, held)
+        return restored
 
     def turn(self, ups: Mapping[int, Up]) -> dict[int, Down]:
         """One tick of a lock-step flight: every agent's message in, the next tick and the packets for it out.
@@ -172,13 +196,23 @@ class Ground:
         poses = keyframe_poses(self.station.mapper)
         return Flown(counts(self.station.mapper), {str(k): pose.ravel().tolist() for k, pose in poses.items()})
 
-    def step(self, packets: Mapping[int, Sequence[bytes]], done: Sequence[JobDone], now_ns: int) -> StationOutput:
-        """One step of the station, logged; in lock-step what it sends waits on the modelled wires."""
+    def step(
+        self,
+        packets: Mapping[int, Sequence[bytes]],
+        done: Sequence[JobDone],
+        now_ns: int,
+        commands: Sequence[Command] = (),
+    ) -> StationOutput:
+        """One step of the station, logged and kept; in lock-step what it sends waits on the modelled wires."""
         begin_ns = time.process_time_ns()
         arrived = {AgentId(agent): tuple(packets[agent]) for agent in sorted(packets)}
-        output = self.station.step(arrived, done, now_ns)
+        orders: list[Import | Command] = [*self._imports[:1], *commands]
+        self._imports = self._imports[1:]
+        output = self.station.step(arrived, done, now_ns, orders)
         if self._log is not None:
-            write_step(self._log, arrived, done, output, now_ns, now_ns + self._log_shift_ns)
+            write_step(self._log, arrived, done, output, now_ns, now_ns + self._log_shift_ns, orders)
+        if self.keeper is not None:
+            self.keeper.keep_at_times(self.station, now_ns)
         for agent, out in output.packets:
             for packet in out:
                 self._wire(agent).send(packet, now_ns)
@@ -220,13 +254,15 @@ class Ground:
         }
 
     def close(self) -> None:
-        """Finish the log."""
+        """Finish the store and the log."""
+        if self.keeper is not None:
+            self.keeper.close(self.station)
         if self._log is not None:
             self._log.close()
 
 
 def _log_metadata(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
-    unlogged = ("folder", "config", "store", "web")
+    unlogged = ("folder", "config", "store", "imports", "web", "maps")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
     plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
     channel = "PlainChannel" if plain_channels else "CodedChannel"
@@ -249,17 +285,27 @@ def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
     return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)
 
 
+def station_of_log(metadata: Mapping[str, str]) -> Station:
+    """A station as the one of a base's log was."""
+    config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
+    logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseSpec.__dataclass_fields__}
+    spec = from_json(json.dumps({"folder": "", **logged}))
+    return Station(config, coded_channels(replace(spec, link=spec.link + ":")), place_words())
+
+
 def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
     """Keep the barrier: step once all agents have handed in their messages. An agent that ends is left out."""
     ground = Ground(spec, coded_channels(spec))
+    _tell(ground.begin(0), parent)
     server = LockstepServer(spec.link.removeprefix("lockstep:"))
     try:
         parent.tell("ready")
-        here = set(spec.agents)
+        here, dying = set(spec.agents), False
         while ground.phase is not Phase.END:
             ups = _collect(server, here, ground, parent)
-            if 0 <= spec.kill_at_s * 1e9 <= ground.now_ns:
-                os.kill(os.getpid(), signal.SIGKILL)
+            if 0 <= spec.kill_at_s * 1e9 <= ground.now_ns and not dying:
+                dying = True
+                threading.Timer(spec.kill_delay_s, os.kill, (os.getpid(), signal.SIGKILL)).start()
             over = ground.flown is not None
             for agent, down in ground.turn(ups).items():
                 with contextlib.suppress(LinkError):  # an agent that has ended is found missing at the next tick
@@ -290,7 +336,7 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
     """Serve any number of agents on real clocks until told to stop; long work is done by a process beside."""
     clock = MonotonicClock()
     with contextlib.ExitStack() as stack:
-        hub = open_link(spec.link, "base", framer=StreamFramer, required=False)
+        plain = hub = open_link(spec.link, "base", framer=StreamFramer, required=False)
         stack.callback(hub.close)
         if spec.key:
             hub = _sealed(spec, hub)
@@ -298,7 +344,8 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         stack.callback(worker.close)
         ground = Ground(spec, coded_channels(spec), worker)
         stack.callback(ground.close)
-        keeper = Keeper(Path(spec.store), ground, clock.now_ns()) if spec.store else None
+        _tell(ground.begin(clock.now_ns()), parent)
+        questions = _questions(spec, plain, stack)
         page = _page(spec, ground, clock.now_ns(), stack) if spec.web else None
         if parent is not None:
             parent.tell("ready")
@@ -308,22 +355,22 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
             now_ns = clock.now_ns()
             packets = {agent: received for agent, link in hub.links().items() if (received := link.receive())}
             done = worker.done(now_ns)
-            if packets or done or now_ns - stepped_ns >= _LIVE_STEP_NS:
-                ground.step(packets, done, now_ns)
+            asked = [Command(q.number, q.verb, q.text) for q in questions.questions()] if questions else []
+            if packets or done or asked or now_ns - stepped_ns >= _LIVE_STEP_NS:
+                output = ground.step(packets, done, now_ns, asked)
+                for answer in output.answers:
+                    if questions is not None:
+                        questions.answer(answer.id, answer.ok, answer.text)
                 stepped_ns = now_ns
                 _send(hub, ground.outgoing(now_ns))
                 ground.compare(hub.alive())
             if page is not None:
                 page.renew(ground.station, now_ns)
-            if keeper is not None:
-                keeper.keep_at_times(now_ns)
             if parent is not None and parent.said() == "frames_over":
                 ground.frames_are_over()
             process.notify("WATCHDOG=1")
             stop.wait(_LIVE_WAIT_S)
         ground.frames_are_over()
-        if keeper is not None:
-            keeper.keep()
         if parent is not None and ground.flown is not None:
             parent.tell("flown", keyframes=ground.flown.keyframes)
             parent.tell("result", report=ground.report(), keyframes=ground.snapshot().keyframes)
@@ -349,34 +396,29 @@ def _send(hub: LinkHub, packets: Mapping[AgentId, Sequence[bytes]]) -> None:
                 link.send(packet)
 
 
-class Keeper:
-    """Keeps what both sides wrote in a file, now and then, so that the next base goes on from there."""
+def _tell(restored: Restored | None, parent: process.Parent | None) -> None:
+    """Say with what the base began, and what in it was wrong."""
+    if restored is None:
+        return
+    print(f"store: {restored.keyframes} keyframes, {restored.awaited} values awaited", file=sys.stderr)
+    for fault in restored.faults:
+        print(f"store: mended: {fault}", file=sys.stderr)
+    if parent is not None:
+        parent.tell(
+            "restored", keyframes=restored.keyframes, faults=list(restored.faults), awaited=restored.awaited
+        )  # fmt: skip
 
-    def __init__(self, folder: Path, ground: Ground, now_ns: int) -> None:
-        self._path = folder / "values.klstore"
-        self._ground = ground
-        self._kept_ns = now_ns
-        self._before: dict[AgentId, Codes] = {}  # what earlier bases received, and this one may not get again
-        if self._path.exists():
-            kept = self._path.read_bytes()
-            self._before = unpack(kept)
-            ground.restore(kept, now_ns)
 
-    def keep_at_times(self, now_ns: int) -> None:
-        """Keep, if the last time is long ago."""
-        if now_ns - self._kept_ns >= _KEEP_NS:
-            self._kept_ns = now_ns
-            self.keep()
-
-    def keep(self) -> None:
-        """Write the file."""
-        agents = {}
-        for agent, channel in self._ground.station.channels.items():
-            if isinstance(channel, CodedChannel):
-                end = channel.endpoint
-                before = self._before[agent].received if agent in self._before else {}
-                agents[agent] = Codes({**before, **end.legacy_values(), **end.peer_values()}, end.own_values())
-        process.write_atomically(self._path, pack(agents))
+def _questions(spec: BaseSpec, hub: LinkHub, stack: contextlib.ExitStack) -> QueryServer | None:
+    """Where other programs ask for maps: --maps, else the agents' link, where it is Zenoh and not sealed."""
+    if spec.maps:
+        server = QueryServer("maps", endpoint=spec.maps.removeprefix("zenoh:"))
+    elif isinstance(hub, ZenohHub) and not spec.key:
+        server = QueryServer("maps", session=hub.session)
+    else:
+        return None
+    stack.callback(server.close)
+    return server
 
 
 def _page(spec: BaseSpec, ground: Ground, now_ns: int, stack: contextlib.ExitStack) -> StatusPage:
@@ -401,10 +443,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not a.link:
         p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline" / "base"
-    session = process.next_number((Path(a.store) if a.store else state) / "session")
+    # Seconds, so that a base on another machine, which knows nothing of this one, begins a later session all the same.
+    session = process.next_number((Path(a.store) if a.store else state) / "session", int(time.time()) - _SESSION_S)
     spec = BaseSpec(
-        folder=a.log, log_name=f"session{session:05d}.mcap" if a.log else "", session=session, link=a.link,
+        folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
         config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
+        imports=tuple(a.imports), maps=a.maps,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
     process.leave(0)
@@ -419,7 +463,7 @@ def run_child(spec: BaseSpec) -> int:
             fly_lockstep(spec, parent)
         else:
             fly_live(spec, parent, process.StopSignal())
-    except (LinkError, WireError, ValueError) as error:
+    except (LinkError, SourceError, StoreError, WireError, ValueError) as error:
         parent.tell("error", text=str(error))
         return 2
     return 0

@@ -7,8 +7,9 @@ undone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,18 @@ from kiteline_basestation.covisibility import Window, covisible_keyframes, windo
 from kiteline_basestation.essential_graph import GraphResult
 from kiteline_basestation.jobs import BundleInputs, Job, JobDone
 from kiteline_basestation.loops import Finding, LoopFinder
+from kiteline_basestation.memory import (
+    Entry,
+    Json,
+    Memory,
+    matrix,
+    parsed,
+    plain,
+    pose_of,
+    slots_of,
+    votes_entry,
+    votes_of,
+)
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
 from kiteline_basestation.refinement import apply_bundle
@@ -36,12 +49,11 @@ F64 = NDArray[np.float64]
 
 @dataclass(slots=True)
 class Merge:
-    """A map that was laid into another. moved: its submaps and where they lay before (T_w_m). votes: the evidence."""
+    """A map that was laid into another. moved: its submaps and where they lay before (T_w_m)."""
 
     eldest: SubmapId
     into: SubmapId
     moved: dict[SubmapId, F64]
-    votes: tuple[Overlap, ...]
     fused: list[tuple[int, int]] = field(default_factory=list)  # slots of points that became one at the merge
 
 
@@ -165,29 +177,56 @@ class Atlas:
             return True
         return False
 
-    def rejoin(self, placements: Mapping[SubmapId, F64]) -> None:
-        """Take up what an earlier base had joined: submaps with common points, at T_w_m (4,4)."""
-        sparse_map, table = self._map, self._map.keypoints
-        number = self._map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS
-        roots = table.root[: sparse_map.slots]
-        crossing = np.flatnonzero((roots >= 0) & (number != number[np.maximum(roots, 0)]))
-        pairs = {(int(number[s]), int(number[roots[s]])) for s in crossing.tolist()}
-        upright = [s for s, T in placements.items() if np.array_equal(T, np.eye(4))]  # the world's first
-        for a, b in sorted(pairs):
-            old, new = (sparse_map.island_of(SubmapId(s)) for s in (a, b))
-            if old == new or old not in placements or new not in placements:
-                continue
-            eldest = next((s for s in upright if s in (old, new)), min(old, new))
-            other = new if eldest == old else old
-            joined = sparse_map.island(other)
-            frames = {s: se3.inverse(placements[eldest]) @ placements[s] for s in joined if s in placements}
-            self.merges.append(Merge(other, eldest, {s: sparse_map.frame(s) for s in joined}, ()))
-            for submap, frame in frames.items():
-                sparse_map.islands[submap] = eldest
-                sparse_map.move_submap(submap, se3.orthonormalise(frame))
-        for keyframe, row in sparse_map.rows.items():
-            if sparse_map.pose(keyframe) is not None and not sparse_map.keyframes.culled[row]:
+    def memory(self) -> Memory:
+        """What a successor needs to go on from here; pose graphs under way are due again."""
+        sparse_map = self._map
+        out = {f"edge/{i:06d}": votes_entry(sparse_map, [v], points=False) for i, v in enumerate(self._edges)}
+        out |= {f"fresh/{s}": votes_entry(sparse_map, votes, points=True) for s, votes in sorted(self._fresh.items())}
+        for i, merge in enumerate(self.merges):
+            mark = (merge.eldest, merge.into, tuple(T.tobytes() for T in merge.moved.values()), len(merge.fused))
+            out[f"merge/{i:04d}"] = Entry(mark, partial(self._merge_text, merge))
+        out["atlas"] = plain(
+            {
+                "loops": self.loops,
+                "undone": self.undone,
+                "returned": [[int(s), at] for s, at in self._returned.items()],
+                "graphs": sorted({int(s) for s in self._graph_due | set(self._graphs.values())}),
+                "revisit": [int(k) for k in self._revisit],
+            }
+        )
+        return out | self.finder.memory()
+
+    def _merge_text(self, merge: Merge) -> Json:
+        fused = np.array(merge.fused, np.int32).reshape(-1, 2)
+        return {
+            "eldest": int(merge.eldest),
+            "into": int(merge.into),
+            "moved": [[int(s), matrix(T)] for s, T in merge.moved.items()],
+            "fused": [self._map.point_ids(fused[:, side]).tolist() for side in (0, 1)],
+        }
+
+    def recall(self, texts: Mapping[str, str]) -> None:
+        """Go on from what a forerunner remembered; every keyframe is a known place."""
+        sparse_map = self._map
+        for keyframe in sorted(sparse_map.rows):
+            if sparse_map.pose(keyframe) is not None and not sparse_map.keyframes.culled[sparse_map.rows[keyframe]]:
                 self.finder.add(keyframe)
+        self.finder.recall(texts)
+        for _, votes in parsed(texts, "edge"):
+            self._edges.extend(votes_of(sparse_map, votes))
+        for (submap,), votes in parsed(texts, "fresh"):
+            self._fresh[SubmapId(int(submap))] = votes_of(sparse_map, votes)
+        for _, m in parsed(texts, "merge"):
+            moved = {SubmapId(s): pose_of(T) for s, T in m["moved"]}
+            fused = [(int(a), int(b)) for a, b in zip(*slots_of(sparse_map, *m["fused"]))]
+            self.merges.append(Merge(SubmapId(m["eldest"]), SubmapId(m["into"]), moved, fused))
+        for _, value in parsed(texts, "atlas"):
+            self.loops, self.undone = value["loops"], value["undone"]
+            self._returned = {SubmapId(s): at for s, at in value["returned"]}
+            self._graph_due = {SubmapId(s) for s in value["graphs"] if s in sparse_map.submaps}
+            self._revisit = [KeyframeId(k) for k in value["revisit"] if k in sparse_map]
+        # What the forerunner had under way is lost, and with it bundles that nobody knows to be missing.
+        self._full_due |= {sparse_map.island_of(s) for s in sparse_map.submaps}
 
     # -- findings ----------------------------------------------------------------------------------------------------
 
@@ -240,7 +279,7 @@ class Atlas:
         for waiting in (self._graph_due, self._full_due):
             waiting.discard(finding.newer)
         self._fresh.setdefault(finding.older, []).extend(self._fresh.pop(finding.newer, []))
-        merge = Merge(finding.newer, finding.older, {s: sparse_map.frame(s) for s in submaps}, finding.votes)
+        merge = Merge(finding.newer, finding.older, {s: sparse_map.frame(s) for s in submaps})
         for submap in submaps:
             sparse_map.move_submap(submap, se3.orthonormalise(finding.T_older_newer @ merge.moved[submap]))
             sparse_map.islands[submap] = finding.older
@@ -316,6 +355,40 @@ class Atlas:
         apply_bundle(self._map, part, result, self._publisher, self._config.cull, self._config.publish)
         self.moved.add(island)
         return True
+
+    # -- orders ------------------------------------------------------------------------------------------------------
+
+    def look_for(self, newer: SubmapId, older: SubmapId) -> None:
+        """A person says that two maps overlap: every keyframe of the newer looks for it, and one proof is enough."""
+        self.finder.asked.add((min(newer, older), max(newer, older)))
+        self._revisit.extend(k for k in keyframes_of(self._map, newer) if k not in self._revisit)
+
+    def join(self, newer: SubmapId, older: SubmapId, T_older_newer: F64) -> None:
+        """A person says how two maps lie to each other: (4,4) moves the newer, in w, onto the older."""
+        self._join(Finding(newer, older, T_older_newer, ()))
+        self._void(older)
+        self._full_due.add(older)
+
+    def split(self, submap: SubmapId) -> bool:
+        """Take the map with which a submap came out of the one that it was laid into, for good. False: it never was."""
+        merge = next((m for m in reversed(self.merges) if submap in m.moved), None)
+        if merge is None:
+            return False
+        rest = frozenset(self._map.island(merge.into)) - merge.moved.keys()
+        self.finder.apart.append((frozenset(merge.moved), rest))
+        self.undo(merge)
+        return True
+
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Maps are deleted: nothing is looked for in them, or made of them, any more."""
+        for submap in submaps:
+            for keyframe in self._map.submaps.get(submap, []):
+                self.finder.forget(keyframe)
+            self._void(submap)
+        self._graph_due.difference_update(submaps)
+        self._full_due.difference_update(submaps)
+        self._revisit = [k for k in self._revisit if submap_of_keyframe(k) not in submaps]
+        self.merges = [m for m in self.merges if m.eldest not in submaps and m.into not in submaps]
 
     # -- second thoughts ---------------------------------------------------------------------------------------------
 

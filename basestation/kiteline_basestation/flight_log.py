@@ -7,17 +7,19 @@ from the same inputs and hands it in at the same step.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from kiteline_basestation.jobs import JobDone
-from kiteline_basestation.station import StationOutput
+from kiteline_basestation.kept import Codes, Kept, pack, unpack
+from kiteline_basestation.management import Command
+from kiteline_basestation.station import Import, StationOutput
 from kiteline_core.ids import AgentId
 
-STEP, JOB, RESTORED = "/step", "/job", "/restored"
+STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/import", "/command", "/answer"
 
 
 class StepLog(Protocol):
@@ -25,6 +27,15 @@ class StepLog(Protocol):
 
     def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
     def json(self, topic: str, t_ns: int, value: object) -> None: ...
+
+
+class StepMessage(Protocol):
+    """What is read back; kiteline_hw.mcap_log.LogMessage is one."""
+
+    @property
+    def topic(self) -> str: ...
+    def blob(self) -> bytes: ...
+    def json(self) -> Any: ...
 
 
 def packets_in(agent: int) -> str:
@@ -44,6 +55,7 @@ def write_step(
     output: StationOutput,
     now_ns: int,
     log_ns: int,
+    orders: Sequence[Import | Command] = (),
 ) -> None:
     """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
     log.json(
@@ -60,11 +72,30 @@ def write_step(
     for agent in sorted(packets):
         for packet in packets[agent]:
             log.blob(packets_in(agent), log_ns, packet)
+    for order in orders:
+        if isinstance(order, Import):
+            log.blob(IMPORT, log_ns, pack(Kept({order.agent: Codes(dict(order.codes), {})})))
+        else:
+            log.json(COMMAND, log_ns, {"id": order.id, "verb": order.verb, "text": order.text})
     for job in done:
         log.json(JOB, log_ns, {"id": job.id, "cost_ops": job.cost_ops, "result": fingerprint(job)})
+    for answer in output.answers:
+        log.json(ANSWER, log_ns, {"id": answer.id, "ok": answer.ok, "text": answer.text})
     for agent, out in output.packets:
         for packet in out:
             log.blob(packets_out(agent), log_ns, packet)
+
+
+def read_orders(messages: Iterable[StepMessage]) -> tuple[Import | Command, ...]:
+    """The orders of one step, in order. Raises WireError."""
+    out: list[Import | Command] = []
+    for message in messages:
+        if message.topic == IMPORT:
+            agents = unpack(message.blob()).agents
+            out += [Import(agent, tuple(codes.received.items())) for agent, codes in agents.items()]
+        elif message.topic == COMMAND:
+            out.append(Command(**message.json()))
+    return tuple(out)
 
 
 def fingerprint(done: JobDone) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
+from kiteline_basestation.memory import Json, matrix, pose_of
 from kiteline_codec.schema import Births, Camera, Head, Level, Live, Record, Sightings
 from kiteline_core.ids import (
     NO_KEYFRAME,
@@ -38,12 +41,15 @@ class Intake:
         self.tracked_ns: dict[SubmapId, int] = {}  # stamp of the last pose in each submap that was no guess
         self.levels: dict[SubmapId, Level] = {}  # what agents say of which way is up
         self.last_seen_ns: dict[AgentId, int] = {}
+        self.deleted: set[SubmapId] = set()  # of which nothing is wanted any more
         self.refused = 0  # records that contradict what is known
 
     def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int) -> None:
         """Put an agent's records into the map."""
         for record in records:
             self.last_seen_ns[agent] = now_ns
+            if self.deleted and _submap_of(record) in self.deleted:
+                continue
             if isinstance(record, Camera):
                 self._map.set_camera(record.agent, record.camera)
             elif isinstance(record, Live):
@@ -93,9 +99,30 @@ class Intake:
         """Whether keyframes are ready that no step has taken up yet."""
         return any(self._map.complete(k) and self._known(k) for k in self._waiting)
 
-    def use_all(self) -> None:
-        """Take all that came for used: an earlier base has worked on it."""
-        self._waiting = {k: t for k, t in self._waiting.items() if not self._map.complete(k)}
+    def memory(self, submap: SubmapId) -> Json:
+        """What a successor cannot have from the newest values of a submap."""
+        last = self.last_of.get(submap)
+        told = None
+        if last is not None:
+            told = [int(last.agent), last.t_ns, int(last.keyframe), matrix(last.T_k_c), last.quality]
+        return {"last": told, "tracked_ns": self.tracked_ns.get(submap)}
+
+    def recall(self, submap: SubmapId, value: Json) -> None:
+        """Go on from what a forerunner remembered."""
+        if value["last"] is not None:
+            agent, t_ns, keyframe, T_k_c, quality = value["last"]
+            self.last_of[submap] = Live(AgentId(agent), t_ns, KeyframeId(keyframe), pose_of(T_k_c), quality)
+        if value["tracked_ns"] is not None:
+            self.tracked_ns[submap] = value["tracked_ns"]
+
+    @property
+    def unused(self) -> list[KeyframeId]:
+        """Keyframes that no step has taken up yet, and those that were taken up in part."""
+        return sorted({*self._waiting, *self._partial})
+
+    def keep_unused(self, keyframes: Collection[KeyframeId]) -> None:
+        """Take all that came for used by an earlier base, but for these."""
+        self._waiting = {k: t for k, t in self._waiting.items() if k in keyframes}
 
     def _known(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe has a pose and a camera."""
@@ -143,3 +170,9 @@ class Intake:
 def _age(live: Live) -> tuple[int, int]:
     """What tells the newer of two poses: an agent that started again may have a clock that did so too."""
     return live.keyframe >> SEQUENCE_BITS + SUBMAP_BITS, live.t_ns
+
+
+def _submap_of(record: Record) -> SubmapId | None:
+    if isinstance(record, Head | Births | Sightings | Live):
+        return submap_of_keyframe(record.keyframe)
+    return record.submap if isinstance(record, Level) else None

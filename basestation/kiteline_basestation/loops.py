@@ -6,13 +6,14 @@ how two maps lie to each other, or for how far one has drifted. A few keyframes 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.memory import Memory, parsed, plain, votes_entry, votes_of
 from kiteline_basestation.overlap import Overlap, View, find_overlap, view_of
 from kiteline_core import se3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
@@ -69,6 +70,8 @@ class LoopFinder:
         self._votes: dict[tuple[SubmapId, SubmapId], list[Overlap]] = {}  # by the submaps of old and new
         self._doubts: dict[tuple[SubmapId, SubmapId], int] = {}  # how often a join of two submaps was taken back
         self._born: dict[SubmapId, int] = {}  # when the base first heard of a submap
+        self.apart: list[tuple[frozenset[SubmapId], frozenset[SubmapId]]] = []  # what a person has split stays so
+        self.asked: set[tuple[SubmapId, SubmapId]] = set()  # maps that a person says to overlap: one proof is enough
         self.proofs = 0  # overlaps that geometry proved
         self.refused = 0  # findings that were no drift, or of places that have twins
 
@@ -97,6 +100,32 @@ class LoopFinder:
             finding = finding or self._count(overlap)
         return finding
 
+    def memory(self) -> Memory:
+        """What a successor needs: evidence that is not enough yet, doubts, and which map is the elder."""
+        out = {f"votes/{a}/{b}": votes_entry(self._map, votes, points=True) for (a, b), votes in self._votes.items()}
+        out["finder"] = plain(
+            {
+                "doubts": [[int(a), int(b), n] for (a, b), n in self._doubts.items()],
+                "born": [int(s) for s in self._born],
+                "apart": [[sorted(map(int, a)), sorted(map(int, b))] for a, b in self.apart],
+                "asked": sorted([int(a), int(b)] for a, b in self.asked),
+            }
+        )
+        return out
+
+    def recall(self, texts: Mapping[str, str]) -> None:
+        """Go on from what a forerunner remembered."""
+        for (a, b), votes in parsed(texts, "votes"):
+            self._votes[SubmapId(int(a)), SubmapId(int(b))] = votes_of(self._map, votes)
+        for _, value in parsed(texts, "finder"):
+            self._doubts = {(SubmapId(a), SubmapId(b)): n for a, b, n in value["doubts"]}
+            self._born = {s: i for i, s in enumerate(dict.fromkeys([*map(SubmapId, value["born"]), *self._born]))}
+            self.apart = [(frozenset(map(SubmapId, a)), frozenset(map(SubmapId, b))) for a, b in value["apart"]]
+            self.asked = {(SubmapId(a), SubmapId(b)) for a, b in value["asked"]}
+
+    def _kept_apart(self, a: SubmapId, b: SubmapId) -> bool:
+        return any((a in x and b in y) or (b in x and a in y) for x, y in self.apart)
+
     # -- inside ------------------------------------------------------------------------------------------------------
 
     def _said_by_agent(self, keyframe: KeyframeId) -> Finding | None:
@@ -111,7 +140,7 @@ class LoopFinder:
             for other in sparse_map.submaps[submap]:
                 if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
                     continue
-                if self._doubts.get((min(new, submap), max(new, submap)), 0):
+                if self._doubts.get((min(new, submap), max(new, submap)), 0) or self._kept_apart(new, submap):
                     continue
                 nothing = np.empty(0, np.int32)
                 vote = Overlap(keyframe, other, np.eye(4), self._config.min_inliers_loop, nothing, nothing, 1.0)
@@ -146,6 +175,7 @@ class LoopFinder:
                 key in taken
                 or left[here] == 0
                 or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old))
+                or self._kept_apart(submap_of_keyframe(keyframe), submap_of_keyframe(old))
             ):
                 continue
             out.append(old)
@@ -175,6 +205,9 @@ class LoopFinder:
             return None
         against = {v.new for v in votes} - supporters
         needed = config.votes * (1 + 2 * self._doubts.get(key, 0)) + config.against * len(against)
+        islands = (self._map.island_of(key[0]), self._map.island_of(key[1]))
+        if (min(islands), max(islands)) in self.asked:
+            needed = 1
         if len(supporters) < needed or not (same_map or self._stands_out(chosen)):
             return None
         if not same_map and any(self._has_twin(v) for v in chosen[-config.votes :]):

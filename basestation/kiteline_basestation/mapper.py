@@ -5,68 +5,52 @@ Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation import culling, newpoints, refind
+from kiteline_basestation import culling, management, newpoints, refind
 from kiteline_basestation.atlas import Atlas
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.covisibility import Window, local_window
 from kiteline_basestation.grid import Grid, GridMap
 from kiteline_basestation.intake import Intake
 from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
+from kiteline_basestation.management import Answer, Command
+from kiteline_basestation.memory import Json, Memory, matrix, parsed, plain, pose_of
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
-from kiteline_codec.schema import Calibration, Live, Placement, Record
+from kiteline_basestation.world_view import world_view
+from kiteline_codec.schema import Calibration, Kind, Live, Record
 from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
-from kiteline_core.ids import (
-    KEYPOINT_BITS,
-    SEQUENCE_BITS,
-    AgentId,
-    KeyframeId,
-    SubmapId,
-    agent_of_keyframe,
-    submap_of_keyframe,
-)
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH, CULLED
 from kiteline_core.place_index import Vocabulary
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class MapperInput:
-    """What has come since the last step: records by agent, in order of agent id, and finished jobs."""
+    """What has come since the last step: records by agent, in order of agent id, finished jobs, and commands."""
 
     arrivals: tuple[tuple[AgentId, tuple[Record, ...]], ...]
     done: tuple[JobDone, ...] = ()
+    commands: tuple[Command, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class MapperOutput:
-    """What is to be shared with each agent, and the work to be done elsewhere."""
+    """What is to be shared with each agent, the work to be done elsewhere, and answers to the commands."""
 
     publish: Published
     jobs: tuple[Job, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class GridView:
-    """The placed part of the map as `grid.build` takes it, and what its rows mean.
-
-    keyframes: (n,) ids of the rows of positions. point_ids: (m,). observations: (k,2) rows of positions and of points.
-    """
-
-    keyframes: I64
-    positions: F64
-    point_ids: I64
-    points: F64
-    observations: I64
+    answers: tuple[Answer, ...] = ()
 
 
 @dataclass(slots=True)
@@ -91,6 +75,7 @@ class Mapper:
         self.map = SparseMap()
         self.grid = Grid(self.config.grid)
         self.placements: dict[SubmapId, F64] = {}  # T_w_m of placed submaps
+        self.names: dict[SubmapId, str] = {}  # what people call maps, by their eldest submap
         self.counts = MapperCounts()
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map)
@@ -113,6 +98,7 @@ class Mapper:
         self._set_upright()  # where an agent has learnt which way is up
         for done in given.done:
             self._finish(done)  # refined poses and points, outliers, grid
+        answers = tuple(management.answer(self, command, now_ns) for command in given.commands)
         for keyframe in self._intake.ready(now_ns):
             self._place(keyframe)  # the first submap is the world
             self.counts.found += refind.refind(self.map, keyframe, self.config.refind, self._publisher)
@@ -132,7 +118,7 @@ class Mapper:
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.atlas is not None:
             jobs += self.atlas.jobs()
-        return MapperOutput(self._publisher.collect(), tuple(jobs))
+        return MapperOutput(self._publisher.collect(), tuple(jobs), answers)
 
     def adopt(self, record: Record) -> None:
         """Compute on with a published record as the other side will hold it."""
@@ -143,16 +129,104 @@ class Mapper:
     ) -> None:  # fmt: skip
         """Begin with what an earlier base had received from an agent and had written for it; nothing is done anew."""
         self._intake.take(agent, received, now_ns)
-        self._intake.use_all()
+        self._intake.last_seen_ns.pop(agent, None)  # it was not heard: a forerunner heard it
         for record in own:
-            if isinstance(record, Placement):
-                self.placements[record.submap] = record.T_w_m
             self.adopt(record)
 
-    def rejoin(self) -> None:
-        """After all was restored: maps that shared points are one again, and every keyframe is a known place."""
+    def memory(self) -> Memory:
+        """What a successor needs to go on from here, beside the shared values."""
+        submaps = self.map.submaps.keys() | self.placements.keys()
+        out: Memory = {f"submap/{s}": plain(self._submap_memory(s)) for s in sorted(submaps - self.deleted)}
+        for agent in sorted(self.map.cameras):
+            offset = self.map.disparity_offset_px.get(agent)
+            known = agent in self.map.disparity_known
+            out[f"agent/{agent}"] = plain({"offset_px": None if offset is None else offset.tolist(), "known": known})
+        stale = {s: list(waiting) for s, waiting in self._stale.items()}
+        for submap, _ in self._windows.values():
+            stale.setdefault(submap, []).append(self.map.submaps[submap][-1])
+        out["base"] = plain(
+            {
+                "counts": asdict(self.counts),
+                "placed": [int(s) for s in self.placements],
+                "stale": [[int(s), sorted({int(k) for k in waiting})] for s, waiting in sorted(stale.items())],
+                "unused": [int(k) for k in self._intake.unused],
+                "calibrate_at": self._calibrate_at,
+                "deleted": sorted(int(s) for s in self.deleted),
+            }
+        )
+        return out | (self.atlas.memory() if self.atlas is not None else {})
+
+    def _submap_memory(self, submap: SubmapId) -> Json:
+        joined = self.map.islands.get(submap)
+        return {
+            "frame": matrix(self.map.frames.get(submap)),
+            "island": None if joined is None else int(joined),
+            "T_w_m": matrix(self.placements.get(submap)),
+            "name": self.names.get(submap),
+            **self._intake.memory(submap),
+        }
+
+    def recall(self, texts: Mapping[str, str]) -> None:
+        """Go on from what a forerunner remembered, when all values are here again."""
+        submaps = {SubmapId(int(number)): value for (number,), value in parsed(texts, "submap")}
+        for submap, value in submaps.items():
+            if value["island"] is not None:
+                self.map.islands[submap] = SubmapId(value["island"])
+            if value["frame"] is not None:
+                self.map.move_submap(submap, pose_of(value["frame"]))
+            if value["name"] is not None:
+                self.names[submap] = value["name"]
+            self._intake.recall(submap, value)
+        for (number,), value in parsed(texts, "agent"):
+            if value["offset_px"] is not None:
+                self.map.disparity_offset_px[AgentId(int(number))] = np.array(value["offset_px"], np.float64)
+            if value["known"]:
+                self.map.disparity_known.add(AgentId(int(number)))
+        unused: set[KeyframeId] = set()
+        for _, value in parsed(texts, "base"):
+            self.counts = MapperCounts(**value["counts"])
+            for submap in map(SubmapId, value["placed"]):
+                self.placements[submap] = pose_of(submaps[submap]["T_w_m"])
+            for submap, waiting in value["stale"]:
+                if here := [KeyframeId(k) for k in waiting if k in self.map]:
+                    self._stale[SubmapId(submap)] = here
+            unused = {KeyframeId(k) for k in value["unused"]}
+            self._calibrate_at = value["calibrate_at"]
+            self._intake.deleted = {SubmapId(s) for s in value["deleted"]}
+        self._intake.keep_unused(unused)
+        self._grid_due = len(self.map)  # the grid is made anew
         if self.atlas is not None:
-            self.atlas.rejoin(self.placements)
+            self.atlas.recall(texts)
+
+    def heard_ns(self, submap: SubmapId) -> int | None:
+        """When the agent that flies in a submap now was last heard; None where nobody flies."""
+        agent = agent_of_submap(submap)
+        live = self._intake.live.get(agent)
+        flies = live is not None and submap_of_keyframe(live.keyframe) == submap
+        return self._intake.last_seen_ns.get(agent) if flies else None
+
+    def delete(self, submaps: Sequence[SubmapId]) -> None:
+        """Drop submaps: their agents are told, their places are forgotten, what comes of them is passed over."""
+        self.deleted.update(submaps)
+        for submap in submaps:
+            for keyframe in self.map.submaps.get(submap, []):
+                slots = self.map.slots_of(keyframe)
+                self.map.set_flags(slots[self.map.keypoints.kind[slots] == BIRTH], CULLED)
+                self.map.cull_keyframe(keyframe)
+                self._publisher.touch(Kind.CULLED, keyframe)
+            self._stale.pop(submap, None)
+            self.placements.pop(submap, None)
+            self.names.pop(submap, None)
+            self.map.islands.pop(submap, None)
+        self._windows = {job: w for job, w in self._windows.items() if w[0] not in submaps}
+        if self.atlas is not None:
+            self.atlas.forget(submaps)
+        self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
+
+    @property
+    def deleted(self) -> set[SubmapId]:
+        """Submaps of which nothing is kept."""
+        return self._intake.deleted
 
     @property
     def idle(self) -> bool:
@@ -197,41 +271,6 @@ class Mapper:
     def live(self, agent: AgentId) -> Live | None:
         """The newest pose that an agent told."""
         return self._intake.live.get(agent)
-
-    def world_view(self) -> GridView:
-        """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
-        rows, positions = [], []
-        for submap in sorted(self.placements):
-            T_w_m = self.placements[submap]
-            for keyframe in self.map.submaps.get(submap, []):
-                pose = self.map.pose(keyframe)
-                if pose is not None:
-                    rows.append(self.map.rows[keyframe])
-                    positions.append((T_w_m @ pose)[:3, 3])
-        number = np.full(len(self.map), -1, np.int64)
-        number[rows] = np.arange(len(rows))
-        points = self.map.roots()
-        xyz, known = self.map.positions(points)
-        known &= number[self.map.keypoints.row[points]] >= 0
-        points, xyz = points[known], xyz[known]
-        starts, slots = self.map.observations(points)
-        seen = np.diff(starts)
-        which = np.repeat(np.arange(len(points)), seen)
-        keep = (seen >= 2)[which] & (number[self.map.keypoints.row[slots]] >= 0)
-        renumber = np.cumsum(seen >= 2) - 1
-        pairs = np.stack([number[self.map.keypoints.row[slots[keep]]], renumber[which[keep]]], 1).astype(np.int64)
-        points, xyz = points[seen >= 2], xyz[seen >= 2]
-        for submap in sorted(self.placements):
-            inside = self.map.point_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
-            T = self.placements[submap] @ se3.inverse(self.map.frame(submap))
-            xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
-        return GridView(
-            self.map.keyframes.id[rows].copy(),
-            np.array(positions).reshape(-1, 3),
-            self.map.point_ids(points),
-            xyz,
-            pairs,
-        )
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
@@ -373,7 +412,7 @@ class Mapper:
         if self._grid_job or self._grid_due < pause:
             return []
         self._grid_due = 0
-        view = self.world_view()
+        view = world_view(self.map, self.placements)
         self._grid_job = self._next_job()
         return [
             Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.observations))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.export import map_ply
 from kiteline_basestation.grid import build, to_pgm, to_yaml
 from kiteline_basestation.mapper import Mapper
+from kiteline_basestation.world_view import world_view
 from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[np.float64]
@@ -26,7 +27,7 @@ def keyframe_poses(mapper: Mapper) -> dict[KeyframeId, F64]:
 
 def map_files(mapper: Mapper) -> dict[str, bytes]:
     """map.ply, grid.pgm and grid.yaml of the map as it stands."""
-    view = mapper.world_view()
+    view = world_view(mapper.map, mapper.placements)
     grid = build(mapper.config.grid, view.positions, view.points, view.observations)
     seen = np.bincount(view.observations[:, 1], minlength=len(view.points)).astype(np.int64)
     return {

@@ -32,8 +32,11 @@ class BaseSpec:
     disorder: float = 0.0  # probability that it is doubled, and that it is late
     seed: int = 0
     kill_at_s: float = -1.0  # end like a crash at this flight time
+    kill_delay_s: float = 0.0  # s of real time after it, so that it strikes anywhere
     store: str = ""
+    imports: tuple[str, ...] = ()
     web: str = ""
+    maps: str = ""  # a Zenoh endpoint on which maps are managed; "": the agents' link
 
 
 def from_json(text: str) -> BaseSpec:
@@ -42,7 +45,8 @@ def from_json(text: str) -> BaseSpec:
     known = {f.name for f in fields(BaseSpec)}
     if unknown := set(values) - known:
         raise ValueError(f"unknown key in spec: {sorted(unknown)}")
-    values["agents"] = tuple(values.get("agents", ()))
+    for name in ("agents", "imports"):
+        values[name] = tuple(values.get(name, ()))
     return BaseSpec(**values)
 
 
@@ -71,6 +75,10 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
     p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")
+    p.add_argument("--import", dest="imports", metavar="LOG", nargs="+", default=[], action="extend",
+                   help="add what agents' logs hold and no link carried; or maps: a store, a base's log")  # fmt: skip
+    p.add_argument("--maps", metavar="ENDPOINT", default="",
+                   help="answer `kiteline maps` here: tcp/HOST:PORT (default: on the link, if not sealed)")  # fmt: skip
     p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")

@@ -112,6 +112,8 @@ class CodedChannel:
         """profile: what to share of a keyframe; None: as the link allows. spill: where old values go."""
         self.endpoint = Endpoint(config, session, tightener=Tightener(), spill=spill)
         self.undecodable = 0  # values whose code was no valid record: the other side speaks another schema
+        self.noting = False  # whether `take_noted` will be asked
+        self._noted: dict[Key, bytes] = {}
         self._removed: list[Key] = []
         self._pacer = Pacer(profile, config.budget_bytes)
         self._live_t_ns: int | None = None  # of the last pose that was shared
@@ -160,7 +162,14 @@ class CodedChannel:
         self.endpoint.put(key, code)
         if isinstance(record, Head):
             self._pacer.keyframe(record.t_ns)
+        if self.noting and not isinstance(record, Live):
+            self._noted[key] = code
         return messages.decode(key, code)
+
+    def take_noted(self) -> dict[Key, bytes]:
+        """The codes that were put since the last call, live poses left out: for a log, while `noting`."""
+        noted, self._noted = self._noted, {}
+        return noted
 
     def _live_is_due(self, t_ns: int) -> bool:
         """Whether the profile has room for another pose; one whose time went back is always due."""

@@ -105,6 +105,16 @@ class Endpoint:
         """What the peer's session wrote, by key; a copy."""
         return {key: code for key, (_, code) in self._in.values.items()}
 
+    def own_value(self, key: Key) -> bytes | None:
+        """The code of a value that this side shares; None where there is none."""
+        held = self._out.held(key)
+        return None if held is None else held[1]
+
+    def peer_value(self, key: Key) -> bytes | None:
+        """The code of a value that the peer's session wrote; None where there is none."""
+        held = self._in.values.get(key)
+        return None if held is None else held[1]
+
     def legacy_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
         return dict(self._legacy)

@@ -94,9 +94,10 @@ class Parent:
             pass  # it is gone: the watch ends us
 
 
-def next_number(path: Path) -> int:
-    """A number one higher than at the last call with this file, which is made when missing; first 1. It survives a
-    crash at any moment. Raises OSError when the folder cannot be written, ValueError when the file holds no number.
+def next_number(path: Path, least: int = 1) -> int:
+    """A number one higher than at the last call with this file, which is made when missing; at least `least`. It
+    survives a crash at any moment. Raises OSError when the folder cannot be written, ValueError when the file holds no
+    number.
     """
     try:
         last = int(path.read_text())
@@ -104,8 +105,9 @@ def next_number(path: Path) -> int:
         last = 0
     except ValueError as error:
         raise ValueError(f"{path} holds no number: write one there that is higher than any used before") from error
-    write_atomically(path, f"{last + 1}\n".encode())
-    return last + 1
+    number = max(last + 1, least)
+    write_atomically(path, f"{number}\n".encode())
+    return number
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -203,7 +203,7 @@ class ZenohHub:
         self._links: dict[int, _AgentLink] = {}
         self._closed = threading.Event()
         self.counters = LinkCounters()
-        self._session = open_session(endpoint, "base")
+        self.session = self._session = open_session(endpoint, "base")
         try:
             liveliness = self._session.liveliness()
             self._keep: list[Any] = [

@@ -15,8 +15,9 @@ from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.export import g2o, tum
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.outputs import keyframe_poses, map_files
+from kiteline_basestation.restore import restore
 from kiteline_basestation.station import Station
-from kiteline_basestation.store import restore
+from kiteline_basestation.store import StoreError, read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError
 from kiteline_codec.sync import SyncConfig
@@ -24,7 +25,6 @@ from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyfram
 
 I64 = NDArray[np.int64]
 
-STORE_FILE = "values.klstore"  # what `kiteline base --store DIR` keeps in DIR
 FORMATS = ("tum", "ply", "pgm", "g2o")
 ESSENTIAL_POINTS = 100  # points that two keyframes share for an edge of the essential graph (ORB-SLAM2)
 
@@ -35,14 +35,12 @@ class ExportError(Exception):
 
 def load(store: Path) -> Mapper:
     """The map that a base kept. store: the folder of `--store`, or the file in it. Raises ExportError."""
-    path = store / STORE_FILE if store.is_dir() else store
     station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
     try:
-        restore(station, path.read_bytes(), 0)
-    except OSError as e:
-        raise ExportError(f"{path}: {e.strerror or e}; expected what `kiteline base --store` keeps") from None
-    except WireError as e:
-        raise ExportError(f"{path}: {e}") from None
+        for fault in restore(station, read(store), 0).faults:
+            print(f"{store}: {fault}", file=sys.stderr)
+    except (StoreError, WireError) as e:
+        raise ExportError(str(e)) from None
     return station.mapper
 
 

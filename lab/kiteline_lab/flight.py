@@ -18,6 +18,7 @@ from kiteline_agent.spec import AgentSpec
 from kiteline_basestation.__main__ import Ground, coded_channels
 from kiteline_basestation.spec import BaseSpec
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
+from kiteline_hw import process
 from kiteline_hw.lockstep_messages import Down, Phase
 from kiteline_hw.ports import FrameSource, LinkError
 from kiteline_hw.spill_file import SpillFile
@@ -32,12 +33,16 @@ _AGENT_END_S = 30.0  # s that the last child may take to end after the others
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """What is about to be flown. frames: how many in all, None unknown. quiet: without progress."""
+    """What is about to be flown. frames: how many in all, None unknown. quiet: without progress.
+
+    deaths: when each base in turn is killed (flight time, and real time after it, in s); a new one follows each.
+    """
 
     agents: Sequence[AgentSpec]
     base: BaseSpec | None
     frames: int | None
     quiet: bool = False
+    deaths: Sequence[tuple[float, float]] = ()
 
 
 @dataclass(slots=True)
@@ -51,6 +56,7 @@ class Outcome:
     flown: dict[int, F64] = field(default_factory=dict)
     drained: dict[int, F64] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    restored: list[dict[str, Any]] = field(default_factory=list)  # how each base that began with a store found it
     failed: bool = False
 
 
@@ -155,8 +161,8 @@ def fly_processes(flight: Flight, link: str, realtime: bool) -> Outcome:
     with contextlib.ExitStack() as stack:
         crew = stack.enter_context(Crew())
         progress = stack.enter_context(Progress("flying", flight.frames, "frames")) if not flight.quiet else None
-        crew.start("base", "kiteline_basestation", asdict(base), Path(base.folder))
-        supervisor = _Supervisor(crew, base, agents, progress)
+        supervisor = _Supervisor(crew, base, agents, progress, flight.deaths)
+        supervisor.start_base()
         supervisor.run()
         return supervisor.outcome
 
@@ -164,14 +170,24 @@ def fly_processes(flight: Flight, link: str, realtime: bool) -> Outcome:
 class _Supervisor:
     """Listens to the children until all have ended, and notes what they say."""
 
-    def __init__(self, crew: Crew, base: BaseSpec, agents: Sequence[AgentSpec], progress: Progress | None) -> None:
+    def __init__(
+        self,
+        crew: Crew,
+        base: BaseSpec,
+        agents: Sequence[AgentSpec],
+        progress: Progress | None,
+        deaths: Sequence[tuple[float, float]],
+    ) -> None:
+        self._deaths = list(deaths)
         self.outcome = Outcome([None] * len(agents))
         self._crew = crew
         self._base = base
         self._agents = agents
         self._progress = progress
         self._frames = [0] * len(agents)
-        self._bases = 1
+        self._bases = 0
+        self._awaited = False  # whether an agent looks for the next one already
+        self._wanted = False  # whether the base that flies now is meant to die
         self._flying = {f"agent{spec.agent}" for spec in agents}
         self._base_up = True
         self._live = not base.link.startswith("lockstep:")
@@ -216,6 +232,8 @@ class _Supervisor:
             case "agents_lost":
                 for number in event.values["agents"]:
                     self._note(f"agent {number} ended in mid-flight; the base kept its map")
+            case "restored":
+                self.outcome.restored.append(dict(event.values))
             case "awaiting_base":
                 self._restart_base()
             case "frames_over":  # live: the base cannot see for itself when the last frame has come
@@ -236,7 +254,9 @@ class _Supervisor:
             if event.child != self._base_name:
                 return  # an earlier base
             self._base_up = False
-            wanted = self._base.kill_at_s >= 0 and self._bases == 1
+            wanted = self._wanted
+            if self._awaited:
+                self._restart_base()
         else:
             self._flying.discard(event.child)
             if self._live and not self._flying:
@@ -254,18 +274,31 @@ class _Supervisor:
 
     @property
     def _base_name(self) -> str:
-        return "base" if self._bases == 1 else f"base-{self._bases}"
+        return "base" if self._bases <= 1 else f"base-{self._bases}"
 
     def _restart_base(self) -> None:
+        self._awaited = self._base_up  # its end is still to be heard of
         if self._base_up:
             return
+        self.start_base()
+        when = f"at {self._agents[0].await_base_at_s:g} s of flight"
+        self._note(f"a new base began {when if not self._agents[0].await_bases else 'where one ended'}")
+
+    def start_base(self) -> None:
+        """The first base, or the next one after one that died."""
         self._bases += 1
         self._base_up = True
-        spec = replace(
-            self._base, kill_at_s=-1.0, session=self._base.session + self._bases - 1, log_name=f"log-{self._bases}.mcap"
-        )
+        spec = self._base
+        if self._bases > 1:
+            session = self._base.session + self._bases - 1
+            if spec.store:
+                session = process.next_number(Path(spec.store) / "session")
+            spec = replace(spec, kill_at_s=-1.0, session=session, log_name=f"log-{self._bases}.mcap")
+        if self._deaths:
+            at_s, delay_s = self._deaths.pop(0)
+            spec = replace(spec, kill_at_s=at_s, kill_delay_s=delay_s)
+        self._wanted = spec.kill_at_s >= 0
         self._crew.start(self._base_name, "kiteline_basestation", asdict(spec), Path(spec.folder))
-        self._note(f"a new base began at {self._agents[0].await_base_at_s:g} s of flight")
 
     def _note(self, text: str) -> None:
         if text not in self.outcome.notes:

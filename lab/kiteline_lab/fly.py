@@ -13,6 +13,7 @@ from pathlib import Path
 from kiteline_agent.spec import AgentSpec
 from kiteline_basestation.spec import BaseSpec
 from kiteline_core.frame import Frame
+from kiteline_hw import process
 from kiteline_hw.mcap_mend import mend
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
 from kiteline_hw.sources import open_source
@@ -45,9 +46,11 @@ class Options:
     config: str = ""
     seed: int = 0
     seconds: float = 0.0
+    store: str = ""
     kill_base_at_s: float = -1.0
     restart_base_at_s: float = -1.0
     kill_agent_at_s: float = -1.0
+    base_deaths: tuple[tuple[float, float], ...] = ()  # s of flight time, and s of real time after it; each restarts
 
 
 @dataclass(slots=True)
@@ -92,6 +95,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--config", metavar="F", default="", help="a TOML file with [agent] and [base] sections")
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
     p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
+    p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
     for hook in ("--kill-base-at", "--restart-base-at", "--kill-agent-at"):
         p.add_argument(hook, metavar="S", type=float, default=-1.0, help=argparse.SUPPRESS)
     return p
@@ -114,7 +118,7 @@ def options(argv: list[str]) -> Options:
     return Options(
         tuple(a.sources), a.out, a.mode, a.link, a.profile, a.link_delay, up, down, a.link_loss, a.cpu, a.mono,
         not a.no_imu, a.realtime,
-        a.config, a.seed, a.seconds, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
+        a.config, a.seed, a.seconds, a.store, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
     )  # fmt: skip
 
 
@@ -137,23 +141,25 @@ def plan(o: Options) -> Plan:
         made.close()
         raise
     counts = [source.frame_count for source in made.sources]
+    boot = process.next_number(Path(o.store) / "session") if o.store else 0  # nothing in one store is named twice
     made.frames = None if o.seconds > 0 or None in counts else sum(count or 0 for count in counts)
     for k, text in enumerate(o.sources):
         made.agents.append(
             AgentSpec(
-                source=text, folder=str(o.out / f"agent{k}"), agent=k, mono=o.mono, imu=o.imu, config=o.config,
+                source=text, folder=str(o.out / f"agent{k}"), agent=k, boot=boot, mono=o.mono, imu=o.imu,
+                config=o.config,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,
                 kill_at_s=o.kill_agent_at_s if k == 0 else -1.0,
-                await_base_at_s=o.restart_base_at_s,
+                await_base_at_s=o.restart_base_at_s, await_bases=bool(o.base_deaths),
             )
         )  # fmt: skip
     if o.mode != "tracker":
         made.base = BaseSpec(
             folder=str(o.out / "base"), agents=tuple(range(len(o.sources))), config=o.config, start_ns=starts[0],
             down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
-            seed=o.seed, kill_at_s=o.kill_base_at_s,
+            seed=o.seed, session=max(1, boot), store=o.store, kill_at_s=o.kill_base_at_s,
         )  # fmt: skip
     return made
 
@@ -197,7 +203,7 @@ def fly(o: Options, quiet: bool = False) -> tuple[dict[str, object], Outcome]:
     made = plan(o)
     with contextlib.closing(made):
         clear(o.out)
-        flight = Flight(made.agents, made.base, made.frames, quiet)
+        flight = Flight(made.agents, made.base, made.frames, quiet, o.base_deaths)
         if o.mode == "distributed":
             outcome = fly_processes(flight, o.link, o.realtime)
         else:

@@ -25,9 +25,10 @@ from kiteline_basestation import flight_log as base_log
 from kiteline_basestation.__main__ import place_words
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import Job, run_job
+from kiteline_basestation.kept import unpack
+from kiteline_basestation.restore import restore
 from kiteline_basestation.spec import BaseSpec
 from kiteline_basestation.station import Station
-from kiteline_basestation.store import restore
 from kiteline_basestation.warm import warm as base_warm
 from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_codec.seal import seal_bytes, suite_for
@@ -166,7 +167,7 @@ def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first:
     jobs: dict[int, Job] = {}
     out = Replayed()
     for kept in log.messages((base_log.RESTORED,)):
-        restore(station, kept.blob(), kept.t_ns - spec["start_ns"])
+        restore(station, unpack(kept.blob()), kept.t_ns - spec["start_ns"])
     for step in steps(log):
         packets = {AgentId(int(a)): step.blobs(base_log.packets_in(int(a))) for a in step.head["agents"]}
         done = []
@@ -175,10 +176,14 @@ def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first:
             if base_log.fingerprint(result) != logged.json()["result"]:
                 out.differs(step, f"job {number} has another result")
             done.append(result)
-        output = station.step(packets, done, step.head["now_ns"])
+        orders = base_log.read_orders([*step.of(base_log.IMPORT), *step.of(base_log.COMMAND)])
+        output = station.step(packets, done, step.head["now_ns"], orders)
         jobs.update({job.id: job for job in output.jobs})
         if [[job.id, job.kind] for job in output.jobs] != step.head["jobs"]:
             out.differs(step, "other jobs")
+        told = [{"id": a.id, "ok": a.ok, "text": a.text} for a in output.answers]
+        if told != [message.json() for message in step.of(base_log.ANSWER)]:
+            out.differs(step, "other answers")
         for agent, sent in output.packets:
             _compare_packets(out, step, base_log.packets_out(agent), sent)
         out.steps += 1

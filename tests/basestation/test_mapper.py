@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
 from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.world_view import world_view
 from kiteline_codec import messages
 from kiteline_codec.schema import Births, Camera, Culled, Depths, Found, Head, Live, Placement, Pose, Record, Removed
 from kiteline_core import se3
@@ -258,7 +259,7 @@ def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
     assert agents[3]["keyframes"] == 5
     assert agents[3]["quality"] == 80
     assert agents[3]["T_w_c"] is not None
-    view = mapper.world_view()
+    view = world_view(mapper.map, mapper.placements)
     assert len(view.positions) == 5
     assert view.observations[:, 1].max() == len(view.points) - 1
     assert np.bincount(view.observations[:, 1]).min() >= 2

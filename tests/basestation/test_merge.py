@@ -15,7 +15,7 @@ from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import Camera, Placement, Record
 from kiteline_core import se3
-from kiteline_core.ids import AgentId, submap_of_keyframe
+from kiteline_core.ids import submap_of_keyframe
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -119,22 +119,3 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     there = sparse_map.keyframes.id[table.row[table.root[slots]]] >> 20
     assert np.array_equal(here, there)  # no point of one is seen from the other
     assert mapper.summary()["maps"] == 2
-
-
-def test_a_second_base_takes_a_joined_map_up(make_flight: MakeFlight, words: Any) -> None:
-    a = make_flight(keyframes=24, turns=0.5)
-    b = make_flight(keyframes=24, turns=0.5, start=0.2, variant=1, agent=1, T_w_m=ELSEWHERE)
-    mapper, second = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
-    published = feed(mapper, [a, b])
-    for flight in (a, b):
-        second.restore(flight.agent, tuple(flight.all_records()), (), 0)
-    second.restore(AgentId(0), (), tuple(published), 0)
-    second.rejoin()
-    assert second.summary()["maps"] == 1 and second.summary()["merges"] == 1
-    assert np.allclose(joint_error_m(second, [a, b]), joint_error_m(mapper, [a, b]), atol=1e-9)
-    rows = [second.map.rows[k] for k in b.keyframes]
-    assert np.allclose(
-        second.map.keyframes.T_w_k[rows],
-        mapper.map.keyframes.T_w_k[[mapper.map.rows[k] for k in b.keyframes]],
-        atol=1e-4,
-    )

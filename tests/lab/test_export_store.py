@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 
+from kiteline_basestation.kept import Codes, Kept
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.store import Codes, pack
+from kiteline_basestation.store import FILE, Store, batch_of
 from kiteline_codec import messages
 from kiteline_codec.schema import Births, Camera, Head, Placement, Record
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_lab import trajectories
-from kiteline_lab.export import STORE_FILE, ExportError, files, main
+from kiteline_lab.export import ExportError, files, main
 from kiteline_lab.grid_eval import read_grid
 from kiteline_lab.plot_map import read_map_ply
 
@@ -89,12 +91,21 @@ def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.Ca
     codes = {messages.key(r): messages.encode(r) for r in records(0)}
     placed = Placement(submap_id(0, 1, 0), np.eye(4))
     own = {messages.key(placed): messages.encode(placed)}
-    (tmp_path / STORE_FILE).write_bytes(pack({AgentId(0): Codes(codes, own)}))
+    placed_at = {"frame": None, "island": None, "T_w_m": np.eye(4).ravel().tolist(), "name": None}
+    memory = {
+        f"submap/{submap_id(0, 1, 0)}": json.dumps({**placed_at, "last": None, "tracked_ns": None}),
+        "base": json.dumps(
+            {"counts": {}, "placed": [submap_id(0, 1, 0)], "stale": [], "unused": [], "calibrate_at": 0, "deleted": []}
+        ),
+    }
+    store = Store(tmp_path)
+    store.write(batch_of(Kept({AgentId(0): Codes(codes, own)}, memory), Kept()))
+    store.close()
     assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")
     found = trajectories.read(str(tmp_path / "new" / "a.tum")).trajectory.T_w_b[:, :3, 3]
     np.testing.assert_allclose(found, [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]], atol=2e-3)  # as coarse as codes are
-    assert main([str(tmp_path / STORE_FILE), "--format", "pgm", "--out", str(tmp_path / "plan.pgm")]) == 0
+    assert main([str(tmp_path / FILE), "--format", "pgm", "--out", str(tmp_path / "plan.pgm")]) == 0
     assert read_grid(tmp_path / "plan.yaml").cell_m > 0
 
 

@@ -1,42 +1,15 @@
-"""What a base keeps for its next start, and the process that does its long work."""
+"""The process that does the long work of a base."""
 
 from __future__ import annotations
 
 import time
 
 import numpy as np
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from kiteline_basestation.flight_log import fingerprint
 from kiteline_basestation.grid import GridConfig
 from kiteline_basestation.jobs import GridInputs, Job, JobDone, run_job
-from kiteline_basestation.store import Codes, pack, unpack
 from kiteline_basestation.worker import Worker
-from kiteline_codec.schema import Key, WireError
-from kiteline_core.ids import AgentId
-
-keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
-values = st.dictionaries(keys, st.binary(max_size=30), max_size=4)
-
-
-@given(st.dictionaries(st.integers(0, 63).map(AgentId), st.builds(Codes, values, values), max_size=3))
-def test_a_store_gives_back_what_it_was_given(agents: dict[AgentId, Codes]) -> None:
-    assert unpack(pack(agents)) == agents
-
-
-@given(st.binary(max_size=80))
-def test_any_other_bytes_are_refused(noise: bytes) -> None:
-    with pytest.raises(WireError):
-        unpack(noise)
-
-
-def test_a_flipped_bit_is_found() -> None:
-    content = bytearray(pack({AgentId(1): Codes({Key(3, 5): b"head"}, {})}))
-    content[12] ^= 1
-    with pytest.raises(WireError, match="damaged"):
-        unpack(bytes(content))
 
 
 def grid_job(number: int) -> Job:

@@ -1,0 +1,89 @@
+"""All that a base keeps for the next: the codes of both sides by agent, and what else it made of them. Pure.
+
+Packed (for a base's log): 8 bytes magic; then for each agent a header (agent, how many received, how many own) and its
+entries (kind, id, part, length, code); then the texts of its memory (length of name, of text; both); at the end a
+BLAKE2b digest of all before it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from kiteline_codec.schema import Key, WireError
+from kiteline_core.ids import AgentId
+
+_MAGIC = b"KLSTORE2"
+_AGENTS = struct.Struct("<B")
+_AGENT = struct.Struct("<BII")
+_ENTRY = struct.Struct("<BqHI")
+_TEXT = struct.Struct("<HI")
+_DIGEST_BYTES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Codes:
+    """The values shared with one agent. received: what it wrote. own: what the base wrote."""
+
+    received: Mapping[Key, bytes]
+    own: Mapping[Key, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A map at rest. memory: JSON texts by name, see `memory`."""
+
+    agents: Mapping[AgentId, Codes] = field(default_factory=dict)
+    memory: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no map."""
+        return not any(codes.received or codes.own for codes in self.agents.values())
+
+
+def pack(kept: Kept) -> bytes:
+    """As bytes."""
+    out = [_MAGIC, _AGENTS.pack(len(kept.agents))]
+    for agent in sorted(kept.agents):
+        codes = kept.agents[agent]
+        out.append(_AGENT.pack(agent, len(codes.received), len(codes.own)))
+        for values in (codes.received, codes.own):
+            for key in sorted(values):
+                out.append(_ENTRY.pack(key.kind, key.id, key.part, len(values[key])))
+                out.append(values[key])
+    for name in sorted(kept.memory):
+        words = name.encode(), kept.memory[name].encode()
+        out += [_TEXT.pack(len(words[0]), len(words[1])), *words]
+    body = b"".join(out)
+    return body + hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest()
+
+
+def unpack(content: bytes) -> Kept:
+    """What `pack` was given. Raises WireError on anything else."""
+    body, digest = content[:-_DIGEST_BYTES], content[-_DIGEST_BYTES:]
+    if not body.startswith(_MAGIC) or hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest() != digest:
+        raise WireError(f"a kept map of {len(content)} bytes is damaged, or of another version")
+    agents: dict[AgentId, Codes] = {}
+    (count,) = _AGENTS.unpack_from(body, len(_MAGIC))
+    at = len(_MAGIC) + _AGENTS.size
+    for _ in range(count):
+        agent, received, own = _AGENT.unpack_from(body, at)
+        at += _AGENT.size
+        parts: tuple[dict[Key, bytes], dict[Key, bytes]] = ({}, {})
+        for values, entries in zip(parts, (received, own), strict=True):
+            for _ in range(entries):
+                kind, number, part, length = _ENTRY.unpack_from(body, at)
+                at += _ENTRY.size
+                values[Key(kind, number, part)] = body[at : at + length]
+                at += length
+        agents[AgentId(agent)] = Codes(*parts)
+    memory: dict[str, str] = {}
+    while at < len(body):
+        name, text = _TEXT.unpack_from(body, at)
+        at += _TEXT.size
+        memory[body[at : at + name].decode()] = body[at + name : at + name + text].decode()
+        at += name + text
+    return Kept(agents, memory)

@@ -1,0 +1,252 @@
+"""Maps in the hands of people and other programs: list, get, name, merge, split, delete. JSON in, JSON out.
+
+A command is an input of the mapper's step like any other, logged and replayed with it; see docs/map-management.md.
+A submap is called AGENT.BOOT.NUMBER; a map by its eldest submap, any other of its submaps, or its name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kiteline_basestation.memory import matrix, pose_of
+from kiteline_core import se3
+from kiteline_core.ids import (
+    BOOT_BITS,
+    KEYPOINT_BITS,
+    SEQUENCE_BITS,
+    SUBMAP_BITS,
+    KeyframeId,
+    SubmapId,
+    agent_of_keyframe,
+    agent_of_submap,
+    submap_id,
+)
+
+if TYPE_CHECKING:
+    from kiteline_basestation.atlas import Atlas
+    from kiteline_basestation.mapper import Mapper
+
+_NAME_CHARS = 64
+_FLIES_NS = 10_000_000_000  # ns after its last word that an agent counts as flying: its map is not deleted
+
+Json = Any
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One question or order. id: chosen by whoever asks. verb: one of VERBS. text: a JSON object."""
+
+    id: int
+    verb: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of it. text: a JSON object; where the command could not be carried out, {"error": …}."""
+
+    id: int
+    ok: bool
+    text: str
+
+
+class _Refused(Exception):
+    """A command that cannot be carried out."""
+
+
+def answer(mapper: Mapper, command: Command, now_ns: int) -> Answer:
+    """Carry a command out, or say why not."""
+    try:
+        verb = VERBS.get(command.verb)
+        if verb is None:
+            raise _Refused(f"no command {command.verb!r}; there are: {', '.join(VERBS)}")
+        try:
+            given = json.loads(command.text or "{}")
+        except ValueError as error:
+            raise _Refused(f"{command.text[:80]!r} is no JSON") from error
+        if not isinstance(given, dict):
+            raise _Refused("expected a JSON object")
+        allowed = _KEYS[command.verb]
+        if unknown := sorted(given.keys() - set(allowed)):
+            raise _Refused(f"unknown key {unknown[0]!r}; {command.verb} takes: {', '.join(allowed) or 'nothing'}")
+        return Answer(command.id, True, json.dumps(verb(mapper, given, now_ns)))
+    except _Refused as error:
+        return Answer(command.id, False, json.dumps({"error": str(error)}))
+
+
+def called(submap: SubmapId) -> str:
+    """A submap's name for people: AGENT.BOOT.NUMBER."""
+    boot, number = submap >> SUBMAP_BITS & (1 << BOOT_BITS) - 1, submap & (1 << SUBMAP_BITS) - 1
+    return f"{agent_of_submap(submap)}.{boot}.{number}"
+
+
+# -- verbs -------------------------------------------------------------------------------------------------------------
+
+
+def _list(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
+    points = _points(mapper)
+    return {"maps": [_overview(mapper, island, points) for island in _islands(mapper)]}
+
+
+def _get(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
+    island = _map(mapper, given, "map")
+    out = _overview(mapper, island, _points(mapper))
+    for submap, told in zip(mapper.map.island(island), out["submaps"], strict=True):
+        told["T_map_m"] = matrix(se3.inverse(mapper.map.frame(island)) @ mapper.map.frame(submap))
+        told["poses"] = [
+            {"id": int(k), "t_ns": int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]), "T_m_k": matrix(pose)}
+            for k in mapper.map.submaps[submap]
+            if (pose := mapper.map.pose(k)) is not None
+        ]
+    return out
+
+
+def _name(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
+    island, name = _map(mapper, given, "map"), given.get("name")
+    if not isinstance(name, str) or not name.isprintable() or len(name) > _NAME_CHARS:
+        raise _Refused(f'"name" is a text of at most {_NAME_CHARS} printable characters; "" takes it back')
+    others = {text for s, text in mapper.names.items() if s != island}
+    if name in others or _parsed(name) is not None:
+        raise _Refused(f"{name!r} is taken: names and ids of maps are told apart")
+    mapper.names.pop(island, None)
+    if name:
+        mapper.names[island] = name
+    return _overview(mapper, island, _points(mapper))
+
+
+def _merge(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
+    atlas = _atlas(mapper)
+    into, other = _map(mapper, given, "into"), _map(mapper, given, "map")
+    if into == other:
+        raise _Refused("these are one map already")
+    if atlas.busy_with(into) or atlas.busy_with(other):
+        raise _Refused("one of the two is being corrected just now; ask again in a moment")
+    if "T_into_map" not in given:
+        atlas.look_for(other, into)
+        return {"merged": False, "looking": len([k for s in mapper.map.island(other) for k in mapper.map.submaps[s]])}
+    try:
+        T = pose_of(given["T_into_map"])
+    except (TypeError, ValueError) as error:
+        raise _Refused('"T_into_map" is a rigid motion: 16 numbers, the rows of a 4x4 matrix') from error
+    frames = mapper.map.frame(into), mapper.map.frame(other)
+    atlas.join(other, into, se3.orthonormalise(frames[0] @ T @ se3.inverse(frames[1])))
+    return {"merged": True, **_overview(mapper, into, _points(mapper))}
+
+
+def _split(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
+    atlas = _atlas(mapper)
+    submap = _submap(mapper, given, "map")
+    island = mapper.map.island_of(submap)
+    if not atlas.split(submap):
+        raise _Refused(f"{called(submap)} was not merged into another map: there is nothing to be undone")
+    apart = mapper.map.island_of(submap)
+    points = _points(mapper)
+    return {"maps": [_overview(mapper, s, points) for s in (island, apart)]}
+
+
+def _delete(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
+    island = _map(mapper, given, "map")
+    submaps = mapper.map.island(island)
+    for submap in submaps:
+        heard_ns = mapper.heard_ns(submap)
+        if heard_ns is not None and now_ns - heard_ns < _FLIES_NS:
+            raise _Refused(f"agent {agent_of_submap(submap)} flies in {called(submap)} now; land it first")
+    mapper.delete(submaps)
+    return {"deleted": [called(s) for s in submaps]}
+
+
+VERBS: dict[str, Callable[[Mapper, Mapping[str, Json], int], Json]] = {
+    "list": _list,
+    "get": _get,
+    "name": _name,
+    "merge": _merge,
+    "split": _split,
+    "delete": _delete,
+}
+_KEYS: dict[str, tuple[str, ...]] = {
+    "list": (),
+    "get": ("map",),
+    "name": ("map", "name"),
+    "merge": ("map", "into", "T_into_map"),
+    "split": ("map",),
+    "delete": ("map",),
+}
+
+
+# -- what they share ---------------------------------------------------------------------------------------------------
+
+
+def _islands(mapper: Mapper) -> list[SubmapId]:
+    return sorted({mapper.map.island_of(s) for s in mapper.map.submaps if s not in mapper.deleted})
+
+
+def _atlas(mapper: Mapper) -> Atlas:
+    if mapper.atlas is None:
+        raise _Refused("this base joins no maps: gtsam is not installed, or [base.loops] enabled is false")
+    return mapper.atlas
+
+
+def _parsed(text: str) -> SubmapId | None:
+    parts = text.split(".")
+    if len(parts) != 3 or not all(part.isdecimal() for part in parts):
+        return None
+    try:
+        return submap_id(*(int(part) for part in parts))
+    except ValueError:
+        return None
+
+
+def _submap(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
+    text = given.get(key)
+    if not isinstance(text, str):
+        raise _Refused(f'"{key}" is missing: the id or the name of a map')
+    found = _parsed(text)
+    if found is None:
+        found = next((s for s, name in mapper.names.items() if name == text), None)
+    if found is None or found not in mapper.map.submaps or found in mapper.deleted:
+        raise _Refused(f"no map {text!r}; `list` tells what there is")
+    return found
+
+
+def _map(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
+    return mapper.map.island_of(_submap(mapper, given, key))
+
+
+def _points(mapper: Mapper) -> dict[int, int]:
+    """How many live points each submap has."""
+    born = mapper.map.point_ids(mapper.map.roots()) >> (SEQUENCE_BITS + KEYPOINT_BITS)
+    submaps, counts = np.unique(born, return_counts=True)
+    return dict(zip(submaps.tolist(), counts.tolist(), strict=True))
+
+
+def _overview(mapper: Mapper, island: SubmapId, points: Mapping[int, int]) -> Json:
+    submaps = mapper.map.island(island)
+    told: list[dict[str, Json]] = []
+    for submap in submaps:
+        keyframes = mapper.map.submaps[submap]
+        stamps = [int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]) for k in keyframes]
+        told.append(
+            {
+                "id": called(submap),
+                "agent": int(agent_of_keyframe(KeyframeId(keyframes[0]))),
+                "keyframes": len(keyframes),
+                "points": points.get(submap, 0),
+                "first_t_ns": min(stamps),
+                "last_t_ns": max(stamps),
+                "T_w_m": matrix(mapper.placements.get(submap)),
+            }
+        )
+    return {
+        "id": called(island),
+        "name": mapper.names.get(island, ""),
+        "placed": island in mapper.placements,
+        "agents": sorted({s["agent"] for s in told}),
+        "keyframes": sum(s["keyframes"] for s in told),
+        "points": sum(s["points"] for s in told),
+        "submaps": told,
+    }

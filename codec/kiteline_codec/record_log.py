@@ -1,0 +1,24 @@
+"""Shared values as they stand in an agent's log, so that what no link carried can be read there after landing."""
+
+from __future__ import annotations
+
+import struct
+
+from kiteline_codec.schema import Key, WireError
+from kiteline_core.ids import AgentId
+
+TOPIC = "/record"
+_HEAD = struct.Struct("<BBqH")  # agent, kind, id, part
+
+
+def write_record(agent: AgentId, key: Key, code: bytes) -> bytes:
+    """One value with its name."""
+    return _HEAD.pack(agent, key.kind, key.id, key.part) + code
+
+
+def read_record(data: bytes) -> tuple[AgentId, Key, bytes]:
+    """What `write_record` was given. Raises WireError."""
+    if len(data) < _HEAD.size:
+        raise WireError(f"a logged record of {len(data)} bytes, expected at least {_HEAD.size}")
+    agent, kind, number, part = _HEAD.unpack_from(data)
+    return AgentId(agent), Key(kind, number, part), data[_HEAD.size :]

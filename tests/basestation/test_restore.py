@@ -1,0 +1,309 @@
+"""A map at rest becomes the same map again; what contradicts itself is found, told and taken out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.combine import combine
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.integrity import contradictions, sound
+from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.keeper import Keeper, snapshot
+from kiteline_basestation.kept import Codes, Kept
+from kiteline_basestation.restore import restore
+from kiteline_basestation.station import Import, Station
+from kiteline_basestation.store import read
+from kiteline_codec import messages
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.schema import Camera, Found, Head, Key, Kind, Placement, Pose, WireError
+from kiteline_codec.sync import SyncConfig
+from kiteline_core import se3
+from kiteline_core.ids import AgentId, KeyframeId, keyframe_id, submap_of_keyframe
+
+STEP_NS = 100_000_000
+ELSEWHERE = se3.exp(np.array([0.5, -0.3, 0.2, 0.1, 0.4, -1.1]))
+
+MakeFlight = Callable[..., Any]
+
+
+def new_station(words: Any, session: int = 1) -> Station:
+    return Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), session), words)
+
+
+class Agents:
+    """Agents that say what they see, a keyframe a step, over channels without loss."""
+
+    def __init__(self, flights: list[Any]) -> None:
+        self.flights = flights
+        self.ends = {f.agent: CodedChannel(SyncConfig(), 1) for f in flights}
+        for flight in flights:
+            self.ends[flight.agent].put(Camera(flight.agent, flight.camera))
+        self.now_ns = 0
+        self.done: list[JobDone] = []
+        self.down: Mapping[AgentId, tuple[bytes, ...]] = {}
+
+    def fly(self, station: Station, begin: int, end: int, each: Callable[[], None] = lambda: None) -> None:
+        """Keyframes begin..end of every flight; beyond the last one time passes."""
+        for n in range(begin, end):
+            self.now_ns += STEP_NS
+            up = {}
+            for flight in self.flights:
+                channel = self.ends[flight.agent]
+                channel.receive(self.down.get(flight.agent, ()), self.now_ns)
+                for record in flight.records[n] if n < len(flight.records) else ():
+                    channel.put(record)
+                up[flight.agent] = channel.poll(self.now_ns)
+            output = station.step(up, self.done, self.now_ns)
+            self.done = [run_job(job) for job in output.jobs]
+            self.down = dict(output.packets)
+            each()
+
+    def base_died(self) -> None:
+        self.done, self.down = [], {}
+
+
+def whole(station: Station) -> dict[str, Any]:
+    """The map, told in a way that does not depend on the order of arrival."""
+    sparse_map = station.mapper.map
+    table, out = sparse_map.keypoints, {}
+    for keyframe in sorted(sparse_map.rows):
+        slots = sparse_map.slots_of(keyframe)
+        roots = table.root[slots]
+        points = np.where(roots >= 0, sparse_map.point_ids(np.maximum(roots, 0)), -1)
+        refined = table.flags[slots] & 4 != 0
+        alive = refined & (roots == slots) & (table.flags[slots] & 2 == 0)
+        pose, world = sparse_map.pose(keyframe), sparse_map.world_pose(keyframe)
+        assert pose is not None and world is not None
+        out[str(keyframe)] = (
+            pose.tobytes(), world.tobytes(), points.tolist(), (table.flags[slots] & 3).tolist(),
+            table.refined[slots[alive]].tobytes(), table.offset[slots[alive]].tobytes(),
+            int(sparse_map.keyframes.culled[sparse_map.rows[keyframe]]),
+        )  # fmt: skip
+    out["placements"] = [(int(s), T.tobytes()) for s, T in station.mapper.placements.items()]
+    out["islands"] = sorted(sparse_map.islands.items())
+    out["offsets"] = sorted(sparse_map.disparity_offset_px.items())
+    out["memory"] = {
+        n: t for n, t in snapshot(station, Kept()).memory.items() if n.partition("/")[0] in ("edge", "merge")
+    }
+    return out
+
+
+@pytest.fixture(scope="module")
+def joined(make_flight: MakeFlight, words: Any) -> tuple[Agents, Station]:
+    """Two agents whose maps have become one, and a third that is alone."""
+    a = make_flight(keyframes=30, turns=0.6)
+    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    c = make_flight(keyframes=8, turns=0.1, seed=9, agent=2)
+    agents, station = Agents([a, b, c]), new_station(words)
+    agents.fly(station, 0, 60)
+    assert station.mapper.summary()["merges"] == 1
+    return agents, station
+
+
+def test_a_restored_map_is_the_map_to_the_last_bit(joined: tuple[Agents, Station], words: Any) -> None:
+    _, first = joined
+    assert contradictions(first.mapper) == []
+    kept = snapshot(first, Kept())
+    second = new_station(words, session=2)
+    restored = restore(second, kept, 0)
+    assert (restored.faults, restored.awaited, restored.keyframes) == ((), 0, 68)
+    assert whole(second) == whole(first)
+    assert snapshot(second, restored.kept) == kept
+    for channel, before in zip(second.channels.values(), first.channels.values(), strict=True):
+        assert isinstance(channel, CodedChannel) and isinstance(before, CodedChannel)
+        assert channel.endpoint.own_values() == before.endpoint.own_values()
+
+
+def test_restarts_in_flight_cost_nothing(make_flight: MakeFlight, words: Any, tmp_path: Path) -> None:
+    flight = make_flight(keyframes=40, turns=1.0)
+
+    def error_m(station: Station) -> float:
+        poses = [station.mapper.map.pose(k) for k in flight.keyframes]
+        errors = [np.linalg.norm(p[:3, 3] - t[:3, 3]) for p, t in zip(poses, flight.true_T_m_k) if p is not None]
+        assert len(errors) == 40
+        return float(np.sqrt(np.mean(np.square(errors))))
+
+    agents, calm = Agents([flight]), new_station(words)
+    agents.fly(calm, 0, 80)
+    agents, at = Agents([flight]), 0
+    for session, until in enumerate((3, 9, 14, 22, 27, 35, 80), 1):
+        station, keeper = new_station(words, session), Keeper(tmp_path)
+        held = keeper.load()
+        restored = restore(station, held, agents.now_ns)
+        assert restored.faults == ()
+        keeper.begin(station, restored.kept, held)
+        agents.fly(station, at, until, each=lambda: keeper.keep_at_times(station, agents.now_ns))  # noqa: B023
+        keeper.close(station)
+        agents.base_died()
+        at = until
+    assert station.mapper.idle
+    end = station.channels[flight.agent]
+    assert isinstance(end, CodedChannel)
+    assert end.endpoint.digest_equal
+    assert contradictions(station.mapper) == []
+    assert error_m(station) < 1.1 * error_m(calm)
+    assert len(read(tmp_path).agents[flight.agent].own) == len(end.endpoint.own_values())
+
+
+def spoilt(kept: Kept, agent: int, received: Mapping[Key, bytes], own: Mapping[Key, bytes], drop: Key | None) -> Kept:
+    codes = kept.agents[AgentId(agent)]
+    mine = {key: code for key, code in codes.received.items() if key != drop}
+    return Kept({**kept.agents, AgentId(agent): Codes({**mine, **received}, {**codes.own, **own})}, kept.memory)
+
+
+def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, Station], words: Any) -> None:
+    agents, first = joined
+    kept = snapshot(first, Kept())
+    keyframe = agents.flights[0].keyframes[10]
+    nowhere = keyframe_id(submap_of_keyframe(keyframe), 999)
+    nowhere_map = replace(Placement(submap_of_keyframe(keyframe), np.eye(4)), submap=submap_of_keyframe(keyframe) + 7)
+    index, ids = np.array([5], np.uint16), np.array([nowhere << 11], np.int64)
+    far = np.array([2000], np.uint16)
+    head = kept.agents[AgentId(0)].received[Key(Kind.HEAD, keyframe)]
+    cases = {
+        "cannot be read": ({Key(Kind.HEAD, keyframe): head + b"!"}, {}),
+        "tells of a keyframe that is not there": ({}, _coded(Pose(nowhere, np.eye(4)))),
+        "names points of a keyframe that is not there": ({}, _coded(Found(keyframe, index, ids))),
+        "tells of keypoint 2000": ({}, _coded(Found(keyframe, far, ids))),
+        "places a submap without keyframes": ({}, _coded(nowhere_map)),
+    }
+    for words_told, (received, own) in cases.items():
+        checked = sound(spoilt(kept, 0, received, own, None))
+        assert any(words_told in fault for fault in checked.faults), (words_told, checked.faults)
+        station = new_station(words, session=3)
+        restored = restore(station, spoilt(kept, 0, received, own, None), 0)
+        assert restored.faults == checked.faults
+        assert contradictions(station.mapper) == []
+        again = restore(new_station(words, session=4), restored.kept, 0)
+        assert again.faults == ()
+
+
+def _coded(record: Any) -> dict[Key, bytes]:
+    return {messages.key(record): messages.encode(record)}
+
+
+def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station], words: Any) -> None:
+    _, first = joined
+    kept = snapshot(first, Kept())
+    alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == Kind.HEAD)[3]
+    bare = Kept({AgentId(2): Codes(kept.agents[AgentId(2)].received, {})})
+    checked = sound(spoilt(bare, 2, {}, {}, alone))
+    assert checked.faults == ()
+    assert checked.awaited > 1  # its child, and its own sections
+    restored = restore(new_station(words, session=2), checked.kept, 0)
+    assert restored.keyframes == 7
+
+
+def test_a_joined_map_whose_other_half_is_gone_stands_alone(joined: tuple[Agents, Station], words: Any) -> None:
+    _, first = joined
+    kept = snapshot(first, Kept())
+    (joined_to,) = {json.loads(t)["island"] for n, t in kept.memory.items() if n.startswith("submap/")} - {None}
+    eldest = 0 if joined_to >> 26 == 0 else 1
+    half = Kept({a: c for a, c in kept.agents.items() if a != eldest}, kept.memory)
+    station = new_station(words, session=2)
+    restored = restore(station, half, 0)
+    assert any("is joined to" in fault for fault in restored.faults)
+    assert contradictions(station.mapper) == []
+    assert station.mapper.summary()["maps"] == 2
+
+
+def test_memory_that_is_no_memory_is_told(joined: tuple[Agents, Station], words: Any) -> None:
+    _, first = joined
+    kept = snapshot(first, Kept())
+    for name, text in (("base", "{}"), ("base", "nonsense"), ("submap/5", "[]")):
+        with pytest.raises(WireError, match="memory"):
+            restore(new_station(words, session=2), Kept(kept.agents, {**kept.memory, name: text}), 0)
+
+
+def test_contradictions_in_the_tables_are_seen(make_flight: MakeFlight, words: Any) -> None:
+    agents, station = Agents([make_flight(keyframes=6, turns=0.1)]), new_station(words)
+    agents.fly(station, 0, 10)
+    sparse_map = station.mapper.map
+    table = sparse_map.keypoints
+    slot = int(np.flatnonzero(table.next[: sparse_map.slots] >= 0)[0])
+    held = int(table.next[slot])
+    table.next[slot] = -1
+    assert any("lists of observations" in text for text in contradictions(station.mapper))
+    table.next[slot] = held
+    assert contradictions(station.mapper) == []
+    sparse_map.keyframes.T_m_k[2, 0, 0] += 0.1
+    assert any("no rigid pose" in text for text in contradictions(station.mapper))
+
+
+def test_yesterdays_map_is_found_again_in_todays(make_flight: MakeFlight, words: Any) -> None:
+    yesterday = Agents([make_flight(keyframes=30, turns=0.6, agent=0)])
+    old = new_station(words)
+    yesterday.fly(old, 0, 40)
+    today = Agents([make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)])
+    station = new_station(words, session=2)
+    restore(station, snapshot(old, Kept()), 0)
+    today.fly(station, 0, 60)
+    assert station.mapper.summary()["merges"] == 1
+    assert next(iter(station.mapper.placements)) == submap_of_keyframe(yesterday.flights[0].keyframes[0])
+
+
+def test_two_finished_maps_are_joined_by_their_places(make_flight: MakeFlight, words: Any) -> None:
+    kept = []
+    for agent, start in ((0, 0.0), (1, 0.3)):
+        agents = Agents([make_flight(keyframes=30, turns=0.6, start=start, variant=agent, agent=agent)])
+        station = new_station(words)
+        agents.fly(station, 0, 40)
+        kept.append(snapshot(station, Kept()))
+    both = combine(*kept)
+    station = new_station(words, session=2)
+    assert restore(station, both, 0).faults == ()
+    assert station.mapper.summary()["maps"] == 2
+    done: list[JobDone] = []
+    for n in range(40):
+        done = [run_job(job) for job in station.step({}, done, n * STEP_NS).jobs]
+    assert station.mapper.summary()["merges"] == 1
+    assert combine(kept[0], kept[0]).agents == kept[0].agents
+
+
+def test_maps_of_two_agents_with_one_number_are_refused(make_flight: MakeFlight, words: Any) -> None:
+    kept = []
+    for seed in (0, 1):
+        agents = Agents([make_flight(keyframes=4, turns=0.1, seed=seed)])
+        station = new_station(words)
+        agents.fly(station, 0, 8)
+        kept.append(snapshot(station, Kept()))
+    with pytest.raises(WireError, match="another agent with this number"):
+        combine(*kept)
+
+
+def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=20, turns=0.4)
+    codes = [(messages.key(r), messages.encode(r)) for r in flight.all_records()]
+    agents, station = Agents([flight]), new_station(words)
+    for records in flight.records[5:12]:  # the link was away for seven keyframes
+        records[:] = []
+    agents.fly(station, 0, 20)
+    assert len(station.mapper.map) == 13
+    station.note_changes()
+    done: list[JobDone] = []
+    for n in range(30):
+        orders = [Import(flight.agent, tuple(codes[n * 20 : n * 20 + 20]))]
+        done = [run_job(j) for j in station.step({}, done, agents.now_ns + n * STEP_NS, orders).jobs]
+    assert len(station.mapper.map) == 20
+    assert all(station.mapper.map.pose(k) is not None for k in flight.keyframes)
+    assert contradictions(station.mapper) == []
+    assert station.touched is not None
+    heads = {KeyframeId(key.id) for _, ours, key in station.touched if not ours and key.kind == Kind.HEAD}
+    assert heads == set(flight.keyframes[5:12])  # the others were here
+
+
+def test_heads_are_what_they_were(joined: tuple[Agents, Station]) -> None:
+    agents, first = joined
+    kept = snapshot(first, Kept())
+    for flight in agents.flights:
+        heads = [k for k in kept.agents[flight.agent].received if k.kind == Kind.HEAD]
+        assert sorted(k.id for k in heads) == flight.keyframes
+        decoded = messages.decode(heads[0], kept.agents[flight.agent].received[heads[0]])
+        assert isinstance(decoded, Head)

@@ -1,0 +1,149 @@
+"""The store: what is put in comes out, in whole batches, whatever kills the writer."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sqlite3
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kiteline_basestation.kept import Codes, Kept, pack, unpack
+from kiteline_basestation.store import FILE, Batch, Store, StoreError, batch_of, read
+from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
+
+keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
+values = st.dictionaries(keys, st.binary(max_size=30), max_size=4)
+codes = st.builds(Codes, values, values)
+memory = st.dictionaries(st.text("abc/01", min_size=1, max_size=5), st.text(max_size=20), max_size=3)
+maps = st.builds(Kept, st.dictionaries(st.integers(0, 63).map(AgentId), codes, max_size=3), memory)
+
+
+def without_nothing(kept: Kept) -> Kept:
+    """A store does not know agents of which it holds no value."""
+    return Kept({a: c for a, c in kept.agents.items() if c.received or c.own}, kept.memory)
+
+
+@given(maps)
+def test_packing_gives_back_what_it_was_given(kept: Kept) -> None:
+    assert unpack(pack(kept)) == kept
+
+
+@given(st.binary(max_size=80))
+def test_any_other_bytes_are_refused(noise: bytes) -> None:
+    with pytest.raises(WireError):
+        unpack(noise)
+
+
+def test_a_flipped_bit_is_found() -> None:
+    content = bytearray(pack(Kept({AgentId(1): Codes({Key(3, 5): b"head"}, {})})))
+    content[12] ^= 1
+    with pytest.raises(WireError, match="damaged"):
+        unpack(bytes(content))
+
+
+@settings(max_examples=25)
+@given(maps, maps)
+def test_a_batch_leads_from_one_map_to_the_other(tmp_path_factory: pytest.TempPathFactory, a: Kept, b: Kept) -> None:
+    folder = tmp_path_factory.mktemp("store")
+    store = Store(folder)
+    store.write(batch_of(a, store.load()))
+    assert store.load() == without_nothing(a)
+    store.write(batch_of(b, store.load()))
+    store.close()
+    assert read(folder) == without_nothing(b)
+    assert read(folder / FILE) == without_nothing(b)
+
+
+def test_nothing_is_left_of_a_deleted_submap(tmp_path: Path) -> None:
+    doomed, other = submap_id(3, 1, 0), submap_id(3, 1, 1)
+    received = {Key(Kind.HEAD, s << SEQUENCE_BITS | 5): b"head" for s in (doomed, other)}
+    received |= {Key(Kind.LEVEL, s): b"level" for s in (doomed, other)}
+    own = {Key(Kind.DEPTHS, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
+    store = Store(tmp_path)
+    store.write(batch_of(Kept({AgentId(3): Codes(received, own)}), Kept()))
+    store.write(Batch(deleted=[doomed]))
+    left = store.load().agents[AgentId(3)]
+    store.close()
+    assert set(left.received) == {Key(Kind.HEAD, other << SEQUENCE_BITS | 5), Key(Kind.LEVEL, other)}
+    assert set(left.own) == {Key(Kind.DEPTHS, other << SEQUENCE_BITS | 5)}
+
+
+def test_a_store_serves_one_base_and_any_number_of_readers(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.write(Batch(rows=[(1, 0, 3, 7, 0, b"x")]))
+    assert read(tmp_path).agents[AgentId(1)].received == {Key(3, 7): b"x"}
+    with pytest.raises(StoreError, match="another base"):
+        Store(tmp_path)
+    store.close()
+    Store(tmp_path).close()
+
+
+def test_what_is_no_store_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no such file"):
+        read(tmp_path)
+    (tmp_path / FILE).write_bytes(b"hello, I am no database at all")
+    with pytest.raises(StoreError, match=r"map\.sqlite"):
+        Store(tmp_path)
+    (tmp_path / FILE).unlink()
+    with sqlite3.connect(tmp_path / FILE) as db:
+        db.execute("CREATE TABLE mine (a)")
+    db.close()
+    with pytest.raises(StoreError, match="no store of a base"):
+        read(tmp_path)
+
+
+def test_another_version_is_told(tmp_path: Path) -> None:
+    Store(tmp_path).close()
+    with sqlite3.connect(tmp_path / FILE) as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+    with pytest.raises(StoreError, match="version 99, expected version 1"):
+        Store(tmp_path)
+
+
+def test_damage_is_found(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.write(Batch(rows=[(1, 0, 3, i, 0, bytes(500)) for i in range(200)]))
+    store.close()
+    content = bytearray((tmp_path / FILE).read_bytes())
+    content[8192:24576] = bytes(16384)
+    (tmp_path / FILE).write_bytes(content)
+    with pytest.raises(StoreError, match=r"map\.sqlite"):
+        Store(tmp_path)
+
+
+def write_for_ever(folder: str) -> None:
+    """Batches in which every value is the number of the batch."""
+    store = Store(Path(folder))
+    number = 0
+    while True:
+        number += 1
+        text = str(number)
+        store.write(Batch(rows=[(1, 0, 3, i, 0, text.encode()) for i in range(300)], memory={"a": text, "b": text}))
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 0.11, 0.17])
+def test_a_kill_leaves_a_whole_batch(tmp_path: Path, delay_s: float) -> None:
+    process = multiprocessing.get_context("spawn").Process(target=write_for_ever, args=(str(tmp_path),))
+    process.start()
+    deadline_s = time.monotonic() + 30.0
+    while not (tmp_path / FILE).exists() or not read(tmp_path).memory:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+    time.sleep(delay_s)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    store = Store(tmp_path)
+    kept = store.load()
+    store.close()
+    written = {code.decode() for code in kept.agents[AgentId(1)].received.values()} | set(kept.memory.values())
+    assert len(written) == 1
+    assert len(kept.agents[AgentId(1)].received) == 300
