@@ -178,6 +178,8 @@ def _open(path: Path, make: bool) -> sqlite3.Connection:
                 raise StoreError(
                     f"{path}: {what}, expected version {_VERSION}; begin an empty store and import the agents' logs"
                 )
+            if not make and not tables:
+                raise StoreError(f"{path}: empty; expected a store that a base has begun")
             if make:
                 db.execute("PRAGMA journal_mode = WAL")
                 db.execute("PRAGMA synchronous = NORMAL")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
 from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.memory import Scribe
 from kiteline_basestation.world_view import world_view
 from kiteline_codec import messages
 from kiteline_codec.schema import Births, Camera, Culled, Depths, Found, Head, Live, Placement, Pose, Record, Removed
@@ -275,6 +276,7 @@ def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFligh
     own = {messages.key(r): r for r in published}
     second = Mapper()
     second.restore(flight.agent, received, tuple(own[key] for key in sorted(own)), 0)
+    second.recall({name: text for name, text in Scribe().changes(first.memory()).items() if text is not None})
     assert second.idle
     assert not second.step(MapperInput(()), 0).publish
     assert np.array_equal(first.map.point_ids(first.map.roots()), second.map.point_ids(second.map.roots()))

@@ -129,12 +129,20 @@ def write_for_ever(folder: str) -> None:
         store.write(Batch(rows=[(1, 0, 3, i, 0, text.encode()) for i in range(300)], memory={"a": text, "b": text}))
 
 
+def begun(folder: Path) -> bool:
+    """Whether a batch stands in a store."""
+    try:
+        return bool(read(folder).memory)
+    except StoreError:
+        return False
+
+
 @pytest.mark.parametrize("delay_s", [0.05, 0.11, 0.17])
 def test_a_kill_leaves_a_whole_batch(tmp_path: Path, delay_s: float) -> None:
-    process = multiprocessing.get_context("spawn").Process(target=write_for_ever, args=(str(tmp_path),))
+    process = multiprocessing.get_context("spawn").Process(target=write_for_ever, args=(str(tmp_path),), daemon=True)
     process.start()
     deadline_s = time.monotonic() + 30.0
-    while not (tmp_path / FILE).exists() or not read(tmp_path).memory:
+    while not begun(tmp_path):
         assert time.monotonic() < deadline_s
         time.sleep(0.02)
     time.sleep(delay_s)

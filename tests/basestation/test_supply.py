@@ -11,8 +11,9 @@ import pytest
 
 from kiteline_basestation.config import BaseConfig, SupplyConfig
 from kiteline_basestation.intake import Intake
+from kiteline_basestation.kept import Codes, Kept
+from kiteline_basestation.restore import restore
 from kiteline_basestation.station import Station
-from kiteline_basestation.store import Codes, pack, restore
 from kiteline_basestation.supply import Supply
 from kiteline_codec import messages
 from kiteline_codec.channel import CodedChannel, plain_pair
@@ -158,7 +159,8 @@ def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: M
     submap = submap_of_keyframe(flight.keyframes[0])
     own = {messages.key(r): messages.encode(r) for r in [Placement(submap, np.eye(4)), *lent]}
     station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 2))
-    restore(station, pack({flight.agent: Codes({}, own)}), 0)
+    received = {messages.key(r): messages.encode(r) for r in flight.records[0]}
+    restore(station, Kept({flight.agent: Codes(received, own)}), 0)
     channel = station.channels[flight.agent]
     assert isinstance(channel, CodedChannel)
     assert list(channel.endpoint.own_values()) == [messages.key(Placement(submap, np.eye(4)))]
