@@ -88,7 +88,7 @@ def whole(station: Station) -> dict[str, Any]:
         )  # fmt: skip
     out["placements"] = [(int(s), T.tobytes()) for s, T in station.mapper.placements.items()]
     out["islands"] = sorted(sparse_map.islands.items())
-    out["offsets"] = sorted(sparse_map.disparity_offset_px.items())
+    out["offsets"] = sorted((int(a), offset.tolist()) for a, offset in sparse_map.disparity_offset_px.items())
     out["memory"] = {
         n: t for n, t in snapshot(station, Kept()).memory.items() if n.partition("/")[0] in ("edge", "merge")
     }
