@@ -215,7 +215,7 @@ class CodedChannel:
 _LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
 _RADIOS = ("serial", "mavlink")
 _SPILLED_BYTES = 3 << 20  # of memory for values of keyframes: some two hundred of them, and more than a local map holds
-_UNSPILLED_BYTES = 12 << 20  # the same where old values are lost: ten minutes without a link
+_UNSPILLED_BYTES = 7 << 20  # the same where old values are lost: five minutes without a link
 
 
 def coded_channel(

@@ -40,7 +40,8 @@ class Outbox:
         spill: Spill | None = None,
     ) -> None:
         """order: of keys whose values come back from the archive. basis: kinds of values that tight forms build upon.
-        resident_bytes: of memory for values, about; 0: any number. spill: where the codes of archived values go.
+        resident_bytes: of memory for values that are not archived, about; 0: any number. spill: where codes of archived
+        values go.
         """
         self._order = order
         self._oldest_every = oldest_every
@@ -106,7 +107,7 @@ class Outbox:
                 self._waiting.add(key, entry)
             return
         self._change(key, code, order)
-        if self._limit_bytes and self.resident_bytes > self._limit_bytes:
+        if self._limit_bytes and self._bulk_bytes > self._limit_bytes:
             self._make_room()
 
     def remove(self, key: Key) -> None:
@@ -218,14 +219,14 @@ class Outbox:
         enough = self._limit_bytes * 3 // 4
         refused = False
         for id_ in list(self._bulk):
-            if self.resident_bytes <= enough:
+            if self._bulk_bytes <= enough:
                 return
             refused |= not self._archive(id_)
-        if self.resident_bytes <= self._limit_bytes or not refused:
+        if self._bulk_bytes <= self._limit_bytes or not refused:
             return
         idle = [k for k, e in self._entries.items() if k.kind in _BULK_KINDS and e.still and not e.clean]
         for key in sorted(idle, key=lambda k: (-self._entries[k].order[0], k.id, -k.part)):
-            if self.resident_bytes <= enough:
+            if self._bulk_bytes <= enough:
                 return
             self.remove(key)
             self.dropped += 1
@@ -289,7 +290,7 @@ class Outbox:
         key = self._waiting.top()
         if key is not None or self.archive.newest_dirty() is None:
             return key
-        if self.resident_bytes > self._limit_bytes:
+        if self._bulk_bytes > self._limit_bytes:
             self._make_room()
         for _ in range(_FETCHED):
             id_ = self.archive.newest_dirty()

@@ -63,7 +63,7 @@ class SyncConfig:
     max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
     max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
     max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
-    resident_bytes: int = 0  # of memory for values of keyframes, about; 0: any number
+    resident_bytes: int = 0  # of memory for values of keyframes, their pages in the archive apart; 0: any number
     order: Callable[[Key], Order] = default_order
 
     def __post_init__(self) -> None:

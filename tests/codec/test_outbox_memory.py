@@ -95,7 +95,7 @@ def test_what_was_written_while_the_link_was_down_arrives() -> None:
 def test_memory_stays_bounded_while_all_arrives() -> None:
     line = Line(Memory())
     line.run(1600, up=True)
-    assert line.most <= 1.2 * LIMIT
+    assert line.most <= 2 * LIMIT  # 400 pages of 450 bytes among it
     assert line.a.stats.archived > 2500
     line.run(100, up=True, flying=False)
     assert line.b.peer_values() == line.a.own_values()
