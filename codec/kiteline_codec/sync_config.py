@@ -12,13 +12,13 @@ from kiteline_codec.schema import Key, Kind
 _RANKS = {
     Kind.LIVE: 0,
     Kind.CAMERA: 0,  # nothing can be made of keypoints without it
+    Kind.PLACEMENT: 0,  # few bytes, and all that a pose in the world is wrong by
+    Kind.LEVEL: 0,
     Kind.POSE: 1,
     Kind.DEPTHS: 1,
     Kind.FOUND: 1,
     Kind.REMOVED: 1,
     Kind.CULLED: 1,
-    Kind.PLACEMENT: 1,
-    Kind.LEVEL: 1,
     Kind.CALIBRATION: 1,
     Kind.HEAD: 2,
     Kind.BIRTHS: 3,

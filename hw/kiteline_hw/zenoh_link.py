@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
@@ -21,6 +22,10 @@ from kiteline_hw.zenoh_session import close_session, direct, open_session
 
 _MAX_AGENT = 63  # agent numbers have six bits
 _NEW_AGENT_S = 0.05  # s in which the hub's sender learns of a new agent
+# s in which a base answers. Over UDP, Zenoh's own declarations may get lost for good: then the session is opened anew,
+# with twice the patience each time, for the link may just be slow.
+_DEAF_S = 3.0
+_LONGEST_DEAF_S = 24.0
 _JOIN_S = 0.3  # s for the sender thread to notice the end; it is a daemon and never keeps the process
 
 
@@ -61,6 +66,7 @@ class ZenohLink:
         self._lane = PacketLane(self._wake)
         self._closed = threading.Event()
         self._base_alive = False
+        self._deaf_s = _DEAF_S
         self._session: zenoh.Session | None = None
         self._session_lock = threading.Lock()
         self._keep: list[Any] = []
@@ -89,32 +95,43 @@ class ZenohLink:
         return self._lane.take()
 
     def _run(self) -> None:
-        session: zenoh.Session | None = None
-        while session is None and not self._closed.is_set():
+        while not self._closed.is_set():
+            session: zenoh.Session | None = None
             with contextlib.suppress(LinkError):
                 session = open_session(self._endpoint, "client", connect_timeout_s=0.0, give_up=self._closed)
             if session is None:
                 self._closed.wait(0.2)
-        if session is None:
-            return
-        with self._session_lock:
-            self._session = session
-            closed = self._closed.is_set()
-        if closed:
+                continue
+            with self._session_lock:
+                self._session = session
+            try:
+                if not self._closed.is_set():
+                    self._serve(self._declare(session))
+            except zenoh.ZError:
+                self._lane.counters.callback_errors += 1
+                self._closed.wait(0.2)
             close_session(session)
-            return
-        try:
-            publisher = self._declare(session)
-        except zenoh.ZError:
-            self._lane.counters.callback_errors += 1
-            return
+
+    def _serve(self, publisher: zenoh.Publisher) -> None:
+        """Send what is queued until the end, or until nothing has come from a base that is said to listen."""
+        heard, heard_s = self._lane.counters.received_packets, time.monotonic()
         while not self._closed.is_set():
             with self._wake:
-                while not self._lane.pending() and not self._closed.is_set():
-                    self._wake.wait()
+                if not self._lane.pending():
+                    self._wake.wait(self._deaf_s)
                 packet = self._lane.next_out()
+            now_s = time.monotonic()
+            received = self._lane.counters.received_packets
+            if received != heard or not self._base_alive:
+                self._deaf_s = _DEAF_S if received != heard else self._deaf_s
+                heard, heard_s = received, now_s
             if packet is None or self._closed.is_set():
                 continue
+            if now_s - heard_s > self._deaf_s:
+                self._deaf_s = min(2.0 * self._deaf_s, _LONGEST_DEAF_S)
+                self._base_alive = False
+                self._lane.drop_out()
+                return
             try:
                 publisher.put(packet)
                 self._lane.count_sent(packet)

@@ -38,7 +38,7 @@ def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
         "mode": "client" if role == "client" else "peer",
         "connect/endpoints": [endpoint] if role == "client" else [],
         "listen/endpoints": [endpoint] if role == "base" else [],
-        "connect/timeout_ms": 500,
+        "connect/timeout_ms": 4000,  # two round trips over a link that is 900 ms late each way
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -85,15 +85,29 @@ def open_session(
             time.sleep(_RETRY_S)
         else:
             give_up.wait(_RETRY_S)
-    threading.Thread(target=_close_after_main, args=(session,), name="zenoh-exit", daemon=True).start()
+    _watch_over(session)
     return session
 
 
-def _close_after_main(session: zenoh.Session) -> None:
-    """Close a forgotten session when the main thread has ended: atexit handlers run too late for that."""
+_open: dict[int, zenoh.Session] = {}  # sessions that are not closed yet
+_watching: list[threading.Thread] = []  # the one thread that closes them at the end
+_open_lock = threading.Lock()
+
+
+def _watch_over(session: zenoh.Session) -> None:
+    with _open_lock:
+        _open[id(session)] = session
+        if not _watching:
+            _watching.append(threading.Thread(target=_close_after_main, name="zenoh-exit", daemon=True))
+            _watching[0].start()
+
+
+def _close_after_main() -> None:
+    """Close forgotten sessions when the main thread has ended: atexit handlers run too late for that."""
     threading.main_thread().join()
-    with contextlib.suppress(zenoh.ZError):
-        session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+    for session in list(_open.values()):
+        with contextlib.suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
 
 
 def close_session(session: zenoh.Session) -> bool:
@@ -106,7 +120,11 @@ def close_session(session: zenoh.Session) -> bool:
     thread = threading.Thread(target=close, name="zenoh-close", daemon=True)
     thread.start()
     thread.join(CLOSE_TIMEOUT_S)
-    return not thread.is_alive()
+    closed = not thread.is_alive()
+    if closed:
+        with _open_lock:
+            _open.pop(id(session), None)
+    return closed
 
 
 def direct(callback: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:

@@ -136,17 +136,17 @@ def free_endpoint() -> str:
 
 
 def link_ends(link: str, realtime: bool) -> tuple[str, str]:
-    """LINK of the agents and of the base. `serial:` and `mavlink:` name both ends, the agent's first, with a comma
-    between. Raises LinkError.
+    """LINK of the agents and of the base. Where the ends differ (always with `serial:` and `mavlink:`) both are named,
+    the agent's first, with a comma between. Raises LinkError.
     """
     kind, _, address = link.partition(":")
-    if kind in ("serial", "mavlink") and realtime and address.count(",") == 1:
+    if kind in ("zenoh", "serial", "mavlink") and realtime and address.count(",") == 1:
         ends = address.split(",")
         return f"{kind}:{ends[0]}", f"{kind}:{ends[1]}"
     if link and kind != "zenoh":
         raise LinkError(
             f"--link {link}: fly joins its processes by zenoh:tcp/HOST:PORT, or with --realtime by "
-            "serial:A:BAUD,B:BAUD or mavlink:URL,URL, the agent's end first"
+            "zenoh:A,B, serial:A:BAUD,B:BAUD or mavlink:URL,URL, the agent's end first"
         )
     endpoint = address or free_endpoint()
     return (f"zenoh:{endpoint}",) * 2 if realtime else (f"lockstep:{endpoint}",) * 2

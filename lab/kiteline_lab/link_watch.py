@@ -13,6 +13,7 @@ from kiteline_codec import messages
 from kiteline_codec.packet import parse
 from kiteline_codec.schema import Head, Kind, Live, WireError
 from kiteline_hw.mcap_log_read import LogReader
+from kiteline_hw.ports import SourceError
 from kiteline_lab.replay import steps
 
 _SECOND_NS = 1_000_000_000
@@ -43,8 +44,17 @@ def most_in_a_second(log: Path, topic: str, overhead_bytes: int) -> int:
     return most
 
 
-def arrivals(base_folder: Path, agent: int, start_ns: int) -> tuple[list[float], list[float]]:
-    """How late each header came, and the gaps between live poses, in s."""
+def live_shift_ns(agent_log_path: Path) -> int:
+    """Of a live flight: the stamp of a frame less the time on this machine's clock at which it was taken."""
+    with LogReader(agent_log_path) as reader:
+        frames = [(int(s.head["frame_ns"]), int(s.head["now_ns"])) for s in steps(reader) if s.head["frame_ns"]]
+    if not frames:
+        raise SourceError(f"{agent_log_path}: no frames in this log")
+    return max(t_ns - now_ns for t_ns, now_ns in frames)
+
+
+def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float], list[float]]:
+    """How late each header came, and the gaps between live poses, in s. shift_ns: stamps less the base's clock."""
     heads: dict[int, float] = {}
     poses_ns: list[int] = []
     with LogReader(base_folder / "log.mcap") as reader:
@@ -60,15 +70,15 @@ def arrivals(base_folder: Path, agent: int, start_ns: int) -> tuple[list[float],
                         continue
                     record = messages.decode(item.key, item.data)
                     if isinstance(record, Head):
-                        heads.setdefault(record.keyframe, (now_ns + start_ns - record.t_ns) / 1e9)
+                        heads.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
                     elif isinstance(record, Live):
                         poses_ns.append(now_ns)
     gaps = [(b - a) / 1e9 for a, b in pairwise(poses_ns)]
     return list(heads.values()), gaps
 
 
-def watch(folder: Path, agent: int, start_ns: int, overhead_bytes: int) -> Watched:
-    """All of an agent's link, upwards."""
-    delays, gaps = arrivals(folder / "base", agent, start_ns)
+def watch(folder: Path, agent: int, shift_ns: int, overhead_bytes: int) -> Watched:
+    """All of an agent's link, upwards. shift_ns: stamps of frames less the clock of the flight."""
+    delays, gaps = arrivals(folder / "base", agent, shift_ns)
     most = most_in_a_second(folder / f"agent{agent}" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
     return Watched(most, delays, gaps)
