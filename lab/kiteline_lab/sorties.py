@@ -6,6 +6,7 @@ Lock-step at the pace of the frames; the codec lies between, packets arrive one 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -63,6 +64,7 @@ class Flown:
     bytes_up: int = 0
     bytes_down: int = 0
     copies: int = 0  # most that the agent held at once
+    cpu_ms: list[float] = field(default_factory=list)  # of each frame's step
 
     def said(self, word: str) -> list[int]:
         """Frames in which an event begins with a word."""
@@ -132,8 +134,10 @@ class _Crew:
         self._next = next(self._frames, None)
         deaf = any(a <= now_ns * 1e-9 < b for a, b in self._deaf)
         received = () if deaf else tuple(packets)
+        begin_ns = time.process_time_ns()
         output = self._box.step(StepInput(frame, imu, received), now_ns)
         out = self.flown
+        out.cpu_ms.append((time.process_time_ns() - begin_ns) / 1e6)
         assert output.estimate is not None
         out.estimates.append(output.estimate)
         out.truth.append(truth)
