@@ -13,7 +13,6 @@ class AloneChannel:
     """A RecordChannel with nobody at the other end."""
 
     profile = EXACT
-    backlog_bytes = 0
 
     def __init__(self) -> None:
         self.noting = False  # whether `take_noted` will be asked
@@ -22,6 +21,10 @@ class AloneChannel:
     def keyframe_gap_ns(self) -> int:
         """None: there is no link."""
         return 0
+
+    def arrived(self, key: Key) -> bool:
+        """Nobody waits for it."""
+        return True
 
     def put(self, record: Record) -> Record:
         """The record as it is: no code has rounded it."""

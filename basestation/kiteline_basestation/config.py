@@ -190,7 +190,6 @@ class SupplyConfig:
     copies: int = 24  # keyframes an agent holds copies of; 0: none. They cover two views of a room and its way there
     every_s: float = 1.0  # between two looks at what an agent needs
     horizon_s: float = 2.0  # how far ahead along its motion: what a thin link takes to bring two keyframes
-    at_once: int = 6  # copies lent at one look: the rest may prove to be of no use a second later
     remembered: int = 48  # newest keyframes of its own that an agent remembers by itself
     reach: float = 1.5  # distance of a keyframe over the depth in view: farther ones see little of the same
     min_cosine: float = 0.3  # of the angle between the optical axes: descriptors do not bear more than 70 degrees

@@ -165,15 +165,20 @@ class Supply:
     def _take_back(
         self, reader: _Reader, wanted: list[KeyframeId], submap: SubmapId, channel: RecordChannel
     ) -> None:  # fmt: skip
-        """What is no longer of one map with the submap in which it was lent; then, for want of room, what is not
-        wanted, the oldest first.
+        """What is no longer of one map with the submap in which it was lent, or no longer wanted before it arrived;
+        then, for want of room, what is not wanted, the oldest first.
         """
         island = self._map.island_of
-        gone = [k for k, lent in reader.lent.items() if island(submap_of_keyframe(k)) != island(lent.copy.submap)]
+        gone = [
+            k
+            for k, lent in reader.lent.items()
+            if island(submap_of_keyframe(k)) != island(lent.copy.submap)
+            or (k not in wanted and not _arrived(lent, channel))
+        ]
         new = sum(k not in reader.lent for k in wanted)
         idle = [k for k in reader.lent if k not in wanted and k not in gone]
         spare = self._config.copies - len(reader.lent) + len(gone)
-        gone += idle[: max(0, min(new, self._config.at_once) - spare)]
+        gone += idle[: max(0, min(new, channel.profile.copies_ahead) - spare)]
         for keyframe in gone:
             for key in reader.lent.pop(keyframe).keys:
                 channel.remove(key)
@@ -196,9 +201,9 @@ class Supply:
         self, agent: AgentId, reader: _Reader, wanted: list[KeyframeId], submap: SubmapId, channel: RecordChannel
     ) -> None:  # fmt: skip
         """The best of what is wanted, as far as there is room here and on the link."""
-        for keyframe in [k for k in wanted if k not in reader.lent][: self._config.at_once]:
-            if len(reader.lent) >= self._config.copies or channel.backlog_bytes > channel.profile.copies_backlog_bytes:
-                return
+        ahead = channel.profile.copies_ahead - sum(not _arrived(lent, channel) for lent in reader.lent.values())
+        room = self._config.copies - len(reader.lent)
+        for keyframe in [k for k in wanted if k not in reader.lent][: max(0, min(ahead, room))]:
             copy = self._copy(keyframe, submap)
             points, strength = self._copied(agent, keyframe)
             records: list[Copy | Copied] = [copy, *channel.profile.copies(points, strength)]
@@ -232,6 +237,10 @@ class Supply:
             table.angle[points].copy(),
             table.descriptor[points].copy(),
         ), points_seen
+
+
+def _arrived(lent: _Lent, channel: RecordChannel) -> bool:
+    return all(channel.arrived(key) for key in lent.keys)
 
 
 def is_copy(key: Key) -> bool:

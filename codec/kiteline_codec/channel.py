@@ -26,9 +26,8 @@ class RecordChannel(Protocol):
         """How long after the last keyframe the link can take another, unless it is pressing."""
         ...
 
-    @property
-    def backlog_bytes(self) -> int:
-        """Of records that the other side is not known to hold."""
+    def arrived(self, key: Key) -> bool:
+        """Whether the other side is known to hold what was put last under a key."""
         ...
 
     def put(self, record: Record) -> Record:
@@ -56,7 +55,6 @@ class PlainChannel:
     """One of two joined ends in one process: records pass as they are, at the next `receive`. Made by `plain_pair`."""
 
     profile = EXACT
-    backlog_bytes = 0
 
     def __init__(self) -> None:
         self._arrived: list[Record] = []
@@ -66,6 +64,10 @@ class PlainChannel:
     def keyframe_gap_ns(self) -> int:
         """None: there is no link."""
         return 0
+
+    def arrived(self, key: Key) -> bool:
+        """As soon as it was put."""
+        return True
 
     def put(self, record: Record) -> Record:
         """Hand a record over."""
@@ -127,10 +129,9 @@ class CodedChannel:
         """How long after the last keyframe the link can take another, unless it is pressing."""
         return self._pacer.keyframe_gap_ns(self.endpoint.backlog_bytes, self.endpoint.throughput_bytes_s)
 
-    @property
-    def backlog_bytes(self) -> int:
-        """Of records that the other side is not known to hold."""
-        return self.endpoint.backlog_bytes
+    def arrived(self, key: Key) -> bool:
+        """Whether the other side is known to hold what was put last under a key."""
+        return self.endpoint.arrived(key)
 
     @property
     def stats(self) -> SyncStats:

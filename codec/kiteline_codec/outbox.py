@@ -81,6 +81,11 @@ class Outbox:
             self._fetch(id_)
         return {key: entry.code for key, entry in self._entries.items() if entry.code is not None}
 
+    def arrived(self, key: Key) -> bool:
+        """Whether the peer is known to hold the newest version of a value, or that there is none."""
+        entry = self._entries.get(key)
+        return entry is None or entry.clean
+
     def held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value, None when there is none."""
         entry = self._find(key)

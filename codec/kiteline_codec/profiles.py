@@ -43,7 +43,7 @@ class Profile:
     overhead_bytes: int = 28  # a packet costs on the wire beyond its own bytes: IPv4 and UDP
     heartbeat_ns: int = 1_000_000_000  # longest silence
     copied: int = 96  # points of a copied keyframe: with its neighbours' they cover what it saw
-    copies_backlog_bytes: int = 8_000  # waiting for the link, above which no further keyframe is copied
+    copies_ahead: int = 6  # copied keyframes on their way at once: the rest may prove to be of no use meanwhile
 
     def choose(self, births: Births, strength: F64, sightings: Sightings) -> tuple[list[Births], list[Sightings]]:
         """The sections to share, best first. births: their first `births` rows are the best ones. strength: (n,)."""
@@ -105,7 +105,7 @@ RADIO = Profile(
     sightings_room_bytes=220,
     packet_bytes=220,  # a quarter of a second at 1000 B/s: a pose waits no longer
     copied=40,  # a kilobyte: two seconds of the whole link
-    copies_backlog_bytes=300,  # next to nothing: what waits there is of more use
+    copies_ahead=1,
     overhead_bytes=7,  # two zeros, COBS and CRC-32 of a frame on a serial line
 )
 EXACT = Profile(name="exact", pixel_step=1, depth_step=1, live_gap_ns=0)  # nothing but the codes' own rounding

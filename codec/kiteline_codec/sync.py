@@ -97,6 +97,10 @@ class Endpoint:
         """Take a value back; unknown keys are ignored."""
         self._out.remove(key)
 
+    def arrived(self, key: Key) -> bool:
+        """Whether the peer is known to hold the newest version of a value of ours, or that there is none."""
+        return self._out.arrived(key)
+
     def own_values(self) -> dict[Key, bytes]:
         """What this side shares, by key; a copy."""
         return self._out.codes()

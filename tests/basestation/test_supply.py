@@ -144,10 +144,13 @@ def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
     for keyframe in base.supply.lent(flight.agent):
         parts = [r for r in base.heard if isinstance(r, Copied) and r.keyframe == keyframe]
         assert 0 < sum(len(p.index) for p in parts) <= RADIO.copied
-    base.here.backlog_bytes = 5_000  # type: ignore[misc]
-    held = base.supply.lent(flight.agent)
-    base.serve(flight.keyframes[5], turns=3)
-    assert set(base.supply.lent(flight.agent)) <= set(held), "nothing new while corrections wait"
+    assert len(base.supply.lent(flight.agent)) == 1
+    base.here.arrived = lambda key: False  # type: ignore[method-assign]
+    first = base.supply.lent(flight.agent)
+    assert base.serve(flight.keyframes[-1], turns=3) == first, "one is on its way"
+    later = base.serve(flight.keyframes[35], turns=2)  # the other side of the room
+    assert not set(later) & set(first), "what is no longer wanted is not sent"
+    assert len(later) <= 1
 
 
 def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: MakeFlight) -> None:
