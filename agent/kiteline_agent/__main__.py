@@ -244,6 +244,7 @@ class Onboard:
             "skipped": dict(sorted(skipped.items())),
             "notes": list(self.source.report.notes),
             "scale": "metric" if self.agent.metric else "own",
+            "time_offset": self.agent.time_offset_report(),
             "drain": {key: total[key] - self.flown[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
                 "cpu_ms_per_frame": self.cpu_ms,
@@ -381,8 +382,8 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
             for packet in onboard.step(frame, imu, link.receive(), now_ns):
                 link.send(packet)
             e = onboard.output.estimate if onboard.output is not None else None
-            if sink is not None and e is not None:
-                sink.push(PoseSample(captured_ns, e.T_o_b, e.tracked, e.quality, spec.boot, e.cov_o), clock.now_ns())
+            if sink is not None and e is not None and e.T_l_b is not None:
+                sink.push(PoseSample(captured_ns, e.T_l_b, e.tracked, e.quality, spec.boot, e.cov_l), clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is None:
                 _tell(narrator.lines(onboard.output, onboard.tally, now_ns - begin_ns) if onboard.output else ())

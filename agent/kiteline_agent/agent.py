@@ -15,9 +15,9 @@ from kiteline_agent.depth_from_motion import DepthFromMotion
 from kiteline_agent.frozen import FrozenEye
 from kiteline_agent.glimpse import Glimpse
 from kiteline_agent.governor import FULL, Extra, Governor, governed
-from kiteline_agent.inertial import level_rotation
 from kiteline_agent.inertial_tracker import InertialTracker
 from kiteline_agent.keyframe_maker import KeyframeMaker
+from kiteline_agent.levelling import Levelling
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.metric_start import Reborn, reborn
 from kiteline_agent.mono_start import MonoStart, Opening
@@ -39,7 +39,6 @@ from kiteline_codec.schema import (
     Culled,
     Depths,
     Found,
-    Level,
     Live,
     Placement,
     Pose,
@@ -84,7 +83,9 @@ class Agent:
             None if imu is None else InertialTracker(self._camera, imu, config.inertial, metric=not one_eye)
         )
         self._bridged = False  # the last pose is the IMU's alone
-        self._levelled = False  # whether the first submap's uprightness has been judged
+        self._levelling = Levelling(
+            self._camera, self._inertial, config.inertial.askew_rad, config.inertial.level_patience_s
+        )
         self.map = LocalMap(self._camera, config.local_map, config.depth_filter)
         self.work = Work()  # of the last step
         self._tracker = Tracker(self.map, config, self.work)
@@ -152,6 +153,7 @@ class Agent:
             if self._lost:
                 self._land(predicted, track)
             self._accept(track, dt_s)
+            self._look_up(frame.t_ns)
             # 4. Look for the depth of what was born without one.
             self._motion_depth.update(view, track)
             # 5. Make a keyframe where the policy asks for one.
@@ -243,9 +245,9 @@ class Agent:
         self.work.fused = 1
         seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
         state = self._inertial.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen)
+        self._events += self._inertial.offset_news()
         if state is None:
             return track
-        self._say_level()
         return replace(track, T_c_m=se3.inverse(state.T_m_b @ self._camera.T_b_c))
 
     def _find_scale(self, view: View, track: Track, t_ns: int) -> None:
@@ -280,19 +282,15 @@ class Agent:
         if self._inertial is not None:
             self._inertial.begin_map(t_ns, self._pose.T_m_c @ self._T_c_b)
 
-    def _say_level(self) -> None:
-        """Once the IMU knows which way is up, tell the base if the first submap lies askew: it began in motion."""
-        if self._levelled or self._inertial is None or self._inertial.metric is False:
-            return
-        self._levelled = True
-        R_l_m = self._inertial.level_R
-        askew_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
-        if self._submaps.opened != 1 or askew_rad < self._config.inertial.askew_rad:
-            return
-        # Turned about where the vehicle is now, so that its place in the world does not jump.
-        here = (self._pose.T_m_c @ self._T_c_b)[:3, 3]
-        self._channel.put(Level(self.submap, se3.from_rt(R_l_m, here - R_l_m @ here)))
-        self._events.append(f"submap lies {np.degrees(askew_rad):.1f} degrees askew")
+    def _look_up(self, t_ns: int) -> None:
+        """See which way is up; where the first submap lies askew, because it began in motion, the base is told."""
+        T_m_b = self._pose.T_m_c @ self._T_c_b
+        level = self._levelling.look(
+            t_ns, T_m_b, self._pose.T_o_m[:3, :3], self.submap, first=self._submaps.opened == 1
+        )
+        if level is not None:
+            self._channel.put(level)
+            self._events.append(f"submap lies {np.degrees(self._levelling.askew_rad):.1f} degrees askew")
 
     def _accept(self, track: Track, dt_s: float) -> None:
         """Take over a measured pose and what it says of the points and of the motion."""
@@ -368,7 +366,7 @@ class Agent:
         opening = None
         if self._mono is not None:
             if self._last_t_ns is None:
-                self._pose.T_m_c = self._first_pose(imu)  # the camera moves from here on
+                self._pose.T_m_c = self._levelling.first_pose(imu)  # the camera moves from here on
             self.work.searches += 1
             opening = self._mono.step(view, t_ns)
             if opening is None:
@@ -382,7 +380,7 @@ class Agent:
             if self._mono is None:  # maps of one eye differ in scale: no rigid motion joins them
                 self._recovery.search_beside(self._frame_number)
         elif opening is None:
-            self._pose.T_m_c = self._first_pose(imu)
+            self._pose.T_m_c = self._levelling.first_pose(imu)
         # 3. Open it.
         self._events.append("submap: opened")
         self._failures = 0
@@ -473,15 +471,6 @@ class Agent:
     def _believes(self, T_c_m: F64, submap: SubmapId) -> bool:
         return self._certainty.believes(T_c_m, submap, self._predicted, self._pose, self._T_c_b, self.submap)
 
-    def _first_pose(self, imu: ImuBatch | None) -> F64:
-        """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""
-        if self._inertial is not None and imu is not None and len(imu.t_ns):
-            R_m_b = level_rotation(imu.accel.mean(axis=0))
-        else:
-            R_m_c = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-            R_m_b = R_m_c @ self._T_c_b[:3, :3]
-        return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
-
     @property
     def submap(self) -> SubmapId:
         """The submap in which the agent tracks (the first one before it has begun)."""
@@ -491,6 +480,10 @@ class Agent:
     def metric(self) -> bool:
         """Whether the active submap's lengths are metres; one eye alone measures in a unit of its own."""
         return self._mono is None or (self._inertial is not None and self._inertial.metric)
+
+    def time_offset_report(self) -> dict[str, float] | None:
+        """InertialTracker.offset_report; None without an IMU."""
+        return None if self._inertial is None else self._inertial.offset_report()
 
     # what the base sends
 
@@ -548,5 +541,6 @@ class Agent:
             quality,
             cov_m,
             cov_o,
+            self._levelling.R_l_o,
             T_w_b if tracked else None,
         )

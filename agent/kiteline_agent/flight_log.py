@@ -85,5 +85,5 @@ def estimate_from_json(value: Mapping[str, Any]) -> Estimate:
 
 def _matrix(numbers: Sequence[float]) -> NDArray[np.float64]:
     a = np.array(numbers, np.float64)
-    side = {16: 4, 36: 6}.get(a.size)
+    side = {9: 3, 16: 4, 36: 6}.get(a.size)
     return a if side is None else a.reshape(side, side)

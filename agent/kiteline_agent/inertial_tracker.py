@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from kiteline_core import imu_alignment, se3
 from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.fixed_lag import FixedLagConfig, FixedLagSmoother, InertialState, StartDeviations, VisualPoints
+from kiteline_core.fixed_lag import (
+    FixedLagConfig,
+    FixedLagSmoother,
+    InertialState,
+    StartDeviations,
+    VisualPoints,
+    tilt_of,
+)
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.imu_preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
 from kiteline_core.time_offset import TimeOffsetEstimator
@@ -32,6 +39,9 @@ class InertialConfig:
     rest_gyro_rad_s: float = 0.02  # deviation of the gyro below which it stands
     rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle
     rest_moved_m: float = 0.005  # most that the images may have moved meanwhile
+    level_window_s: float = 0.19  # after which gravity is known to a degree: five frames at 20 Hz
+    level_error: float = 0.03  # relative, of gravity's length as found then: its direction is as good
+    level_patience_s: float = 2.0  # so long a flight controller waits at most for level poses
     motion_window_s: float = 0.7  # window of the alignment in motion
     window_frames: int = 60  # most frames that are kept while waiting; a scale needs some seconds
     max_residual_m: float = 0.02  # of the alignment: above it the poses do not fit the IMU, wait on
@@ -45,7 +55,8 @@ class InertialConfig:
     offset_trusted_s: float = 3e-3  # deviation below which the estimate is applied
     offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
     offset_rate: float = 0.05  # s/s, how fast the applied offset follows
-    apply_offset: bool = True
+    offset_s: float = 0.0  # camera stamp + offset = time of the IMU, where a calibration says so
+    apply_offset: bool = True  # False: only what is configured
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +87,9 @@ class InertialTracker:
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
         self._offset = TimeOffsetEstimator(
-            config.offset_memory_s, config.offset_start_sigma_s, config.offset_turn_sigma_rad
+            config.offset_memory_s, config.offset_start_sigma_s, config.offset_turn_sigma_rad, config.offset_s
         )
-        self._applied_s = 0.0
+        self._applied_s = self._told_s = config.offset_s
         self._bias = np.zeros(6)
         self._waiting: list[_Pose] = []
         self._last: _Pose | None = None  # the last pose, however it was come by
@@ -100,16 +111,37 @@ class InertialTracker:
         """The newest state; None while waiting for a start."""
         return self._smoother.state if self._smoother.running else None
 
-    @property
-    def level_R(self) -> F64:
-        """R_level_m (3,3): the turn that would set the map upright, by what is known of gravity now."""
-        tilt = self._smoother.state.tilt if self._smoother.running else np.zeros(2)
+    def level_R(self) -> F64 | None:
+        """R_level_m (3,3): the turn that sets the map upright; None until gravity is known, a few frames after the
+        begin.
+        """
+        if self._smoother.running:
+            tilt = self._smoother.state.tilt
+        else:
+            gravity = self._gravity_so_far()
+            if gravity is None:
+                return None
+            tilt = tilt_of(gravity)
         return se3.so3_exp(np.array([-tilt[0], -tilt[1], 0.0]))
 
     @property
     def time_offset_s(self) -> tuple[float, float]:
         """Camera stamp + offset = time of the IMU, and one standard deviation, s."""
         return self._offset.offset_s, self._offset.sigma_s
+
+    def offset_report(self) -> dict[str, float]:
+        """The time offset in ms: as estimated, one standard deviation of that, and what is applied."""
+        offset_s, sigma_s = self.time_offset_s
+        told = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self._applied_s}
+        return {name: round(1e3 * value, 2) for name, value in told.items()}
+
+    def offset_news(self) -> list[str]:
+        """What to tell of the applied offset: a line whenever it has moved by a millisecond."""
+        if abs(self._applied_s - self._told_s) < 1e-3:
+            return []
+        self._told_s = self._applied_s
+        offset_s, sigma_s = self.time_offset_s
+        return [f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)"]
 
     @property
     def blind_s(self) -> float:
@@ -269,6 +301,20 @@ class InertialTracker:
         if sigma_s < config.offset_trusted_s and significant:
             step = offset_s - self._applied_s
             self._applied_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
+
+    def _gravity_so_far(self) -> F64 | None:
+        """Gravity (3,) in m from the frames that wait for a start, well before they are enough for one."""
+        config = self._config
+        if not self.metric or len(self._waiting) < 5:
+            return None
+        if (self._waiting[-1].t_ns - self._waiting[0].t_ns) * 1e-9 < config.level_window_s:
+            return None
+        poses, motions = self._window(config.window_frames)
+        if len(motions) < len(poses) - 1:
+            return None
+        found = imu_alignment.align(poses, self._p_b_c, motions, self._bias, config.gravity_m_s2, with_scale=False)
+        fits = found is not None and found.residual_m < config.max_residual_m
+        return found.gravity if found is not None and fits and found.gravity_error < config.level_error else None
 
     # start
 

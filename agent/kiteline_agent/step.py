@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from numpy import float64
+import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 
-F64 = NDArray[float64]
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +42,8 @@ class Estimate:
     (CertaintyConfig), at least 1; -1 where nothing measures the motion.
     cov_m: (6,6) of T_m_b against where its submap began, [translation in m, rotation about the body's axes], m and rad.
     cov_o: (6,6) of T_o_b against where the flight began, [translation in o, rotation about the body's axes].
+    R_l_o: (3,3) sets the odometry frame upright, the same for good once it is known; None before, where a flight begins
+    in motion.
     """
 
     t_ns: int
@@ -56,7 +58,24 @@ class Estimate:
     quality: int
     cov_m: F64
     cov_o: F64
+    R_l_o: F64 | None
     T_w_b: F64 | None
+
+    @property
+    def T_l_b(self) -> F64 | None:
+        """(4,4) body in the odometry frame set upright: what a flight controller gets. None until that is known."""
+        if self.R_l_o is None:
+            return None
+        T = self.T_o_b.copy()
+        T[:3] = self.R_l_o @ T[:3]
+        return T
+
+    @property
+    def cov_l(self) -> F64:
+        """cov_o with translations in the upright frame."""
+        turn = np.eye(6)
+        turn[:3, :3] = np.eye(3) if self.R_l_o is None else self.R_l_o
+        return np.asarray(turn @ self.cov_o @ turn.T)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,15 @@ class TimeOffsetEstimator:
     2014).
     """
 
-    def __init__(self, memory_s: float, start_sigma_s: float, turn_sigma_rad: float) -> None:
-        """memory_s: time constant of forgetting. turn_sigma_rad: error of a visual turn between two frames."""
+    def __init__(self, memory_s: float, start_sigma_s: float, turn_sigma_rad: float, start_s: float = 0.0) -> None:
+        """memory_s: time constant of forgetting. turn_sigma_rad: error of a visual turn between two frames. start_s: the
+        offset as configured.
+        """
         self._memory_s = memory_s
         self._weight = turn_sigma_rad**-2.0
         self._prior = np.diag([start_sigma_s**-2.0, *3 * [_BIAS_RAD_S**-2.0]])
-        self._h, self._g = self._prior.copy(), np.zeros(4)
+        self._at_start = self._prior @ np.array([start_s, 0.0, 0.0, 0.0])
+        self._h, self._g = self._prior.copy(), self._at_start.copy()
 
     def add(self, error: F64, rate_change: F64, dt_s: float) -> None:
         """error: (3,) Log(gyro_turn^T visual_turn) with an interval taken at the present offset 0 of this estimator.
@@ -34,7 +37,7 @@ class TimeOffsetEstimator:
         w = self._weight * min(1.0, 4.0 / (size * np.sqrt(self._weight) + 1e-12))
         keep = float(np.exp(-dt_s / self._memory_s))
         self._h = keep * self._h + (1.0 - keep) * self._prior + w * (j.T @ j)
-        self._g = keep * self._g + w * (j.T @ error)
+        self._g = keep * self._g + (1.0 - keep) * self._at_start + w * (j.T @ error)
 
     @property
     def offset_s(self) -> float:

@@ -82,7 +82,7 @@ def estimate(tracked: bool = True, placed: bool = False, keyframe: int = 3) -> E
     pose = se3.exp(np.array([0.1, -0.2, 1 / 3, 0.3, 1e-9, -2.0]))
     return Estimate(
         1_000_000_007, tracked, False, pose if tracked else None, pose, KeyframeId(keyframe), np.eye(4), SubmapId(0),
-        120, 80, 0.1 * np.eye(6), np.full((6, 6), 1 / 3),
+        120, 80, 0.1 * np.eye(6), np.full((6, 6), 1 / 3), np.eye(3) if tracked else None,
         np.eye(4) if placed and tracked else None,
     )  # fmt: skip
 

@@ -113,7 +113,9 @@ def test_starts_in_motion_in_a_map_that_is_not_level(seed: int) -> None:
     tracker, states = run(steps)
     assert tracker.started == "motion"
     assert next(k for k, s in enumerate(states) if s is not None) < 25
-    upright = tracker.level_R @ lean[:3, :3]
+    level_R = tracker.level_R()
+    assert level_R is not None
+    upright = level_R @ lean[:3, :3]
     assert upright[2, 2] > np.cos(np.radians(1.0))
     assert apart_m(states[-1], steps[-1].truth) < 0.004
 
@@ -171,6 +173,18 @@ def test_time_offset_is_found_and_applied(late_ns: int) -> None:
     assert offset_s == pytest.approx(late_ns * 1e-9, abs=1.5e-3)
     assert sigma_s < 1e-3
     assert apart_m(states[-1], steps[-1].truth) < 0.004
+
+
+def test_a_configured_time_offset_holds_and_changes_are_told() -> None:
+    steps = flight(60, 6, late_ns=12_000_000)
+    tracker, states = run(steps, config=InertialConfig(offset_s=0.012, apply_offset=False))
+    assert tracker.offset_report()["applied_ms"] == 12.0
+    assert tracker.offset_report()["ms"] == pytest.approx(12.0, abs=2.0)
+    assert tracker.offset_news() == []
+    assert apart_m(states[-1], steps[-1].truth) < 0.004
+    tracker, _ = run(flight(160, 6, late_ns=12_000_000))
+    assert "ms are the IMU's time" in tracker.offset_news()[0]
+    assert tracker.offset_news() == []
 
 
 def test_scale_of_a_map_without_one() -> None:

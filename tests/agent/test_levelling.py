@@ -1,0 +1,121 @@
+"""Which way is up: at once, after a few frames in motion, and who is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kiteline_agent.inertial_tracker import InertialTracker
+from kiteline_agent.levelling import Levelling, level_rotation
+from kiteline_agent.step import Estimate
+from kiteline_core import se3
+from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.ids import KeyframeId, SubmapId
+
+CAMERA = RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, True, np.eye(4))
+
+
+class Knows(InertialTracker):
+    """An inertial tracker of which only what it knows of gravity counts."""
+
+    def __init__(self) -> None:
+        super().__init__(CAMERA, ImuCalibration(), _config())
+        self.up: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None = None
+
+    def level_R(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+        return self.up
+
+
+def _config():  # type: ignore[no-untyped-def]
+    from kiteline_agent.inertial_tracker import InertialConfig
+
+    return InertialConfig()
+
+
+def test_the_accelerometer_alone_sets_the_body_upright() -> None:
+    for up in ([0.0, 0.0, 9.8], [9.8, 0.0, 0.0], [1.0, -3.0, 9.0], [0.0, 0.0, -9.8]):
+        u = np.array(up)
+        np.testing.assert_allclose(level_rotation(u) @ u, [0.0, 0.0, np.linalg.norm(u)], atol=1e-9)
+
+
+def test_without_an_imu_nobody_waits() -> None:
+    levelling = Levelling(CAMERA, None, 0.035, 2.0)
+    np.testing.assert_array_equal(levelling.R_l_o, np.eye(3))
+    assert levelling.look(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    ahead = levelling.first_pose(None)[:3, :3]
+    np.testing.assert_allclose(ahead @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_the_base_is_told_once_and_the_place_stays() -> None:
+    knows = Knows()
+    levelling = Levelling(CAMERA, knows, 0.035, 2.0)
+    T_m_b = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    assert levelling.look(0, T_m_b, np.eye(3), SubmapId(0), first=True) is None
+    assert levelling.R_l_o is None
+    lean = se3.so3_exp(np.array([0.2, -0.3, 0.0]))
+    knows.up = lean.T
+    level = levelling.look(10**8, T_m_b, np.eye(3), SubmapId(0), first=True)
+    assert level is not None
+    np.testing.assert_allclose((level.T_l_m @ T_m_b)[:3, 3], T_m_b[:3, 3], atol=1e-12)
+    assert levelling.R_l_o is not None
+    np.testing.assert_allclose(levelling.R_l_o @ lean @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
+    assert levelling.askew_rad == pytest.approx(np.hypot(0.2, 0.3))
+    assert levelling.look(2 * 10**8, T_m_b, np.eye(3), SubmapId(0), first=True) is None
+
+
+def test_what_leans_hardly_is_left_and_patience_ends() -> None:
+    knows = Knows()
+    hardly = Levelling(CAMERA, knows, 0.035, 2.0)
+    knows.up = se3.so3_exp(np.array([0.02, 0.0, 0.0]))
+    assert hardly.look(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    assert hardly.R_l_o is not None and abs(hardly.R_l_o[2, 1]) > 0.01  # the flight controller gets even this
+    knows.up = None
+    patient = Levelling(CAMERA, knows, 0.035, 2.0)
+    for t_s in (0.0, 1.0, 1.9):
+        patient.look(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+        assert patient.R_l_o is None
+    patient.look(int(2.1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+    np.testing.assert_array_equal(patient.R_l_o, np.eye(3))
+
+
+def test_gravity_is_known_after_five_frames_in_motion() -> None:
+    rng = np.random.default_rng(4)
+    errors = []
+    for _ in range(10):
+        turn, accel, v0 = 0.8 * rng.normal(size=3), 3.0 * rng.normal(size=3), rng.normal(size=3)
+        lean = se3.so3_exp(np.array([0.3, -0.2, 0.0]))
+        tracker = InertialTracker(CAMERA, ImuCalibration(), _config())
+        first = None
+        for k in range(6):
+            now = 0.05 * k
+            stamps = np.arange(0, 11) * 5_000_000 + (k - 1) * 50_000_000
+            turns = [se3.so3_exp(turn * t * 1e-9) for t in stamps]
+            felt = np.array([r.T @ (accel + [0.0, 0.0, 9.81]) for r in turns])
+            tracker.predict(ImuBatch(stamps, np.tile(turn, (11, 1)), felt), k * 50_000_000)
+            T = se3.from_rt(lean @ se3.so3_exp(turn * now), lean @ (v0 * now + 0.5 * accel * now * now))
+            T[:3, 3] += 3e-4 * rng.normal(size=3)
+            tracker.update(k * 50_000_000, T, _nothing())
+            if first is None and tracker.level_R() is not None:
+                first = k
+        assert first is not None and first <= 5
+        up = tracker.level_R() @ lean @ [0.0, 0.0, 1.0]
+        errors.append(np.degrees(np.arccos(min(up[2], 1.0))))
+    assert np.mean(errors) < 1.0 and max(errors) < 2.5
+
+
+def _nothing():  # type: ignore[no-untyped-def]
+    from kiteline_core.fixed_lag import VisualPoints
+
+    none = np.zeros((0, 3))
+    return VisualPoints(none, none, none, np.zeros(0), np.zeros(0, np.bool_))
+
+
+def test_a_flight_controller_gets_upright_poses() -> None:
+    T = se3.exp(np.array([1.0, 0.0, 0.0, 0.1, 0.2, 0.0]))
+    R = se3.so3_exp(np.array([0.0, np.pi / 2, 0.0]))
+    cov = np.diag([4.0, 1.0, 1.0, 0.1, 0.2, 0.3])
+    e = Estimate(0, True, False, T, T, KeyframeId(0), np.eye(4), SubmapId(0), 100, 90, cov, cov, R, None)
+    assert e.T_l_b is not None
+    np.testing.assert_allclose(e.T_l_b, se3.from_rt(R, np.zeros(3)) @ T, atol=1e-12)
+    np.testing.assert_allclose(np.diag(e.cov_l), [1.0, 1.0, 4.0, 0.1, 0.2, 0.3], atol=1e-12)
