@@ -19,8 +19,8 @@ class TimeOffsetEstimator:
     """
 
     def __init__(self, memory_s: float, start_sigma_s: float, turn_sigma_rad: float, start_s: float = 0.0) -> None:
-        """memory_s: time constant of forgetting. turn_sigma_rad: error of a visual turn between two frames. start_s: the
-        offset as configured.
+        """memory_s: time constant of forgetting. turn_sigma_rad: error of a visual turn between two frames. start_s:
+        the offset as configured.
         """
         self._memory_s = memory_s
         self._weight = turn_sigma_rad**-2.0

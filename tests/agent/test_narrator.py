@@ -14,7 +14,8 @@ def output(tracked: bool, *events: str) -> StepOutput:
     pose = np.eye(4)
     estimate = Estimate(
         t_ns=0, tracked=tracked, bridged=False, T_m_b=pose if tracked else None, T_o_b=pose, keyframe=KeyframeId(0),
-        T_k_c=pose, submap=SubmapId(0), inliers=0, quality=1, cov_m=np.eye(6), cov_o=np.eye(6), T_w_b=None,
+        T_k_c=pose, submap=SubmapId(0), inliers=0, quality=1, cov_m=np.eye(6), cov_o=np.eye(6), R_l_o=np.eye(3),
+        T_w_b=None,
     )  # fmt: skip
     return StepOutput(estimate, (), events)
 
