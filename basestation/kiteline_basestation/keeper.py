@@ -112,14 +112,16 @@ class Keeper:
 
 
 def snapshot(station: Station, before: Kept) -> Kept:
-    """A station's whole map at rest. before: what it was restored from."""
+    """A station's whole map at rest. before: what it was restored from; what was imported since must have been noted."""
     agents = {}
     for agent, channel in sorted(station.channels.items()):
         if isinstance(channel, CodedChannel):
             end = channel.endpoint
             old = before.agents.get(agent, Codes({}, {}))
             own = {key: code for key, code in end.own_values().items() if not is_copy(key)}
-            agents[agent] = Codes({**old.received, **end.legacy_values(), **end.peer_values()}, own)
+            noted = (station.touched or {}).items()
+            imported = {key: code for (a, _, key), code in noted if a == agent and code is not None}
+            agents[agent] = Codes({**old.received, **imported, **end.legacy_values(), **end.peer_values()}, own)
     texts = Scribe().changes(station.mapper.memory())
     return Kept(agents, {name: text for name, text in texts.items() if text is not None})
 
@@ -165,6 +167,7 @@ def _of_base(log: LogReader, path: Path, station: Station) -> Kept:
     for blob in log.messages((flight_log.RESTORED,)):
         before = unpack(blob.blob())
         restore(station, before, blob.t_ns)
+    station.note_changes()
     jobs: dict[int, Job] = {}
     for messages in _steps(log):
         head = messages[0].json()

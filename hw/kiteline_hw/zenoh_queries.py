@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import json
 import queue
+import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -17,6 +19,7 @@ import zenoh
 from kiteline_hw.ports import LinkError
 from kiteline_hw.zenoh_session import close_session, direct, open_session
 
+_RETRY_S = 0.1  # s between two questions that nobody answered
 _WAITING = 64  # questions that may wait; more are refused
 
 
@@ -101,27 +104,30 @@ def _reply(query: Any, ok: bool, text: str) -> None:
 
 
 def ask(endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10.0) -> tuple[bool, str]:
-    """Ask once. Returns whether it was done, and the answer. Raises LinkError where nobody answers."""
+    """Ask, again while nobody answers yet. Returns whether it was done, and the answer. Raises LinkError."""
+    deadline_s = time.monotonic() + timeout_s
     session = open_session(endpoint, "client", connect_timeout_s=timeout_s)
     try:
-        replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()
-
-        def on_reply(reply: Any) -> None:
-            if reply.ok is not None:
-                replies.put((True, reply.ok.payload.to_bytes().decode(errors="replace")))
-            elif reply.err is not None:
-                replies.put((False, reply.err.payload.to_bytes().decode(errors="replace")))
-
-        session.get(
-            f"{prefix(service)}/{verb}", direct(on_reply, lambda: replies.put(None)), payload=text.encode(),
-            encoding=zenoh.Encoding.APPLICATION_JSON, timeout=timeout_s,
-        )  # fmt: skip
-        with contextlib.suppress(queue.Empty):
-            first = replies.get(timeout=timeout_s + 1.0)
-            if first is not None:
-                return first
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()
+            session.get(
+                f"{prefix(service)}/{verb}", direct(partial(_take, replies), partial(replies.put, None)),
+                payload=text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=left_s,
+            )  # fmt: skip
+            with contextlib.suppress(queue.Empty):
+                first = replies.get(timeout=left_s + 1.0)
+                if first is not None:
+                    return first
+            time.sleep(_RETRY_S)  # the base is just starting: it listens, and reads its store
         raise LinkError(f"no base at {endpoint} answers {service}/{verb}: is it one that serves its maps there?")
     except zenoh.ZError as error:
         raise LinkError(f"the link to {endpoint} broke: {error}") from error
     finally:
         close_session(session)
+
+
+def _take(replies: queue.SimpleQueue[tuple[bool, str] | None], reply: Any) -> None:
+    if reply.ok is not None:
+        replies.put((True, reply.ok.payload.to_bytes().decode(errors="replace")))
+    elif reply.err is not None:
+        replies.put((False, reply.err.payload.to_bytes().decode(errors="replace")))

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,9 +18,14 @@ from urllib.request import urlopen
 
 import pytest
 
+from kiteline_basestation.integrity import sound
 from kiteline_basestation.store import FILE, StoreError, read
+from kiteline_codec import record_log
 from kiteline_codec.schema import Kind
-from kiteline_hw.mcap_log import LogReader
+from kiteline_core.frame import EncodedImage
+from kiteline_core.ids import AgentId
+from kiteline_hw.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, read_frame
+from kiteline_hw.rig_json import rig_from_json
 from kiteline_lab.flight import free_endpoint
 from kiteline_lab.flight_report import check_contract
 from kiteline_lab.fly import Options, fly
@@ -194,3 +200,94 @@ def test_a_mistake_ends_in_one_line(
     assert program.returncode == 2
     assert re.fullmatch(r"kiteline: error: [^\n]+\n", errors), errors
     assert told in errors
+
+
+def test_a_second_base_takes_over_with_a_copy_of_the_store_or_with_none(
+    recording: Path, tmp_path: Path, start: Start
+) -> None:
+    """The agent goes on; what the new base has at the end is all that the agent has said, whatever it began with."""
+    endpoint = free_endpoint()
+    words = ("--link", f"zenoh:{endpoint}")
+    slow = tmp_path / "slow.mcap"
+    stretched(recording, slow, 4)
+    for how in ("copy", "none"):
+        first, second = tmp_path / how / "first", tmp_path / how / "second"
+        base = start("base", *words, "--store", first, XDG_STATE_HOME=str(tmp_path / how / "one"))
+        agent = start("agent", slow, *words, "--log", tmp_path / how / "log")
+        wait_for("the first base to keep something", lambda first=first: heads(first / FILE) >= 2)  # type: ignore[misc]
+        base.kill()
+        base.wait()
+        if how == "copy":
+            shutil.copytree(first, second)
+        held = heads(first / FILE)
+        # Another machine: it knows nothing of the sessions of the first.
+        again = start("base", *words, "--store", second, XDG_STATE_HOME=str(tmp_path / how / "two"))
+        assert agent.wait(40.0) == 0
+        with LogReader(tmp_path / how / "log" / "agent0" / "boot00001.mcap") as log:
+            said = {record_log.read_record(m.blob())[1] for m in log.messages((record_log.TOPIC,))}
+        made = sum(key.kind == Kind.HEAD for key in said)
+        wait_for("all keyframes", lambda second=second, made=made: heads(second / FILE) == made)  # type: ignore[misc]
+        stop(again)
+        assert made > held >= 2
+        kept = read(second)
+        assert said <= kept.agents[AgentId(0)].received.keys()
+        assert not sound(kept).faults
+
+
+def stretched(source: Path, out: Path, times: int) -> None:
+    """The same recording, slower."""
+    with LogReader(source) as log, LogWriter(out, {"made": "for tests"}) as writer:
+        rig, imu = rig_from_json(next(log.messages((RIG,))).json())
+        images: dict[int, list[EncodedImage]] = {}
+        for message in log.messages((LEFT, RIGHT)):
+            images.setdefault(message.t_ns, []).append(message.image())
+        begin_ns = min(images)
+        writer.rig(begin_ns, rig, imu)
+        for t_ns, pair in sorted(images.items()):
+            frame = read_frame(pair, begin_ns + times * (t_ns - begin_ns))
+            writer.frame(frame)
+
+
+def test_after_landing_a_base_adds_what_no_link_carried_and_maps_are_managed(
+    recording: Path, tmp_path: Path, start: Start
+) -> None:
+    agent = start("agent", recording, "--log", tmp_path / "log")  # without a link
+    assert agent.wait(30.0) == 0
+    log = tmp_path / "log" / "agent0" / "boot00001.mcap"
+    endpoint = free_endpoint()
+    words = ("--link", f"zenoh:{endpoint}", "--store", tmp_path / "store", "--log", tmp_path / "log")
+    base = start("base", *words, "--import", log)
+
+    def ask(*verb: str) -> tuple[int, str, str]:
+        command = start("maps", "--base", endpoint, *verb)
+        out, errors = command.communicate(timeout=30.0)
+        return command.returncode, out, errors
+
+    wait_for("the store", lambda: heads(tmp_path / "store" / FILE) >= 3)
+    status, out, _ = ask("--json", "list")
+    assert status == 0
+    (told,) = json.loads(out)["maps"]
+    assert (told["id"], told["placed"]) == ("0.1.0", True)
+    assert told["keyframes"] == heads(tmp_path / "store" / FILE)
+    assert told["points"] > 50
+    assert ask("name", "0.1.0", "wall")[0] == 0
+    status, _, errors = ask("split", "wall")
+    assert status == 1
+    assert errors == "kiteline maps: 0.1.0 was not merged into another map: there is nothing to be undone\n"
+    stop(base)
+    base = start("base", *words)
+    status, out, _ = ask("list")
+    assert status == 0
+    assert "wall" in out
+    assert ask("delete", "wall")[0] == 0
+    stop(base)
+    assert heads(tmp_path / "store" / FILE) == 0
+    logs = sorted((tmp_path / "log").glob("session*.mcap"))
+    assert len(logs) == 2
+    for path in logs:
+        assert replay([str(path), "--verify"]) == 0
+    # The first base's log is a finished map as well.
+    base = start("base", "--link", f"zenoh:{endpoint}", "--import", logs[0])
+    status, out, _ = ask("--json", "list")
+    assert json.loads(out)["maps"][0]["keyframes"] == told["keyframes"]
+    stop(base)

@@ -1,0 +1,193 @@
+"""Maps in the hands of people: every verb does what it says, and says why where it cannot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.integrity import contradictions
+from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.management import VERBS, Answer, Command, called
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.schema import Camera, Culled, Live, Record
+from kiteline_core import se3
+from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
+
+MakeFlight = Callable[..., Any]
+STEP_NS = 250_000_000
+ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
+
+
+class Base:
+    """A mapper, and whoever commands it."""
+
+    def __init__(self, words: Any) -> None:
+        self.mapper = Mapper(BaseConfig(), words)
+        self.now_ns = 0
+        self.published: list[Record] = []
+        self._done: tuple[JobDone, ...] = ()
+
+    def step(self, arrivals: Any = (), commands: Sequence[Command] = ()) -> tuple[Answer, ...]:
+        self.now_ns += STEP_NS
+        output = self.mapper.step(MapperInput(tuple(arrivals), self._done, tuple(commands)), self.now_ns)
+        self._done = tuple(run_job(job) for job in output.jobs)
+        for _, out in output.publish:
+            self.published.extend(out)
+        return output.answers
+
+    def fly(self, flights: Sequence[Any]) -> None:
+        for n in range(max(len(f.records) for f in flights) + 40):
+            arrivals = []
+            for flight in flights:
+                records: list[Record] = [Camera(flight.agent, flight.camera)] if n == 0 else []
+                arrivals.append((flight.agent, (*records, *(flight.records[n] if n < len(flight.records) else ()))))
+            self.step(arrivals)
+
+    def rest(self, steps: int = 60) -> None:
+        for _ in range(steps):
+            self.step()
+
+    def ask(self, verb: str, **given: Any) -> dict[str, Any]:
+        (answer,) = self.step(commands=[Command(7, verb, json.dumps(given))])
+        assert answer.id == 7
+        value: dict[str, Any] = json.loads(answer.text)
+        assert ("error" not in value) == answer.ok
+        assert contradictions(self.mapper) == []
+        return value
+
+
+def ids(value: dict[str, Any]) -> list[str]:
+    return [m["id"] for m in value["maps"]]
+
+
+@pytest.fixture
+def pair(make_flight: MakeFlight, words: Any) -> Base:
+    """Two agents in one room, whose maps have become one."""
+    base = Base(words)
+    a = make_flight(keyframes=30, turns=0.6)
+    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    base.fly([a, b])
+    assert base.mapper.summary()["merges"] == 1
+    return base
+
+
+def test_list_and_get_tell_what_there_is(pair: Base) -> None:
+    (told,) = pair.ask("list")["maps"]
+    assert told["id"] == "0.1.0"
+    assert told["agents"] == [0, 1]
+    assert told["placed"] is True
+    assert [s["id"] for s in told["submaps"]] == ["0.1.0", "1.1.0"]
+    assert told["keyframes"] == 60 == sum(s["keyframes"] for s in told["submaps"])
+    assert told["points"] == len(pair.mapper.map.roots())
+    got = pair.ask("get", map="1.1.0")
+    assert got["id"] == "0.1.0"
+    submap = got["submaps"][1]
+    assert np.allclose(np.reshape(submap["T_map_m"], (4, 4)), ELSEWHERE, atol=0.05)
+    pose = submap["poses"][3]
+    held = pair.mapper.map.pose(KeyframeId(pose["id"]))
+    assert held is not None
+    assert np.array_equal(np.reshape(pose["T_m_k"], (4, 4)), held)
+
+
+def test_a_name_serves_as_an_id(pair: Base) -> None:
+    assert pair.ask("name", map="1.1.0", name="hangar")["name"] == "hangar"
+    assert pair.ask("get", map="hangar")["id"] == "0.1.0"
+    assert "characters" in pair.ask("name", map="hangar", name="x" * 65)["error"]
+    assert "taken" in pair.ask("name", map="hangar", name="3.4.5")["error"]
+    assert pair.ask("name", map="hangar", name="")["name"] == ""
+    assert "no map 'hangar'" in pair.ask("get", map="hangar")["error"]
+
+
+def test_a_split_is_for_good_until_a_person_merges_again(pair: Base, make_flight: MakeFlight) -> None:
+    assert ids(pair.ask("split", map="1.1.0")) == ["0.1.0", "1.1.0"]
+    assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
+    more = make_flight(keyframes=45, turns=0.9, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    for records in more.records[30:]:
+        pair.step([(more.agent, tuple(records))])
+    pair.rest()
+    assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
+    assert "nothing to be undone" in pair.ask("split", map="1.1.0")["error"]
+
+
+def test_maps_are_merged_where_a_person_says(make_flight: MakeFlight, words: Any) -> None:
+    base = Base(words)
+    a = make_flight(keyframes=20, turns=0.3)
+    b = make_flight(keyframes=20, turns=0.3, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
+    base.fly([a, b])
+    assert ids(base.ask("list")) == ["0.1.0", "1.1.0"]
+    assert "rigid" in base.ask("merge", map="1.1.0", into="0.1.0", T_into_map=[1.0] * 16)["error"]
+    T = ELSEWHERE.ravel().tolist()
+    assert base.ask("merge", map="1.1.0", into="0.1.0", T_into_map=T)["merged"] is True
+    base.rest()
+    (told,) = base.ask("list")["maps"]
+    assert told["keyframes"] == 40
+    placed = np.reshape(told["submaps"][1]["T_w_m"], (4, 4))
+    assert np.allclose(placed, ELSEWHERE, atol=0.03)
+    assert "one map already" in base.ask("merge", map="1.1.0", into="0.1.0")["error"]
+
+
+def test_maps_that_a_person_says_to_overlap_are_looked_at_again(make_flight: MakeFlight, words: Any) -> None:
+    base = Base(words)
+    a = make_flight(keyframes=24, turns=0.5)
+    b = make_flight(keyframes=24, turns=0.5, start=0.42, variant=1, agent=1, T_w_m=ELSEWHERE)
+    base.fly([a, b])
+    if len(ids(base.ask("list"))) == 1:
+        base.ask("split", map="1.1.0")
+        base.mapper.atlas.finder.apart.clear()  # type: ignore[union-attr]
+    assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 24}
+    base.rest()
+    assert ids(base.ask("list")) == ["0.1.0"]
+
+
+def test_a_deleted_map_is_gone_for_agents_and_for_good(make_flight: MakeFlight, words: Any) -> None:
+    base = Base(words)
+    a = make_flight(keyframes=12, turns=0.2)
+    b = make_flight(keyframes=12, turns=0.2, seed=4, agent=1)
+    base.fly([a, b])
+    last = b.keyframes[-1]
+    base.step([(b.agent, (Live(b.agent, 1, last, np.eye(4), 90),))])
+    assert "flies in" in base.ask("delete", map="1.1.0")["error"]
+    base.rest()
+    base.published.clear()
+    assert base.ask("delete", map="1.1.0") == {"deleted": ["1.1.0"]}
+    culled = [
+        r for r in base.published if isinstance(r, Culled) and submap_of_keyframe(r.keyframe) == submap_id(1, 1, 0)
+    ]
+    assert len(culled) == 12 and all(r.keyframe_too for r in culled)
+    for records in b.records:  # its agent says it all again
+        base.step([(b.agent, tuple(records))])
+    base.rest()
+    assert ids(base.ask("list")) == ["0.1.0"]
+    assert "no map" in base.ask("get", map="1.1.0")["error"]
+    assert base.mapper.idle
+
+
+@pytest.mark.parametrize(
+    ("verb", "text", "told"),
+    [
+        ("explode", "{}", "no command 'explode'; there are: list"),
+        ("get", "{", "no JSON"),
+        ("get", "[]", "JSON object"),
+        ("get", "{}", "missing"),
+        ("get", '{"map": "9.9.9"}', "no map '9.9.9'"),
+        ("get", '{"map": "99.99999.0"}', "no map"),
+        ("list", '{"map": "0.1.0"}', "unknown key 'map'; list takes: nothing"),
+        ("merge", '{"map": "0.1.0", "into": "0.1.0"}', "gtsam"),
+    ],
+)
+def test_what_cannot_be_done_is_explained(make_flight: MakeFlight, verb: str, text: str, told: str) -> None:
+    base = Base(None)
+    base.fly([make_flight(keyframes=3, turns=0.05)])
+    (answer,) = base.step(commands=[Command(1, verb, text)])
+    assert not answer.ok
+    assert told in json.loads(answer.text)["error"]
+
+
+def test_ids_are_read_as_they_are_written() -> None:
+    assert called(SubmapId(submap_id(3, 17, 4))) == "3.17.4"
+    assert set(VERBS) == {"list", "get", "name", "merge", "split", "delete"}
