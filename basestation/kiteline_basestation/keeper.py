@@ -112,7 +112,7 @@ class Keeper:
 
 
 def snapshot(station: Station, before: Kept) -> Kept:
-    """A station's whole map at rest. before: what it was restored from; what was imported since must have been noted."""
+    """A station's whole map at rest. before: what it was restored from. What was imported since must be noted."""
     agents = {}
     for agent, channel in sorted(station.channels.items()):
         if isinstance(channel, CodedChannel):

@@ -14,7 +14,7 @@ from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.essential_graph import GraphInputs, optimise
 from kiteline_core import se3
 from kiteline_core.bundle import BundleConfig, BundleProblem, bundle
-from kiteline_lab import logs, metrics, simulate, trajectories
+from kiteline_lab import bench_store, logs, metrics, simulate, trajectories
 from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
 from kiteline_lab.fly import Options, fly
 
@@ -29,7 +29,7 @@ _AGENTS, _SECONDS = 20, 120  # of the modelled queue: one keyframe a second each
 
 def run(bench: Bench) -> list[Bar]:
     """All bars, in the order of the promise."""
-    return [*_recordings(bench), *_hall(bench), *_street(bench), *_work(bench)]
+    return [*_recordings(bench), *_hall(bench), *_street(bench), *_work(bench), *bench_store.run(bench)]
 
 
 # accuracy

@@ -20,8 +20,6 @@ from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
 from kiteline_lab.flight import Outcome
 from kiteline_lab.fly import Options, fly
 
-TITLE = "The base's store"
-
 _DEATHS = 50
 _FIRST_S = 2.0  # s of flight before which nothing is kept yet
 _DELAY_S = 0.05  # s of real time after the drawn instant within which the base is killed: anywhere in a step or a batch

@@ -1,0 +1,84 @@
+"""The keeper: batches follow each other in order, a disk that refuses loses nothing, and nothing waits for it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kiteline_basestation import keeper as keeper_module
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.keeper import KEEP_NS, Keeper
+from kiteline_basestation.kept import Kept
+from kiteline_basestation.station import Import, Station
+from kiteline_basestation.store import Batch, Store, StoreError, read
+from kiteline_codec import messages
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.schema import Kind
+from kiteline_codec.sync import SyncConfig
+
+MakeFlight = Callable[..., Any]
+
+
+class Flown:
+    """A station that hears of one keyframe a step, and its keeper."""
+
+    def __init__(self, flight: Any, folder: Path) -> None:
+        self.flight = flight
+        self.station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 1))
+        self.keeper = Keeper(folder)
+        self.keeper.begin(self.station, Kept(), Kept())
+
+    def step(self, n: int) -> None:
+        codes = tuple((messages.key(r), messages.encode(r)) for r in self.flight.records[n])
+        self.station.step({}, (), n * KEEP_NS, [Import(self.flight.agent, codes)])
+        self.keeper.keep_at_times(self.station, n * KEEP_NS)
+
+
+def kept_heads(folder: Path) -> int:
+    return sum(key.kind == Kind.HEAD for codes in read(folder).agents.values() for key in codes.received)
+
+
+def test_a_disk_that_refuses_for_a_while_loses_nothing(
+    make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(keeper_module, "_RETRY_S", 0.02)
+    flown, write, refused = Flown(make_flight(keyframes=6, turns=0.1), tmp_path), Store.write, []
+
+    def sometimes(store: Store, batch: Batch) -> None:
+        if len(refused) < 3:
+            refused.append(batch)
+            raise StoreError("the disk is full")
+        write(store, batch)
+
+    monkeypatch.setattr(Store, "write", sometimes)
+    for n in range(6):
+        flown.step(n)
+        time.sleep(0.01)
+    flown.keeper.close(flown.station)
+    assert refused[0] is refused[1] is refused[2], "the same batch is tried again"
+    assert kept_heads(tmp_path) == 6
+    assert capsys.readouterr().err.count("the disk is full") == 1
+
+
+def test_a_slow_disk_makes_fewer_batches_and_holds_nobody_up(
+    make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown, write, go = Flown(make_flight(keyframes=12, turns=0.2), tmp_path), Store.write, threading.Event()
+
+    def slow(store: Store, batch: Batch) -> None:
+        go.wait(20.0)
+        write(store, batch)
+
+    monkeypatch.setattr(Store, "write", slow)
+    for n in range(12):
+        flown.step(n)  # returns while the first batch is still being written
+    assert flown.keeper.batches == 1
+    go.set()
+    flown.keeper.close(flown.station)
+    assert flown.keeper.batches == 2
+    assert kept_heads(tmp_path) == 12
