@@ -35,20 +35,20 @@ class Work:
 # ns each on the modelled core: an x86 laptop's, fitted to measured steps at every level of effort, and rounded.
 PRICES_NS: dict[str, float] = {
     "steps": 40_000,  # endpoint and log
-    "frames": 350_000,  # what does not grow with anything: arrays, motion model, estimate
-    "rectified_px": 2.5,  # a pixel that was remapped
+    "frames": 375_000,  # what does not grow with anything: arrays, motion model, estimate
+    "rectified_px": 2.1,  # a pixel that was remapped
     "pyramid_px": 0.35,  # a pixel of an image on which a pyramid was built
-    "projected": 15,  # a point of the local map that is in view
-    "alignments": 1_900,  # a template aligned at one level
-    "stereo_points": 900,  # a row looked along
-    "posed_points": 1_200,  # a point in the motion-only optimisation
-    "inertial_samples": 3_000,  # preintegration
-    "fused": 120_000,  # a frame in the smoother
-    "keyframes": 700_000,  # coding and bookkeeping
-    "detected_px": 7,  # a pixel of the image searched for corners
-    "births": 24_000,  # row search, descriptor, template, code
-    "sightings": 1_500,  # code
-    "bearings": 6_000,  # a segment searched for a point without depth
+    "projected": 60,  # a point of the local map that is in view
+    "alignments": 800,  # a template aligned at one level
+    "stereo_points": 1_750,  # a row looked along
+    "posed_points": 1_300,  # a point in the motion-only optimisation
+    "inertial_samples": 8_000,  # preintegration
+    "fused": 250_000,  # a frame in the smoother
+    "keyframes": 1_200_000,  # coding and bookkeeping
+    "detected_px": 2.1,  # a pixel of the image searched for corners
+    "births": 7_400,  # row search, descriptor, template, code
+    "sightings": 1_600,  # code
+    "bearings": 12_000,  # a segment searched for a point without depth
     "searches": 5_000_000,  # a look for a lost place
 }
 

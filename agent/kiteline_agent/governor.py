@@ -37,26 +37,26 @@ FULL = Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 1, 1.00, 1.00)
 # over from the other.
 CARRIED = (
     FULL,
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.85, 1.00),
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.85, 1.00),
-    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 3, 0.76, 0.85),
-    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 4, 0.76, 0.85),
-    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 4, 0.65, 0.55),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.42, 0.45),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 0.5, 6, 0.42, 0.45),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 8, 0.34, 0.35),
-)  # an IMU carries the pose over skipped frames: frames before points
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.93, 1.00),
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.93, 1.00),
+    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 3, 0.84, 0.97),
+    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 4, 0.84, 0.97),
+    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 4, 0.72, 0.82),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.58, 0.75),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 0.5, 6, 0.58, 0.75),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 8, 0.52, 0.70),
+)  # an IMU carries the pose over skipped frames: frames go before pixels
 ALONE = (
     FULL,
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.85, 1.00),
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.85, 1.00),
-    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.65, 0.55),
-    Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.48, 0.50),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.42, 0.45),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.42, 0.45),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.42, 0.45),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.34, 0.35),
-)  # images alone: a turn between two frames has to be followed
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.93, 1.00),
+    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.93, 1.00),
+    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.72, 0.82),
+    Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.62, 0.78),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.58, 0.75),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.58, 0.75),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.58, 0.75),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.52, 0.70),
+)  # images alone: a turn between two frames has to be followed, so pixels go before frames
 
 
 class Extra(Enum):
@@ -136,7 +136,8 @@ class Governor:
         self._tracked_t_ns = 0  # of the last frame that was tracked
         self._last_tracked = False
         self._last_extra: Extra | None = None  # of the last frame
-        self._waiting: Extra | None = None  # what there was no room for
+        self._waiting: Extra | None = None  # what there was no room for in the last frame that was tracked
+        self._waited: Extra | None = None  # the same of the one before
         self._calm_since_ns = 0
         self._level_since_ns = 0
         self._gap_s = config.max_gap_s  # most that may lie between two tracked frames
@@ -168,16 +169,17 @@ class Governor:
         self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
         self._climb_to(CARRIED if carried else ALONE, self.level)
         self._steer(t_ns)
-        track = self._its_turn(lost) and self._affordable(lost)
-        if not track and not lost and t_ns + self._period_ns - self._tracked_t_ns > self._gap_s * 1e9:
+        track = self._its_turn(lost) and self._affordable(t_ns, lost)
+        if not track and not lost and self._blind_for(t_ns, self._gap_s):
             track = True  # frames before tracking
-            if not self._affordable(lost):
+            if not self._affordable(t_ns, lost):
                 events.append("governor: over budget, or the track would be lost")
         if self.level != before:
             events.insert(0, f"governor: effort {before} -> {self.level}, the load was {100.0 * load:.0f} % of it")
         if track:
             self._turn = max(self._turn - 1.0, 0.0)
             self._tracked_t_ns = t_ns
+            self._waited, self._waiting = self._waiting, None
         else:
             events.append("governor: frame skipped")
         self._last_t_ns, self._last_tracked, self._last_extra = t_ns, track, None
@@ -189,9 +191,7 @@ class Governor:
         urgent: without it the track may be lost; that is prevented over budget where no IMU bridges the loss.
         """
         if self.on and not (urgent and self._ladder is ALONE):
-            waiting, self._waiting = self._waiting, None
-            if waiting is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
-                self._waiting = waiting
+            if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
                 return False
             if not self._room_for(extra):
                 self._waiting = extra
@@ -247,12 +247,19 @@ class Governor:
         self._made = 0
         self._turn += self._share() * passed_ns / self._period_ns
 
-    def _affordable(self, lost: bool) -> bool:
+    def _affordable(self, t_ns: int, lost: bool) -> bool:
         """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
         if lost:
             return self._room_for(self._waiting or Extra.SEARCH)
+        keyframe_first = self._waiting is Extra.KEYFRAME and self._ladder is CARRIED
+        if keyframe_first and not self._blind_for(t_ns, self._config.max_gap_s):
+            return self._room_for(Extra.KEYFRAME)  # it goes before more frames
         cost_ns = self._frame_ns * (1.0 + self._config.doubt)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
+
+    def _blind_for(self, t_ns: int, gap_s: float) -> bool:
+        """Whether the last tracked frame will be longer ago than gap_s if this one is not tracked."""
+        return t_ns + self._period_ns - self._tracked_t_ns > gap_s * 1e9
 
     def _room_for(self, extra: Extra) -> bool:
         """Whether a frame with something dear fits; what never fits is done when little else was."""

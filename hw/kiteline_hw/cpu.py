@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import math
 import os
 import resource
 import time
@@ -17,6 +18,7 @@ _MADV_DONTNEED = 4  # Linux, on every architecture
 _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")  # lines of smaps that count pages unlike their file's
 _CGROUP = Path("/sys/fs/cgroup/cpu")
 _PERIOD_US = 50_000  # us; a twentieth of the one-second window in which the limit has to hold
+_LONGEST_PERIOD_US = 500_000  # us; for small limits, whose quota would be too small in a shorter one
 _LEAST_QUOTA_US = 1_000  # us; what the kernel accepts at least
 
 
@@ -94,10 +96,11 @@ class CpuQuota:
     """
 
     def __init__(self, percent: float, *, root: Path = _CGROUP) -> None:
-        least = 100.0 * _LEAST_QUOTA_US / _PERIOD_US
+        least = 100.0 * _LEAST_QUOTA_US / _LONGEST_PERIOD_US
         if not least <= percent <= 100.0 * (os.cpu_count() or 1):
             raise ValueError(f"CPU limit of {percent:g} percent: expected {least:g} to 100 per core of this machine")
-        quota_us = round(percent / 100.0 * _PERIOD_US)
+        period_us = max(_PERIOD_US, math.ceil(100.0 * _LEAST_QUOTA_US / percent))
+        quota_us = max(round(percent / 100.0 * period_us), _LEAST_QUOTA_US)
         reason = self.unavailable(root)
         if reason is not None:
             raise QuotaError(reason)
@@ -106,7 +109,7 @@ class CpuQuota:
         self._group = root / f"kiteline-{os.getpid()}-{time.monotonic_ns()}"
         try:
             self._group.mkdir()
-            (self._group / "cpu.cfs_period_us").write_text(str(_PERIOD_US))
+            (self._group / "cpu.cfs_period_us").write_text(str(period_us))
             (self._group / "cpu.cfs_quota_us").write_text(str(quota_us))
         except OSError as error:
             self.close()
@@ -130,7 +133,7 @@ class CpuQuota:
         self._pids.append(pid)
 
     def throttled_periods(self) -> int:
-        """In how many periods of 50 ms the limit has stopped someone."""
+        """In how many periods the limit has stopped someone."""
         with contextlib.suppress(OSError, ValueError):
             for line in (self._group / "cpu.stat").read_text().splitlines():
                 if line.startswith("nr_throttled "):

@@ -1,20 +1,10 @@
-"""Flights under a CPU limit, modelled or by the kernel, with the governor on or off; and what came of them.
-
-Run as a module it flies one of them under the kernel's limit, or one of the other trials that need a process of their
-own (see `main`), and prints what came of it as JSON.
-"""
+"""Flights under a CPU limit, modelled or by the kernel, with the governor on or off; and what came of them."""
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import json
-import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,12 +15,11 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import cost_ns
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_agent.warm import warm
-from kiteline_core.frame import Frame, ImuBatch, Trajectory
+from kiteline_core.frame import ImuBatch, Trajectory
 from kiteline_core.ids import AgentId
-from kiteline_hw.cpu import CpuQuota, process_cpu_ns
+from kiteline_hw.cpu import process_cpu_ns
 from kiteline_lab import metrics
-from kiteline_lab.clip import Clip, load
+from kiteline_lab.clip import Clip
 
 I64 = NDArray[np.int64]
 
@@ -122,72 +111,3 @@ def dearest_window(spent: I64, settled_ns: int = _SETTLED_NS) -> float:
     first = np.searchsorted(t_ns, t_ns - _WINDOW_NS, side="right")
     sums = total[1:] - total[first]
     return float(sums[t_ns >= t_ns[0] + settled_ns].max(initial=0)) / _WINDOW_NS
-
-
-def rss_over_time(clip: Clip, minutes: float, agent: Agent, rss_mib: Callable[[], float]) -> list[float]:
-    """Resident memory in MiB at the end of each minute of a flight to and fro."""
-    found: list[float] = []
-    per_minute = round(60e9 / clip.period_ns)
-    for k, frame in enumerate(clip.to_and_fro(round(minutes * per_minute)), 1):
-        agent.step(StepInput(frame), frame.t_ns)
-        if k % per_minute == 0:
-            found.append(rss_mib())
-    return found
-
-
-def main(argv: list[str] | None = None) -> int:
-    """quota: fly under the kernel's limit. soak: memory over minutes, the link being down. first-pose: its time."""
-    p = argparse.ArgumentParser(description="Trials of the agent that need a process of their own.")
-    p.add_argument("trial", choices=("quota", "soak", "first-pose"))
-    p.add_argument("source")
-    p.add_argument("--percent", type=float, default=0.0)
-    p.add_argument("--governor", action="store_true")
-    p.add_argument("--no-imu", action="store_true")
-    p.add_argument("--frames", type=int, default=0)
-    p.add_argument("--minutes", type=float, default=30.0)
-    a = p.parse_args(argv)
-    cv2.setNumThreads(1)
-    if a.trial == "first-pose":
-        print(json.dumps({"seconds": _first_pose_s(a.source)}))
-        return 0
-    clip = load(a.source, imu=not a.no_imu, frames=a.frames)
-    warm(clip.rig)
-    if a.trial == "soak":
-        from kiteline_codec.channel import CodedChannel
-        from kiteline_codec.sync import SyncConfig
-        from kiteline_hw.cpu import rss_mib
-
-        agent = Agent(clip.rig, None, AgentConfig(), Identity(AgentId(0), 0), CodedChannel(SyncConfig(), 1))
-        print(json.dumps({"rss_mib": rss_over_time(clip, a.minutes, agent, rss_mib)}))
-        return 0
-    with contextlib.ExitStack() as stack:
-        if a.percent > 0.0:
-            stack.enter_context(CpuQuota(a.percent)).add(os.getpid())
-        print(json.dumps(asdict(fly_clip(clip, a.percent, governor=a.governor, real=True))))
-    return 0
-
-
-def _first_pose_s(source: str) -> float:
-    """Seconds from the start of this process to its first pose."""
-    from kiteline_hw.sources import open_source
-
-    opened = open_source(source)
-    warm(opened.rig)
-    agent = Agent(opened.rig, opened.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
-    imu = None
-    for item in opened:
-        if not isinstance(item, Frame):
-            imu = item
-            continue
-        estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
-        if estimate is not None and estimate.tracked:
-            break
-    with open("/proc/self/stat") as file:
-        started_ticks = int(file.read().rsplit(")", 1)[1].split()[19])
-    with open("/proc/uptime") as file:
-        uptime_s = float(file.read().split()[0])
-    return uptime_s - started_ticks / os.sysconf("SC_CLK_TCK")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

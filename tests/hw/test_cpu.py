@@ -86,9 +86,35 @@ def test_the_kernel_limits_a_process() -> None:
 def test_reasons_why_not(tmp_path: Path) -> None:
     with pytest.raises(QuotaError, match="no cgroup v1"):
         CpuQuota(50.0, root=tmp_path)
-    for percent in (0.0, -1.0, float("nan"), 1.0, 1e9):
-        with pytest.raises(ValueError, match="expected 2 to 100 per core"):
+    for percent in (0.0, -1.0, float("nan"), 0.1, 1e9):
+        with pytest.raises(ValueError, match=r"expected 0\.2 to 100 per core"):
             CpuQuota(percent)
+
+
+@pytest.mark.parametrize(("percent", "period_us", "quota_us"), [(25.0, 50_000, 12_500), (1.0, 100_000, 1_000)])
+def test_small_limits_have_long_periods(percent: float, period_us: int, quota_us: int) -> None:
+    try:
+        quota = CpuQuota(percent)
+    except QuotaError as error:
+        pytest.skip(str(error))
+    with quota:
+        assert int((quota._group / "cpu.cfs_period_us").read_text()) == period_us
+        assert int((quota._group / "cpu.cfs_quota_us").read_text()) == quota_us
+
+
+def test_a_small_limit_holds_over_a_second() -> None:
+    try:
+        quota = CpuQuota(1.5)
+    except QuotaError as error:
+        pytest.skip(str(error))
+    with quota:
+        code = f"import sys; sys.stdin.readline()\n{SPIN.format(0.02)}"
+        process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+        time.sleep(0.3)  # it has started
+        quota.add(process.pid)
+        began = time.monotonic()
+        process.communicate(b"\n")
+        assert time.monotonic() - began > 0.7  # 20 ms of CPU at 1.5 percent take 1.3 s less a period or two
 
 
 def test_memory_that_only_the_start_needed_is_given_back() -> None:
