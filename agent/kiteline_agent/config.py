@@ -221,6 +221,7 @@ class GovernorConfig:
     up_s: float = 1.5  # s of comfort before a rise
     max_gap_s: float = 0.35  # s between tracked frames; after more, a track is hard to find again
     carried_gap_s: float = 0.8  # the same with an IMU, whose prediction counts as tracking for 1 s
+    blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
     doubt: float = 0.1  # how much dearer than expected a frame may be
     learning: float = 0.15  # gain of the expectations of frames
     keyframe_memory_s: float = 2.0  # s over which keyframes are counted

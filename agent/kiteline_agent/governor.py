@@ -4,7 +4,7 @@ A closed loop on the CPU time that is handed in with each frame. What is steered
 many points, how much stereo, how fine the images, how many keyframes, and every which frame is tracked. The rows stand
 in the order of what they cost in accuracy (docs/decisions/governor-ladder.md). Effort follows the expected load, with
 hysteresis; on the last row frames are let through evenly, as many as the budget bears; and over all stands a sum over
-the last second that is overdrawn only to keep the vehicle from being lost.
+the last second that is overdrawn only where nothing was tracked for a second.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _LONGER = 1.03  # growth of the expected period a frame, should the camera be sl
 _FIRST_LONGER = 2.5  # the same between the first two frames; more, and the core was busy with the first
 _GUESS = 3.0  # usual frames that something dear costs, before it was seen
 _OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
-_LEAST = 0.2  # of the budget is for frames, whatever keyframes cost
+_LEAST = 0.1  # of the budget is for frames, whatever keyframes cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,9 +170,10 @@ class Governor:
         self._climb_to(CARRIED if carried else ALONE, self.level)
         self._steer(t_ns)
         track = self._its_turn(lost) and self._affordable(t_ns, lost)
-        if not track and not lost and self._blind_for(t_ns, self._gap_s):
-            track = True  # frames before tracking
-            if not self._affordable(t_ns, lost):
+        if not track and not lost and self._blind_for(t_ns, self._gap_s):  # frames before tracking
+            track = self._window_ns + self._frame_ns <= self._budget_ns
+            if not track and self._blind_for(t_ns, self._config.blind_s):
+                track = True
                 events.append("governor: over budget, or the track would be lost")
         if self.level != before:
             events.insert(0, f"governor: effort {before} -> {self.level}, the load was {100.0 * load:.0f} % of it")
@@ -188,12 +189,12 @@ class Governor:
     def may(self, extra: Extra, *, urgent: bool = False) -> bool:
         """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it.
 
-        urgent: without it the track may be lost; that is prevented over budget where no IMU bridges the loss.
+        urgent: without it the track may be lost; then it need but fit.
         """
-        if self.on and not (urgent and self._ladder is ALONE):
+        if self.on:
             if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
                 return False
-            if not self._room_for(extra):
+            if not self._room_for(extra, 1.0 if urgent else 1.0 + self._config.doubt):
                 self._waiting = extra
                 return False
         self.note(extra)
@@ -250,10 +251,10 @@ class Governor:
     def _affordable(self, t_ns: int, lost: bool) -> bool:
         """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
         if lost:
-            return self._room_for(self._waiting or Extra.SEARCH)
+            return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._config.doubt)
         keyframe_first = self._waiting is Extra.KEYFRAME and self._ladder is CARRIED
         if keyframe_first and not self._blind_for(t_ns, self._config.max_gap_s):
-            return self._room_for(Extra.KEYFRAME)  # it goes before more frames
+            return self._room_for(Extra.KEYFRAME, 1.0)  # it goes before more frames
         cost_ns = self._frame_ns * (1.0 + self._config.doubt)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 
@@ -261,13 +262,15 @@ class Governor:
         """Whether the last tracked frame will be longer ago than gap_s if this one is not tracked."""
         return t_ns + self._period_ns - self._tracked_t_ns > gap_s * 1e9
 
-    def _room_for(self, extra: Extra) -> bool:
-        """Whether a frame with something dear fits; what never fits is done when little else was."""
+    def _room_for(self, extra: Extra, dearer: float) -> bool:
+        """Whether a frame with something dear fits, were it dearer than expected; what never fits is done when little
+        else was.
+        """
         need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
         if self._last_extra is not None and self._last_extra is not extra:  # done in this very frame
             need_ns += self._extra_ns[self._last_extra] or _GUESS * self._frame_ns
-        need_ns *= 1.0 + self._config.doubt
-        return self._window_ns + need_ns <= self._budget_ns or self._window_ns <= _LEAST * self._budget_ns
+        fits = self._window_ns + dearer * need_ns <= self._budget_ns
+        return fits or (dearer * need_ns > self._budget_ns and self._window_ns <= _LEAST * self._budget_ns)
 
     def _its_turn(self, lost: bool) -> bool:
         """Whether the frame is one of those, evenly spread, that are tracked. A turn that cannot be paid for waits."""
