@@ -33,30 +33,27 @@ class Effort:
 
 
 FULL = Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 1, 1.00, 1.00)
-# Rows from the best to the cheapest. The two ladders have as many, of about equal cost: at the same level one takes
-# over from the other.
 CARRIED = (
     FULL,
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.93, 1.00),
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.93, 1.00),
-    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 3, 0.84, 0.97),
-    Effort(0.80, 0.80, 0.5, 0, 0, 1.2, 1.0, 4, 0.84, 0.97),
-    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 4, 0.72, 0.82),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.58, 0.75),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 0.5, 6, 0.58, 0.75),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 8, 0.52, 0.70),
-)  # an IMU carries the pose over skipped frames: frames go before pixels
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 3, 1.00, 1.00),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 4, 1.00, 1.00),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 6, 1.00, 1.00),
+    Effort(1.00, 0.80, 0.5, 1, 0, 1.2, 1.0, 8, 0.95, 0.97),
+    Effort(0.50, 0.50, 0.5, 1, 0, 1.2, 0.5, 8, 0.75, 0.90),
+    Effort(0.65, 0.65, 0.5, 1, 1, 1.2, 0.5, 8, 0.60, 0.75),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 9, 0.52, 0.70),
+)  # an IMU carries the pose over skipped frames: they cost next to nothing
 ALONE = (
     FULL,
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.0, 1.0, 1, 0.93, 1.00),
-    Effort(1.00, 1.00, 0.5, 0, 0, 1.2, 1.0, 2, 0.93, 1.00),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
     Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.72, 0.82),
     Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.62, 0.78),
     Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.58, 0.75),
     Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.58, 0.75),
     Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.58, 0.75),
     Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.52, 0.70),
-)  # images alone: a turn between two frames has to be followed, so pixels go before frames
+)  # images alone: a turn between two frames has to be followed, so pixels go before more frames
 
 
 class Extra(Enum):
@@ -167,8 +164,7 @@ class Governor:
         before, load = self.level, self._load(self.level)
         events: list[str] = []
         self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
-        self._climb_to(CARRIED if carried else ALONE, self.level)
-        self._steer(t_ns)
+        self._steer(t_ns, CARRIED if carried else ALONE)
         track = self._its_turn(lost) and self._affordable(t_ns, lost)
         if not track and not lost and self._blind_for(t_ns, self._gap_s):  # frames before tracking
             track = self._window_ns + self._frame_ns <= self._budget_ns
@@ -269,8 +265,11 @@ class Governor:
         need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
         if self._last_extra is not None and self._last_extra is not extra:  # done in this very frame
             need_ns += self._extra_ns[self._last_extra] or _GUESS * self._frame_ns
-        fits = self._window_ns + dearer * need_ns <= self._budget_ns
-        return fits or (dearer * need_ns > self._budget_ns and self._window_ns <= _LEAST * self._budget_ns)
+        if self._window_ns + dearer * need_ns <= self._budget_ns:
+            return True
+        idle_ns = self._idle_ns * self._config.window_s * 1e9 / self._period_ns
+        little = self._window_ns <= idle_ns + _LEAST * self._budget_ns
+        return little and idle_ns + dearer * need_ns > self._budget_ns
 
     def _its_turn(self, lost: bool) -> bool:
         """Whether the frame is one of those, evenly spread, that are tracked. A turn that cannot be paid for waits."""
@@ -307,9 +306,13 @@ class Governor:
         idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * self._config.window_s * 1e9 / self._period_ns
         return self._frames(level) + (keyframes * keyframe_ns + idle_ns) / self._budget_ns
 
-    def _steer(self, t_ns: int) -> None:
+    def _steer(self, t_ns: int, ladder: tuple[Effort, ...]) -> None:
         """Hysteresis on the load: down at once, up only after a calm while and one row a time."""
         config = self._config
+        if ladder is not self._ladder:
+            self._climb_to(ladder, 0)
+            self._set_level(t_ns, self._bearable(0))
+            return
         if t_ns - self._first_t_ns < config.settling_s * 1e9:  # nothing to hold on to yet
             self._set_level(t_ns, self._bearable(0))
             return
