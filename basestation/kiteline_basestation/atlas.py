@@ -33,6 +33,7 @@ from kiteline_basestation.memory import (
     votes_entry,
     votes_of,
 )
+from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
 from kiteline_basestation.refinement import apply_bundle
@@ -157,7 +158,8 @@ class Atlas:
                         self._map, part.slots, part.problem, self._config.disparity
                     )  # fmt: skip
                     part = replace(part, problem=problem)
-                job = Job(self._next_job(), "full", BundleInputs(part.problem, self._full_config()))
+                linked = with_links(self._map, part, self._config.links)
+                job = Job(self._next_job(), "full", BundleInputs(linked, self._full_config()))
                 self._fulls[job.id] = (island, part, agents)
                 out.append(job)
             self._full_due.discard(island)
@@ -172,8 +174,9 @@ class Atlas:
             return True
         if isinstance(done.result, BundleResult) and done.id in self._fulls:
             island, part, agents = self._fulls.pop(done.id)
-            if self._settle(island, part, done.result):
-                disparity.take(self._map, agents, part.problem, done.result, self._config.disparity)
+            result = without_links(part, done.result)
+            if self._settle(island, part, result):
+                disparity.take(self._map, agents, part.problem, result, self._config.disparity)
             return True
         return False
 

@@ -45,9 +45,10 @@ class WindowConfig:
 
 @dataclass(frozen=True, slots=True)
 class LinkConfig:
-    """The agent's own pose of a keyframe in its parent, where a bundle has little else."""
+    """The agent's own pose of a keyframe in its parent."""
 
-    enough: int = 80  # observations of a keyframe above which its points alone hold it: every keyframe of a wide link
+    enough: int = 80  # observations of a keyframe above which its points hold it: every keyframe of a wide link
+    enough_px: float = 0.4  # of each of 12 made-up points there: all of them together err by a tenth of a pixel
     sigma_px: float = 0.15  # of each of 12 made-up points where there is nothing else; it grows with what there is
 
 
@@ -154,7 +155,7 @@ class DisparityConfig:
     growth: float = 1.25  # of the number of keyframes from one to the next: each knows the map better
     prior_px: float = 0.1  # one deviation of a constant offset: what calibrations are good to
     prior_rad: float = 3e-4  # of the turn of a right camera (times the focal length: px where x or y is 1)
-    inflation: float = 3.0  # of deviations of what is found: the lens bends what motion tells of depths, too
+    inflation: float = 4.0  # of deviations of what is found: the lens bends what motion tells of depths, too
     settled_px: float = 0.03  # deviation of the offset below which it is known
 
 

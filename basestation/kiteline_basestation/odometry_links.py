@@ -1,7 +1,9 @@
-"""What the agent measured between a keyframe and its parent, for bundles in which keyframes are seen by few points.
+"""What the agent measured between a keyframe and its parent, for bundles.
 
-A thin link carries a tenth of what the tracker saw, but the pose relative to the parent is made of all of it. It enters
-a bundle as a few made-up points that both keyframes see just where that pose puts them.
+The agent saw all frames in between, and felt them where it has an IMU; a thin link carries a tenth of the points that
+its tracker saw. So the pose relative to the parent knows what the points of two keyframes do not tell. It enters a
+bundle as a few made-up points that both keyframes see just where that pose puts them. How long the way was is left
+to the points of the base, as long as there are enough of them: disparities that are off spoil the agent's lengths.
 """
 
 from __future__ import annotations
@@ -25,11 +27,12 @@ _DEPTHS = (0.7, 1.8)  # times the median depth: near points hold the position, f
 
 
 def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> BundleProblem:
-    """The window's problem with the links of those of its keyframes that see few points; made-up points come last."""
+    """The window's problem with the links between its keyframes, firmer where few points are; made-up points last."""
     problem = window.problem
     table = sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    ratio = _length_ratio(sparse_map, window, number)
     points, camera, measured, sigma = [], [], [], []
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
@@ -37,10 +40,12 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
         deep = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
         if p is None or not deep or not (problem.free[k] or problem.free[p]):
             continue
-        few = 1.0 - min(counts[k], counts[p]) / config.enough
-        if few <= 0.0:
-            continue
-        seen = _made_up(sparse_map, problem, k, p, table.T_p_k[row])
+        few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough)
+        T_p_k = table.T_p_k[row].copy()
+        if few == 0.0:
+            T_p_k[:3, 3] *= ratio
+        deviation = 1.0 / np.hypot(few / config.sigma_px, 1.0 / config.enough_px)
+        seen = _made_up(sparse_map, problem, k, p, T_p_k)
         if seen is None:
             continue
         in_k, in_p, world = seen
@@ -49,10 +54,15 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
         for i in range(len(world)):
             camera += [first, second]
             measured += [in_p[i], in_k[i]] if p < k else [in_k[i], in_p[i]]
-            sigma += [[config.sigma_px / few, config.sigma_px / few]] * 2
+            sigma += [[deviation, deviation]] * 2
     if not points:
         return problem
     added = np.concatenate(points)
+    border = problem.border
+    if border is not None:
+        none = np.full(len(camera), -1, np.int32)
+        terms = np.concatenate([border.terms, np.zeros((len(camera), border.terms.shape[1]))])
+        border = replace(border, group=np.concatenate([border.group, none]), terms=terms)
     return replace(
         problem,
         points=np.concatenate([problem.points, added]),
@@ -62,7 +72,21 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
         camera=np.concatenate([problem.camera, np.array(camera, np.int32)]),
         measured=np.concatenate([problem.measured, np.array(measured)]),
         sigma=np.concatenate([problem.sigma, np.array(sigma)]),
+        border=border,
     )
+
+
+def _length_ratio(sparse_map: SparseMap, window: Window, number: dict[int, int]) -> float:
+    """By how much the window's steps are longer than the agent said, the median."""
+    table = sparse_map.keyframes
+    ratios = []
+    for k, row in enumerate(window.rows.tolist()):
+        p = number.get(int(table.parent[row]))
+        said = float(np.linalg.norm(table.T_p_k[row, :3, 3]))
+        if p is not None and said > 1e-3:
+            step = window.problem.T_c_m[p] @ np.linalg.inv(window.problem.T_c_m[k])
+            ratios.append(float(np.linalg.norm(step[:3, 3])) / said)
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def _made_up(
