@@ -1,4 +1,4 @@
-"""Links between keyframes that see few points: they hold poses, and leave well-seen ones alone."""
+"""Links between keyframes: they hold the poses of those that see few points, and are loose where many are seen."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from kiteline_basestation.config import BaseConfig, LinkConfig
 from kiteline_basestation.covisibility import window
+from kiteline_basestation.disparity import with_border
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_core import se3
 from kiteline_core.bundle import bundle
@@ -72,11 +73,31 @@ def test_links_hold_what_few_points_cannot() -> None:
     assert error_m(result.T_c_m, truth) < 0.5 * error_m(alone.T_c_m, truth)
 
 
-def test_keyframes_with_many_points_need_no_link() -> None:
+def test_keyframes_with_many_points_are_linked_loosely_and_lengths_are_theirs() -> None:
+    sparse_map, truth = flight(noise_px=0.0)
+    for keyframe, row in sparse_map.rows.items():  # the agent's steps are 3 % too long, and it believes so
+        sparse_map.keyframes.T_p_k[row, :3, 3] *= 1.03
+        assert sparse_map.pose(keyframe) is not None
+    config = BaseConfig()
+    part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
+    assert part is not None
+    loose, firm = (with_links(sparse_map, part, LinkConfig(enough=e)) for e in (5, 80))
+    added = len(part.slots)
+    assert loose.sigma[added:].min() > 2.0 * firm.sigma[added:].max()
+    right = without_links(part, bundle(loose, config.bundle))
+    wrong = without_links(part, bundle(firm, config.bundle))
+    assert error_m(right.T_c_m, truth) < 0.2 * error_m(wrong.T_c_m, truth)
+
+
+def test_links_stand_aside_of_the_border() -> None:
     sparse_map, _ = flight(noise_px=0.3)
     config = BaseConfig()
     part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
     assert part is not None
-    assert with_links(sparse_map, part, LinkConfig(enough=5)) is part.problem
-    held = replace(part, problem=replace(part.problem, free=np.zeros(len(part.rows), bool)))
-    assert with_links(sparse_map, held, config.links) is held.problem
+    problem, agents = with_border(sparse_map, part.slots, part.problem, config.disparity)
+    assert agents == (AgentId(0),)
+    linked = with_links(sparse_map, replace(part, problem=problem), config.links)
+    assert linked.border is not None
+    assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
+    assert (linked.border.group[len(part.slots) :] == -1).all()
+    assert bundle(linked, config.bundle).offset.shape == (1, 5)
