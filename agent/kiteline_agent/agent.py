@@ -39,6 +39,7 @@ from kiteline_codec.schema import (
     Culled,
     Depths,
     Found,
+    Kind,
     Live,
     Placement,
     Pose,
@@ -123,7 +124,11 @@ class Agent:
         """Take in what arrived, track the frame if there is one, say what is to be sent. Never waits."""
         self._events = []
         self._take_corrections(self._channel.receive(step_input.packets, now_ns))
-        self.window.take_back(self._channel.take_removed())
+        removed = self._channel.take_removed()
+        self.window.take_back(removed)
+        for key in removed:
+            if key.kind == Kind.PLACEMENT:  # the map was taken out of a larger one, and has no place any more
+                self._placements.pop(SubmapId(key.id), None)
         estimate = None
         self.work.clear()
         self.work.steps = 1

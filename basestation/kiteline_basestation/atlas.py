@@ -74,6 +74,7 @@ class Atlas:
         self.merges: list[Merge] = []
         self.undone = 0
         self.moved: set[SubmapId] = set()  # maps (eldest submap) that moved as a whole since the mapper last asked
+        self.parted: set[SubmapId] = set()  # submaps that were taken out of a map since the mapper last asked
         self._returned: dict[SubmapId, int] = {}  # where in each submap the way last was where it had been before
         self._edges: list[Overlap] = []  # proved loops, edges of the pose graph
         self._fresh: dict[SubmapId, list[Overlap]] = {}  # of each map, those whose points are not fused yet
@@ -434,4 +435,5 @@ class Atlas:
             if submap != merge.eldest:
                 sparse_map.islands[submap] = merge.eldest
             sparse_map.move_submap(submap, frame)
+        self.parted |= mine
         self.moved |= {merge.into, merge.eldest}

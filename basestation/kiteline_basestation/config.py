@@ -155,7 +155,7 @@ class DisparityConfig:
     growth: float = 1.25  # of the number of keyframes from one to the next: each knows the map better
     prior_px: float = 0.1  # one deviation of a constant offset: what calibrations are good to
     prior_rad: float = 3e-4  # of the turn of a right camera (times the focal length: px where x or y is 1)
-    inflation: float = 4.0  # of deviations of what is found: the lens bends what motion tells of depths, too
+    inflation: float = 3.0  # of deviations of what is found: the lens bends what motion tells of depths, too
     settled_px: float = 0.03  # deviation of the offset below which it is known
 
 

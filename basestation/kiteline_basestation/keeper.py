@@ -75,6 +75,8 @@ class Keeper:
                 code = channel.endpoint.own_value(key) if ours else channel.endpoint.peer_value(key)
             if code is not None and (not self._deleted or submap_of(key) not in self._deleted):
                 batch.rows.append((int(agent), int(ours), key.kind, key.id, key.part, code))
+            elif code is None and ours:
+                batch.gone.append((int(agent), 1, key.kind, key.id, key.part))  # it was taken back
         station.touched.clear()
         return batch
 

@@ -24,7 +24,7 @@ from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
 from kiteline_basestation.world_view import world_view
-from kiteline_codec.schema import Calibration, Kind, Live, Record
+from kiteline_codec.schema import Calibration, Key, Kind, Live, Record
 from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
@@ -46,11 +46,14 @@ class MapperInput:
 
 @dataclass(frozen=True, slots=True)
 class MapperOutput:
-    """What is to be shared with each agent, the work to be done elsewhere, and answers to the commands."""
+    """What is to be shared with each agent, the work to be done elsewhere, answers to the commands, and what was shared
+    and is true no more.
+    """
 
     publish: Published
     jobs: tuple[Job, ...]
     answers: tuple[Answer, ...] = ()
+    withdrawn: tuple[tuple[AgentId, Key], ...] = ()
 
 
 @dataclass(slots=True)
@@ -75,6 +78,8 @@ class Mapper:
         self.map = SparseMap()
         self.grid = Grid(self.config.grid)
         self.placements: dict[SubmapId, F64] = {}  # T_w_m of placed submaps
+        self._carried: dict[SubmapId, F64] = {}  # T_w_m of those that have a place by themselves
+        self._withdrawn: list[tuple[AgentId, Key]] = []
         self.names: dict[SubmapId, str] = {}  # what people call maps, by their eldest submap
         self.counts = MapperCounts()
         self._intake = Intake(self.config.intake, self.map)
@@ -118,7 +123,9 @@ class Mapper:
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.atlas is not None:
             jobs += self.atlas.jobs()
-        return MapperOutput(self._publisher.collect(), tuple(jobs), answers)
+        withdrawn = tuple((agent, key) for agent, key in self._withdrawn if key.id not in self.placements)
+        self._withdrawn.clear()
+        return MapperOutput(self._publisher.collect(), tuple(jobs), answers, withdrawn)
 
     def adopt(self, record: Record) -> None:
         """Compute on with a published record as the other side will hold it."""
@@ -281,6 +288,7 @@ class Mapper:
         if first is None or level is None or np.array_equal(level.T_l_m, self.placements[first]):
             return
         T_new_old = level.T_l_m @ se3.inverse(self.placements[first])
+        self._carried = {s: se3.orthonormalise(T_new_old @ T_w_m) for s, T_w_m in self._carried.items()}
         for submap, T_w_m in self.placements.items():
             upright = level.T_l_m if submap == first else se3.orthonormalise(T_new_old @ T_w_m)
             self.placements[submap] = upright
@@ -307,7 +315,7 @@ class Mapper:
             if self.map.keyframes.t_ns[self.map.rows[first]] - tracked_ns > self.config.intake.carry_s * 1e9:
                 return  # a place that it reached unseen: it is found when it is recognised
             T_w_m = se3.orthonormalise(T_w_before @ left @ live.T_k_c @ se3.inverse(begin))
-        self.placements[submap] = T_w_m
+        self.placements[submap] = self._carried[submap] = T_w_m
         self._publisher.place(submap, T_w_m)
 
     def _finish(self, done: JobDone) -> None:
@@ -339,6 +347,8 @@ class Mapper:
             return
         for keyframe in self.atlas.revisit():
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
+        self._unplace(self.atlas.parted)
+        self.atlas.parted.clear()
         for island in sorted(self.atlas.moved):
             for job, (submap, _) in list(self._windows.items()):
                 if self.map.island_of(submap) == island:
@@ -364,6 +374,18 @@ class Mapper:
             if not np.array_equal(self._told.get(agent, 0.0), offset):
                 self._told[agent] = offset
                 self._publisher.send(agent, Calibration(agent, offset))
+
+    def _unplace(self, parted: set[SubmapId]) -> None:
+        """Submaps that were taken out of a map lie where they lay by themselves, or nowhere; their agents are told."""
+        first = next(iter(self.placements), None)
+        for submap in sorted(parted & self.placements.keys() - {first}):
+            if submap in self._carried:
+                self.placements[submap] = self._carried[submap]
+                self._publisher.place(submap, self._carried[submap])
+            else:
+                del self.placements[submap]
+                self._publisher.forget_place(submap)
+                self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.PLACEMENT), int(submap), 0)))
 
     def _place_island(self, island: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place."""

@@ -37,6 +37,12 @@ class Publisher:
         """A submap has a new place in the world."""
         self._records.append((agent_of_submap(submap), Placement(submap, T_w_m)))
 
+    def forget_place(self, submap: SubmapId) -> None:
+        """A submap has no place any more: what is not said yet is not to be said."""
+        self._records = [
+            (a, r) for a, r in self._records if not (isinstance(r, Placement) and r.submap == submap)
+        ]  # fmt: skip
+
     def send(self, agent: AgentId, record: Record) -> None:
         """Any other record, as it is."""
         self._records.append((agent, record))

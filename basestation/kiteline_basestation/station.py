@@ -83,6 +83,10 @@ class Station:
             for record in records:
                 self.mapper.adopt(channel.put(record))  # from here on we compute with what the agent will hold
             self._note(agent, True, records)
+        for agent, key in output.withdrawn:
+            self.join(agent).remove(key)
+            if self.touched is not None:
+                self.touched[agent, True, key] = None
         for agent, channel in sorted(self.channels.items()):
             self.supply.serve(agent, self.mapper.live(agent), channel, now_ns)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))

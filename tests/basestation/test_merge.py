@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_codec.schema import Camera, Placement, Record
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import plain_pair
+from kiteline_codec.schema import Camera, Key, Kind, Placement, Record
 from kiteline_core import se3
 from kiteline_core.ids import submap_of_keyframe
 
@@ -119,3 +121,32 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     there = sparse_map.keyframes.id[table.row[table.root[slots]]] >> 20
     assert np.array_equal(here, there)  # no point of one is seen from the other
     assert mapper.summary()["maps"] == 2
+    young = submap_of_keyframe(b.keyframes[0])
+    output = mapper.step(MapperInput(((a.agent, ()),)), 10**12)
+    assert output.withdrawn == ((a.agent, Key(int(Kind.PLACEMENT), young, 0)),)  # its place was the merge's
+    assert young not in mapper.placements and submap_of_keyframe(a.keyframes[0]) in mapper.placements
+    assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
+
+
+def test_an_agent_hears_that_its_map_has_no_place_any_more(make_flight: MakeFlight, words: Any) -> None:
+    a = make_flight(keyframes=30, turns=0.6)
+    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    ours, theirs = {}, {}
+    for flight in (a, b):
+        theirs[flight.agent], ours[flight.agent] = plain_pair()
+    station = Station(BaseConfig(), ours.__getitem__, words)
+    done: tuple[JobDone, ...] = ()
+    young = submap_of_keyframe(b.keyframes[0])
+    for n in range(70):
+        for flight in (a, b):
+            if n == 0:
+                theirs[flight.agent].put(Camera(flight.agent, flight.camera))
+            for record in flight.records[n] if n < len(flight.records) else []:
+                theirs[flight.agent].put(record)
+        done = tuple(run_job(job) for job in station.step({a.agent: (), b.agent: ()}, done, n * STEP_NS).jobs)
+    assert any(isinstance(r, Placement) and r.submap == young for r in theirs[b.agent].receive((), 0))
+    assert station.mapper.atlas is not None
+    assert station.mapper.atlas.split(young)
+    station.step({}, (), 100 * STEP_NS)
+    assert theirs[b.agent].take_removed() == [Key(int(Kind.PLACEMENT), young, 0)]
+    assert not any(isinstance(r, Placement) for r in theirs[b.agent].receive((), 0))
