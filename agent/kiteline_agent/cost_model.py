@@ -42,8 +42,8 @@ PRICES_NS: dict[str, float] = {
     "alignments": 800,  # a template aligned at one level
     "stereo_points": 1_750,  # a row looked along
     "posed_points": 1_300,  # a point in the motion-only optimisation
-    "inertial_samples": 8_000,  # preintegration
-    "fused": 250_000,  # a frame in the smoother
+    "inertial_samples": 1_000,  # preintegration
+    "fused": 340_000,  # a frame in the smoother
     "keyframes": 1_200_000,  # coding and bookkeeping
     "detected_px": 2.1,  # a pixel of the image searched for corners
     "births": 7_400,  # row search, descriptor, template, code
