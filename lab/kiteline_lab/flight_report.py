@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,31 +29,70 @@ BASE_TIMINGS = ("bundle_ms", "grid_ms", "rss_mib")
 def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) -> list[tuple[int, F64]]:
     """Every tracked frame in w: (t_ns, T_w_b), from the agent's frames and the base's keyframe poses (camera in w).
 
-    A frame whose keyframe the base does not hold (still on its way when the flight ended) hangs on the agent's own
-    submap, placed where the nearest earlier keyframe that the base does hold puts it; before the first such keyframe,
-    where that first one puts it. Frames of a submap of which the base holds nothing have no place in w: left out.
+    Where the base moved the keyframe that follows, the frames up to it take on their share of that correction, so that
+    the path has no step where the reference changes. A frame whose keyframe the base does not hold (still on its way
+    when the flight ended) hangs on the agent's own submap, placed where the nearest earlier keyframe that the base does
+    hold puts it; before the first such keyframe, where that first one puts it. Frames of a submap of which the base
+    holds nothing have no place in w: left out.
     """
     poses: list[tuple[int, F64]] = []
     placed: dict[int, F64] = {}  # submap -> T_w_m that its latest known keyframe implies
     waiting: dict[int, list[tuple[int, F64]]] = {}
     T_c_b = se3.inverse(T_b_c)
-    for frame in frames:
-        if not frame.tracked or frame.T_m_b is None:
-            continue
-        submap = int(frame.submap)
-        known = T_w_k.get(int(frame.keyframe))
-        if known is not None:
-            T_w_b = known @ frame.T_k_c @ T_c_b
-            placed[submap] = T_w_b @ se3.inverse(frame.T_m_b)
-            early = waiting.pop(submap, ())
-            poses.extend((t_ns, placed[submap] @ T_m_b) for t_ns, T_m_b in early)
-            poses.append((frame.t_ns, T_w_b))
-        elif submap in placed:
-            poses.append((frame.t_ns, placed[submap] @ frame.T_m_b))
-        else:
-            waiting.setdefault(submap, []).append((frame.t_ns, frame.T_m_b))
+    for run, bend in _runs(frames, T_w_k, T_b_c):
+        begin_ns = run[0].t_ns
+        for frame in run:
+            assert frame.T_m_b is not None
+            submap = int(frame.submap)
+            known = T_w_k.get(int(frame.keyframe))
+            if known is not None:
+                if bend is not None:
+                    known = known @ se3.exp((frame.t_ns - begin_ns) / (bend[0] - begin_ns) * bend[1])
+                T_w_b = known @ frame.T_k_c @ T_c_b
+                placed[submap] = T_w_b @ se3.inverse(frame.T_m_b)
+                early = waiting.pop(submap, ())
+                poses.extend((t_ns, placed[submap] @ T_m_b) for t_ns, T_m_b in early)
+                poses.append((frame.t_ns, T_w_b))
+            elif submap in placed:
+                poses.append((frame.t_ns, placed[submap] @ frame.T_m_b))
+            else:
+                waiting.setdefault(submap, []).append((frame.t_ns, frame.T_m_b))
     poses.sort(key=lambda pose: pose[0])
     return [(t_ns, se3.orthonormalise(T_w_b)) for t_ns, T_w_b in poses]
+
+
+def _runs(
+    frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64
+) -> Iterator[tuple[list[Estimate], tuple[int, F64] | None]]:
+    """Tracked frames that hang on one keyframe, without a gap; when the next keyframe was born, and by how much the
+    base moved it, seen from here: a tangent vector (6,). None where the run ends otherwise.
+    """
+    run: list[Estimate] = []
+    seen: set[int] = set()
+    for frame in frames:
+        if not frame.tracked or frame.T_m_b is None:
+            if run:
+                yield run, None
+            run = []
+            continue
+        if run and frame.keyframe != run[-1].keyframe:
+            born = int(frame.keyframe) not in seen and frame.submap == run[-1].submap
+            yield run, (_bend(run[-1], frame, T_w_k, T_b_c) if born else None)
+            run = []
+        seen.add(int(frame.keyframe))
+        run.append(frame)
+    if run:
+        yield run, None
+
+
+def _bend(last: Estimate, born: Estimate, T_w_k: Mapping[int, F64], T_b_c: F64) -> tuple[int, F64] | None:
+    """last: the last frame on a keyframe. born: the next one, which became a keyframe."""
+    old, new = T_w_k.get(int(last.keyframe)), T_w_k.get(int(born.keyframe))
+    if old is None or new is None:
+        return None
+    step = se3.inverse(last.T_o_b @ T_b_c) @ born.T_o_b @ T_b_c  # of the camera, as the agent saw it
+    change = se3.inverse(old) @ new @ born.T_k_c @ se3.inverse(last.T_k_c @ step)
+    return born.t_ns, se3.log(se3.orthonormalise(change))
 
 
 def write_tum(path: Path, poses: Iterable[tuple[int, F64]]) -> None:

@@ -25,6 +25,7 @@ class FlownFrame:
     t_ns: int
     tracked: bool
     T_m_b: F64 | None
+    T_o_b: F64
     keyframe: KeyframeId
     T_k_c: F64
     submap: SubmapId
@@ -40,8 +41,8 @@ T_c_b = se3.inverse(T_b_c)
 
 def flown(t_ns: int, T_m_k: F64, T_k_c: F64, keyframe: int, submap: int = 0, tracked: bool = True) -> FlownFrame:
     """A frame seen near a keyframe that the agent believed at T_m_k."""
-    T_m_b = T_m_k @ T_k_c @ T_c_b if tracked else None
-    return FlownFrame(t_ns, tracked, T_m_b, KeyframeId(keyframe), T_k_c, SubmapId(submap))
+    T_m_b = T_m_k @ T_k_c @ T_c_b
+    return FlownFrame(t_ns, tracked, T_m_b if tracked else None, T_m_b, KeyframeId(keyframe), T_k_c, SubmapId(submap))
 
 
 def test_frames_follow_their_refined_keyframe() -> None:
@@ -50,6 +51,25 @@ def test_frames_follow_their_refined_keyframe() -> None:
     ((t_ns, T_w_b),) = compose([flown(5, at(0, 0, 0, 0, 0, 0), near, 7)], {7: refined}, T_b_c)
     assert t_ns == 5
     np.testing.assert_allclose(T_w_b, refined @ near @ T_c_b, atol=1e-12)
+
+
+def test_frames_bend_towards_the_next_keyframe_and_the_path_has_no_step() -> None:
+    step = np.array([0.1, 0.02, 0.0, 0.0, 0.0, 0.03])
+    eye, moved = np.eye(4), at(0.03, -0.01, 0.02, 0.01, 0.0, -0.02)  # what the base makes of the second keyframe
+    frames = [flown(10 * i, eye, se3.exp(step * i), 7) for i in range(10)]
+    frames += [flown(100 + 10 * i, se3.exp(step * 10), se3.exp(step * i), 8) for i in range(3)]
+    plain = dict(compose(frames, {7: eye, 8: se3.exp(step * 10)}, T_b_c))
+    for i in range(13):
+        np.testing.assert_allclose(plain[10 * i], se3.exp(step * i) @ T_c_b, atol=1e-9)
+    bent = dict(compose(frames, {7: eye, 8: se3.exp(step * 10) @ moved}, T_b_c))
+    np.testing.assert_allclose(bent[0], T_c_b, atol=1e-12)
+    np.testing.assert_allclose(bent[100], se3.exp(step * 10) @ moved @ T_c_b, atol=1e-9)
+    ways = [np.linalg.norm((se3.inverse(bent[10 * i]) @ bent[10 * i + 10])[:3, 3]) for i in range(12)]
+    assert max(ways) < 1.2 * min(ways)
+    # A gap, or a keyframe of old, is no next keyframe: nothing bends.
+    lost = [*frames[:10], flown(95, eye, eye, 7, tracked=False), *frames[10:]]
+    apart = dict(compose(lost, {7: eye, 8: moved}, T_b_c))
+    np.testing.assert_allclose(apart[90], plain[90], atol=1e-9)
 
 
 def test_a_keyframe_that_is_under_way_hangs_on_the_last_one_that_arrived() -> None:
