@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_core.bundle import BundleConfig, bundle
-from kiteline_lab.bench_mapper import map_bytes_a_keyframe, queue_p95_s, ring_of_poses, row_of_cameras
+from kiteline_lab.bench_mapper import further_kb, map_bytes_a_keyframe, queue_p95_s, ring_of_poses, row_of_cameras
 
 
 def test_the_row_of_cameras_is_a_bundle_that_converges() -> None:
@@ -32,3 +32,8 @@ def test_a_queue_waits_longer_the_fuller_it_is() -> None:
 
 def test_memory_grows_with_keypoints() -> None:
     assert 2_000 < map_bytes_a_keyframe(100, 50) < map_bytes_a_keyframe(100, 400)
+
+
+def test_memory_of_further_keyframes_is_that_of_the_process() -> None:
+    short, long = ({"keyframes": n, "timing": {"rss_mib": mib}} for n, mib in ((60, 200.0), (560, 240.0)))
+    assert abs(further_kb(short, long) - 40 * 1048.576 / 500) < 1e-9
