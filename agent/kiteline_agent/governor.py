@@ -267,6 +267,8 @@ class Governor:
             need_ns += self._extra_ns[self._last_extra] or _GUESS * self._frame_ns
         if self._window_ns + dearer * need_ns <= self._budget_ns:
             return True
+        if self._last_extra not in (None, extra):
+            return False  # it comes next, alone
         idle_ns = self._idle_ns * self._config.window_s * 1e9 / self._period_ns
         little = self._window_ns <= idle_ns + _LEAST * self._budget_ns
         return little and idle_ns + dearer * need_ns > self._budget_ns
