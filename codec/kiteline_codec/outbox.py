@@ -112,8 +112,7 @@ class Outbox:
                 self._waiting.add(key, entry)
             return
         self._change(key, code, order)
-        if self._limit_bytes and self._bulk_bytes > self._limit_bytes:
-            self._make_room()
+        self._make_room()
 
     def remove(self, key: Key) -> None:
         """Take a value back. One of which nothing was ever sent is forgotten without a word."""
@@ -220,7 +219,9 @@ class Outbox:
                 del self._bulk[key.id]
 
     def _make_room(self) -> None:
-        """Archive what was not touched for long, else give up what is worth least, until a quarter is free."""
+        """Beyond the bound, archive what was not touched for long, else give up what is worth least, down to 3/4."""
+        if self._bulk_bytes <= self._limit_bytes:
+            return
         enough = self._limit_bytes * 3 // 4
         refused = False
         for id_ in list(self._bulk):
@@ -295,8 +296,7 @@ class Outbox:
         key = self._waiting.top()
         if key is not None or self.archive.newest_dirty() is None:
             return key
-        if self._bulk_bytes > self._limit_bytes:
-            self._make_room()
+        self._make_room()
         for _ in range(_FETCHED):
             id_ = self.archive.newest_dirty()
             if id_ is not None:
@@ -307,6 +307,7 @@ class Outbox:
         """The value that has waited longest, or one of the archive: what went there waits longer than what is here."""
         there = self.archive.oldest_dirty()
         if there is not None:
+            self._make_room()
             self._fetch(there[1])
             idle = [k for k in self._bulk.get(there[1], ()) if self._entries[k].todo]
             if idle:

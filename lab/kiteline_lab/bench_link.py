@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import random
-import resource
 from typing import Any
 
 import numpy as np
 
 from kiteline_codec.profiles import RADIO
-from kiteline_codec.schema import Key, Kind
-from kiteline_codec.sync import Endpoint, SyncConfig
 from kiteline_hw.mavlink_tunnel import TunnelConfig, TunnelEnd
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sim.link_model import LinkModelConfig
 from kiteline_hw.sim.relay import UdpController, UdpRelay
 from kiteline_hw.sim.serial_pair import SerialPair
 from kiteline_hw.sim.telemetry_radio import RoutingController, TelemetryConfig
@@ -22,13 +19,12 @@ from kiteline_lab.bench_link_cpu import coding_ms, packet_ms
 from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
 from kiteline_lab.flight import free_endpoint
 from kiteline_lab.fly import Options, flight_starts, fly
+from kiteline_lab.link_silence import silence
 from kiteline_lab.link_watch import Watched, live_shift_ns, watch
 
 TITLE = "The thin line"
 
 _FLIGHT = "room_flight.mcap"
-_MINUTE_NS = 60_000_000_000
-_TICK_NS = 50_000_000
 
 
 def run(bench: Bench) -> list[Bar]:
@@ -176,62 +172,24 @@ def telemetry_p95_ms(rate_bytes_s: int, seconds: int = 120) -> tuple[float, floa
 
 
 def _outage(bench: Bench) -> list[Bar]:
-    """Ten minutes up, ten down, up again, at two keyframes a second."""
-    bench.say("ten minutes without a link")
-    draw = random.Random(5)
-    config = SyncConfig(budget_bytes=1_000_000)
-    agent, base = Endpoint(config, 1), Endpoint(config, 1)
-    model = LinkModelConfig(
-        rate_bytes_s=2_000_000, delay_ns=20_000_000, loss=0.01, outages=((10 * _MINUTE_NS, 20 * _MINUTE_NS),)
-    )
-    up, down = LinkModel(model, 1), LinkModel(model, 2)
-    before_mib = 0.0
-    most_mib = 0.0
-    synced_s = first_pose_s = None
-    pose_before = b""
-    for tick in range(21 * 60 * 20):
-        now_ns = tick * _TICK_NS
-        if now_ns < 20 * _MINUTE_NS:
-            agent.put(Key(Kind.LIVE, 0), draw.randbytes(29))
-            if tick % 10 == 0:
-                _keyframe(agent, tick // 10, draw)
-        elif now_ns == 20 * _MINUTE_NS:
-            pose_before = base.peer_values()[Key(Kind.LIVE, 0)]
-        for packet in up.deliver(now_ns):
-            base.receive(packet, now_ns)
-        for packet in down.deliver(now_ns):
-            agent.receive(packet, now_ns)
-        for end, wire in ((agent, up), (base, down)):
-            while (out := end.poll(now_ns)) is not None:
-                wire.send(out, now_ns)
-        if now_ns == 10 * _MINUTE_NS:
-            before_mib = agent.stats.backlog_bytes / 2**20
-        most_mib = max(most_mib, agent.stats.backlog_bytes / 2**20) if tick % 20 == 0 else most_mib
-        if now_ns >= 20 * _MINUTE_NS:
-            since_s = (now_ns - 20 * _MINUTE_NS) / 1e9
-            if first_pose_s is None and base._in.values[Key(Kind.LIVE, 0)][1] != pose_before:
-                first_pose_s = since_s
-            if agent.digest_equal and base.digest_equal:
-                synced_s = since_s
-                break
-    rss_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    bench.more.append(
-        f"Outage: backlog {most_mib:.1f} MiB at its end ({before_mib:.2f} before), process {rss_mib:.0f} MiB."
-    )
-    return [
-        at_most(
-            "after 10 minutes without a link: synchronised", synced_s if synced_s is not None else 999.0, 30.0, "s", 1
-        ),
-        at_most("the same: outbox", most_mib, 20.0, "MiB", 1),
-        at_most("the same: first pose", first_pose_s if first_pose_s is not None else 999.0, 2.5, "s", 2),
-    ]
-
-
-def _keyframe(agent: Endpoint, number: int, draw: random.Random) -> None:
-    agent.put(Key(Kind.HEAD, number), draw.randbytes(26))
-    for part in range(7):
-        agent.put(Key(Kind.BIRTHS, number, part), draw.randbytes(930))
-    agent.put(Key(Kind.SIGHTINGS, number), draw.randbytes(500))
+    """Ten minutes up, ten down or an hour, up again, at two keyframes a second of the wide profile."""
+    bars = []
+    for minutes in (10, 60):
+        bench.say(f"{minutes} minutes without a link")
+        found = silence(bench.folder, minutes)
+        name = f"after {minutes} minutes without a link"
+        bench.more.append(
+            f"{name.capitalize()}: {found.backlog_mib:.1f} MiB waited, values took {found.most_mib:.1f} MiB of memory at "
+            f"most; the process grew by {found.grown_mib:.1f} MiB."
+        )
+        if minutes == 10:
+            bars.append(at_most(f"{name}: synchronised", found.synced_s, 30.0, "s", 1))
+        bars += [
+            at_most(f"{name}: process grown, agent's end", found.grown_mib, 20.0, "MiB", 1),
+            at_most(f"{name}: first pose", found.first_pose_s, 2.5, "s", 2),
+            is_true(f"{name}: all arrived, digests", "equal", found.synced_s < 300, f"after {found.synced_s:.1f} s"),
+        ]
+    return bars
 
 
 def _cpu(bench: Bench) -> list[Bar]:
