@@ -24,6 +24,7 @@ Shrink = Callable[[Key, bytes, Known], bytes | None]  # a shorter form of a code
 _MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
 _BULK_KINDS = frozenset({int(Kind.HEAD), int(Kind.BIRTHS), int(Kind.SIGHTINGS)})  # of keyframes: what may be archived
 _ENTRY_BYTES = 700  # of memory that a value takes beside its code, about
+_FIRST = (1,)  # orders below it, poses and placements, go before what has waited longest
 _FETCHED = 16  # pages that are taken back at once when nothing else is left to be sent
 
 
@@ -333,15 +334,18 @@ class Outbox:
         skipped: list[tuple[Key, Entry]] = []
         empty = limit - len(out)
         last_id = 0
-        oldest = self._oldest() if self.flights.number % self._oldest_every == 0 else None
+        turn_of_oldest = self.flights.number % self._oldest_every == 0
         while len(skipped) < _MAX_SKIPPED:
-            key = oldest if oldest is not None else self._top()
+            key, oldest = self._top(), None
+            if turn_of_oldest and (key is None or self._entries[key].order > _FIRST):
+                turn_of_oldest = False
+                oldest = self._oldest()
+            key = key if oldest is None else oldest
             if key is None:
                 break
             entry = self._entries[key]
             if oldest is None:
                 self._waiting.pop(entry)
-            oldest = None
             form = self._former(key, entry, known) if self._shrink is not None else None
             item = item_of(key, entry, limit - len(out), empty, last_id, watermark, form)
             if item is None:

@@ -9,6 +9,8 @@ from kiteline_codec.profiles import RADIO, WIFI, Profile
 _THIN_BYTES_S = 6_000  # below it, keyframes of the wide profile would come every second at best
 _WIDE_BYTES_S = 15_000  # above it, two a second
 _PATIENCE_NS = 3_000_000_000  # ns that a link must look thin, or wide, before the profile changes
+_LASTING_NS = 60_000_000_000  # ns; a wide profile that was given up sooner is tried again later each time
+_MOST_CAUTION = 16
 _LEAST_DESCRIBED = 7  # births of a keyframe: one section
 _LONGEST_GAP_NS = 5_000_000_000  # ns; beyond it a map would come apart
 
@@ -22,6 +24,8 @@ class Pacer:
         thin = 0 < budget_bytes < _THIN_BYTES_S
         self.profile = profile or (RADIO if thin else WIFI)
         self._other_since_ns: int | None = None
+        self._widened_ns: int | None = None  # when the wide profile was tried again
+        self._caution = 1  # times the patience before it is tried again
         self._keyframe_t_ns: int | None = None
         self._interval_ns = 1_000_000_000  # between keyframes, smoothed
 
@@ -37,9 +41,13 @@ class Pacer:
             self._other_since_ns = None
         elif self._other_since_ns is None:
             self._other_since_ns = now_ns
-        elif now_ns - self._other_since_ns >= _PATIENCE_NS * (1 if self.profile is WIFI else 4):
-            self.profile = RADIO if self.profile is WIFI else WIFI
-            self._other_since_ns = None
+        elif self.profile is WIFI and now_ns - self._other_since_ns >= _PATIENCE_NS:
+            soon = self._widened_ns is not None and now_ns - self._widened_ns < _LASTING_NS
+            self._caution = min(2 * self._caution, _MOST_CAUTION) if soon else 1
+            self.profile, self._other_since_ns = RADIO, None
+        elif self.profile is RADIO and now_ns - self._other_since_ns >= 4 * self._caution * _PATIENCE_NS:
+            self._widened_ns = now_ns
+            self.profile, self._other_since_ns = WIFI, None
 
     def keyframe(self, t_ns: int) -> None:
         """A keyframe was made at a time."""

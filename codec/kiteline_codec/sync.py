@@ -29,6 +29,7 @@ from kiteline_codec.schema import Key, WireError
 from kiteline_codec.sync_config import MIN_PACKET_BYTES, SyncConfig, SyncStats, default_order
 from kiteline_codec.throughput import Throughput
 from kiteline_codec.tight import BASIS_KINDS, Tightener
+from kiteline_codec.window import Window
 
 __all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
 
@@ -77,6 +78,7 @@ class Endpoint:
         self._digest_sent: tuple[int, int] = (-1, 0)  # version, when
         self._rtt_ns = self._rtt_var_ns = 0
         self._backoff = 0
+        self._window = Window(config.window_packets)
         self._throughput = Throughput()
         self.throughput_bytes_s: int | None = None  # what the link delivers; None while nothing has to wait
         self._bytes_sent = self._packets_sent = self._bytes_received = self._packets_received = 0
@@ -260,6 +262,7 @@ class Endpoint:
         self._reset = None
         self._digest_sent = (-1, 0)
         self._backoff = self._overtaken = 0
+        self._window = Window(self.config.window_packets)
 
     def _owe(self, now_ns: int) -> None:
         if not self._owed:
@@ -268,11 +271,12 @@ class Endpoint:
 
     def _take_control(self, header: Header, now_ns: int) -> None:
         if header.ack is not None:
-            before = self._out.flights.acked_bytes
+            before, on_way = self._out.flights.acked_bytes, self._out.flights.in_flight
             sent_ns, number = self._out.acknowledge(*header.ack)
             self._throughput.acked(self._out.flights.acked_bytes - before, now_ns)
             if number:
                 self._measure(now_ns - sent_ns)
+                self._window.measured(now_ns - sent_ns, on_way - self._out.flights.in_flight, on_way, now_ns)
                 self._backoff = 0
                 self._overtaken = max(self._overtaken, number - self.config.reorder_packets)
                 if self._reset is not None and number >= self._reset[1]:
@@ -328,6 +332,11 @@ class Endpoint:
 
     # ---- sending
 
+    @property
+    def _most_packets(self) -> int:
+        """That may be on their way: a budget paces by itself."""
+        return self.config.window_packets if self.config.budget_bytes else self._window.packets
+
     def poll(self, now_ns: int) -> bytes | None:
         """The next packet to send now, or None. Call until None."""
         c = self.config
@@ -339,7 +348,7 @@ class Endpoint:
         left = self._budget.left(now_ns) - c.overhead_bytes
         if (
             self._peer
-            and self._out.flights.window_open(max(1, c.window_packets >> self._backoff))
+            and self._out.flights.window_open(max(1, self._most_packets >> self._backoff))
             and self._out.has_work()
         ):
             if left < c.filled_bytes:

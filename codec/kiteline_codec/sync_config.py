@@ -59,7 +59,9 @@ class SyncConfig:
     max_rto_ns: int = 2_000_000_000  # a link that comes back is found again within this time
     hello_ns: int = 250_000_000  # between greetings while the peer is unknown
     heartbeat_ns: int = 1_000_000_000  # longest silence while the peer is known
-    oldest_every: int = 8  # every eighth packet begins with the value that has waited longest, so that none starves
+    oldest_every: int = (
+        8  # in every eighth packet the value that has waited longest follows the poses, so that none starves
+    )
     max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
     max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
     max_inbox_bytes: int = 1 << 30  # of values that the peer wrote

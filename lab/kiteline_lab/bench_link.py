@@ -179,8 +179,8 @@ def _outage(bench: Bench) -> list[Bar]:
         found = silence(bench.folder, minutes)
         name = f"after {minutes} minutes without a link"
         bench.more.append(
-            f"{name.capitalize()}: {found.backlog_mib:.1f} MiB waited, values took {found.most_mib:.1f} MiB of memory at "
-            f"most; the process grew by {found.grown_mib:.1f} MiB."
+            f"{name.capitalize()}: {found.backlog_mib:.1f} MiB waited, values took {found.most_mib:.1f} MiB of memory "
+            f"at most; the process grew by {found.grown_mib:.1f} MiB."
         )
         if minutes == 10:
             bars.append(at_most(f"{name}: synchronised", found.synced_s, 30.0, "s", 1))
