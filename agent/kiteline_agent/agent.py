@@ -520,8 +520,7 @@ class Agent:
     def _estimate(self, t_ns: int, inliers: int, *, tracked: bool) -> Estimate:
         T_m_b = self._pose.T_m_c @ self._T_c_b
         T_w_m = self._placements.get(self.submap)
-        cov_m = self._certainty.of_map_pose(T_m_b)
-        cov_o = self._certainty.of_odometry(self._pose, self._T_c_b)
+        cov_m, cov_o = self._certainty.of_poses(self._pose, T_m_b)
         quality = self._certainty.quality(cov_m if tracked else cov_o, inliers or None)
         carried = self._submaps.any and self._inertial is not None and self._inertial.running
         if not tracked and (not carried or quality < self._config.certainty.flagged_below):

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.certainty_kernels import DISPARITY_SHAPES, SHAPES, sensitivity
+from kiteline_agent.certainty_kernels import DISPARITY_SHAPES, SHAPES, adjoint_into, pose_covariance, sensitivity
 from kiteline_agent.config import CertaintyConfig
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.pose_state import PoseState
@@ -27,6 +27,8 @@ F64 = NDArray[np.float64]
 
 _MET_PX = 1.0  # px, of a corner at full size that met a copy of another keyframe's
 _MET_DEPTH_M = 4.0  # of such corners
+_EVERY = 4  # frames between two that are weighed
+_FEWER = 0.7  # share of the inliers of the last weighed frame below which another is at once
 
 
 class Certainty:
@@ -51,9 +53,14 @@ class Certainty:
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))  # of the camera in m
         self._way: dict[SubmapId, F64] = {}  # T_o_m of the submaps that were left since all motion was last measured
         self._guided = False  # an IMU measures all motion
-        self._blind_s = 0.0
+        self._blind_s: float | None = 0.0  # that nothing measured motion; None: the last frame was measured
         self._blind = np.zeros((6, 6))  # [translation in m, rotation about the body's axes], since images were lost
         self._carried = np.zeros((6, 6))  # of the submap in o
+        self._nothing = np.zeros((6, 6))
+        self._in_one = True  # o is the submap's own frame
+        self._age = 0  # frames since the last was weighed
+        self._inliers = 0  # of that one
+        self._track: Track | None = None  # of this frame, where it was not weighed
         self._T_m_b0: F64 = np.eye(4)  # where the submap began
         self._T_o_b0: F64 | None = None  # where the flight began
         self._h, self._g = np.zeros((6, 6)), np.zeros((6, SHAPES))
@@ -62,14 +69,26 @@ class Certainty:
 
     def begin(self, T_m_b: F64) -> None:
         """A submap begins with the keyframe that follows, at T_m_b (4,4)."""
-        self._noise, self._shift, self._blind = np.zeros((6, 6)), np.zeros((6, SHAPES)), np.zeros((6, 6))
+        self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))
+        self._seen(0)
         self._blind_s = 0.0
         self._T_m_b0 = T_m_b
         if self._T_o_b0 is None:
             self._T_o_b0 = T_m_b
 
     def measured(self, track: Track) -> None:
-        """The images gave the camera's pose, from points of the local map."""
+        """The images gave the camera's pose, from points of the local map.
+
+        What that is worth changes slowly from frame to frame, told as errors on the left: it is worked out for every
+        keyframe, after what was no such frame, and now and then between.
+        """
+        if self._blind_s is None and self._age < _EVERY and track.inliers >= _FEWER * self._inliers:
+            self._age += 1
+            self._track = track
+            return
+        self._weigh(track)
+
+    def _weigh(self, track: Track) -> None:
         m = self._map
         sensitivity(
             track.T_c_m, m.intrinsics, 0.5 * m.camera.width, track.rows, track.inlier, track.xyz, track.ray,
@@ -79,14 +98,22 @@ class Certainty:
         inverse = np.linalg.inv(self._h + 1e-6 * np.eye(6))
         a = adjoint(se3.inverse(track.T_c_m))
         noise = max(track.rms, self._config.least_rms) ** 2 * self._config.inflation * inverse
-        seen = np.bincount(track.rows[track.inlier] // m.births, minlength=len(self._noise_k))
-        share = seen / max(int(seen.sum()), 1)
-        self._noise = a @ noise @ a.T + np.tensordot(share, self._noise_k, 1)
-        self._shift = a @ inverse @ self._g
-        self._blind, self._blind_s = np.zeros((6, 6)), 0.0
+        seen = np.bincount(track.rows[track.inlier] // m.births)
+        slots = np.flatnonzero(seen)
+        share = seen[slots] / max(int(seen.sum()), 1)
+        self._noise = a @ noise @ a.T + np.tensordot(share, self._noise_k[slots], 1)
+        self._shift = a @ (inverse @ self._g)
+        self._seen(track.inliers)
+
+    def _seen(self, inliers: int) -> None:
+        """The pose is measured now."""
+        self._blind, self._blind_s = np.zeros((6, 6)), None
+        self._age, self._inliers, self._track = 0, inliers, None
 
     def remember(self, keyframe: KeyframeId) -> None:
         """This frame became a keyframe."""
+        if self._track is not None:
+            self._weigh(self._track)
         slot = self._map.slot_of(keyframe)
         self._noise_k[slot], self._shift_k[slot], self._by_base[slot] = self._noise, self._shift, False
 
@@ -94,11 +121,13 @@ class Certainty:
         """No image for another dt_s. inertial: (6,6) of the pose by the IMU, [translation in m, rotation about the
         body's axes]; None where nothing measures motion.
         """
+        c = self._config
+        before = self._blind_s or 0.0
+        self._blind_s = before
         if inertial is not None:
             self._blind = inertial
             return
-        c = self._config
-        before, self._blind_s = self._blind_s, self._blind_s + dt_s
+        self._blind_s = before + dt_s
         moved, turned = (
             (v * s + 0.5 * a * s * s for s in (before, self._blind_s))
             for v, a in ((c.blind_velocity_m_s, c.blind_accel_m_s2), (c.blind_rate_rad_s, c.blind_turn_rad_s2))
@@ -115,15 +144,24 @@ class Certainty:
         own = np.diag(np.repeat([turn * depth_m, turn], 3) ** 2)
         a = adjoint(se3.inverse(T_c_m))
         self._noise, self._shift = self._noise_k[slot] + a @ own @ a.T, self._shift_k[slot].copy()
-        self._blind, self._blind_s = np.zeros((6, 6)), 0.0
+        self._seen(0)
+        self._blind_s = 0.0
 
     def carry(self, pose: PoseState, T_c_b: F64, submap: SubmapId) -> None:
         """The map of this submap is about to change under the camera, the odometry frame goes on as it is."""
         if self._guided:
             self._way[submap] = pose.T_o_m
         T_m_b = pose.T_m_c @ T_c_b
-        back = np.linalg.inv(_to_body(pose.T_o_m @ T_m_b))
-        self._carried = back @ self._in_o(pose.T_o_m, T_m_b) @ back.T
+        left, out = np.empty((6, 6)), np.empty((6, 6))
+        self._tell(pose.T_o_m, T_m_b, np.eye(4), left, out)
+        # what was flown blind is told about the body, the rest on the left
+        T_o_b = pose.T_o_m @ T_m_b
+        back = np.eye(6)
+        back[:3, 3:], back[3:, 3:] = se3.skew(T_o_b[:3, 3]) @ T_o_b[:3, :3], T_o_b[:3, :3]
+        turn = np.eye(6)
+        turn[:3, :3] = pose.T_o_m[:3, :3]
+        blind = back @ turn @ self._blind @ turn.T @ back.T
+        self._carried, self._in_one = left + blind, False
 
     def corrected(self, pose: PoseState) -> None:
         """The base has optimised keyframes: those that it placed for the first time are better known."""
@@ -135,22 +173,32 @@ class Certainty:
         lost = 1.0 - self._config.refined_share
         self._noise_k[new] *= self._config.refined_share
         # what the map gains, the odometry frame keeps
+        self._in_one = False
         a = adjoint(pose.T_o_m)
         self._carried = self._carried + lost * a @ self._noise @ a.T
         self._noise = self._noise * self._config.refined_share
 
     # what is known
 
-    def of_map_pose(self, T_m_b: F64) -> F64:
-        """(6,6) of T_m_b against where its submap began, [translation in m, rotation about the body's axes]."""
-        j = _to_body(T_m_b)
-        return np.asarray(j @ self._in_m() @ j.T + self._blind + self._of_extrinsic(self._T_m_b0, T_m_b))
+    def of_poses(self, pose: PoseState, T_m_b: F64) -> tuple[F64, F64]:
+        """(6,6) of T_m_b against where its submap began and of T_o_b against where the flight began, each [translation
+        in m or o, rotation about the body's axes].
+        """
+        left, cov_m = np.empty((6, 6)), np.empty((6, 6))
+        kept, self._carried = self._carried, self._nothing
+        self._tell(np.eye(4), T_m_b, self._T_m_b0, left, cov_m)
+        self._carried = kept
+        if self._in_one:  # o and m have been one so far
+            return cov_m, cov_m
+        cov_o = np.empty((6, 6))
+        self._tell(pose.T_o_m, T_m_b, self._T_m_b0 if self._T_o_b0 is None else self._T_o_b0, left, cov_o)
+        return cov_m, cov_o
 
-    def of_odometry(self, pose: PoseState, T_c_b: F64) -> F64:
-        """(6,6) of T_o_b against where the flight began, [translation in o, rotation about the body's axes]."""
-        T_m_b = pose.T_m_c @ T_c_b
-        T_o_b0 = pose.T_o_m @ T_m_b if self._T_o_b0 is None else self._T_o_b0
-        return self._in_o(pose.T_o_m, T_m_b) + self._of_extrinsic(T_o_b0, pose.T_o_m @ T_m_b)
+    def _tell(self, T_a_m: F64, T_m_b: F64, T_a_b0: F64, left: F64, out: F64) -> None:
+        pose_covariance(
+            self._noise, self._shift, self._calibration, self._carried, self._blind, self._extrinsic,
+            np.ascontiguousarray(T_a_m), np.ascontiguousarray(T_m_b), np.ascontiguousarray(T_a_b0), left, out,
+        )  # fmt: skip
 
     def guide(self, guided: bool) -> None:
         """Whether an IMU has measured the motion since the last frame."""
@@ -166,9 +214,14 @@ class Certainty:
         if T_o_m is None or not self._guided:
             return True
         c = self._config
-        here, there = pose.T_o_m @ predicted_T_m_c @ T_c_b, T_o_m @ se3.inverse(T_c_m) @ T_c_b
+        here, there = pose.T_o_m @ predicted_T_m_c, T_o_m @ se3.inverse(T_c_m)
+        away_m = float(np.abs(there[:3, 3] - here[:3, 3]).sum())
+        turned = 0.5 * (3.0 - float(np.vdot(here[:3, :3], there[:3, :3])))  # 1 - cos
+        if away_m < c.surprise_m and turned < 0.5 * c.surprise_rad**2:
+            return True
+        here, there = here @ T_c_b, there @ T_c_b
         e = np.concatenate([there[:3, 3] - here[:3, 3], se3.so3_log(here[:3, :3].T @ there[:3, :3])])
-        cov = self.of_odometry(pose, T_c_b) + np.diag(np.repeat([c.surprise_m, c.surprise_rad], 3) ** 2)
+        cov = self.of_poses(pose, pose.T_m_c @ T_c_b)[1] + np.diag(np.repeat([c.surprise_m, c.surprise_rad], 3) ** 2)
         return float(e @ np.linalg.solve(cov, e)) < c.surprise**2
 
     def quality(self, cov: F64, inliers: int | None) -> int:
@@ -180,21 +233,6 @@ class Certainty:
         if inliers is not None:
             trust = min(max((inliers - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
         return max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad)))
-
-    def _in_m(self) -> F64:
-        return np.asarray(self._noise + (self._shift * self._calibration) @ self._shift.T)
-
-    def _in_o(self, T_o_m: F64, T_m_b: F64) -> F64:
-        a, j = adjoint(T_o_m), _to_body(T_o_m @ T_m_b)
-        turn = np.eye(6)
-        turn[:3, :3] = T_o_m[:3, :3]
-        return np.asarray(j @ (self._carried + a @ self._in_m() @ a.T) @ j.T + turn @ self._blind @ turn.T)
-
-    def _of_extrinsic(self, T_a_b0: F64, T_a_b: F64) -> F64:
-        """What a wrong place of the camera in the body makes of a motion of the body from T_a_b0 to T_a_b."""
-        T_b0_b = se3.inverse(T_a_b0) @ T_a_b
-        j = _to_body(T_a_b) @ adjoint(T_a_b0) @ (np.eye(6) - adjoint(T_b0_b))
-        return np.asarray(j @ self._extrinsic @ j.T)
 
 
 def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
@@ -215,14 +253,6 @@ def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
 
 def adjoint(T: F64) -> F64:
     """(6,6): Exp(adjoint @ x) T = T Exp(x) for x [translation, rotation]."""
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = T[:3, :3]
-    out[:3, 3:] = se3.skew(T[:3, 3]) @ T[:3, :3]
+    out = np.empty((6, 6))
+    adjoint_into(np.ascontiguousarray(T), out)
     return out
-
-
-def _to_body(T_a_b: F64) -> F64:
-    """(6,6): of [translation in a, rotation about the body's axes] by a perturbation on the left of T_a_b."""
-    j = np.zeros((6, 6))
-    j[:3, :3], j[:3, 3:], j[3:, 3:] = np.eye(3), -se3.skew(T_a_b[:3, 3]), T_a_b[:3, :3].T
-    return j

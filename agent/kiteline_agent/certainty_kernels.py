@@ -122,3 +122,108 @@ def sensitivity(
                 for k in range(measured):
                     t += jac[k, a] * e[k, s]
                 g[a, s] += (t - jv[a] * ev[s] / vv) / s2
+
+
+@njit
+def _sandwich(a: F64, m: F64, out: F64) -> None:
+    """out (6,6) = a m a^T."""
+    t = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            s = 0.0
+            for k in range(6):
+                s += a[i, k] * m[k, j]
+            t[i, j] = s
+    for i in range(6):
+        for j in range(6):
+            s = 0.0
+            for k in range(6):
+                s += t[i, k] * a[j, k]
+            out[i, j] = s
+
+
+@njit
+def _cross_into(t: F64, r: F64, sign: float, a: F64) -> None:
+    """a[:3, 3:] = sign * skew(t) @ r."""
+    for j in range(3):
+        x, y, z = r[0, j], r[1, j], r[2, j]
+        a[0, 3 + j] = sign * (t[1] * z - t[2] * y)
+        a[1, 3 + j] = sign * (t[2] * x - t[0] * z)
+        a[2, 3 + j] = sign * (t[0] * y - t[1] * x)
+
+
+@njit
+def adjoint_into(T: F64, a: F64) -> None:
+    """a (6,6): Exp(a x) T = T Exp(x) for x [translation, rotation]."""
+    a[:] = 0.0
+    for i in range(3):
+        for j in range(3):
+            a[i, j] = a[3 + i, 3 + j] = T[i, j]
+    _cross_into(T[:3, 3], T, 1.0, a)
+
+
+@njit
+def body_into(T: F64, j: F64) -> None:
+    """j (6,6): of [translation in a, rotation about the body's axes] by a perturbation on the left of T = T_a_b."""
+    j[:] = 0.0
+    t = T[:3, 3]
+    for i in range(3):
+        j[i, i] = 1.0
+        for k in range(3):
+            j[3 + i, 3 + k] = T[k, i]
+    j[0, 4], j[0, 5] = t[2], -t[1]
+    j[1, 3], j[1, 5] = -t[2], t[0]
+    j[2, 3], j[2, 4] = t[1], -t[0]
+
+
+@njit
+def pose_covariance(
+    noise: F64, shift: F64, calibration: F64, carried: F64, blind: F64, extrinsic: F64, T_a_m: F64, T_m_b: F64,
+    T_a_b0: F64, left: F64, out: F64,
+) -> None:  # fmt: skip
+    """Covariance of a body pose in a frame a (o or m itself), all parts together; see certainty.
+
+    noise (6,6), shift (6,10): of the camera in m, on the left. calibration: (10,) variances. carried: (6,6) of m in a.
+    blind: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6) of the camera in the body. T_a_b0:
+    where the frame began. Out: left (6,6) the first three parts on the left of T_a_b; out (6,6) all of it, [translation
+    in a, rotation about the body's axes].
+    """
+    a, j, m, e = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    for i in range(6):
+        for k in range(6):
+            s = noise[i, k]
+            for p in range(shift.shape[1]):
+                s += shift[i, p] * calibration[p] * shift[k, p]
+            m[i, k] = s
+    adjoint_into(T_a_m, a)
+    _sandwich(a, m, left)
+    for i in range(6):
+        for k in range(6):
+            left[i, k] += carried[i, k]
+    T = np.eye(4)
+    for i in range(3):
+        for k in range(4):
+            s = T_a_m[i, 3] if k == 3 else 0.0
+            for p in range(3):
+                s += T_a_m[i, p] * T_m_b[p, k]
+            T[i, k] = s
+    body_into(T, j)
+    _sandwich(j, left, out)
+    # blind: translations turn from m to a
+    turn = np.eye(6)
+    for i in range(3):
+        for k in range(3):
+            turn[i, k] = T_a_m[i, k]
+    _sandwich(turn, blind, m)
+    # extrinsic: on the left of T_a_b it is Ad(T_a_b0) - Ad(T_a_b)
+    adjoint_into(T_a_b0, a)
+    adjoint_into(T, e)
+    for i in range(6):
+        for k in range(6):
+            out[i, k] += m[i, k]
+            a[i, k] -= e[i, k]
+    _sandwich(a, extrinsic, m)
+    _sandwich(j, m, e)
+    for i in range(6):
+        for k in range(6):
+            out[i, k] += e[i, k]

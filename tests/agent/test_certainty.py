@@ -122,7 +122,7 @@ def test_noise_of_a_measured_pose_is_what_it_says() -> None:
         T = se3.inverse(track.T_c_m)
         good = se3.inverse(T_c_m)
         e = np.concatenate([good[:3, 3] - T[:3, 3], se3.so3_log(T[:3, :3].T @ good[:3, :3])])
-        nees.append(e @ np.linalg.solve(certainty.of_map_pose(T), e))
+        nees.append(e @ np.linalg.solve(certainty.of_poses(PoseState(), T)[0], e))
     assert 5.0 < np.mean(nees) < 7.2
 
 
@@ -131,9 +131,9 @@ def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
     certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config, has_body=True,
                           has_depth=True)  # fmt: skip
     certainty.begin(np.eye(4))
-    assert not certainty.of_map_pose(np.eye(4)).any()
+    assert not certainty.of_poses(PoseState(), np.eye(4))[0].any()
     half = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi]))
-    sigma = np.sqrt(np.diag(certainty.of_map_pose(half))[3:])
+    sigma = np.sqrt(np.diag(certainty.of_poses(PoseState(), half)[0])[3:])
     np.testing.assert_allclose(sigma, [2e-3, 2e-3, 0.0], atol=1e-6)
 
 
@@ -146,18 +146,18 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
     pose = PoseState()
     certainty.begin(np.eye(4))
     certainty.measured(tracked(local_map, clean, np.eye(4)))
-    before = certainty.of_odometry(pose, np.eye(4))
+    before = certainty.of_poses(pose, np.eye(4))[1]
     sizes = []
     for _ in range(20):
         certainty.blind(0.05, None)
-        sizes.append(certainty.of_odometry(pose, np.eye(4))[0, 0])
+        sizes.append(certainty.of_poses(pose, np.eye(4))[1][0, 0])
     assert (np.diff(sizes) > 0.0).all()
     assert np.sqrt(sizes[-1]) == pytest.approx(1.0, abs=0.1)  # half of 2 m/s^2 for a second
     certainty.carry(pose, np.eye(4), SubmapId(0))
     pose.move_map(se3.exp(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.3])))
     certainty.measured(tracked(local_map, clean, np.eye(4)))
-    assert certainty.of_map_pose(np.eye(4))[0, 0] < 1e-4  # seen in the map again
-    after = certainty.of_odometry(pose, np.eye(4))
+    assert certainty.of_poses(PoseState(), np.eye(4))[0][0, 0] < 1e-4  # seen in the map again
+    after = certainty.of_poses(pose, pose.T_m_c)[1]
     assert np.trace(after[:3, :3]) == pytest.approx(3 * sizes[-1], rel=0.05)  # but nobody knows the way there
     assert after[0, 0] > before[0, 0]
 
@@ -175,3 +175,34 @@ def test_how_likely_an_error_is_small() -> None:
 def test_adjoint_carries_a_perturbation_from_right_to_left() -> None:
     T, x = se3.exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.7])), np.array([0.1, 0.2, -0.1, 0.03, 0.2, 0.1])
     np.testing.assert_allclose(se3.exp(adjoint(T) @ x) @ T, T @ se3.exp(x), atol=1e-12)
+
+
+def test_the_kernel_of_poses_composes_as_written() -> None:
+    rng = np.random.default_rng(2)
+
+    def some(n: int) -> F64:
+        a = rng.normal(size=(n, n))
+        return np.asarray(1e-3 * a @ a.T)
+
+    def pose() -> F64:
+        return se3.exp(rng.normal(size=6))
+
+    def to_body(T: F64) -> F64:
+        j = np.zeros((6, 6))
+        j[:3, :3], j[:3, 3:], j[3:, 3:] = np.eye(3), -se3.skew(T[:3, 3]), T[:3, :3].T
+        return j
+
+    noise, carried, blind, extrinsic = some(6), some(6), some(6), some(6)
+    shift, calibration = rng.normal(size=(6, SHAPES)), rng.uniform(0.1, 1.0, SHAPES)
+    T_a_m, T_m_b, T_a_b0 = pose(), pose(), pose()
+    left, out = np.empty((6, 6)), np.empty((6, 6))
+    certainty_kernels.pose_covariance(
+        noise, shift, calibration, carried, blind, extrinsic, T_a_m, T_m_b, T_a_b0, left, out
+    )  # fmt: skip
+    T_a_b = T_a_m @ T_m_b
+    a, j, turn = adjoint(T_a_m), to_body(T_a_b), np.eye(6)
+    turn[:3, :3] = T_a_m[:3, :3]
+    want = carried + a @ (noise + shift @ np.diag(calibration) @ shift.T) @ a.T
+    np.testing.assert_allclose(left, want, rtol=1e-10)
+    e = j @ adjoint(T_a_b0) @ (np.eye(6) - adjoint(se3.inverse(T_a_b0) @ T_a_b))
+    np.testing.assert_allclose(out, j @ want @ j.T + turn @ blind @ turn.T + e @ extrinsic @ e.T, rtol=1e-9, atol=1e-12)
