@@ -80,6 +80,7 @@ class Atlas:
         self._fresh: dict[SubmapId, list[Overlap]] = {}  # of each map, those whose points are not fused yet
         self._graph_due: set[SubmapId] = set()
         self._full_due: set[SubmapId] = set()
+        self._plain: set[SubmapId] = set()  # of those, the ones whose disparities are to be taken as they are
         self._graphs: dict[int, SubmapId] = {}  # open jobs
         self._fulls: dict[int, tuple[SubmapId, Window, tuple[AgentId, ...]]] = {}  # whose disparities are found, too
         self._revisit: list[KeyframeId] = []  # keyframes of merged maps that have not looked around in the other yet
@@ -154,7 +155,7 @@ class Atlas:
             part = self._whole(island)
             if part is not None:
                 agents: tuple[AgentId, ...] = ()
-                if self.fits(island):
+                if self.fits(island) and island not in self._plain:
                     problem, agents = disparity.with_border(
                         self._map, part.slots, part.problem, self._config.disparity
                     )  # fmt: skip
@@ -164,6 +165,7 @@ class Atlas:
                 self._fulls[job.id] = (island, part, agents)
                 out.append(job)
             self._full_due.discard(island)
+            self._plain.discard(island)
         return out
 
     def finish(self, done: JobDone) -> bool:
@@ -176,7 +178,10 @@ class Atlas:
         if isinstance(done.result, BundleResult) and done.id in self._fulls:
             island, part, agents = self._fulls.pop(done.id)
             result = without_links(part, done.result)
-            if self._settle(island, part, result):
+            if agents and not disparity.stands_out(self._map, agents, result, self._config.disparity):
+                self._plain.add(island)  # nothing is known to be off: the same again, with disparities as they are
+                self._full_due.add(island)
+            elif self._settle(island, part, result):
                 disparity.take(self._map, agents, part.problem, result, self._config.disparity)
             return True
         return False

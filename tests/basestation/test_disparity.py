@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.jobs import Job, JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import Births, Camera, Record, Sightings
 from kiteline_core.disparity_offset import none, terms
@@ -34,14 +34,17 @@ def shifted(record: Record, offset: F64) -> Record:
     return record
 
 
-def fly(mapper: Mapper, flight: Any, offset: F64) -> None:
+def fly(mapper: Mapper, flight: Any, offset: F64) -> list[Job]:
     done: tuple[JobDone, ...] = ()
+    jobs: list[Job] = []
     for n in range(len(flight.records) + 30):
         records = flight.records[n] if n < len(flight.records) else []
         first = [Camera(flight.agent, flight.camera)] if n == 0 else []
         given = tuple(first) + tuple(shifted(r, offset) for r in records)
         output = mapper.step(MapperInput(((flight.agent, given),), done), n * 250_000_000)
         done = tuple(run_job(job) for job in output.jobs)
+        jobs.extend(output.jobs)
+    return jobs
 
 
 @pytest.mark.parametrize("offset", [NONE, CONSTANT, -CONSTANT, TURNED])
@@ -59,9 +62,10 @@ def test_an_offset_is_found(
     assert np.sqrt(np.mean(np.square(error))) < 0.01
 
 
-def test_a_short_look_changes_little(make_flight: MakeFlight, words: Any) -> None:
-    flight = make_flight(keyframes=14, turns=0.1, drift_m=0.001)
+def test_disparities_that_are_right_are_left_alone(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=40, turns=0.6, drift_m=0.001)
     mapper = Mapper(BaseConfig(), words)
-    fly(mapper, flight, NONE)
-    assert np.all(np.abs(mapper.map.disparity_offset_px[AgentId(0)]) < 0.06)
-    assert AgentId(0) not in mapper.map.disparity_known
+    jobs = fly(mapper, flight, NONE)
+    assert any(job.kind == "full" for job in jobs)
+    assert mapper.map.disparity_offset_px == {}
+    assert mapper.idle
