@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from kiteline_lab.governed import Governed
 
+_LOOKS = ((True, "#1f77b4", "o-", "governor on"), (False, "#d62728", "s--", "governor off: the newest frame wins"))
+
 
 def plot_governor(path: Path, flights: Sequence[Governed], title: str) -> None:
-    """Draw flights under limits; the ones without a limit are the reference."""
+    """Draw flights under limits; the one without a limit is the reference."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 4.0), layout="constrained")
+    free = next((flight for flight in flights if not flight.percent), flights[0])
+    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
-    error, given = figure.subplots(1, 2)
-    for governor, colour, label in ((True, "#1f77b4", "governor on"), (False, "#d62728", "governor off")):
-        chosen = sorted((f for f in flights if f.percent and f.governor is governor), key=lambda f: f.percent)
-        percent = [f.percent for f in chosen]
-        error.plot(percent, [1000.0 * f.ate_m for f in chosen], "o-", color=colour, label=label)
-        given.plot(percent, [100.0 * f.tracked / f.frames for f in chosen], "o-", color=colour, label=label)
-        given.plot(percent, [100.0 * f.peak / f.percent for f in chosen], "x--", color=colour, alpha=0.6,
-                   label=f"{label}: dearest second, % of budget")  # fmt: skip
-    for flight in flights:
-        if not flight.percent:
-            error.axhline(1000.0 * flight.ate_m, color="0.6", linewidth=0.8, label="no limit")
-    error.set(xlabel="budget, % of one core", ylabel="ATE live, mm", yscale="log")
-    given.set(xlabel="budget, % of one core", ylabel="%", title="frames tracked", ylim=(0.0, None))
-    error.set_title(title)
-    for axes in (error, given):
+    error, given, dearest = figure.subplots(1, 3)
+    parts: tuple[tuple[Any, str, Callable[[Governed], float]], ...] = (
+        (error, "ATE live, mm", lambda f: 1000.0 * f.ate_m),
+        (given, "frames with a pose, %", lambda f: 100.0 * f.tracked / f.frames),
+        (dearest, "dearest second, % of the budget", lambda f: 100.0 * f.peak / f.percent),
+    )
+    for axes, label, value in parts:
+        for governor, colour, style, name in _LOOKS:
+            chosen = sorted((f for f in flights if f.percent and f.governor is governor), key=lambda f: f.percent)
+            axes.plot([f.percent for f in chosen], [value(f) for f in chosen], style, color=colour, label=name)
+        axes.set(xlabel="budget, % of one core", ylabel=label, xlim=(0.0, None))
         axes.grid(True, alpha=0.3)
-        axes.legend(fontsize=7)
+    error.axhline(1000.0 * free.ate_m, color="0.5", linewidth=1.0, label="no limit")
+    error.set_yscale("log")
+    given.set_ylim(0.0, 105.0)
+    dearest.axhline(100.0, color="0.5", linewidth=1.0)
+    dearest.set_ylim(0.0, None)
+    error.legend(fontsize=8)
+    figure.suptitle(f"{title}: {free.load:.1f} % of a core without a limit", fontsize=10)
     figure.savefig(path, dpi=110)
