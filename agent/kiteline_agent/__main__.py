@@ -55,6 +55,7 @@ from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_lockstep import LockstepClient
 
 _ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
+_LINK_NS = 1_000_000_000  # ns between two words of the link in the log
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
 _QUIET_S = 1.0  # s that it has to stay so: the base may still be working on the last keyframe
@@ -127,6 +128,7 @@ class Onboard:
         self._spent_ns = 0
         self._told_cpu_ns = 0  # what the last frame cost: modelled in lock-step, measured in a live flight
         self._live_clock = False
+        self._link_due_ns = 0
         self._core = VirtualCpu(spec.cpu_percent)
         self.output: StepOutput | None = None  # of the last step
 
@@ -189,6 +191,7 @@ class Onboard:
         if self._log is not None:
             write_step(self._log, step_input, output, now_ns, now_ns + self._log_shift_ns)
             self._log_records(now_ns + self._log_shift_ns)
+            self._log_link(now_ns)
         if frame is not None:
             self._record(output)
             if not self._live_clock:
@@ -209,6 +212,12 @@ class Onboard:
             for key, code in self.channel.take_noted().items():
                 record = record_log.write_record(AgentId(self.spec.agent), key, code)
                 self._log.blob(record_log.TOPIC, log_ns, record)
+
+    def _log_link(self, now_ns: int) -> None:
+        """The link as the agent sees it, once a second."""
+        if self._log is not None and isinstance(self.channel, CodedChannel) and now_ns >= self._link_due_ns:
+            self._link_due_ns = now_ns + _LINK_NS
+            self._log.json("/link", now_ns + self._log_shift_ns, self.channel.report())
 
     def _record(self, output: StepOutput) -> None:
         self.tally.count(output.estimate)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_hw.mcap_log_read import LogReader
 from kiteline_lab.flight_report import check_contract, without_timing
 from kiteline_lab.fly import Options, fly, main
 
@@ -37,6 +38,15 @@ def test_two_flights_are_alike_to_the_last_byte(recording: Path, tmp_path: Path)
     a, b = (json.loads((tmp_path / run / "report.json").read_text()) for run in "ab")
     assert without_timing(a) == without_timing(b)
     assert a["base"]["digest_equal"] is True
+
+
+def test_the_log_tells_of_the_link_once_a_second(recording: Path, tmp_path: Path) -> None:
+    report, _ = fly(Options((str(recording),), tmp_path, "local"), quiet=True)
+    with LogReader(tmp_path / "agent0" / "log.mcap") as log:
+        told = [message.json() for message in log.messages(("/link",))]
+    assert 2 <= len(told) <= 5
+    assert told[-1]["profile"] == report["agents"][0]["link"]["profile"] == "wifi"
+    assert {"budget_bytes_s", "backlog_bytes", "outbox_bytes", "archived", "given_up", "rtt_ms"} <= told[-1].keys()
 
 
 def test_loss_changes_what_arrives_but_not_what_is_held_in_the_end(recording: Path, tmp_path: Path) -> None:
