@@ -80,7 +80,9 @@ def situation(
     uv = track.observed[track.inlier, :2]
     columns = -(-camera.width // _COVER_CELL_PX)
     rows = -(-camera.height // _COVER_CELL_PX)
-    cells = (uv[:, 1] // _COVER_CELL_PX).astype(np.int64) * columns + (uv[:, 0] // _COVER_CELL_PX).astype(np.int64)
+    row, column = (uv[:, 1] // _COVER_CELL_PX).astype(np.int64), (uv[:, 0] // _COVER_CELL_PX).astype(np.int64)
+    covered = np.zeros((rows, columns), np.bool_)
+    covered[row, column] = True
     T_c_k = track.T_c_m @ T_m_k
     depth = float(np.median(track.depth_m[track.inlier])) if len(uv) else 1.0
     return Situation(
@@ -88,7 +90,7 @@ def situation(
         seconds_since,
         track.inliers,
         reference_inliers,
-        len(np.unique(cells)) / (columns * rows),
+        np.count_nonzero(covered) / covered.size,
         float(np.linalg.norm(T_c_k[:3, 3])) / max(depth, 0.1),
         float(np.linalg.norm(se3.so3_log(T_c_k[:3, :3]))),
     )

@@ -102,8 +102,8 @@ class LocalMap:
 
     def slot_of(self, keyframe: int) -> int:
         """The slot of a keyframe, -1 when it is not remembered."""
-        found = np.flatnonzero(self.keyframe == keyframe)
-        return int(found[0]) if len(found) else -1
+        slot = int((self.keyframe == keyframe).argmax())
+        return slot if self.keyframe[slot] == keyframe else -1
 
     def point_ids(self, rows: I64) -> I64:
         """Point ids (n,) of rows (n,)."""

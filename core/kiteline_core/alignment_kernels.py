@@ -239,7 +239,9 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
     raw = np.zeros(LANES + STRIDE, np.uint8)
     across = np.zeros(LANES + STRIDE, np.int16)
     patches = np.zeros((5, LANES), np.int16)
-    patches[4].reshape(PATCH, STRIDE)[:, :PATCH] = 1
+    for r in range(PATCH):
+        for c in range(PATCH):
+            patches[4, r * STRIDE + c] = 1
     for i in range(rows.shape[0]):
         found[i] = False
         ncc[i] = 0.0

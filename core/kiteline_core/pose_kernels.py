@@ -6,6 +6,8 @@ import numpy as np
 
 from kiteline_core.jit import njit
 
+_STILL = 1e-8  # square of a step, in m and rad, after which the next would be a thousandth of it
+
 
 @njit
 def _exp(xi, r, t):  # type: ignore[no-untyped-def]
@@ -167,7 +169,7 @@ def optimise_pose(  # type: ignore[no-untyped-def]
             norm = 0.0
             for a in range(6):
                 norm += step[a] * step[a]
-            if norm < 1e-12:
+            if norm < _STILL:
                 break
         count = 0
         total = 0.0

@@ -27,8 +27,8 @@ def so3_exp(w: F64) -> F64:
     angle = float(np.sqrt(w @ w))
     k = skew(w)
     if angle < _SMALL_RAD:
-        return np.eye(3) + k + 0.5 * (k @ k)
-    return np.asarray(np.eye(3) + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k))
+        return np.asarray(_EYE + k + 0.5 * (k @ k))
+    return np.asarray(_EYE + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k))
 
 
 def so3_log(r: F64) -> F64:
@@ -44,18 +44,13 @@ def _left_jacobian(w: F64) -> F64:
     angle = float(np.sqrt(w @ w))
     k = skew(w)
     if angle < 1e-4:
-        return np.eye(3) + 0.5 * k + (k @ k) / 6.0
-    return np.asarray(
-        np.eye(3) + ((1.0 - np.cos(angle)) / angle**2) * k + ((angle - np.sin(angle)) / angle**3) * (k @ k)
-    )
+        return np.asarray(_EYE + 0.5 * k + (k @ k) / 6.0)
+    return np.asarray(_EYE + ((1.0 - np.cos(angle)) / angle**2) * k + ((angle - np.sin(angle)) / angle**3) * (k @ k))
 
 
 def exp(xi: F64) -> F64:
     """T (4,4) of a tangent vector (6,) [translation, rotation]."""
-    t = np.eye(4)
-    t[:3, :3] = so3_exp(xi[3:])
-    t[:3, 3] = _left_jacobian(xi[3:]) @ xi[:3]
-    return t
+    return from_rt(so3_exp(xi[3:]), _left_jacobian(xi[3:]) @ xi[:3])
 
 
 def log(t: F64) -> F64:
@@ -66,17 +61,16 @@ def log(t: F64) -> F64:
 
 def inverse(t: F64) -> F64:
     """T_b_a of T_a_b."""
-    out = np.eye(4)
-    out[:3, :3] = t[:3, :3].T
-    out[:3, 3] = -t[:3, :3].T @ t[:3, 3]
-    return out
+    back = t[:3, :3].T
+    return from_rt(back, -(back @ t[:3, 3]))
 
 
 def from_rt(r: F64, t: F64) -> F64:
     """T (4,4) of a rotation (3,3) and a translation (3,) in metres."""
-    out = np.eye(4)
+    out = np.zeros((4, 4))
     out[:3, :3] = r
     out[:3, 3] = t
+    out[3, 3] = 1.0
     return out
 
 
