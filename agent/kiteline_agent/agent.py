@@ -442,7 +442,7 @@ class Agent:
         if found is None:
             self._failures += self._recovery.textured
             return None
-        self._events.append("recovered")
+        self._events.append("recovered by copies" if found.lent else "recovered")
         self._return_to(found)
         self._pose.stand()
         if found.lent:  # none of its points is in the local map yet

@@ -47,7 +47,7 @@ def _together(bench: Bench, first: str, second: str) -> list[Bar]:
     """MH_03 begins when MH_01 has mapped the place."""
     sorties = [Sortie(first, 0, parts=(Part(0.0, 30.0),)), Sortie(second, 1, begin_s=27.0)]
     with_, without = _both(bench, "MH_03 in the map of MH_01", sorties)
-    there, alone = with_.flown(1), without.flown(1)
+    there = with_.flown(1)
     lent = {agent_of_keyframe(k) for k in with_.flight.station.supply.lent(AgentId(1))}
     return [
         is_true("MH_03 begins in the hall that MH_01 mapped", "one map, copies lent",
@@ -56,7 +56,7 @@ def _together(bench: Bench, first: str, second: str) -> list[Bar]:
         at_most("the same over that without copies", with_.live_m(1) / without.live_m(1), 1.05, "", 2),
         is_true("every frame of it tracked", "all", all(e.tracked for e in there.estimates),
                 f"{sum(e.tracked for e in there.estimates)} of {len(there.estimates)}"),
-        at_most("CPU that copies add to a frame, mean", _mean_ms(there) - _mean_ms(alone), 0.4, "ms", 2),
+        at_most("CPU of a frame with a full window, mean", _mean_ms(there), 5.0, "ms", 2),
     ]  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def _lost(bench: Bench, first: str) -> list[Bar]:
     return [
         at_most("dark for 1.5 s, then a place forgotten since: frames until it is found", blind, 3, "frames", 0),
         is_true("found by copies, in the old submap", "no new one",
-                bool(flown.said("recovered")) and len(flown.said("submap: opened")) == 1,
+                bool(flown.said("recovered by copies")) and len(flown.said("submap: opened")) == 1,
                 f"{len(flown.said('submap: opened'))} submaps, recovered {len(flown.said('recovered'))} times"),
         at_most("its live error in w from then on", came_back.live_m(0, -170), 0.03, "m", 4),
     ]  # fmt: skip

@@ -6,10 +6,10 @@ import numpy as np
 
 from kiteline_codec import messages
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
-from kiteline_codec.schema import Key, Kind, Pose, Record, Removed
+from kiteline_codec.schema import Copied, Copy, Key, Kind, Placement, Pose, Record, Removed, Tile
 from kiteline_codec.sync import SyncConfig
 from kiteline_core import se3
-from kiteline_core.ids import KeyframeId
+from kiteline_core.ids import KeyframeId, SubmapId
 
 POSE = Pose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))
 
@@ -68,3 +68,32 @@ def test_plain_records_pass_as_they_are() -> None:
     assert b.receive([], 0) == []
     assert b.take_removed() == [messages.key(POSE)]
     assert b.receive([], 0) == []
+
+
+def test_a_thin_link_carries_corrections_first_then_copies_then_tiles() -> None:
+    config = SyncConfig(packet_bytes=220, overhead_bytes=7, budget_bytes=500)
+    a, b = CodedChannel(config, 1), CodedChannel(config, 1)
+    rng = np.random.default_rng(0)
+    cross(a, b)  # greetings
+    index, flat = np.arange(6, dtype=np.uint16), np.zeros(6, np.uint8)
+    uv, depth = rng.uniform(0, 400, (6, 2)).astype(np.float32), np.full(6, 0.2, np.float32)
+    a.put(Tile(0, 0, 0.1, rng.integers(0, 101, (32, 32)).astype(np.int8)))
+    for k in range(3):
+        a.put(Copy(KeyframeId(k), SubmapId(0), POSE.T_m_k))
+        described = rng.integers(0, 256, (6, 32), dtype=np.uint8)
+        a.put(Copied(KeyframeId(k), 0, index, uv, depth, flat, flat, described))
+    for k in range(6):
+        a.put(Pose(KeyframeId(100 + k), POSE.T_m_k))
+    a.put(Placement(SubmapId(0), POSE.T_m_k))
+    order: list[str] = []
+    for tick in range(20, 300):
+        now_ns = tick * 50_000_000
+        order += [type(r).__name__ for r in b.receive(a.poll(now_ns), now_ns)]
+        a.receive(b.poll(now_ns), now_ns)
+    last = {name: max(i for i, n in enumerate(order) if n == name) for name in ("Pose", "Placement", "Copied", "Tile")}
+    first = {name: order.index(name) for name in last}
+    assert max(last["Pose"], last["Placement"]) < first["Copied"]
+    assert last["Copied"] < first["Tile"]
+    assert a.arrived(messages.key(Copy(KeyframeId(0), SubmapId(0), POSE.T_m_k)))
+    a.put(Copy(KeyframeId(0), SubmapId(3), POSE.T_m_k))
+    assert not a.arrived(Key(Kind.COPY, 0)), "a newer version is not there yet"
