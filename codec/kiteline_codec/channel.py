@@ -215,7 +215,7 @@ class CodedChannel:
 # What a link adds to a packet: IPv4 and UDP; frames of a serial line; four pieces in MAVLink's TUNNEL.
 _LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
 _RADIOS = ("serial", "mavlink")
-_SPILLED_BYTES = 3 << 20  # of memory for values of keyframes: some two hundred of them, and more than a local map holds
+_SPILLED_BYTES = 2 << 20  # of memory for values of keyframes: some 140 of them, three times what a local map holds
 _UNSPILLED_BYTES = 7 << 20  # the same where old values are lost: five minutes without a link
 
 
