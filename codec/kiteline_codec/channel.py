@@ -175,7 +175,7 @@ class CodedChannel:
     def _live_is_due(self, t_ns: int) -> bool:
         """Whether the profile has room for another pose; one whose time went back is always due."""
         last = self._live_t_ns
-        if last is not None and 0 <= t_ns - last < self._pacer.profile.live_gap_ns:
+        if last is not None and 0 <= t_ns - last < self._pacer.live_gap_ns:
             return False
         self._live_t_ns = t_ns
         return True

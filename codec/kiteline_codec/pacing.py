@@ -11,6 +11,8 @@ _WIDE_BYTES_S = 15_000  # above it, two a second
 _PATIENCE_NS = 3_000_000_000  # ns that a link must look thin, or wide, before the profile changes
 _LASTING_NS = 60_000_000_000  # ns; a wide profile that was given up sooner is tried again later each time
 _MOST_CAUTION = 16
+_LIVE_BYTES = 45  # of a live pose in a packet
+_LONGEST_LIVE_GAP_NS = 750_000_000  # ns; one a second arrives, a little late or early
 _LEAST_DESCRIBED = 7  # births of a keyframe: one section
 _LONGEST_GAP_NS = 5_000_000_000  # ns; beyond it a map would come apart
 
@@ -66,6 +68,14 @@ class Pacer:
         described = max(_LEAST_DESCRIBED, min(room // (3 * p.birth_bytes), p.described))
         blank = max(0, room - described * p.birth_bytes) // p.blank_bytes
         return replace(p, described=described, births=min(described + blank, p.births))
+
+    @property
+    def live_gap_ns(self) -> int:
+        """Between two live poses: what the profile says, but no more than a fifth of a budget, and one a second."""
+        if not self._budget_bytes:
+            return self.profile.live_gap_ns
+        fair_ns = _LIVE_BYTES * 5 * 1_000_000_000 // self._budget_bytes
+        return max(self.profile.live_gap_ns, min(fair_ns, _LONGEST_LIVE_GAP_NS))
 
     def keyframe_gap_ns(self, backlog_bytes: int, measured_bytes_s: int | None) -> int:
         """How long a keyframe that is not pressing waits after the one before. backlog_bytes: still to be sent."""

@@ -146,13 +146,20 @@ def test_births_follow_the_pace_of_keyframes() -> None:
     assert Pacer(WIFI, 1000).share(None) is WIFI
 
 
+def test_poses_take_no_more_than_a_fifth_of_a_budget() -> None:
+    assert Pacer(RADIO, 0).live_gap_ns == Pacer(RADIO, 1000).live_gap_ns == RADIO.live_gap_ns
+    assert Pacer(RADIO, 500).live_gap_ns == SECOND * 45 // 100
+    assert Pacer(RADIO, 300).live_gap_ns == SECOND * 3 // 4
+    assert Pacer(WIFI, 1_000_000).live_gap_ns == WIFI.live_gap_ns
+
+
 def test_live_poses_are_thinned_by_their_time() -> None:
     channel = coded_channel(1, 1000)
     sent = set()
     for i in range(100):
         channel.put(Live(AgentId(0), i * 50_000_000, KEYFRAME, np.eye(4), 50))
         sent.add(next(iter(channel.endpoint.own_values().values())))
-    assert len(sent) == 17  # 5 s at one in 0.3 s
+    assert len(sent) == 20  # 5 s at 4 Hz
     channel.put(Live(AgentId(0), 0, KEYFRAME, np.eye(4), 50))
     channel.put(Head(KEYFRAME, 0, NO_KEYFRAME, np.eye(4), 0))
     assert channel.report()["profile"] == "radio"
