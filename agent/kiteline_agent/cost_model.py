@@ -46,9 +46,9 @@ PRICES_NS: dict[str, float] = {
     "fused": 340_000,  # a frame in the smoother
     "keyframes": 1_200_000,  # coding and bookkeeping
     "detected_px": 2.1,  # a pixel of the image searched for corners
-    "births": 7_400,  # row search, descriptor, template, code
+    "births": 11_000,  # row search, descriptor, template, code
     "sightings": 1_600,  # code
-    "bearings": 12_000,  # a segment searched for a point without depth
+    "bearings": 7_500,  # a segment searched for a point without depth
     "searches": 5_000_000,  # a look for a lost place
 }
 

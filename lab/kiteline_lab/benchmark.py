@@ -26,6 +26,7 @@ BENCHMARKS = {
     "link": "kiteline_lab.bench_link",
     "fuzz": "kiteline_lab.bench_fuzz",
     "places": "kiteline_lab.bench_places",
+    "stages": "kiteline_lab.bench_stages",
     "mapper": "kiteline_lab.bench_mapper",
 }  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`
 
