@@ -120,7 +120,7 @@ def table(found: dict[str, list[dict[str, int]]]) -> str:
     """Means in ms as Markdown, a line a stage."""
     lines = ["| stage | a frame, ms | a keyframe, ms |", "|---|---|---|"]
     for _, _, stage in STAGES:
-        cells = (np.mean([own.get(stage, 0) for own in found[kind]] or [0.0]) / 1e6 for kind in ("frame", "keyframe"))
+        cells = (np.mean([own.get(stage, 0) for own in found[kind]] or [0]) / 1e6 for kind in ("frame", "keyframe"))
         lines.append(f"| {stage} | {' | '.join(f'{cell:.2f}' for cell in cells)} |")
     sums = (np.mean(_sums_ms(found[kind])) for kind in ("frame", "keyframe"))
     return "\n".join([*lines, f"| **together** | {' | '.join(f'**{ms:.2f}**' for ms in sums)} |"])
