@@ -98,7 +98,7 @@ class Agent:
             self.map, self._camera.T_b_c, config.certainty, has_body=rig.has_body, has_depth=not one_eye
         )
         self._full_config = config  # before the governor saves on it
-        self._governor = Governor(config.governor)
+        self._governor = Governor(config.governor, inertial=imu is not None)
         self._effort = FULL
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
         self._motion_depth = DepthFromMotion(self.map, config, self.work)

@@ -37,11 +37,11 @@ CARRIED = (
     FULL,
     Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
     Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 3, 1.00, 1.00),
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 4, 1.00, 1.00),
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 6, 1.00, 1.00),
-    Effort(1.00, 0.80, 0.5, 1, 0, 1.2, 1.0, 8, 0.95, 0.97),
-    Effort(0.50, 0.50, 0.5, 1, 0, 1.2, 0.5, 8, 0.75, 0.90),
-    Effort(0.65, 0.65, 0.5, 1, 1, 1.2, 0.5, 8, 0.60, 0.75),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 4, 1.00, 1.00),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 6, 1.00, 1.00),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 8, 1.00, 1.00),
+    Effort(0.50, 0.50, 0.5, 1, 0, 1.4, 0.5, 8, 0.75, 0.90),
+    Effort(0.65, 0.65, 0.5, 1, 1, 1.4, 0.5, 8, 0.60, 0.75),
     Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 9, 0.52, 0.70),
 )  # an IMU carries the pose over skipped frames: they cost next to nothing
 ALONE = (
@@ -114,10 +114,11 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
 class Governor:
     """Asked once before each frame, and told of each keyframe. Without a budget it never says no."""
 
-    def __init__(self, config: GovernorConfig) -> None:
+    def __init__(self, config: GovernorConfig, *, inertial: bool = False) -> None:
+        """inertial: there is an IMU, which will soon carry the pose."""
         self._config = config
         self.level = 0
-        self._ladder: tuple[Effort, ...] = ALONE
+        self._ladder: tuple[Effort, ...] = CARRIED if inertial else ALONE
         self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # a window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
@@ -141,7 +142,11 @@ class Governor:
         self._measured = False  # until then frames are expected to cost what they do elsewhere
         if self.on:  # a map begins with dear frames: not at an effort that cannot be borne
             self._frame_ns = config.first_frame_ms * 1e6
-            self._climb_to(ALONE, self._bearable(0))
+            self._climb_to(self._ladder, self._bearable(0))
+            if self._row.every > 3:  # too few frames for the IMU to start from
+                self._climb_to(ALONE, 0)
+                self._climb_to(ALONE, self._bearable(0))
+        self._first_ladder = self._ladder
 
     @property
     def on(self) -> bool:
@@ -164,8 +169,8 @@ class Governor:
         before, load = self.level, self._load(self.level)
         events: list[str] = []
         self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
-        self._steer(t_ns, CARRIED if carried else ALONE)
-        track = self._its_turn(lost) and self._affordable(t_ns, lost)
+        self._steer(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
+        track = (self._its_turn(lost) or self._early(t_ns)) and self._affordable(t_ns, lost)
         if not track and not lost and self._blind_for(t_ns, self._gap_s):  # frames before tracking
             track = self._window_ns + self._frame_ns <= self._budget_ns
             if not track and self._blind_for(t_ns, self._config.blind_s):
@@ -204,7 +209,7 @@ class Governor:
         """Book what the last frame cost, and sharpen what frames and keyframes are expected to cost."""
         if self._last_t_ns is None:
             return
-        if self._last_t_ns >= self._first_t_ns + self._config.grace_s * 1e9:
+        if not self._early(self._last_t_ns):
             self._spent.append((self._last_t_ns, cpu_ns))
             self._window_ns += cpu_ns
         gain = self._config.learning
@@ -272,6 +277,10 @@ class Governor:
         idle_ns = self._idle_ns * self._config.window_s * 1e9 / self._period_ns
         little = self._window_ns <= idle_ns + _LEAST * self._budget_ns
         return little and idle_ns + dearer * need_ns > self._budget_ns
+
+    def _early(self, t_ns: int) -> bool:
+        """Whether the map has just begun: nothing is booked, and an IMU needs frames to start from."""
+        return t_ns < self._first_t_ns + self._config.grace_s * 1e9
 
     def _its_turn(self, lost: bool) -> bool:
         """Whether the frame is one of those, evenly spread, that are tracked. A turn that cannot be paid for waits."""
