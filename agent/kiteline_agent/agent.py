@@ -295,6 +295,8 @@ class Agent:
         )
         if level is not None:
             self._channel.put(level)
+            # Until the base says where it lies: there too the first map is upright, and a thin link takes seconds.
+            self._placements.setdefault(level.submap, level.T_l_m)
             self._events.append(f"submap lies {np.degrees(self._levelling.askew_rad):.1f} degrees askew")
 
     def _accept(self, track: Track, dt_s: float) -> None:
