@@ -28,6 +28,7 @@ BENCHMARKS = {
     "places": "kiteline_lab.bench_places",
     "stages": "kiteline_lab.bench_stages",
     "mapper": "kiteline_lab.bench_mapper",
+    "window": "kiteline_lab.bench_window",
 }  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`
 
 _HEAD = (
