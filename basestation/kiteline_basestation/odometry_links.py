@@ -2,8 +2,9 @@
 
 The agent saw all frames in between, and felt them where it has an IMU; a thin link carries a tenth of the points that
 its tracker saw. So the pose relative to the parent knows what the points of two keyframes do not tell. It enters a
-bundle as a few made-up points that both keyframes see just where that pose puts them. How long the way was is left
-to the points of the base, as long as there are enough of them: disparities that are off spoil the agent's lengths.
+bundle as a few made-up points that both keyframes see just where that pose puts them. Where a keyframe has enough
+points of its own, the made-up ones are far away and say only how it turned, which the agent knows best (it measured
+0.3 mrad a keyframe, bundles alone 0.3 to 0.5); disparities that are off spoil the agent's lengths.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from kiteline_core.sparse_map import SparseMap
 F64 = NDArray[np.float64]
 
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
+_FAR = (8.0,)  # the same where only the turn is to be held
 _DEPTHS = (0.7, 1.8)  # times the median depth: near points hold the position, far ones the direction
 
 
@@ -32,7 +34,6 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
     table = sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    ratio = _length_ratio(sparse_map, window, number)
     points, camera, measured, sigma = [], [], [], []
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
@@ -41,11 +42,8 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
         if p is None or not deep or not (problem.free[k] or problem.free[p]):
             continue
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough)
-        T_p_k = table.T_p_k[row].copy()
-        if few == 0.0:
-            T_p_k[:3, 3] *= ratio
         deviation = 1.0 / np.hypot(few / config.sigma_px, 1.0 / config.enough_px)
-        seen = _made_up(sparse_map, problem, k, p, T_p_k)
+        seen = _made_up(sparse_map, problem, k, p, table.T_p_k[row], _DEPTHS if few > 0.0 else _FAR)
         if seen is None:
             continue
         in_k, in_p, world = seen
@@ -76,28 +74,15 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
     )
 
 
-def _length_ratio(sparse_map: SparseMap, window: Window, number: dict[int, int]) -> float:
-    """By how much the window's steps are longer than the agent said, the median."""
-    table = sparse_map.keyframes
-    ratios = []
-    for k, row in enumerate(window.rows.tolist()):
-        p = number.get(int(table.parent[row]))
-        said = float(np.linalg.norm(table.T_p_k[row, :3, 3]))
-        if p is not None and said > 1e-3:
-            step = window.problem.T_c_m[p] @ np.linalg.inv(window.problem.T_c_m[k])
-            ratios.append(float(np.linalg.norm(step[:3, 3])) / said)
-    return float(np.median(ratios)) if ratios else 1.0
-
-
 def _made_up(
-    sparse_map: SparseMap, problem: BundleProblem, k: int, p: int, T_p_k: F64
+    sparse_map: SparseMap, problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: tuple[float, ...]
 ) -> tuple[F64, F64, F64] | None:  # fmt: skip
     """What both keyframes measure (n,3) of made-up points, and where these are now (n,3)."""
     own = problem.camera == k
     depth = problem.measured[own, 2]
     depth = depth[depth > 0]
     typical = problem.lens[k, 4] / float(np.median(depth)) if len(depth) else 3.0
-    local = np.concatenate([np.column_stack([_GRID, np.ones(len(_GRID))]) * typical * d for d in _DEPTHS])
+    local = np.concatenate([np.column_stack([_GRID, np.ones(len(_GRID))]) * typical * d for d in depths])
     in_parent = se3.transform(T_p_k, local)
     ahead = in_parent[:, 2] > 0.1 * typical
     if np.count_nonzero(ahead) < 4:
