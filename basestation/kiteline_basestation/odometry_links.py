@@ -24,6 +24,7 @@ from kiteline_core.sparse_map import SparseMap
 F64 = NDArray[np.float64]
 
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
+_LOOSE = 1.7  # deviations of each of 6 far points, seen twice, that make one of the turn
 _FAR = (8.0,)  # the same where only the turn is to be held
 _DEPTHS = (0.7, 1.8)  # times the median depth: near points hold the position, far ones the direction
 
@@ -34,6 +35,7 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
     table = sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    loose = max(config.enough_px, _LOOSE * _turns_differ_px(sparse_map, window, number))
     points, camera, measured, sigma = [], [], [], []
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
@@ -42,7 +44,7 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
         if p is None or not deep or not (problem.free[k] or problem.free[p]):
             continue
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough)
-        deviation = 1.0 / np.hypot(few / config.sigma_px, 1.0 / config.enough_px)
+        deviation = 1.0 / np.hypot(few / config.sigma_px, 1.0 / loose)
         seen = _made_up(sparse_map, problem, k, p, table.T_p_k[row], _DEPTHS if few > 0.0 else _FAR)
         if seen is None:
             continue
@@ -72,6 +74,20 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
         sigma=np.concatenate([problem.sigma, np.array(sigma)]),
         border=border,
     )
+
+
+def _turns_differ_px(sparse_map: SparseMap, window: Window, number: dict[int, int]) -> float:
+    """By how much the window's turns from keyframe to keyframe differ from what agents said: the median, an axis."""
+    table, T = sparse_map.keyframes, window.problem.T_c_m
+    parents = [number.get(int(p), -1) for p in table.parent[window.rows].tolist()]
+    pairs = [(k, p) for k, p in enumerate(parents) if p >= 0]
+    if not pairs:
+        return 0.0
+    k, p = np.array(pairs).T
+    turn = T[p, :3, :3] @ np.swapaxes(T[k, :3, :3], 1, 2)
+    said = table.T_p_k[window.rows[k], :3, :3]
+    angle = np.linalg.norm(turn - said, axis=(1, 2)) / np.sqrt(2.0)
+    return float(np.median(angle * window.problem.lens[k, 0]) / np.sqrt(3.0))
 
 
 def _made_up(
