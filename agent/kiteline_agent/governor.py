@@ -172,7 +172,7 @@ class Governor:
         self._steer(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
         track = (self._its_turn(lost) or self._early(t_ns)) and self._affordable(t_ns, lost)
         if not track and not lost and self._blind_for(t_ns, self._gap_s):  # frames before tracking
-            track = self._window_ns + self._frame_ns <= self._budget_ns
+            track = self._window_ns + (1.0 + 0.5 * self._config.doubt) * self._frame_ns <= self._budget_ns
             if not track and self._blind_for(t_ns, self._config.blind_s):
                 track = True
                 events.append("governor: over budget, or the track would be lost")
@@ -190,12 +190,12 @@ class Governor:
     def may(self, extra: Extra, *, urgent: bool = False) -> bool:
         """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it.
 
-        urgent: without it the track may be lost; then it need but fit.
+        urgent: without it the track may be lost; then half of the doubt is enough.
         """
         if self.on:
             if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
                 return False
-            if not self._room_for(extra, 1.0 if urgent else 1.0 + self._config.doubt):
+            if not self._room_for(extra, 1.0 + (0.5 if urgent else 1.0) * self._config.doubt):
                 self._waiting = extra
                 return False
         self.note(extra)
@@ -255,7 +255,7 @@ class Governor:
             return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._config.doubt)
         keyframe_first = self._waiting is Extra.KEYFRAME and self._ladder is CARRIED
         if keyframe_first and not self._blind_for(t_ns, self._config.max_gap_s):
-            return self._room_for(Extra.KEYFRAME, 1.0)  # it goes before more frames
+            return self._room_for(Extra.KEYFRAME, 1.0 + 0.5 * self._config.doubt)  # it goes before more frames
         cost_ns = self._frame_ns * (1.0 + self._config.doubt)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 

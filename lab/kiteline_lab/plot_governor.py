@@ -17,7 +17,7 @@ def plot_governor(path: Path, flights: Sequence[Governed], title: str) -> None:
     from matplotlib.figure import Figure
 
     free = next((flight for flight in flights if not flight.percent), flights[0])
-    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
+    figure = Figure(figsize=(10.0, 3.9), layout="constrained")
     FigureCanvasAgg(figure)
     error, given, dearest = figure.subplots(1, 3)
     parts: tuple[tuple[Any, str, Callable[[Governed], float]], ...] = (
@@ -29,13 +29,14 @@ def plot_governor(path: Path, flights: Sequence[Governed], title: str) -> None:
         for governor, colour, style, name in _LOOKS:
             chosen = sorted((f for f in flights if f.percent and f.governor is governor), key=lambda f: f.percent)
             axes.plot([f.percent for f in chosen], [value(f) for f in chosen], style, color=colour, label=name)
-        axes.set(xlabel="budget, % of one core", ylabel=label, xlim=(0.0, None))
+        axes.set(xlabel="budget, % of one core", ylabel=label, xlim=(0.0, 1.1 * free.load))
         axes.grid(True, alpha=0.3)
     error.axhline(1000.0 * free.ate_m, color="0.5", linewidth=1.0, label="no limit")
     error.set_yscale("log")
+    error.margins(y=0.1)
     given.set_ylim(0.0, 105.0)
     dearest.axhline(100.0, color="0.5", linewidth=1.0)
-    dearest.set_ylim(0.0, None)
-    error.legend(fontsize=8)
+    dearest.set_ylim(0.0, 1.1 * dearest.get_ylim()[1])
+    figure.legend(*error.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     figure.suptitle(f"{title}: {free.load:.1f} % of a core without a limit", fontsize=10)
     figure.savefig(path, dpi=110)
