@@ -36,7 +36,7 @@ def plot_governor(path: Path, flights: Sequence[Governed], title: str) -> None:
     error.margins(y=0.1)
     given.set_ylim(0.0, 105.0)
     dearest.axhline(100.0, color="0.5", linewidth=1.0)
-    dearest.set_ylim(0.0, 1.1 * dearest.get_ylim()[1])
+    dearest.set_ylim(0.0, max(110.0, 1.1 * dearest.get_ylim()[1]))
     figure.legend(*error.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     figure.suptitle(f"{title}: {free.load:.1f} % of a core without a limit", fontsize=10)
     figure.savefig(path, dpi=110)
