@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import pnp_kernels as kernels
-from kiteline_core import se3
+from kiteline_core import se3, similarity_kernels
 from kiteline_core.pose_kernels import optimise_pose
 
 Bools = NDArray[np.bool_]
@@ -78,7 +78,7 @@ def solve_pnp(
 def align_points(a: F64, b: F64, with_scale: bool = False) -> F64 | None:
     """Least-squares S_a_b (4,4) with a = S_a_b b of points (n,3) (B. Horn, 1987). None when they leave it open."""
     S = np.eye(4)
-    if not kernels.align_points(a, b, np.ones(len(a), np.bool_), with_scale, S):
+    if not similarity_kernels.align_points(a, b, np.ones(len(a), np.bool_), with_scale, S):
         return None
     return S
 
@@ -99,7 +99,7 @@ def align_views(
     S, inlier = np.eye(4), np.zeros(len(a), np.bool_)
     limit_a = config.limit_px * np.ldexp(1.0, octave_a.astype(np.int32))
     limit_b = config.limit_px * np.ldexp(1.0, octave_b.astype(np.int32))
-    count = kernels.align_ransac(
+    count = similarity_kernels.align_ransac(
         a, uv_a, limit_a, camera_a, b, uv_b, limit_b, camera_b, with_scale, config.draws, config.confidence,
         _state(seed), S, inlier,
     )  # fmt: skip

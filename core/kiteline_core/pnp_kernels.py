@@ -1,4 +1,4 @@
-"""Kernels of absolute pose: P3P and three-point alignment, each in its own RANSAC with draws seeded by the caller."""
+"""Kernels of absolute pose: P3P in a RANSAC whose draws are seeded by the caller."""
 
 from __future__ import annotations
 
@@ -6,22 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.jit import njit
+from kiteline_core.ransac_kernels import draws_needed, reprojection_cost, three
 
 Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 U64 = NDArray[np.uint64]
-
-
-@njit
-def draw(state: U64, n: int) -> int:
-    """The next number in [0, n) of a xorshift64* generator (S. Vigna, 2016). state: (1,) uint64, not 0, in and out."""
-    x = state[0]
-    x ^= x >> np.uint64(12)
-    x ^= x << np.uint64(25)
-    x ^= x >> np.uint64(27)
-    state[0] = x
-    return int(((x * np.uint64(0x2545F4914F6CDD1D)) >> np.uint64(33)) % np.uint64(n))
 
 
 @njit
@@ -197,55 +186,13 @@ def p3p(ray: F64, point: F64, T: F64) -> int:
 
 
 @njit
-def _reprojection_cost(T: F64, point: F64, uv: F64, limit_px: F64, camera: F64, give_up: float) -> float:
-    """Sum over points of squared error over squared limit, at most 1 each (MSAC). Stops above `give_up`."""
-    total = 0.0
-    for i in range(point.shape[0]):
-        p0, p1, p2 = point[i, 0], point[i, 1], point[i, 2]
-        z = T[2, 0] * p0 + T[2, 1] * p1 + T[2, 2] * p2 + T[2, 3]
-        if z > 0.05:
-            du = camera[0] * (T[0, 0] * p0 + T[0, 1] * p1 + T[0, 2] * p2 + T[0, 3]) / z + camera[2] - uv[i, 0]
-            dv = camera[1] * (T[1, 0] * p0 + T[1, 1] * p1 + T[1, 2] * p2 + T[1, 3]) / z + camera[3] - uv[i, 1]
-            total += min(1.0, (du * du + dv * dv) / (limit_px[i] * limit_px[i]))
-        else:
-            total += 1.0
-        if total >= give_up:
-            return total
-    return total
-
-
-@njit
 def _mark_inliers(T: F64, point: F64, uv: F64, limit_px: F64, camera: F64, inlier: Bools) -> int:
     count = 0
     for i in range(point.shape[0]):
-        one = _reprojection_cost(T, point[i : i + 1], uv[i : i + 1], limit_px[i : i + 1], camera, 2.0)
+        one = reprojection_cost(T, point[i : i + 1], uv[i : i + 1], limit_px[i : i + 1], camera, 2.0)
         inlier[i] = one < 1.0
         count += inlier[i]
     return count
-
-
-@njit
-def _draws_needed(share: float, confidence: float, most: int) -> int:
-    """Draws of three after which one without outliers has come with the given confidence."""
-    bad = 1.0 - share * share * share
-    if bad <= 0.0:
-        return 1
-    if bad >= 1.0:
-        return most
-    return min(most, int(np.log(1.0 - confidence) / np.log(bad)) + 1)
-
-
-@njit
-def _three(state: U64, n: int, pick: I64) -> None:
-    pick[0] = draw(state, n)
-    pick[1] = draw(state, n - 1)
-    if pick[1] >= pick[0]:
-        pick[1] += 1
-    pick[2] = draw(state, n - 2)
-    if pick[2] >= min(pick[0], pick[1]):
-        pick[2] += 1
-    if pick[2] >= max(pick[0], pick[1]):
-        pick[2] += 1
 
 
 @njit
@@ -266,7 +213,7 @@ def p3p_ransac(
     count, needed, k = 0, most_draws, 0
     while k < needed:
         k += 1
-        _three(state, n, pick)
+        three(state, n, pick)
         for i in range(3):
             x, y = (uv[pick[i], 0] - camera[2]) / camera[0], (uv[pick[i], 1] - camera[3]) / camera[1]
             norm = np.sqrt(x * x + y * y + 1.0)
@@ -274,190 +221,12 @@ def p3p_ransac(
             for j in range(3):
                 corner[i, j] = point[pick[i], j]
         for s in range(p3p(ray, corner, found)):
-            cost = _reprojection_cost(found[s], point, uv, limit_px, camera, least)
+            cost = reprojection_cost(found[s], point, uv, limit_px, camera, least)
             if cost < least:
                 least = cost
                 T_c_m[:] = found[s]
                 count = _mark_inliers(T_c_m, point, uv, limit_px, camera, inlier)
-                needed = _draws_needed(count / n, confidence, most_draws)
+                needed = draws_needed(count / n, confidence, most_draws)
     if count == 0:
         inlier[:] = False
-    return count
-
-
-@njit
-def align_points(a: F64, b: F64, chosen: Bools, with_scale: bool, S_a_b: F64) -> bool:
-    """Least-squares similarity a = S_a_b b over the chosen rows (B. Horn, 1987; scale symmetric in a and b).
-
-    a, b: (n,3). S_a_b: (4,4) out, its upper left part scale times rotation. False when the points leave it open.
-    """
-    n = 0
-    mean_a, mean_b = np.zeros(3), np.zeros(3)
-    for i in range(a.shape[0]):
-        if chosen[i]:
-            n += 1
-            for k in range(3):
-                mean_a[k] += a[i, k]
-                mean_b[k] += b[i, k]
-    if n < 3:
-        return False
-    mean_a /= n
-    mean_b /= n
-    m = np.zeros((3, 3))
-    spread_a, spread_b = 0.0, 0.0
-    for i in range(a.shape[0]):
-        if chosen[i]:
-            for k in range(3):
-                spread_a += (a[i, k] - mean_a[k]) ** 2
-                spread_b += (b[i, k] - mean_b[k]) ** 2
-                for j in range(3):
-                    m[k, j] += (b[i, k] - mean_b[k]) * (a[i, j] - mean_a[j])
-    if spread_a < 1e-18 or spread_b < 1e-18:
-        return False
-    h = np.empty((4, 4))
-    h[0, 0] = m[0, 0] + m[1, 1] + m[2, 2]
-    h[1, 1] = m[0, 0] - m[1, 1] - m[2, 2]
-    h[2, 2] = -m[0, 0] + m[1, 1] - m[2, 2]
-    h[3, 3] = -m[0, 0] - m[1, 1] + m[2, 2]
-    h[0, 1], h[0, 2], h[0, 3] = m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0]
-    h[1, 2], h[1, 3], h[2, 3] = m[0, 1] + m[1, 0], m[2, 0] + m[0, 2], m[1, 2] + m[2, 1]
-    for i in range(4):
-        for j in range(i):
-            h[i, j] = h[j, i]
-    q = np.empty(4)
-    if not _largest_eigenvector(h, q):
-        return False
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    scale = np.sqrt(spread_a / spread_b) if with_scale else 1.0
-    S_a_b[0, 0], S_a_b[0, 1], S_a_b[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    S_a_b[1, 0], S_a_b[1, 1], S_a_b[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    S_a_b[2, 0], S_a_b[2, 1], S_a_b[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    for i in range(3):
-        S_a_b[i, 3] = mean_a[i]
-        S_a_b[3, i] = 0.0
-        for j in range(3):
-            S_a_b[i, j] *= scale
-            S_a_b[i, 3] -= S_a_b[i, j] * mean_b[j]
-    S_a_b[3, 3] = 1.0
-    return True
-
-
-@njit
-def _largest_eigenvector(h: F64, q: F64) -> bool:
-    """Unit eigenvector of the largest eigenvalue of a symmetric (4,4), by Jacobi rotations. False when two tie."""
-    v = np.eye(4)
-    scale = 0.0
-    for i in range(4):
-        for j in range(4):
-            scale += h[i, j] * h[i, j]
-    for _ in range(12):
-        off = 0.0
-        for i in range(4):
-            for j in range(i):
-                off += h[i, j] * h[i, j]
-        if off <= 1e-30 * scale:
-            break
-        for i in range(3):
-            for j in range(i + 1, 4):
-                if abs(h[i, j]) < 1e-300:
-                    continue
-                theta = 0.5 * (h[j, j] - h[i, i]) / h[i, j]
-                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                if theta < 0.0:
-                    t = -t
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c
-                for k in range(4):
-                    x, y = h[k, i], h[k, j]
-                    h[k, i], h[k, j] = c * x - s * y, s * x + c * y
-                for k in range(4):
-                    x, y = h[i, k], h[j, k]
-                    h[i, k], h[j, k] = c * x - s * y, s * x + c * y
-                    x, y = v[k, i], v[k, j]
-                    v[k, i], v[k, j] = c * x - s * y, s * x + c * y
-    best = 0
-    for i in range(1, 4):
-        if h[i, i] > h[best, best]:
-            best = i
-    for i in range(4):
-        if i != best and h[best, best] - h[i, i] <= 1e-9 * np.sqrt(scale):
-            return False
-    for k in range(4):
-        q[k] = v[k, best]
-    return True
-
-
-@njit
-def _invert(S: F64, out: F64) -> None:
-    """Inverse of a similarity (4,4)."""
-    scale2 = S[0, 0] * S[0, 0] + S[1, 0] * S[1, 0] + S[2, 0] * S[2, 0]
-    for i in range(3):
-        out[i, 3] = 0.0
-        out[3, i] = 0.0
-        for j in range(3):
-            out[i, j] = S[j, i] / scale2
-            out[i, 3] -= S[j, i] * S[j, 3] / scale2
-    out[3, 3] = 1.0
-
-
-@njit
-def align_ransac(
-    a: F64, uv_a: F64, limit_a_px: F64, camera_a: F64, b: F64, uv_b: F64, limit_b_px: F64, camera_b: F64,
-    with_scale: bool, most_draws: int, confidence: float, state: U64, S_a_b: F64, inlier: Bools,
-) -> int:  # fmt: skip
-    """The similarity between two views' points that most pairs support, in both images.
-
-    a, b: (n,3) m in either camera, n >= 3. uv_*: (n,2) px at which each is seen there. limit_*_px: (n,). camera_*: fx,
-    fy, cx, cy. state: (1,) uint64 seed, in and out. S_a_b: (4,4) out. inlier: (n,) out: the pair reprojects within the
-    limits both ways. Returns how many inliers, 0 for none.
-    """
-    n = a.shape[0]
-    pick = np.empty(3, np.int64)
-    three_a, three_b, all3 = np.empty((3, 3)), np.empty((3, 3)), np.ones(3, np.bool_)
-    S, back = np.empty((4, 4)), np.empty((4, 4))
-    mine = np.empty(n, np.bool_)
-    count, needed, k = 0, most_draws, 0
-    while k < needed:
-        k += 1
-        _three(state, n, pick)
-        for i in range(3):
-            for j in range(3):
-                three_a[i, j], three_b[i, j] = a[pick[i], j], b[pick[i], j]
-        if not align_points(three_a, three_b, all3, with_scale, S):
-            continue
-        _invert(S, back)
-        support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, mine)
-        if support <= count:
-            continue
-        # Every new best is fitted to its support, as long as that grows it.
-        while support > count:
-            count = support
-            S_a_b[:] = S
-            inlier[:] = mine
-            if not align_points(a, b, inlier, with_scale, S):
-                break
-            _invert(S, back)
-            support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, mine)
-        if support == count:
-            S_a_b[:] = S
-            inlier[:] = mine
-        needed = _draws_needed(count / n, confidence, most_draws)
-    if count == 0:
-        inlier[:] = False
-    return count
-
-
-@njit
-def _mark_pairs(
-    S: F64, back: F64, a: F64, uv_a: F64, limit_a: F64, camera_a: F64, b: F64, uv_b: F64, limit_b: F64, camera_b: F64,
-    inlier: Bools,
-) -> int:  # fmt: skip
-    count = 0
-    for i in range(a.shape[0]):
-        one = slice(i, i + 1)
-        inlier[i] = (
-            _reprojection_cost(S, b[one], uv_a[one], limit_a[one], camera_a, 2.0) < 1.0
-            and _reprojection_cost(back, a[one], uv_b[one], limit_b[one], camera_b, 2.0) < 1.0
-        )
-        count += inlier[i]
     return count

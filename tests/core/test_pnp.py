@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_core import pnp, pnp_kernels, se3
+from kiteline_core import pnp, pnp_kernels, ransac_kernels, se3
 
 CAMERA = np.array([450.0, 455.0, 370.0, 245.0, 50.0])
 
@@ -77,7 +77,7 @@ def test_the_same_seed_gives_the_same_bits_and_draws_end_early() -> None:
     T, inlier = np.eye(4), np.zeros(50, np.bool_)
     pnp_kernels.p3p_ransac(points, uv, np.full(50, 3.0), CAMERA, 1000, 0.99, state, T, inlier)
     for _ in range(12):  # fewer than four triples were drawn: all points are inliers of the first pose
-        pnp_kernels.draw(again, 50)
+        ransac_kernels.draw(again, 50)
         if again[0] == state[0]:
             return
     pytest.fail("draws went on although all points agreed")
