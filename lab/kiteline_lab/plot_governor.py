@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,8 @@ def plot_governor(path: Path, flights: Sequence[Governed], title: str) -> None:
         axes.grid(True, alpha=0.3)
     error.axhline(1000.0 * free.ate_m, color="0.5", linewidth=1.0, label="no limit")
     error.set_yscale("log")
-    error.margins(y=0.1)
+    errors_mm = [1000.0 * flight.ate_m for flight in flights if math.isfinite(flight.ate_m)] or [1.0]
+    error.set_ylim(min(errors_mm) / 1.6, max(errors_mm) * 1.6)
     given.set_ylim(0.0, 105.0)
     dearest.axhline(100.0, color="0.5", linewidth=1.0)
     dearest.set_ylim(0.0, max(110.0, 1.1 * dearest.get_ylim()[1]))
