@@ -255,7 +255,7 @@ class _Supervisor:
                 return  # an earlier base
             self._base_up = False
             wanted = self._wanted
-            if self._awaited:
+            if self._awaited and code != 0:
                 self._restart_base()
         else:
             self._flying.discard(event.child)
