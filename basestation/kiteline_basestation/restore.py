@@ -9,6 +9,7 @@ from kiteline_basestation.kept import Kept
 from kiteline_basestation.station import Station
 from kiteline_basestation.supply import is_copy
 from kiteline_codec import messages
+from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError
 
 
@@ -37,7 +38,9 @@ def restore(station: Station, kept: Kept, now_ns: int) -> Restored:
 def _restore(station: Station, checked: Checked, now_ns: int) -> Restored:
     mapper = station.mapper
     for agent, codes in sorted(checked.kept.agents.items()):
-        station.join(agent)
+        channel = station.join(agent)
+        if isinstance(channel, CodedChannel):
+            channel.endpoint.remember(codes.received)  # so that its agent need not send it again
         received = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
         mapper.restore(agent, received, (), now_ns)
     for agent, codes in sorted(checked.kept.agents.items()):  # what is ours may tell of points of several agents

@@ -7,8 +7,11 @@ newest version. Nothing is queued, so nothing grows old in a queue. Packets are 
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Mapping
 from dataclasses import replace
 
+from kiteline_codec import remembered
 from kiteline_codec.archive import Spill
 from kiteline_codec.budget import SlidingBudget
 from kiteline_codec.entries import Order
@@ -64,6 +67,7 @@ class Endpoint:
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self._peer = 0
         self._legacy: dict[Key, bytes] = {}
+        self._remembered: dict[Key, int] = {}  # what the peer says to know of earlier sessions of ours
         self._peer_verified = -1  # our version that the peer found equal
         self._verified = -1  # the peer's version that we found equal
         self._resync = -1  # the peer's version that we found different
@@ -105,11 +109,11 @@ class Endpoint:
 
     def own_values(self) -> dict[Key, bytes]:
         """What this side shares, by key; a copy."""
-        return self._out.codes()
+        return {key: code for key, code in self._out.codes().items() if key.kind != remembered.KIND}
 
     def peer_values(self) -> dict[Key, bytes]:
         """What the peer's session wrote, by key; a copy."""
-        return {key: code for key, (_, code) in self._in.values.items()}
+        return {key: code for key, (_, code) in self._in.values.items() if key.kind != remembered.KIND}
 
     def own_value(self, key: Key) -> bytes | None:
         """The code of a value that this side shares; None where there is none."""
@@ -124,6 +128,10 @@ class Endpoint:
     def legacy_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
         return dict(self._legacy)
+
+    def remember(self, values: Mapping[Key, bytes]) -> None:
+        """What the peer wrote in earlier sessions, as it was kept somewhere: it need not send that again."""
+        self._legacy.update(values)
 
     def forget_legacy(self) -> None:
         """Drop the values of earlier sessions of the peer."""
@@ -215,6 +223,9 @@ class Endpoint:
                 if update is not None:
                     if update.key.kind in BASIS_KINDS:
                         self._out.basis_changed()
+                    if update.key.kind == remembered.KIND:
+                        self._hear(update)
+                        continue
                     self._legacy.pop(update.key, None)
                     updates.append(update)
         self._compare(header, now_ns)
@@ -223,6 +234,9 @@ class Endpoint:
     def _shrink(self, key: Key, code: bytes, known: Known) -> bytes | None:
         """A shorter form of a value of ours: the peer holds what it wrote itself, and what of ours is known to it."""
         assert self._tightener is not None
+        form = remembered.form_of(key, code, self._remembered)
+        if form is not None:
+            return form
         return self._tightener.shrink(key, code, lambda k: self._in.values.get(k) or known(k), self._out.held)
 
     def _grown(self, items: list[Item]) -> list[Item]:
@@ -238,13 +252,23 @@ class Endpoint:
             return along.get(key) or self._in.values.get(key) or self._out.held(key)
 
         for item in items:
-            if item.tight:
+            if item.tight and len(item.data) == remembered.FORM_BYTES:
+                before = self._legacy.get(item.key) or (held(item.key) or (0, None))[1]
+                code = remembered.code_of(item.data, before)
+                item = replace(item, data=code, total=len(code), tight=False)
+            elif item.tight:
                 code = self._tightener.grow(item.key, item.data, held)
                 item = replace(item, data=code, total=len(code), tight=False)
             if item.whole:
                 along[item.key] = item.version, item.data
             grown.append(item)
         return grown
+
+    def _hear(self, update: Update) -> None:
+        """The peer tells what it remembers."""
+        with contextlib.suppress(WireError):  # words that cannot be read say nothing
+            self._remembered.update(remembered.heard(update.code or b""))
+            self._out.basis_changed()
 
     def _refuse(self, reason: str) -> list[Update]:
         self._reasons[reason] = self._reasons.get(reason, 0) + 1
@@ -257,7 +281,11 @@ class Endpoint:
         self._peer = session
         self._legacy.update(self.peer_values())
         self._in = Inbox()
+        self._remembered.clear()
         self._out.restart()
+        if self._tightener is not None:
+            for key, code in remembered.told(self._legacy, session).items():
+                self._out.put(key, code, self.config.order(key))
         self._peer_verified = self._verified = self._resync = -1
         self._reset = None
         self._digest_sent = (-1, 0)

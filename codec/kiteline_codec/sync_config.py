@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from kiteline_codec.entries import Order
 from kiteline_codec.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
+from kiteline_codec.remembered import KIND as REMEMBERED
 from kiteline_codec.schema import Key, Kind
 
 _RANKS = {
@@ -35,6 +36,8 @@ MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
 
 def default_order(key: Key) -> Order:
     """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
+    if key.kind == REMEMBERED:
+        return (0, 0, key.part)  # it saves more than it costs
     rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
     if key.part >= (_FIRST_PARTS if key.kind == Kind.BIRTHS else 1):
         rank = max(rank, _RANK_OTHER_PARTS)

@@ -1,0 +1,115 @@
+"""After a restart what the other side still knows goes as a checksum, not as a code."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_codec import remembered
+from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_codec.tight import Tightener
+from kiteline_core.ids import keyframe_id, submap_id
+
+STEP_NS = 25_000_000
+keys = st.builds(Key, st.integers(7, 62), st.integers(0, 2**61), st.integers(0, 65535))
+
+
+def values(boot: int, seed: int = 0) -> dict[Key, bytes]:
+    """What an agent says of 30 keyframes."""
+    random = np.random.default_rng(seed)
+    submap = submap_id(1, boot, 0)
+    ids = [keyframe_id(submap, i) for i in range(30)]
+    return {Key(Kind.BIRTHS, k, part): random.bytes(400) for k in ids for part in range(3)}
+
+
+def talk(a: Endpoint, b: Endpoint, begin_ns: int, steps: int = 60, lose: float = 0.0, seed: int = 0) -> int:
+    """Let two ends talk. Returns the bytes that a sent."""
+    random = np.random.default_rng(seed)
+    sent = 0
+    for n in range(steps):
+        now_ns = begin_ns + n * STEP_NS
+        for one, other in ((a, b), (b, a)):
+            while (packet := one.poll(now_ns)) is not None:
+                sent += len(packet) if one is a else 0
+                if random.random() >= lose:
+                    other.receive(packet, now_ns)
+    return sent
+
+
+def end(session: int) -> Endpoint:
+    return Endpoint(SyncConfig(budget_bytes=8000), session, tightener=Tightener())
+
+
+@pytest.mark.parametrize("lose", [0.0, 0.3])
+def test_a_base_that_kept_everything_is_sent_checksums(lose: float) -> None:
+    agent, base = end(5), end(1)
+    mine = values(boot=4)
+    for key, code in mine.items():
+        agent.put(key, code)
+    first = talk(agent, base, 0, 400, lose)
+    assert base.peer_values() == mine
+    second = end(2)
+    second.remember(mine)
+    again = talk(agent, second, 400 * STEP_NS, 400, lose, seed=1)
+    assert second.peer_values() == mine
+    assert agent.digest_equal and second.digest_equal
+    assert second.stats.mismatches == agent.stats.mismatches == 0
+    assert again < (0.2 if lose == 0.0 else 0.9) * first
+
+
+def test_only_what_is_missing_or_new_goes_whole() -> None:
+    agent, mine = end(5), values(boot=4)
+    for key, code in mine.items():
+        agent.put(key, code)
+    base = end(2)
+    held = dict(list(mine.items())[:60])
+    changed = next(iter(held))
+    base.remember({**held, changed: b"something else that was said before"})
+    talk(agent, base, 0, 200)
+    assert base.peer_values() == mine
+    assert agent.digest_equal and base.digest_equal
+
+
+def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> None:
+    agent, base, again = end(5), end(1), end(2)
+    own = {Key(Kind.DEPTHS, keyframe_id(submap_id(1, 4, 0), i)): bytes([i]) * 300 for i in range(40)}
+    for side in (base, again):
+        for key, code in own.items():
+            side.put(key, code)
+    first = talk(base, agent, 0, 200)
+    second = talk(again, agent, 200 * STEP_NS, 200)
+    assert agent.peer_values() == own
+    assert second < 0.3 * first
+    assert again.digest_equal
+
+
+def test_another_boot_is_told_nothing() -> None:
+    old = values(boot=4)
+    assert remembered.told(old, 5) and not remembered.told(old, 6)
+
+
+@given(st.dictionaries(keys, st.binary(min_size=16, max_size=40), max_size=150))
+def test_what_is_told_is_heard(known: dict[Key, bytes]) -> None:
+    told = remembered.told(known, 1)
+    heard: dict[Key, int] = {}
+    for code in told.values():
+        heard.update(remembered.heard(code))
+    assert heard.keys() == known.keys()
+    for key, code in known.items():
+        form = remembered.form_of(key, code, heard)
+        assert form is not None
+        assert remembered.code_of(form, code) == code
+        assert remembered.form_of(key, code + b"!", heard) is None
+        with pytest.raises(WireError):
+            remembered.code_of(form, code + b"!")
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_heard_or_refused(noise: bytes) -> None:
+    with contextlib.suppress(WireError):
+        remembered.heard(noise)
