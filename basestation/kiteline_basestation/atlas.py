@@ -187,7 +187,7 @@ class Atlas:
         return False
 
     def memory(self) -> Memory:
-        """What a successor needs to go on from here; pose graphs under way are due again."""
+        """What a successor needs to go on from here; corrections under way are due again."""
         sparse_map = self._map
         out = {f"edge/{i:06d}": votes_entry(sparse_map, [v], points=False) for i, v in enumerate(self._edges)}
         out |= {f"fresh/{s}": votes_entry(sparse_map, votes, points=True) for s, votes in sorted(self._fresh.items())}
@@ -200,6 +200,7 @@ class Atlas:
                 "undone": self.undone,
                 "returned": [[int(s), at] for s, at in self._returned.items()],
                 "graphs": sorted({int(s) for s in self._graph_due | set(self._graphs.values())}),
+                "fulls": sorted({int(s) for s in self._full_due | {full[0] for full in self._fulls.values()}}),
                 "revisit": [int(k) for k in self._revisit],
             }
         )
@@ -233,9 +234,8 @@ class Atlas:
             self.loops, self.undone = value["loops"], value["undone"]
             self._returned = {SubmapId(s): at for s, at in value["returned"]}
             self._graph_due = {SubmapId(s) for s in value["graphs"] if s in sparse_map.submaps}
+            self._full_due = {SubmapId(s) for s in value["fulls"] if s in sparse_map.submaps}
             self._revisit = [KeyframeId(k) for k in value["revisit"] if k in sparse_map]
-        # What the forerunner had under way is lost, and with it bundles that nobody knows to be missing.
-        self._full_due |= {sparse_map.island_of(s) for s in sparse_map.submaps}
 
     # -- findings ----------------------------------------------------------------------------------------------------
 

@@ -158,6 +158,7 @@ class Mapper:
                 "stale": [[int(s), sorted({int(k) for k in waiting})] for s, waiting in sorted(stale.items())],
                 "unused": [int(k) for k in self._intake.unused],
                 "calibrate_at": self._calibrate_at,
+                "carried": [[int(s), matrix(T)] for s, T in self._carried.items()],
                 "deleted": sorted(int(s) for s in self.deleted),
             }
         )
@@ -199,6 +200,7 @@ class Mapper:
                     self._stale[SubmapId(submap)] = here
             unused = {KeyframeId(k) for k in value["unused"]}
             self._calibrate_at = value["calibrate_at"]
+            self._carried = {SubmapId(s): pose_of(T) for s, T in value["carried"]}
             self._intake.deleted = {SubmapId(s) for s in value["deleted"]}
         self._intake.keep_unused(unused)
         self._grid_due = len(self.map)  # the grid is made anew

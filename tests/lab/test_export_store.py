@@ -95,7 +95,15 @@ def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.Ca
     memory = {
         f"submap/{submap_id(0, 1, 0)}": json.dumps({**placed_at, "last": None, "tracked_ns": None}),
         "base": json.dumps(
-            {"counts": {}, "placed": [submap_id(0, 1, 0)], "stale": [], "unused": [], "calibrate_at": 0, "deleted": []}
+            {
+                "counts": {},
+                "placed": [submap_id(0, 1, 0)],
+                "stale": [],
+                "unused": [],
+                "calibrate_at": 0,
+                "carried": [],
+                "deleted": [],
+            }
         ),
     }
     store = Store(tmp_path)
