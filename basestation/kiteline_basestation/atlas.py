@@ -178,7 +178,8 @@ class Atlas:
         if isinstance(done.result, BundleResult) and done.id in self._fulls:
             island, part, agents = self._fulls.pop(done.id)
             result = without_links(part, done.result)
-            if agents and not disparity.stands_out(self._map, agents, result, self._config.disparity):
+            if agents and not disparity.stands_out(result, self._config.disparity):
+                disparity.forget(self._map, agents)
                 self._plain.add(island)  # nothing is known to be off: the same again, with disparities as they are
                 self._full_due.add(island)
             elif self._settle(island, part, result):

@@ -63,12 +63,15 @@ def with_border(
     return replace(problem, measured=measured, border=border), agents
 
 
-def stands_out(
-    sparse_map: SparseMap, agents: tuple[AgentId, ...], result: BundleResult, config: DisparityConfig
-) -> bool:  # fmt: skip
-    """Whether what a bundle found is more than chance for one of the agents, or was so before."""
-    if any(agent in sparse_map.disparity_offset_px for agent in agents):
-        return True
+def forget(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:
+    """Nothing is known to be off."""
+    for agent in agents:
+        if agent in sparse_map.disparity_offset_px:
+            sparse_map.disparity_offset_px[agent] = none()
+
+
+def stands_out(result: BundleResult, config: DisparityConfig) -> bool:
+    """Whether what a bundle found is more than chance for one of the agents."""
     for g, offset in enumerate(result.offset):
         cov = config.inflation**2 * result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > config.stands_out**2 * TERMS:

@@ -363,9 +363,9 @@ class Mapper:
 
     def _calibrate(self) -> None:
         """Now and then, bundle whole maps, in which the offsets of disparities show."""
-        if self.atlas is None or self.counts.keyframes < self._calibrate_at:
+        if self.atlas is None or self.counts.keyframes == 0 or len(self.map) < self._calibrate_at:
             return
-        self._calibrate_at = round(self._calibrate_at * self.config.disparity.growth)
+        self._calibrate_at = round(len(self.map) * self.config.disparity.growth)
         for island in sorted({self.map.island_of(s) for s in self.map.submaps}):
             if self.atlas.fits(island) and not self.atlas.busy_with(island):
                 self.atlas.bundle_all(island)
