@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,10 +10,11 @@ from kiteline_agent.certainty import Certainty
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.depth_from_motion import DepthFromMotion
+from kiteline_agent.from_base import FromBase
 from kiteline_agent.frozen import FrozenEye
 from kiteline_agent.glimpse import Glimpse
 from kiteline_agent.governor import FULL, Extra, Governor, governed
-from kiteline_agent.inertial_tracker import InertialTracker
+from kiteline_agent.inertia import Inertia
 from kiteline_agent.keyframe_maker import KeyframeMaker
 from kiteline_agent.levelling import Levelling
 from kiteline_agent.local_map import LocalMap
@@ -25,31 +24,14 @@ from kiteline_agent.pose_state import PoseState
 from kiteline_agent.recovery import Recovered, Recovery
 from kiteline_agent.reference import Reference
 from kiteline_agent.right_eye import RightEye, rectified
-from kiteline_agent.smoothing import Smoothing
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.submaps import Submaps
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_agent.window import Window, corners_of, with_depths
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import (
-    Calibration,
-    Camera,
-    Copied,
-    Copy,
-    Culled,
-    Depths,
-    Found,
-    Kind,
-    Live,
-    Placement,
-    Pose,
-    Record,
-    Removed,
-    Tile,
-)
+from kiteline_codec.schema import Camera, Live, Record, Tile
 from kiteline_core import se3
 from kiteline_core.cameras import CameraRig, Rectifier
-from kiteline_core.fixed_lag import VisualPoints
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.ids import (
     NO_KEYFRAME,
@@ -80,18 +62,16 @@ class Agent:
         self._camera = self._rectifier.camera
         self._T_c_b = se3.inverse(self._camera.T_b_c)
         one_eye = rig.right is None and not rig.has_depth
-        self._inertial = (
-            None if imu is None else InertialTracker(self._camera, imu, config.inertial, metric=not one_eye)
-        )
+        self._pose = PoseState()
+        self._inertia = Inertia(self._camera, imu, config.inertial, self._pose, metric=not one_eye)
         self._bridged = False  # the last pose is the IMU's alone
         self._levelling = Levelling(
-            self._camera, self._inertial, config.inertial.askew_rad, config.inertial.level_patience_s
+            self._camera, self._inertia.tracker, config.inertial.askew_rad, config.inertial.level_patience_s
         )
         self.map = LocalMap(self._camera, config.local_map, config.depth_filter)
         self.work = Work()  # of the last step
         self._tracker = Tracker(self.map, config, self.work)
         self._maker = KeyframeMaker(self.map, self._camera, config, channel, self.work)
-        self._pose = PoseState()
         self._reference = Reference(self.map, self._camera, self._maker)
         self._submaps = Submaps(identity, self.map, self._pose, self._reference, self._maker)
         self._certainty = Certainty(
@@ -105,7 +85,7 @@ class Agent:
         self._mono = MonoStart(self._camera, config) if one_eye else None
         self._glimpse = Glimpse(self._camera)
         self.window = Window(self._camera, config.window, config.matching, config.ransac, words)
-        self._smoothing = Smoothing(config.smoothing)
+        self._base = FromBase(self.map, self.window, config.smoothing)
         self._recovery = Recovery(self.map, self._tracker, config, words, self.window, self._believes)
         self._frozen = FrozenEye(self._camera)
         self._events: list[str] = []
@@ -114,8 +94,6 @@ class Agent:
         self._failures = 0  # tries since the old map was lost that had texture in view
         self._lost = False  # the last frame had no pose
         self._predicted: F64 = np.eye(4)  # T_m_c of this frame
-        self._placements: dict[SubmapId, F64] = {}
-        self.tiles: dict[tuple[int, int], Tile] = {}
         channel.put(Camera(identity.agent, self._camera))
 
     # one step
@@ -124,11 +102,6 @@ class Agent:
         """Take in what arrived, track the frame if there is one, say what is to be sent. Never waits."""
         self._events = []
         self._take_corrections(self._channel.receive(step_input.packets, now_ns))
-        removed = self._channel.take_removed()
-        self.window.take_back(removed)
-        for key in removed:
-            if key.kind == Kind.PLACEMENT:  # the map was taken out of a larger one, and has no place any more
-                self._placements.pop(SubmapId(key.id), None)
         estimate = None
         self.work.clear()
         self.work.steps = 1
@@ -143,8 +116,8 @@ class Agent:
         view = self._view(frame)
         # 2. Predict from the IMU or from the last motion.
         dt_s = 0.0 if self._last_t_ns is None else (frame.t_ns - self._last_t_ns) * 1e-9
-        predicted = self._predicted = self._predict(frame.t_ns, imu, dt_s)
-        self._certainty.guide(self._inertial is not None and self._inertial.running)
+        predicted = self._predicted = self._inertia.predict(frame.t_ns, imu, dt_s)
+        self._certainty.guide(self._inertia.running)
         # 3. Track against the local map, or begin a map.
         self._frame_number += 1
         track = None
@@ -174,7 +147,7 @@ class Agent:
             found = track is not None or (not frozen and self._begin_submap(view, frame.t_ns, imu))
             if found:
                 self._bridged = False
-                self._restart_inertial(frame.t_ns)
+                self._inertia.restart(frame.t_ns)
             tracked = found or self._bridged
         inliers = track.inliers if track is not None else 0
         self._lost = not tracked or self._bridged
@@ -187,8 +160,7 @@ class Agent:
         """Whether the frame is tracked, at the effort on which the governor decides; its samples are kept anyhow."""
         if step_input.imu is not None:
             self._held_imu.append(step_input.imu)
-        carried = self._inertial is not None and self._inertial.running
-        decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=self._failures > 0, carried=carried)
+        decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=self._failures > 0, carried=self._inertia.running)
         self._events.extend(decision.events)
         if decision.effort != self._effort:
             self._effort, points = decision.effort, self._config.align.points
@@ -233,39 +205,27 @@ class Agent:
     def _holds(self, track: Track) -> bool:
         return track.inliers >= max(self._config.pose.min_inliers, self._config.pose.min_share * track.tried)
 
-    # motion model
-
-    def _predict(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
-        """T_m_c of this frame: by the IMU where there is one that knows, else by constant velocity."""
-        known = None if self._inertial is None else self._inertial.predict(imu, t_ns)
-        if known is not None:
-            return se3.orthonormalise(known.T_m_b @ self._camera.T_b_c)
-        return self._pose.predict(dt_s)
+    # motion
 
     def _fuse(self, track: Track, t_ns: int) -> Track:
         """The track with the pose that images and IMU together give."""
         self._bridged = False
-        if self._inertial is None:
-            return track
-        self.work.fused = 1
-        seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
-        state = self._inertial.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen)
-        self._events += self._inertial.offset_news()
-        if state is None:
-            return track
-        return replace(track, T_c_m=se3.inverse(state.T_m_b @ self._camera.T_b_c))
+        self.work.fused = int(self._inertia.tracker is not None)
+        fused = self._inertia.fuse(track, t_ns)
+        self._events += self._inertia.news()
+        return fused
 
     def _find_scale(self, view: View, track: Track, t_ns: int) -> None:
         """One eye with an IMU: once acceleration tells how long the map's unit is, begin a map in metres."""
         limits = self._config.mono_start
-        if self._inertial is None or self._inertial.metric or self._frame_number % limits.scale_every:
+        if self._frame_number % limits.scale_every or not self._submaps.room:
             return
-        scale = self._inertial.metric_scale()
-        if scale is None or scale[1] > limits.scale_sigma * scale[0] or not self._submaps.room:
+        unit_m = self._inertia.unit_m(limits.scale_sigma)
+        if unit_m is None:
             return
-        born = reborn(view, track, self.map, scale[0], self._config.detector.cell_px)
+        born = reborn(view, track, self.map, unit_m, self._config.detector.cell_px)
         if len(born.sigma_rho) >= self._config.local_map.first_points:
-            self._begin_in_metres(view, t_ns, scale[0], born)
+            self._begin_in_metres(view, t_ns, unit_m, born)
 
     def _land(self, guessed_T_m_c: F64, track: Track) -> None:
         """Tracked again after a loss: what the guess was off by is the map's, the odometry frame stays continuous."""
@@ -275,17 +235,11 @@ class Agent:
 
     def _coast(self, predicted: F64, t_ns: int, dt_s: float) -> bool:
         """A frame that the images do not place. Returns whether the IMU alone still carries a pose to be trusted."""
-        state = None if self._inertial is None else self._inertial.coast(t_ns)
-        self._pose.T_m_c = predicted if state is None else state.T_m_b @ self._camera.T_b_c
+        coasted = self._inertia.coast(predicted, t_ns)
+        self._pose.T_m_c = coasted.T_m_c
         self._reference.refresh(self._pose.T_m_c)
-        self._certainty.blind(dt_s, None if state is None else state.pose_cov)
-        blind_s = 0.0 if self._inertial is None else self._inertial.blind_s
-        return state is not None and blind_s <= self._config.inertial.trusted_blind_s
-
-    def _restart_inertial(self, t_ns: int) -> None:
-        """The pose was found again, or a new map began: the inertial state moves there."""
-        if self._inertial is not None:
-            self._inertial.begin_map(t_ns, self._pose.T_m_c @ self._T_c_b)
+        self._certainty.blind(dt_s, coasted.cov)
+        return coasted.trusted
 
     def _look_up(self, t_ns: int) -> None:
         """See which way is up; where the first submap lies askew, because it began in motion, the base is told."""
@@ -295,8 +249,7 @@ class Agent:
         )
         if level is not None:
             self._channel.put(level)
-            # Until the base says where it lies: there too the first map is upright, and a thin link takes seconds.
-            self._placements.setdefault(level.submap, level.T_l_m)
+            self._base.set_upright(level)
             self._events.append(f"submap lies {np.degrees(self._levelling.askew_rad):.1f} degrees askew")
 
     def _accept(self, track: Track, dt_s: float) -> None:
@@ -350,8 +303,7 @@ class Agent:
         """The camera is at T_m_c (4,4) in the submap, and moved in no other frame."""
         before = self._pose.T_m_c
         self._pose.move_map(T_m_c)
-        if self._inertial is not None:
-            self._inertial.shift_map(se3.orthonormalise(self._pose.T_m_c @ se3.inverse(before)))
+        self._inertia.shift(se3.orthonormalise(self._pose.T_m_c @ se3.inverse(before)))
         self._reference.refresh(self._pose.T_m_c)
 
     def _note_keyframe(self, view: View, extra: Extra) -> None:
@@ -401,9 +353,7 @@ class Agent:
     def _open_from_two_views(self, view: View, t_ns: int, opening: Opening) -> bool:
         """The first two keyframes of one eye's map."""
         self._events.append(f"mono: scale by convention, median depth {opening.median_depth_m:.3g} m")
-        if self._inertial is not None:
-            self._inertial.reset()
-            self._inertial.metric = False
+        self._inertia.forget_unit()
         self._certainty.begin(self._pose.T_m_c @ self._T_c_b)
         T_m_a = self._submaps.open_from_two_views(self._frame_number, opening, self._config.align.sigma_px)
         self._note_keyframe(view, Extra.SUBMAP)
@@ -419,14 +369,13 @@ class Agent:
 
     def _begin_in_metres(self, view: View, t_ns: int, unit_m: float, born: Reborn) -> None:
         """Go on in a new submap whose unit is a metre."""
-        assert self._inertial is not None and self._mono is not None
+        assert self._mono is not None
         self._events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
         self._certainty.carry(self._pose, self._T_c_b, self.submap)
         T_n_m = self._submaps.open_in_metres(view, t_ns, self._frame_number, unit_m, born)
         self._certainty.begin(self._pose.T_m_c @ self._T_c_b)
         self._note_keyframe(view, Extra.SUBMAP)
-        self._inertial.rescale(unit_m)
-        self._inertial.shift_map(T_n_m)
+        self._inertia.begin_metres(unit_m, T_n_m)
         self._mono.rescale(unit_m)
 
     # the old map found again
@@ -463,7 +412,7 @@ class Agent:
         if not self._reference.is_of(self._frame_number):
             self._add_keyframe(view, track, t_ns)
         self._return_to(found)
-        self._restart_inertial(t_ns)
+        self._inertia.restart(t_ns)
         self._add_keyframe(view, found.track, t_ns)
 
     def _return_to(self, found: Recovered) -> None:
@@ -484,34 +433,25 @@ class Agent:
         return self._submaps.active
 
     @property
+    def tiles(self) -> dict[tuple[int, int], Tile]:
+        """The grid as the base sent it, by column and row."""
+        return self._base.tiles
+
+    @property
     def metric(self) -> bool:
         """Whether the active submap's lengths are metres; one eye alone measures in a unit of its own."""
-        return self._mono is None or (self._inertial is not None and self._inertial.metric)
+        return self._inertia.metric
 
     def time_offset_report(self) -> dict[str, float] | None:
         """InertialTracker.offset_report; None without an IMU."""
-        return None if self._inertial is None else self._inertial.offset_report()
+        return None if self._inertia.tracker is None else self._inertia.tracker.offset_report()
 
     # what the base sends
 
     def _take_corrections(self, records: list[Record]) -> None:
         """Swap in what the base made of the map; the odometry frame stays still."""
-        touched = False
-        for record in records:
-            if isinstance(record, Pose | Depths | Found | Removed | Culled):
-                touched |= self.map.apply(record)
-            elif isinstance(record, Placement):
-                self._placements[record.submap] = record.T_w_m
-            elif isinstance(record, Copy | Copied):
-                self.window.take(record)
-            elif isinstance(record, Calibration) and self._camera.stereo:
-                self.map.calibrate(record.disparity_px)
-                self._events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
-            elif isinstance(record, Tile):
-                self.tiles[record.column, record.row] = record
-        if not touched:
+        if not self._base.take(records, self._channel.take_removed(), self._events):
             return
-        self.map.settle()
         T_m_k = self._reference.T_m_k
         if T_m_k is not None:
             self._move_map(T_m_k @ self._reference.T_k_c)
@@ -521,25 +461,21 @@ class Agent:
 
     def _estimate(self, t_ns: int, inliers: int, *, tracked: bool) -> Estimate:
         T_m_b = self._pose.T_m_c @ self._T_c_b
-        T_w_m = self._placements.get(self.submap)
         cov_m, cov_o = self._certainty.of_poses(self._pose, T_m_b)
         quality = self._certainty.quality(cov_m if tracked else cov_o, inliers or None)
-        carried = self._submaps.any and self._inertial is not None and self._inertial.running
+        carried = self._submaps.any and self._inertia.running
         if not tracked and (not carried or quality < self._config.certainty.flagged_below):
             quality = -1
         keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c
         if keyframe != NO_KEYFRAME:
             self._channel.put(Live(self._identity.agent, t_ns, keyframe, T_k_c, quality))
-        T_o_b = self._pose.T_o_m @ T_m_b
-        T_w_b = None if T_w_m is None else T_w_m @ T_m_b
-        if T_w_m is not None and self._smoothing.on:
-            T_w_b = self._smoothing.follow(T_w_m @ se3.inverse(self._pose.T_o_m), T_o_b[:3, 3], t_ns) @ T_o_b
+        T_w_b = self._base.in_world(self.submap, T_m_b, self._pose.T_o_m, t_ns)
         return Estimate(
             t_ns,
             tracked,
             self._bridged,
             T_m_b if tracked else None,
-            T_o_b,
+            self._pose.T_o_m @ T_m_b,
             keyframe,
             T_k_c.copy(),
             self.submap,

@@ -7,6 +7,7 @@ copy's depth, and which moves a little towards where the copies say that it is. 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -129,7 +130,7 @@ class Window:
         self._parts[slot][record.part] = record
         self._fill(slot)
 
-    def take_back(self, keys: list[Key]) -> None:
+    def take_back(self, keys: Sequence[Key]) -> None:
         """Copies that the base wants back."""
         for key in keys:
             if key.kind == Kind.COPY:

@@ -1,0 +1,81 @@
+"""What the base says: corrections of the local map, copies, where submaps lie in the world, tiles of the grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from kiteline_agent.config import SmoothingConfig
+from kiteline_agent.local_map import LocalMap
+from kiteline_agent.smoothing import Smoothing
+from kiteline_agent.window import Window
+from kiteline_codec.schema import (
+    Calibration,
+    Copied,
+    Copy,
+    Culled,
+    Depths,
+    Found,
+    Key,
+    Kind,
+    Level,
+    Placement,
+    Pose,
+    Record,
+    Removed,
+    Tile,
+)
+from kiteline_core import se3
+from kiteline_core.ids import SubmapId
+
+F64 = NDArray[float64]
+
+
+class FromBase:
+    """Takes records to where they belong, and knows the world as far as the base told of it."""
+
+    def __init__(self, local_map: LocalMap, window: Window, smoothing: SmoothingConfig) -> None:
+        self._map = local_map
+        self._window = window
+        self._smoothing = Smoothing(smoothing)
+        self._T_w_m: dict[SubmapId, F64] = {}
+        self.tiles: dict[tuple[int, int], Tile] = {}
+
+    def take(self, records: Sequence[Record], removed: Sequence[Key], events: list[str]) -> bool:
+        """Swap in what came, and drop what the base took back. Whether the local map moved."""
+        touched = False
+        for record in records:
+            if isinstance(record, Pose | Depths | Found | Removed | Culled):
+                touched |= self._map.apply(record)
+            elif isinstance(record, Placement):
+                self._T_w_m[record.submap] = record.T_w_m
+            elif isinstance(record, Copy | Copied):
+                self._window.take(record)
+            elif isinstance(record, Calibration) and self._map.camera.stereo:
+                self._map.calibrate(record.disparity_px)
+                events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
+            elif isinstance(record, Tile):
+                self.tiles[record.column, record.row] = record
+        self._window.take_back(removed)
+        for key in removed:
+            if key.kind == Kind.PLACEMENT:  # the map was taken out of a larger one, and has no place any more
+                self._T_w_m.pop(SubmapId(key.id), None)
+        if touched:
+            self._map.settle()
+        return touched
+
+    def set_upright(self, level: Level) -> None:
+        """Where a submap lies until the base says so, who sets it upright too; over a thin link that takes seconds."""
+        self._T_w_m.setdefault(level.submap, level.T_l_m)
+
+    def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int) -> F64 | None:
+        """T_w_b (4,4) as it is told: corrections arrive at once, or slowly. None where the submap has no place yet."""
+        T_w_m = self._T_w_m.get(submap)
+        if T_w_m is None:
+            return None
+        if not self._smoothing.on:
+            return T_w_m @ T_m_b
+        T_o_b = T_o_m @ T_m_b
+        return self._smoothing.follow(T_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns) @ T_o_b
