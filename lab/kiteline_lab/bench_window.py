@@ -140,15 +140,15 @@ class Judged:
         flown, T_true_w = self.flown(sortie), self._world()
         pairs = [
             ((T_true_w @ e.T_w_b)[:3, 3], true[:3, 3])
-            for e, true in zip(flown.estimates[first:], flown.truth[first:], strict=True)
-            if e.tracked and e.T_w_b is not None
+            for e, true, placed in zip(flown.estimates[first:], flown.truth[first:], flown.placed[first:], strict=True)
+            if e.tracked and placed and e.T_w_b is not None
         ]
         return float(np.sqrt(np.mean([np.sum((a - b) ** 2) for a, b in pairs]))) if pairs else float("inf")
 
     def placed_s(self, sortie: int) -> float:
         """From a sortie's first frame until its live pose stands in w for the first time."""
         estimates = self.flown(sortie).estimates
-        known = [e.t_ns for e in estimates if e.T_w_b is not None]
+        known = [e.t_ns for e, placed in zip(estimates, self.flown(sortie).placed, strict=True) if placed]
         return (known[0] - estimates[0].t_ns) * 1e-9 if known else float("inf")
 
     def _world(self) -> F64:

@@ -63,6 +63,7 @@ class Flown:
     events: list[tuple[str, ...]] = field(default_factory=list)
     bytes_up: int = 0
     bytes_down: int = 0
+    placed: list[bool] = field(default_factory=list)  # whether the base had placed the frame's submap by then
     copies: int = 0  # most that the agent held at once
     cpu_ms: list[float] = field(default_factory=list)  # of each frame's step
 
@@ -99,6 +100,8 @@ def fly(
         for crew in crews:
             if not crew.over and crew.begin_ns <= now_ns:
                 up.setdefault(crew.agent, []).extend(crew.tick(down.pop(crew.agent, ()), now_ns))
+                if not crew.over:
+                    crew.flown.placed.append(crew.flown.estimates[-1].submap in station.mapper.placements)
         output = station.step(up, jobs.done(now_ns), now_ns)
         jobs.add(output.jobs, now_ns)
         up, down = {}, dict(output.packets)
