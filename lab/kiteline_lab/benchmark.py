@@ -1,7 +1,8 @@
 """`kiteline bench [NAME…]`: measure the bars that kiteline promises to keep, and write docs/results.md.
 
 A benchmark is a function that takes a Bench and returns its bars; it is entered in BENCHMARKS. The file holds one
-section a benchmark: running one replaces its section and leaves the others.
+section a benchmark: running one replaces its section and leaves the others. A long benchmark has parts, each with a
+section of its own, that can be run alone as NAME/PART.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ BENCHMARKS = {
     "stages": "kiteline_lab.bench_stages",
     "mapper": "kiteline_lab.bench_mapper",
     "window": "kiteline_lab.bench_window",
-}  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`
+}  # name -> module that has `TITLE` and `run(bench) -> list[Bar]`, or `PARTS`, by name, of both
 
 _HEAD = (
     "# Results\n\nMade by `kiteline bench`; each section says which command made it and on which machine. "
@@ -73,6 +74,9 @@ class Bench:
         if not path.exists():
             raise SourceError(f"{path}: not there; set KITELINE_DATA to the folder that holds the recordings")
         return str(path)
+
+
+Run = Callable[[Bench], list[Bar]]
 
 
 def data_folder() -> Path:
@@ -122,6 +126,18 @@ def replace_section(text: str, title: str, new: str) -> str:
     return text.rstrip() + "\n\n" + new
 
 
+def parts(name: str) -> list[tuple[str, str, Run]]:
+    """Name, title and function of each part of NAME, or of the one part of NAME/PART; nothing where there is none."""
+    whole, _, part = name.partition("/")
+    if whole not in BENCHMARKS:
+        return []
+    module = importlib.import_module(BENCHMARKS[whole])
+    if not hasattr(module, "PARTS"):
+        return [] if part else [(name, module.TITLE, module.run)]
+    found: dict[str, tuple[str, Run]] = module.PARTS
+    return [(f"{whole}/{key}", title, run) for key, (title, run) in found.items() if part in ("", key)]
+
+
 def main(argv: list[str]) -> int:
     """Run `kiteline bench`; 1 when a bar is not met."""
     p = argparse.ArgumentParser(
@@ -133,21 +149,23 @@ def main(argv: list[str]) -> int:
     p.add_argument("--results", metavar="F", type=Path, default=Path("docs/results.md"), help="default: %(default)s")
     p.add_argument("--keep", metavar="DIR", type=Path, help="keep the flights in this folder")
     a = p.parse_args(argv)
-    for name in a.names:
-        if name not in BENCHMARKS:
+    chosen: list[tuple[str, str, Run]] = []
+    for name in a.names or BENCHMARKS:
+        found = parts(name)
+        if not found:
             p.error(f"no benchmark {name!r}; there are: {', '.join(BENCHMARKS)}")
+        chosen += found
     data = data_folder()
     good = True
-    for name in a.names or BENCHMARKS:
-        module = importlib.import_module(BENCHMARKS[name])
+    for name, title, run in chosen:
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:
             bench = Bench(data, a.keep or Path(scratch), lambda text: print(text, flush=True))
-            bars: list[Bar] = module.run(bench)
-        text = section(name, module.TITLE, bars, bench.more)
+            bars = run(bench)
+        text = section(name, title, bars, bench.more)
         print("\n" + text)
         a.results.parent.mkdir(parents=True, exist_ok=True)
         old = a.results.read_text() if a.results.exists() else ""
-        a.results.write_text(replace_section(old, module.TITLE, text))
+        a.results.write_text(replace_section(old, title, text))
         good = good and all(bar.met for bar in bars)
     print(f"written: {a.results}")
     return 0 if good else 1
