@@ -44,6 +44,7 @@ from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
 from kiteline_hw.key_store import read_keys
 from kiteline_hw.links import open_link
+from kiteline_hw.lockstep_barrier import Barrier
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, PoseSink, SourceError
@@ -52,9 +53,7 @@ from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
 from kiteline_hw.spill_file import SpillFile
 from kiteline_hw.words import shipped_words
-from kiteline_hw.zenoh_lockstep import LockstepClient
 
-_ANSWER_S = 120.0  # s that the base may take for one tick of a lock-step flight before it counts as gone
 _LINK_NS = 1_000_000_000  # ns between two words of the link in the log
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
@@ -318,42 +317,6 @@ def fly_lockstep(spec: AgentSpec, parent: process.Parent) -> None:
         source.close()
 
 
-class Barrier:
-    """The agent's side of the barrier, that turns a base which has ended into silence."""
-
-    def __init__(self, endpoint: str, agent: int, parent: process.Parent) -> None:
-        self._endpoint, self._agent, self._parent = endpoint, agent, parent
-        self._client: LockstepClient | None = LockstepClient(endpoint, agent)
-        self.times_lost = 0
-
-    @property
-    def lost(self) -> bool:
-        """There was a base, and there is none now."""
-        return self._client is None
-
-    def exchange(self, up: Up) -> Down | None:
-        """The base's answer; None when there is no base."""
-        if self._client is None:
-            return None
-        try:
-            return Down.decode(self._client.exchange(up.encode(), _ANSWER_S))
-        except LinkError as error:
-            self.times_lost += 1
-            self._parent.tell("base_lost", text=str(error))
-            self.close()
-            return None
-
-    def meet_again(self) -> None:
-        """Look for a base where the last one was. Raises LinkError when none comes."""
-        self._client = LockstepClient(self._endpoint, self._agent)
-
-    def close(self) -> None:
-        """Leave the barrier."""
-        if self._client is not None:
-            self._client.close()
-            self._client = None
-
-
 def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopSignal) -> None:
     """Fly on real clocks: frames are paced by their stamps, the newest wins, and the tracker waits for nobody."""
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
@@ -484,17 +447,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run_child(spec: AgentSpec) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
-    parent = process.Parent()
-    try:
+
+    def fly(parent: process.Parent) -> None:
         if spec.link.startswith("lockstep:"):
             process.exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
             fly_lockstep(spec, parent)
         else:
             fly_live(spec, parent, process.StopSignal())
-    except (SourceError, LinkError, ValueError) as error:
-        parent.tell("error", text=str(error))
-        return 2
-    return 0
+
+    return process.run_child(fly, (SourceError, LinkError, ValueError))
 
 
 if __name__ == "__main__":

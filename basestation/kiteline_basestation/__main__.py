@@ -456,17 +456,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run_child(spec: BaseSpec) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
-    parent = process.Parent()
-    try:
+
+    def fly(parent: process.Parent) -> None:
         if spec.link.startswith("lockstep:"):
             process.exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
             fly_lockstep(spec, parent)
         else:
             fly_live(spec, parent, process.StopSignal())
-    except (LinkError, SourceError, StoreError, WireError, ValueError) as error:
-        parent.tell("error", text=str(error))
-        return 2
-    return 0
+
+    return process.run_child(fly, (LinkError, SourceError, StoreError, WireError, ValueError))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -92,6 +93,17 @@ class Parent:
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
             pass  # it is gone: the watch ends us
+
+
+def run_child(work: Callable[[Parent], None], expected: tuple[type[Exception], ...]) -> int:
+    """Do the work of a child process; errors that a user can mend become one word to the parent. The exit status."""
+    parent = Parent()
+    try:
+        work(parent)
+    except expected as error:
+        parent.tell("error", text=str(error))
+        return 2
+    return 0
 
 
 def next_number(path: Path, least: int = 1) -> int:
