@@ -22,6 +22,7 @@ F64 = NDArray[np.float64]
 
 _CUT_OVERLAP = 0.05  # of the uncut flight's frames, that two neighbouring pieces share
 _PIECES = 3
+_HALL_S = 100.0  # of both flights, so that they are rendered in minutes
 _AGENTS, _SECONDS = 20, 120  # of the modelled queue: one keyframe a second each
 
 
@@ -44,8 +45,8 @@ def _recordings(bench: Bench) -> list[Bar]:
 
 
 def _hall(bench: Bench) -> list[Bar]:
-    """MH_01 and MH_03 in one hall: apart, together, one of them cut in three, and one with losses."""
-    both = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"])
+    """The beginnings of MH_01 and MH_03 in one hall: apart, together, one of them cut in three, and one with losses."""
+    both = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
     apart = [_fly(bench, [str(source)], f"hall_{i}") for i, source in enumerate(both)]
     together = _fly(bench, [str(source) for source in both], "hall_together")
     pieces = _cut(bench, both[1])
@@ -116,15 +117,16 @@ def _joint_ate(folder: Path, sources: Sequence[Path]) -> float:
     return float(np.sqrt(np.mean(np.sum((se3.transform(T, a) - b) ** 2, axis=1))))
 
 
-def _recorded(bench: Bench, name: str, scene: str, paths: Sequence[str]) -> list[Path]:
-    """Simulated flights in one world; rendered once, if the folder is kept."""
+def _recorded(bench: Bench, name: str, scene: str, paths: Sequence[str], seconds: float = 0.0) -> list[Path]:
+    """Simulated flights in one world, so many seconds of them (0: all); rendered once, if the folder is kept."""
     out = [bench.folder / (f"{name}-{i}.mcap" if i else f"{name}.mcap") for i in range(len(paths))]
     if not all(path.exists() for path in out):
         bench.say(f"rendering {name}")
         files = [bench.source(f"trajectories/{path}") for path in paths]
+        length = ["--seconds", f"{seconds:g}"] if seconds else []
         also = ["--also", *files[1:]] if files[1:] else []
         bench.folder.mkdir(parents=True, exist_ok=True)
-        simulate.main([scene, "--trajectory", files[0], "--out", str(out[0]), *also])
+        simulate.main([scene, "--trajectory", files[0], "--out", str(out[0]), *length, *also])
     return out
 
 
@@ -279,7 +281,7 @@ def map_bytes_a_keyframe(keyframes: int = 400, keypoints: int = 400) -> float:
 
 PARTS = {
     "recordings": ("The base's mapper", _recordings),
-    "hall": ("The base's mapper: a hall, two agents, losses", _hall),
+    "hall": (f"The base's mapper: a hall, two agents, losses (the first {_HALL_S:g} s of both flights)", _hall),
     "street": ("The base's mapper: a street, a loop", _street),
     "store": ("The base's store", bench_store.run),
 }
