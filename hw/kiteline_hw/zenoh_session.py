@@ -20,12 +20,14 @@ from kiteline_hw.ports import LinkError
 
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
 _RETRY_S = 0.1  # s between two tries to connect
+_ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
 
 Role = Literal["client", "base"]
 
 
 def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
-    """The configuration of a session. endpoint: a Zenoh locator such as tcp/127.0.0.1:7447. Raises LinkError.
+    """The configuration of a session. endpoint: a Zenoh locator such as tcp/127.0.0.1:7447, at which the base listens;
+    or router/ and the locator of a router. Raises LinkError.
 
     A file that the environment variable ZENOH_CONFIG names is the ground on which this one stands: it is the place for
     certificates and access control.
@@ -34,6 +36,8 @@ def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
         config = zenoh.Config.from_env() if os.environ.get("ZENOH_CONFIG") else zenoh.Config()
     except zenoh.ZError as error:
         raise LinkError(f"ZENOH_CONFIG={os.environ['ZENOH_CONFIG']} is no configuration of Zenoh: {error}") from error
+    if endpoint.startswith(_ROUTER):
+        endpoint, role = endpoint.removeprefix(_ROUTER), "client"
     options: dict[str, Any] = {
         "mode": "client" if role == "client" else "peer",
         "connect/endpoints": [endpoint] if role == "client" else [],
@@ -71,14 +75,15 @@ def open_session(
             session = zenoh.open(config)
             break
         except zenoh.ZError as error:
-            if role == "base":
+            if role == "base" and not endpoint.startswith(_ROUTER):
                 raise LinkError(
                     f"cannot listen on {endpoint} ({error}): is another base station running, and is the address "
                     "one of this machine (tcp/0.0.0.0:PORT listens on all)?"
                 ) from error
             if time.monotonic() >= deadline_s or (give_up is not None and give_up.is_set()):
+                who = "router" if endpoint.startswith(_ROUTER) else "base station"
                 raise LinkError(
-                    f"no base station answers at {endpoint} within {connect_timeout_s:g} s: start it first, and check "
+                    f"no {who} answers at {endpoint} within {connect_timeout_s:g} s: start it first, and check "
                     "the address and the network"
                 ) from error
         if give_up is None:
