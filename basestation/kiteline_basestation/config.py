@@ -140,7 +140,7 @@ class GraphConfig:
     huber: float = 3.0  # deviations beyond which an edge counts less
     iterations: int = 8
     stop: float = 1e-4  # relative gain below which more iterations change nothing
-    max_full: int = 250  # keyframes whose poses a full bundle moves; of a larger map, those around the loop
+    max_full: int = 800  # keyframes that a full bundle moves, in 0.4 s; of a larger map, those around the loop
     robust_trials: int = 6  # of the full bundle before the outlier test
     final_trials: int = 6  # after it
     revisits: int = 2  # keyframes a step that look again for what joined maps know
