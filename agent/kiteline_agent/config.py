@@ -201,7 +201,7 @@ class WindowConfig:
 class SmoothingConfig:
     """How corrections reach the live pose in the world. They never touch the odometry frame."""
 
-    max_m_s: float = 0.0  # m/s at which the odometry frame moves in w; 0: at once, which is nearest to the truth
+    max_m_s: float = 0.2  # m/s at which the odometry frame moves in w: no jump, and told within a second; 0: at once
     max_rad_s: float = 0.0  # rad/s at which it turns; 0: at once
     snap_m: float = 5.0  # farther than this is another place: taken at once
 

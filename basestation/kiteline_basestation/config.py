@@ -156,7 +156,7 @@ class DisparityConfig:
     prior_px: float = 0.1  # one deviation of a constant offset: what calibrations are good to
     prior_rad: float = 3e-4  # of the turn of a right camera (times the focal length: px where x or y is 1)
     inflation: float = 3.0  # of deviations of what is found: the lens bends what motion tells of depths, too
-    stands_out: float = 1.0  # of such deviations a number, from which on an offset is believed
+    stands_out: float = 0.5  # of such deviations a number, from which on an offset is believed: by chance 1 in 20
     settled_px: float = 0.03  # deviation of the offset below which it is known
 
 

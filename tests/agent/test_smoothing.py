@@ -14,7 +14,7 @@ TICK_NS = 50_000_000
 
 
 def test_off_is_at_once() -> None:
-    smoothing = Smoothing(SmoothingConfig())
+    smoothing = Smoothing(SmoothingConfig(max_m_s=0.0, max_rad_s=0.0))
     assert not smoothing.on
     for n in range(3):
         T = se3.exp(np.array([n, 0.0, 0.0, 0.0, 0.0, 0.1 * n]))
