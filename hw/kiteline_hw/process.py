@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
+import select
 import signal
 import socket
 import sys
@@ -16,22 +18,31 @@ from typing import Any, NoReturn
 
 
 class StopSignal:
-    """Turns SIGTERM and SIGINT into a flag that a loop asks for, so that logs and sessions are closed in order."""
+    """Turns SIGTERM and SIGINT into a flag that a loop asks for, so that logs and sessions are closed in order.
+
+    No threading.Event: its lock may be held by the very `wait` that a signal interrupts, and `set` would wait for ever.
+    """
 
     def __init__(self) -> None:
-        self._event = threading.Event()
+        self._asked = False
+        self._wake, self._waker = os.pipe()
+        os.set_blocking(self._waker, False)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._event.set()
+        self._asked = True
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._waker, b"!")
 
     def __bool__(self) -> bool:
-        return self._event.is_set()
+        return self._asked
 
     def wait(self, seconds: float) -> bool:
         """Sleep, but no longer than until a signal comes; True when one has come."""
-        return self._event.wait(max(0.0, seconds))
+        if not self._asked:
+            select.select([self._wake], [], [], max(0.0, seconds))
+        return self._asked
 
 
 def exit_on_sigterm() -> None:

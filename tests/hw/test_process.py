@@ -86,3 +86,29 @@ def test_leaving_says_its_last_words() -> None:
     with run("print('last'); process.leave(7)") as child:
         assert child.communicate()[0] == b"last\n"
         assert child.returncode == 7
+
+
+def test_a_stop_signal_comes_through_whenever_it_comes() -> None:
+    """Also into the middle of a `wait`, thousands of times: a lock that the interrupted wait holds would end it all."""
+    code = (
+        "import os, signal\n"
+        "from kiteline_hw.process import StopSignal\n"
+        "stop = StopSignal()\n"
+        "signal.signal(signal.SIGALRM, stop._on_signal)\n"
+        "signal.setitimer(signal.ITIMER_REAL, 2e-4, 2e-4)\n"
+        "for _ in range(4000):\n"
+        "    stop._asked = False\n"
+        "    stop.wait(1e-5)\n"
+        "signal.setitimer(signal.ITIMER_REAL, 0)\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+        "assert stop and stop.wait(60.0)\n"
+    )
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        timeout=30,
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert done.returncode == 0, done.stderr
