@@ -203,7 +203,7 @@ class SmoothingConfig:
 
     max_m_s: float = 0.2  # m/s at which the odometry frame moves in w: no jump, and told within a second; 0: at once
     max_rad_s: float = 0.0  # rad/s at which it turns; 0: at once
-    snap_m: float = 5.0  # farther than this is another place: taken at once
+    snap_m: float = 0.3  # farther than this two maps were joined: taken at once
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ def test_off_is_at_once() -> None:
 @given(st.integers(0, 1 << 30))
 def test_it_keeps_its_pace_and_arrives(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    smoothing = Smoothing(SmoothingConfig(max_m_s=0.5, max_rad_s=0.2))
+    smoothing = Smoothing(SmoothingConfig(snap_m=5.0, max_m_s=0.5, max_rad_s=0.2))
     here = rng.normal(0.0, 10.0, 3)
     told = smoothing.follow(np.eye(4), here, 0)
     turn = se3.exp(np.concatenate([np.zeros(3), rng.normal(0.0, 0.02, 3)]))
@@ -42,7 +42,7 @@ def test_it_keeps_its_pace_and_arrives(seed: int) -> None:
 
 
 def test_another_place_is_taken_at_once() -> None:
-    smoothing = Smoothing(SmoothingConfig(max_m_s=0.5, max_rad_s=0.2))
+    smoothing = Smoothing(SmoothingConfig(snap_m=5.0, max_m_s=0.5, max_rad_s=0.2))
     smoothing.follow(np.eye(4), np.zeros(3), 0)
     far = se3.from_rt(np.eye(3), np.array([9.0, 0.0, 0.0]))
     assert np.array_equal(smoothing.follow(far, np.zeros(3), TICK_NS), far)
