@@ -125,12 +125,24 @@ class Tracker:
         self._work.projected += len(candidates.rows)
         self._work.alignments += len(rows) * (first - last + 1)
         self._work.posed_points += int(np.count_nonzero(found))
-        rows, uv, octave, chosen = rows[found], uv[found], (octave + fine)[found], chosen[found]
+        uv, octave, chosen = uv[found], (octave + fine)[found], chosen[found]
         scale = (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
         sigma_px = config.align.sigma_px * scale
-        depth = candidates.depth[chosen]
+        return self._solve(
+            view, candidates, chosen, uv, octave, sigma_px, T_c_m, tried=len(found), stereo=not coarse_only
+        )
+
+    def _solve(
+        self, view: View, candidates: Candidates, chosen: I64, uv: F64, octave: NDArray[np.uint8], sigma_px: F64,
+        T_c_m: F64, *, tried: int, stereo: bool,
+    ) -> Track:  # fmt: skip
+        """The pose from candidates[chosen] (n,), seen at uv (n,2) px on octave (n,), each to sigma_px (n,); stereo:
+        disparities count too. tried: how many were looked for.
+        """
+        config = self._config
+        rows, depth = candidates.rows[chosen], candidates.depth[chosen]
         observed = np.column_stack([uv, np.full(len(uv), -1.0)])
-        if not coarse_only:
+        if stereo:
             self._add_disparities(view, rows, uv, octave, depth, observed)
         T = T_c_m.copy()
         inlier = np.ones(len(rows), np.bool_)
@@ -141,19 +153,9 @@ class Tracker:
             T_c_m, self._zero_prior, config.pose.rounds, config.pose.iterations, config.pose.chi2, inlier, information,
         )  # fmt: skip
         return Track(
-            se3.orthonormalise(T),
-            rows,
-            observed,
-            sigma_px,
-            depth,
-            inlier,
-            information,
-            int(inliers),
-            float(rms),
-            len(found),
-            xyz,
-            ray,
-        )
+            T_c_m=se3.orthonormalise(T), rows=rows, observed=observed, sigma_px=sigma_px, depth_m=depth, inlier=inlier,
+            information=information, inliers=int(inliers), rms=float(rms), tried=tried, xyz=xyz, ray=ray,
+        )  # fmt: skip
 
     def _add_disparities(
         self, view: View, rows: I64, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64

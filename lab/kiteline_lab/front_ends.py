@@ -23,7 +23,7 @@ from kiteline_agent.recovery import Recovery
 from kiteline_agent.step import Identity
 from kiteline_agent.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
-from kiteline_core import features, matching, pose_kernels, se3
+from kiteline_core import features, matching, se3
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.ids import SEQUENCE_BITS
@@ -89,36 +89,15 @@ class _Follower(Tracker):
         )  # fmt: skip
         return matches.a.astype(np.int64), matches.b.astype(np.int64)
 
-    def _solve(
-        self, view: View, candidates: Candidates, chosen: I64, uv: F64, octave: U8, sigma_px: F64, T_c_m: F64,
-        *, stereo: bool,
-    ) -> Track:  # fmt: skip
-        """The pose from candidates[chosen] seen at uv (n,2); as the agent's tracker ends."""
-        config = self._config
-        rows, depth = candidates.rows[chosen], candidates.depth[chosen]
-        observed = np.column_stack([uv, np.full(len(uv), -1.0)])
-        if stereo:
-            self._add_disparities(view, rows, uv, octave, depth, observed)
-        T = T_c_m.copy()
-        inlier = np.ones(len(rows), np.bool_)
-        information = np.zeros((6, 6))
-        xyz, ray = candidates.xyz[chosen], candidates.ray[chosen]
-        inliers, rms = pose_kernels.optimise_pose(
-            T, xyz, ray, observed, sigma_px, self._map.intrinsics,
-            T_c_m, self._zero_prior, config.pose.rounds, config.pose.iterations, config.pose.chi2, inlier, information,
-        )  # fmt: skip
-        return Track(
-            T_c_m=se3.orthonormalise(T), rows=rows, observed=observed, sigma_px=sigma_px, depth_m=depth, inlier=inlier,
-            information=information, inliers=int(inliers), rms=float(rms), tried=len(rows), xyz=xyz, ray=ray,
-        )  # fmt: skip
-
     def _by_descriptors(self, view: View, T_c_m: F64, seen: tuple[F64, U8, U8]) -> Track:
         """A wide search mends the prediction, a narrow one measures the pose."""
         for radius_px, scaled in ((self._corners.wide_px, False), (self._corners.near_px, True)):
             candidates = self._map.candidates(T_c_m, _MARGIN_PX, self._config.align.max_scale)
             a, b = self._matched(candidates, radius_px, scaled, seen)
             sigma_px = self._corners.sigma_px * np.exp2(seen[1][b].astype(np.float64))
-            track = self._solve(view, candidates, a, seen[0][b], seen[1][b], sigma_px, T_c_m, stereo=scaled)
+            track = self._solve(
+                view, candidates, a, seen[0][b], seen[1][b], sigma_px, T_c_m, tried=len(a), stereo=scaled
+            )
             if track.inliers >= self._config.pose.min_inliers // 2:
                 T_c_m = track.T_c_m
         return track
@@ -180,13 +159,16 @@ class FlowTracker(_Follower):
         self._rows, self._ids, self._uv = self._rows[held[found]], self._ids[held[found]], uv[found]
         octave = np.zeros(len(self._uv), np.uint8)
         sigma_px = np.full(len(self._uv), self._flow.sigma_px)
-        rough = self._solve(view, candidates, chosen[found], self._uv, octave, sigma_px, T_c_m, stereo=False)
+        n = len(self._uv)
+        rough = self._solve(view, candidates, chosen[found], self._uv, octave, sigma_px, T_c_m, tried=n, stereo=False)
         if rough.inliers < self._config.pose.min_inliers:
             return None
         candidates = self._map.candidates(rough.T_c_m, _MARGIN_PX, self._config.align.max_scale)
         held, chosen = self._among(candidates)
         uv, octave = self._uv[held], self._map.octave[self._rows[held]]
-        return self._solve(view, candidates, chosen, uv, octave, sigma_px[held], rough.T_c_m, stereo=True)
+        return self._solve(
+            view, candidates, chosen, uv, octave, sigma_px[held], rough.T_c_m, tried=len(held), stereo=True
+        )
 
     def _among(self, candidates: Candidates) -> tuple[I64, I64]:
         """Which held points are among the candidates, and where there."""
