@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 import tomllib
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from kiteline_basestation.spec import BaseSpec, base_config, from_json, parser
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store import StoreError
 from kiteline_basestation.warm import warm
-from kiteline_basestation.worker import LockstepJobs, Worker
+from kiteline_basestation.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.framing import StreamFramer
@@ -46,7 +47,7 @@ from kiteline_core.ids import AgentId
 from kiteline_core.place_index import Vocabulary
 from kiteline_hw import process
 from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.cpu import rss_mib
+from kiteline_hw.cpu import return_large_arrays, rss_mib
 from kiteline_hw.key_store import read_keys
 from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
@@ -110,7 +111,8 @@ class Ground:
         self.phase = Phase.FLY
         self.now_ns = -1
         self.rss_mib = 0.0
-        self.step_ms: list[float] = []
+        self.steps = 0
+        self.step_ms: deque[float] = deque(maxlen=SAMPLES)
         self.drained_ns = 0
         self.digest_equal = False
         self.flown: Flown | None = None  # the base when the last frame had come
@@ -218,7 +220,8 @@ class Ground:
                 self._wire(agent).send(packet, now_ns)
         self.step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
         self.jobs.add(output.jobs, now_ns)
-        if len(self.step_ms) % _MEMORY_STEPS == 1:
+        self.steps += 1
+        if self.steps % _MEMORY_STEPS == 1:
             self.rss_mib = max(self.rss_mib, rss_mib())
         return output
 
@@ -246,9 +249,9 @@ class Ground:
             "agents_lost": sorted(self.agents_lost),
             "drain": {"flight_ms": self.drained_ns // 1_000_000, **counts(self.station.mapper)},
             "timing": {
-                "bundle_ms": self.jobs.cpu_ms.get("bundle", []),
-                "grid_ms": self.jobs.cpu_ms.get("grid", []),
-                "step_ms": self.step_ms,
+                "bundle_ms": list(self.jobs.cpu_ms["bundle"]),
+                "grid_ms": list(self.jobs.cpu_ms["grid"]),
+                "step_ms": list(self.step_ms),
                 "rss_mib": round(max(self.rss_mib, rss_mib()), 1),
             },
         }
@@ -295,6 +298,7 @@ def station_of_log(metadata: Mapping[str, str]) -> Station:
 
 def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
     """Keep the barrier: step once all agents have handed in their messages. An agent that ends is left out."""
+    return_large_arrays()
     ground = Ground(spec, coded_channels(spec))
     _tell(ground.begin(0), parent)
     server = LockstepServer(spec.link.removeprefix("lockstep:"))
@@ -334,6 +338,7 @@ def _collect(server: LockstepServer, here: set[int], ground: Ground, parent: pro
 
 def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSignal) -> None:
     """Serve any number of agents on real clocks until told to stop; long work is done by a process beside."""
+    return_large_arrays()
     clock = MonotonicClock()
     with contextlib.ExitStack() as stack:
         plain = hub = open_link(spec.link, "base", framer=StreamFramer, required=False)

@@ -6,7 +6,7 @@ import contextlib
 import multiprocessing
 import signal
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 
@@ -14,13 +14,16 @@ import cv2
 
 from kiteline_basestation.jobs import Job, JobDone, run_job
 from kiteline_basestation.warm import warm
+from kiteline_hw.cpu import return_large_arrays
 
+SAMPLES = 1 << 15  # newest CPU times that are kept: half an hour of steps, a megabyte
 _END_S = 0.5  # s that a worker may take to end before it is killed
 
 
 def _work(pipe: Connection) -> None:
     """The worker: one job in, its result and its CPU time in ms out, until the other side is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the base, which then closes the pipe
+    return_large_arrays()
     cv2.setNumThreads(1)
     warm()
     with contextlib.suppress(EOFError, OSError):
@@ -35,7 +38,7 @@ class Worker:
     """One process that runs jobs in order. A worker that dies is replaced; its job is given to the next."""
 
     def __init__(self) -> None:
-        self.cpu_ms: dict[str, list[float]] = {}
+        self.cpu_ms: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=SAMPLES))
         self.deaths = 0
         self._queue: deque[Job] = deque()
         self._open: Job | None = None
@@ -60,7 +63,7 @@ class Worker:
             while self._pipe.poll():
                 result, cpu_ms = self._pipe.recv()
                 if self._open is not None:
-                    self.cpu_ms.setdefault(self._open.kind, []).append(cpu_ms)
+                    self.cpu_ms[self._open.kind].append(cpu_ms)
                 self._open = None
                 results.append(result)
                 self._feed()
@@ -103,7 +106,7 @@ class LockstepJobs:
     """One worker in flight time: a job begins when the worker is free and is done after its modelled cost."""
 
     def __init__(self) -> None:
-        self.cpu_ms: dict[str, list[float]] = {}
+        self.cpu_ms: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=SAMPLES))
         self._waiting: list[tuple[int, JobDone]] = []
         self._free_ns = 0
 
@@ -112,7 +115,7 @@ class LockstepJobs:
         for job in jobs:
             begin_ns = time.process_time_ns()
             done = run_job(job)
-            self.cpu_ms.setdefault(job.kind, []).append((time.process_time_ns() - begin_ns) / 1e6)
+            self.cpu_ms[job.kind].append((time.process_time_ns() - begin_ns) / 1e6)
             self._free_ns = max(now_ns, self._free_ns) + done.cost_ops
             self._waiting.append((self._free_ns, done))
 

@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
 _PIXEL_STEPS = 16.0
@@ -56,13 +57,15 @@ def _inverse_depth(code: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def pick(births: I64, keypoint: I64, mask: int, out: I64) -> None:
+def pick(births: I32, keypoint: I64, mask: int, out: I64) -> None:
     """Codes (4, n) of the births at keypoints (n,), as they are where they came with a part that the mask names.
 
-    births: (5, 2048) codes of u, v, inverse depth and octave by keypoint, and the part, -1 where there is none.
+    births: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part, -1 where there is none.
     """
     for i in range(keypoint.size):
         at = keypoint[i]
+        if at >= births.shape[1]:
+            continue
         part = births[4, at]
         if part >= 0 and (mask >> part) & 1 == 1:
             for k in range(4):

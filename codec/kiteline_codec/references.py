@@ -16,6 +16,7 @@ from kiteline_codec.rows import read_codes
 from kiteline_codec.schema import Camera, Head, Key, Kind, WireError
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId, agent_of_keyframe
 
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
@@ -30,12 +31,14 @@ _BIRTHS, _HEAD = int(Kind.BIRTHS), int(Kind.HEAD)
 
 @dataclass(slots=True)
 class _Keyframe:
-    """births: (5, 2048) codes of u, v, inverse depth and octave by keypoint, and the part that they came with."""
+    """births: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part that they came with, -1 where
+    there is none; as wide as the last birth asks.
+    """
 
     head: Head | None = None
     head_version: int = 0
     part_versions: dict[int, int] = field(default_factory=dict)
-    births: I64 = field(default_factory=lambda: np.full((5, MAX_KEYPOINTS), _NO_PART, np.int64))
+    births: I32 = field(default_factory=lambda: np.empty((5, 0), np.int32))
 
 
 class References:
@@ -83,8 +86,10 @@ class References:
             entry.head, entry.head_version = record, now[0]
         return entry.head_version, entry.head
 
-    def births(self, keyframe: int, held: Held) -> tuple[dict[int, int], I64]:
-        """Versions by part of what both sides hold; codes (5, 2048) of u, v, inverse depth, octave, and the part."""
+    def births(self, keyframe: int, held: Held) -> tuple[dict[int, int], I32]:
+        """Versions by part of what both sides hold; codes (5, k) of u, v, inverse depth, octave, and the part, of the
+        first k keypoints: beyond them there are no births.
+        """
         versions: dict[int, int] = {}
         entry = self._keyframe(keyframe)
         missing = 0
@@ -102,6 +107,7 @@ class References:
                 if values.shape[1]:
                     if values[0].min() < 0 or values[0].max() >= MAX_KEYPOINTS:
                         raise WireError("a keypoint is out of range")
+                    entry.births = _widened(entry.births, int(values[0].max()) + 1)
                     entry.births[:4, values[0]] = values[1:5]
                     entry.births[4, values[0]] = part
                 entry.part_versions[part] = now[0]
@@ -157,3 +163,14 @@ class References:
             left -= at in wanted
         above.append((at, T_k_a, 0))
         return above
+
+
+def parts_at(births: I32, keypoint: I64) -> set[int]:
+    """The parts with which the births at keypoints (n,) came, and perhaps -1."""
+    return set(births[4, keypoint[keypoint < births.shape[1]]].tolist())
+
+
+def _widened(births: I32, width: int) -> I32:
+    """The same with room for so many keypoints at least."""
+    more = width - births.shape[1]
+    return births if more <= 0 else np.pad(births, ((0, 0), (0, more)), constant_values=_NO_PART)

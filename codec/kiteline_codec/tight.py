@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from kiteline_codec import foresee_kernels as kernels
 from kiteline_codec import messages, quantise
 from kiteline_codec.packing import Reader, Writer
-from kiteline_codec.references import Held, References
+from kiteline_codec.references import Held, References, parts_at
 from kiteline_codec.rows import MAX_KEYFRAME_ID, read_codes
 from kiteline_codec.schema import Head, Key, Kind, WireError
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
 TIGHT_KINDS = frozenset({int(Kind.BIRTHS), int(Kind.SIGHTINGS), int(Kind.DEPTHS)})
@@ -32,7 +33,7 @@ BASIS_KINDS = frozenset({int(Kind.CAMERA), int(Kind.HEAD), int(Kind.BIRTHS)})  #
 _CRC_BYTES = 4
 _MAX_SHIFT = 8
 _DESCRIPTOR_SIZES = (0, 16, 32)
-_UNBORN: tuple[dict[int, int], I64] = ({}, np.full((5, 0), -1, np.int64))  # a keyframe whose births are not used
+_UNBORN: tuple[dict[int, int], I32] = ({}, np.empty((5, 0), np.int32))  # a keyframe whose births are not used
 _REMEMBERED = 64  # forms of births that are kept: they build upon nothing, and are asked for until they fit a packet
 
 
@@ -112,7 +113,7 @@ class Tightener:
         born = [self._references.births(keyframe, held) for keyframe in table]
         masks = []
         for (versions, births), begin, end in zip(born, [0, *ends], ends, strict=False):
-            parts = set(births[4, keypoint[begin:end]].tolist())
+            parts = parts_at(births, keypoint[begin:end])
             masks.append(sum(1 << part for part in versions if part in parts))
         ways = self._references.poses(key.id, {a for a, m in zip(table, masks, strict=True) if m}, held)
         if self._references.camera(key.id, held) is None:
@@ -168,7 +169,7 @@ class Tightener:
 
     def _foreseen(
         self, keyframe: int, table: Sequence[int], masks: Sequence[int], place: I64, keypoint: I64,
-        born: Sequence[tuple[dict[int, int], I64]], ways: tuple[dict[int, F64], list[int]], held: Held,
+        born: Sequence[tuple[dict[int, int], I32]], ways: tuple[dict[int, F64], list[int]], held: Held,
     ) -> tuple[I64, I64, list[int]]:  # fmt: skip
         """Codes (3, n) where points are foreseen (-1 where not), octaves (n,) of their births, versions used.
 
@@ -282,7 +283,7 @@ def _gaps(index: I64) -> I64:
     return np.diff(index, prepend=-1) - 1
 
 
-def _seen_depths(births: I64, parts: Sequence[int] | dict[int, int], index: I64) -> I64:
+def _seen_depths(births: I32, parts: Sequence[int] | dict[int, int], index: I64) -> I64:
     """Codes (n,) of inverse depths as the agent saw them, 0 where none of the parts tells."""
     seen: I64 = np.zeros((4, len(index)), np.int64)
     kernels.pick(births, index, sum(1 << part for part in parts), seen)

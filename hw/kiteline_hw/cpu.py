@@ -15,6 +15,9 @@ from typing import Self
 
 _MIB = 1024.0 * 1024.0
 _MADV_DONTNEED = 4  # Linux, on every architecture
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of mallopt in the GNU C library
+_LARGE_BYTES = 256 << 10  # a mapping of its own costs a few microseconds: little beside what is done with so much
+_SPARE_BYTES = 2 << 20  # of freed heap that is kept for what comes next
 _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")  # lines of smaps that count pages unlike their file's
 _CGROUP = Path("/sys/fs/cgroup/cpu")
 _PERIOD_US = 50_000  # us; a twentieth of the one-second window in which the limit has to hold
@@ -65,6 +68,19 @@ def release_memory() -> None:
         libc.malloc_trim(0)
         for begin, end in clean_mappings(Path("/proc/self/smaps").read_text()):
             libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
+
+
+def return_large_arrays() -> None:
+    """From here on the memory of large arrays goes back to the system as soon as they are freed.
+
+    The GNU C library keeps ever larger freed blocks for later ones (M_MMAP_THRESHOLD grows by itself, up to 32 MiB):
+    where sizes grow with what a process holds, hardly any fits the next, and the holes add up. Does nothing where the
+    system has no such call.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+        libc.mallopt(_M_TRIM_THRESHOLD, _SPARE_BYTES)
 
 
 def clean_mappings(smaps: str) -> list[tuple[int, int]]:

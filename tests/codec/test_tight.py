@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_codec import foresee_kernels, messages, quantise
+from kiteline_codec import foresee_kernels, messages, quantise, references
 from kiteline_codec.packing import Reader, Writer
 from kiteline_codec.schema import Births, Camera, Depths, Head, Key, Kind, Record, Sightings, WireError
 from kiteline_codec.sync import Endpoint, SyncConfig
@@ -180,13 +180,21 @@ def test_any_bytes_are_a_code_or_an_error(kind: int, data: bytes) -> None:
 
 def test_births_are_picked_by_keypoint_and_part() -> None:
     rng = np.random.default_rng(4)
-    births = rng.integers(0, 100, (5, 2048))
-    births[4] = rng.integers(-1, 4, 2048)
+    births = rng.integers(0, 100, (5, 1200)).astype(np.int32)
+    births[4] = rng.integers(-1, 4, 1200)
     keypoint, mask = rng.integers(0, 2048, 300), 0b101
     out = np.full((4, 300), -7, np.int64)
     foresee_kernels.pick(births, keypoint, mask, out)
-    named = np.isin(births[4, keypoint], (0, 2))
-    assert np.array_equal(out, np.where(named, births[:4, keypoint], -7))
+    whole = np.pad(births, ((0, 0), (0, 2048 - 1200)), constant_values=-1)
+    named = np.isin(whole[4, keypoint], (0, 2))
+    assert np.array_equal(out, np.where(named, whole[:4, keypoint], -7))
+    assert references.parts_at(births, keypoint) | {-1} == set(whole[4, keypoint].tolist()) | {-1}
+
+
+def test_what_is_kept_decoded_of_a_keyframe_is_as_large_as_its_births() -> None:
+    held = coded(flight(0, births=10)).get
+    versions, births = references.References().births(keyframe_id(SUBMAP, 0), held)
+    assert versions and births.nbytes <= 5 * 4 * (int(np.flatnonzero(births[4] >= 0).max()) + 1)
 
 
 def test_foreseen_codes_are_those_of_plain_arithmetic() -> None:
