@@ -37,7 +37,7 @@ from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.framing import StreamFramer
 from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core import config as configuration
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw import kernel_cache, process
 from kiteline_hw.clock import MonotonicClock
@@ -148,14 +148,14 @@ class Onboard:
         """One tick of a lock-step flight: the base's packets, then the frame that is due, if one is."""
         if down.phase is not Phase.FLY:
             self.frames_are_over()
-        frame = imu = None
+        frame = imu = driven = None
         if self.next_ns is not None and self.next_ns <= down.now_ns:
             if self._core.newest_wins(self.next_ns, self.camera.period_ns):
                 self.camera.drop()
                 self.tally.dropped += 1
             else:
-                frame, imu = self.camera.take()
-        sent = self.step(frame, imu, down.packets, down.now_ns)
+                frame, imu, driven = self.camera.take()
+        sent = self.step(frame, imu, down.packets, down.now_ns, driven)
         quiet, equal = settled(self.channel)
         return Up(self._next_or_end(), quiet, equal, tuple(sent))
 
@@ -182,10 +182,13 @@ class Onboard:
         next_ns = self.next_ns
         return NO_MORE_FRAMES_NS if next_ns is None else next_ns
 
-    def step(self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int) -> list[bytes]:
+    def step(
+        self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int,
+        driven: OdometryBatch | None = None,
+    ) -> list[bytes]:  # fmt: skip
         """One step of the agent, logged and counted; the packets that leave for the wire."""
         begin_ns = time.process_time_ns()
-        step_input = StepInput(frame, imu, tuple(packets), self._told_cpu_ns)
+        step_input = StepInput(frame, imu, tuple(packets), self._told_cpu_ns, driven)
         self.output = output = self.agent.step(step_input, now_ns)
         if self._log is not None:
             write_step(self._log, step_input, output, now_ns, now_ns + self._log_shift_ns)
@@ -345,13 +348,13 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
             if wait_s > 0.0 and stop.wait(min(wait_s, _IDLE_TICK_S)):
                 break
             now_ns = clock.now_ns()
-            frame = imu = None
+            frame = imu = driven = None
             if now_ns >= begin_ns + onboard.next_ns:
                 if not onboard.drop_stale(now_ns - begin_ns):
                     break
                 captured_ns = begin_ns + onboard.next_ns
-                frame, imu = onboard.camera.take()
-            for packet in onboard.step(frame, imu, link.receive(), now_ns):
+                frame, imu, driven = onboard.camera.take()
+            for packet in onboard.step(frame, imu, link.receive(), now_ns, driven):
                 link.send(packet)
             e = onboard.output.estimate if onboard.output is not None else None
             if sink is not None and e is not None and e.T_l_b is not None:

@@ -6,16 +6,19 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core import odometry
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
 
 class Camera:
-    """Frames of a source, each with the inertial samples since the one taken before it.
+    """Frames of a source, each with the inertial samples, and what an odometer measured, since the one taken before it.
 
     until_ns: frames with a later stamp are left out; None: all. cpu_clock: process CPU time in ns, handed in.
     """
 
-    def __init__(self, items: Iterable[Frame | ImuBatch], until_ns: int | None, cpu_clock: Callable[[], int]) -> None:
+    def __init__(
+        self, items: Iterable[Frame | ImuBatch | OdometryBatch], until_ns: int | None, cpu_clock: Callable[[], int],
+    ) -> None:  # fmt: skip
         self.decode_ms: list[float] = []
         self.decode_ns = 0  # process CPU spent on reading and decoding so far
         self.period_ns = 0  # between the last two frames that were read
@@ -24,6 +27,7 @@ class Camera:
         self._clock = cpu_clock
         self._frame: Frame | None = None
         self._imu: list[ImuBatch] = []
+        self._odometry: list[OdometryBatch] = []
         self._advance()
 
     @property
@@ -31,16 +35,16 @@ class Camera:
         """Stamp of the next frame; None after the last."""
         return None if self._frame is None else self._frame.t_ns
 
-    def take(self) -> tuple[Frame, ImuBatch | None]:
-        """The next frame, and the inertial samples since the one that was taken before it."""
+    def take(self) -> tuple[Frame, ImuBatch | None, OdometryBatch | None]:
+        """The next frame, and the inertial samples and velocities since the one that was taken before it."""
         assert self._frame is not None, "no frame is left"
-        frame, imu = self._frame, joined(self._imu)
-        self._imu = []
+        frame, imu, driven = self._frame, joined(self._imu), odometry.joined(self._odometry)
+        self._imu, self._odometry = [], []
         self._advance()
-        return frame, imu
+        return frame, imu, driven
 
     def drop(self) -> None:
-        """Pass over the next frame; its inertial samples go with the one after."""
+        """Pass over the next frame; its samples go with the one after."""
         self._advance()
 
     def _advance(self) -> None:
@@ -49,6 +53,9 @@ class Camera:
         for item in self._items:
             if isinstance(item, ImuBatch):
                 self._imu.append(item)
+                continue
+            if isinstance(item, OdometryBatch):
+                self._odometry.append(item)
                 continue
             if self._until_ns is None or item.t_ns <= self._until_ns:
                 self._frame = item

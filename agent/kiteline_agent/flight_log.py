@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.step import Estimate, StepInput, StepOutput
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
-STEP, IMU, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
-    "/step", "/imu", "/packets/in", "/packets/out", "/estimate", "/events",
+STEP, IMU, ODOMETER, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
+    "/step", "/imu", "/odometer", "/packets/in", "/packets/out", "/estimate", "/events",
 )  # fmt: skip
 
 
@@ -26,6 +26,7 @@ class StepLog(Protocol):
 
     def frame(self, frame: Frame) -> None: ...
     def imu(self, topic: str, t_ns: int, batch: ImuBatch) -> None: ...
+    def odometer(self, topic: str, t_ns: int, batch: OdometryBatch) -> None: ...
     def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
     def json(self, topic: str, t_ns: int, value: object) -> None: ...
     def pose(self, topic: str, t_ns: int, frame_id: str, pose: NDArray[np.float64]) -> None: ...
@@ -42,12 +43,15 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
             "cpu_ns": step_input.cpu_ns,
             "frame_ns": None if frame is None else frame.t_ns,
             "imu": imu is not None,
+            "odometer": step_input.odometry is not None,
             "packets_in": len(step_input.packets),
             "packets_out": len(output.packets),
         },
     )
     if imu is not None:
         log.imu(IMU, log_ns, imu)
+    if step_input.odometry is not None:
+        log.odometer(ODOMETER, log_ns, step_input.odometry)
     if frame is not None:
         log.frame(frame)
     for packet in step_input.packets:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
@@ -23,12 +23,15 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class StepInput:
-    """All that enters a step. cpu_ns: process CPU time that the last frame took, as measured or modelled outside."""
+    """All that enters a step. imu, odometry: samples since the last frame. cpu_ns: process CPU time that the last frame
+    took, as measured or modelled outside.
+    """
 
     frame: Frame | None = None
     imu: ImuBatch | None = None
     packets: tuple[bytes, ...] = ()
     cpu_ns: int = 0
+    odometry: OdometryBatch | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What a sensor delivers: images at one instant, and inertial samples."""
+"""What a sensor delivers: images at one instant, inertial samples, velocities of an odometer."""
 
 from __future__ import annotations
 
@@ -55,6 +55,26 @@ class ImuCalibration:
     accel_noise: float = 2.0e-3  # m/s^2/sqrt(Hz)
     accel_walk: float = 3.0e-3  # m/s^3/sqrt(Hz)
     rate_hz: float = 200.0
+
+
+UNMEASURED = 1e6  # variance, (m/s)^2 or (rad/s)^2, of a direction in which an odometer measures nothing
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryBatch:
+    """Velocities that wheels or a flight controller measured, in order of time, of the body frame's origin and in the
+    axes of the body frame (whatever axes and place the device has: its source turns them, `odometry.in_body`).
+
+    t_ns: (n,) int64, strictly increasing. velocity: (n, 3) m/s. rate: (n, 3) rad/s, how the body turns. velocity_cov,
+    rate_cov: (n, 3, 3), (m/s)^2 and (rad/s)^2, with the variance UNMEASURED (or more) in directions in which nothing is
+    measured: the value along them says nothing.
+    """
+
+    t_ns: NDArray[np.int64]
+    velocity: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    velocity_cov: NDArray[np.float64]
+    rate_cov: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,8 +50,37 @@ class HighresImu:
 
 
 @dataclass(frozen=True, slots=True)
+class LocalPosition:
+    """Message 32, LOCAL_POSITION_NED: where the flight controller's filter thinks it is. m and m/s in NED."""
+
+    t_ms: int
+    position_m: tuple[float, float, float]
+    velocity_m_s: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """Message 30. Roll, pitch, yaw in rad turn body FRD into NED, yaw first (z, y', x''); rates in body FRD, rad/s."""
+
+    t_ms: int
+    angles_rad: tuple[float, float, float]
+    rate_rad_s: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class WheelDistance:
+    """Message 9000. What each wheel has rolled since the start, in m, forward positive. At most 16."""
+
+    t_us: int
+    distance_m: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Odometry:
-    """Message 331. Position in local FRD, q [w, x, y, z] from body FRD to local FRD, velocities in body FRD."""
+    """Message 331. Position in local FRD, q [w, x, y, z] from body FRD to local FRD, velocities in body FRD.
+
+    system, component: of who sent it.
+    """
 
     time_usec: int
     position_m: Sequence[float]
@@ -65,6 +94,8 @@ class Odometry:
     frame_id: int = 20  # MAV_FRAME_LOCAL_FRD: ArduPilot drops all others silently
     child_frame_id: int = 12  # MAV_FRAME_BODY_FRD: the same
     estimator_type: int = 3  # MAV_ESTIMATOR_TYPE_VIO: PX4 discards the covariance of a naive one
+    system: int = 0
+    component: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +119,9 @@ class RadioStatus:
     remote_rssi: int
 
 
-Incoming = Heartbeat | TimeSync | HighresImu | Odometry | Tunnel | RadioStatus
+Incoming = (
+    Heartbeat | TimeSync | HighresImu | Odometry | Tunnel | RadioStatus | LocalPosition | Attitude | WheelDistance
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +204,19 @@ class MavlinkCodec:
                 o.quality,
             )
         )
+
+    def local_position(self, p: LocalPosition) -> bytes:
+        """LOCAL_POSITION_NED (as a flight controller sends it)."""
+        return self._pack(common.MAVLink_local_position_ned_message(p.t_ms, *p.position_m, *p.velocity_m_s))
+
+    def attitude(self, a: Attitude) -> bytes:
+        """ATTITUDE (as a flight controller sends it)."""
+        return self._pack(common.MAVLink_attitude_message(a.t_ms, *a.angles_rad, *a.rate_rad_s))
+
+    def wheel_distance(self, w: WheelDistance) -> bytes:
+        """WHEEL_DISTANCE (as a flight controller sends it)."""
+        rolled = [*w.distance_m, *[0.0] * (16 - len(w.distance_m))]
+        return self._pack(common.MAVLink_wheel_distance_message(w.t_us, len(w.distance_m), rolled))
 
     def tunnel(self, target_system: int, target_component: int, payload_type: int, data: bytes) -> bytes:
         """TUNNEL with up to 128 bytes."""
@@ -255,7 +301,16 @@ class MavlinkCodec:
                 m.frame_id,
                 m.child_frame_id,
                 m.estimator_type,
+                system,
+                component,
             )
+        if kind == "LOCAL_POSITION_NED":
+            return LocalPosition(m.time_boot_ms, (m.x, m.y, m.z), (m.vx, m.vy, m.vz))
+        if kind == "ATTITUDE":
+            angles, rate = (m.roll, m.pitch, m.yaw), (m.rollspeed, m.pitchspeed, m.yawspeed)
+            return Attitude(m.time_boot_ms, angles, rate)
+        if kind == "WHEEL_DISTANCE":
+            return WheelDistance(m.time_usec, tuple(m.distance[: min(m.count, 16)]))
         if kind == "TUNNEL":
             payload = bytes(m.payload[: min(m.payload_length, 128)])
             return Tunnel(system, component, m.target_system, m.target_component, m.payload_type, payload)

@@ -6,8 +6,10 @@ import threading
 from types import TracebackType
 from typing import Self
 
+from kiteline_core.frame import OdometryBatch
 from kiteline_core.se3 import F64
 from kiteline_hw.mavlink_messages import Heartbeat, MavlinkCodec, Signing
+from kiteline_hw.mavlink_odometry import FromController
 from kiteline_hw.mavlink_wire import MavlinkWire
 from kiteline_hw.odometry_stream import OdometryConfig, OdometryCounters, OdometryStream
 from kiteline_hw.ports import Clock, PoseSample
@@ -19,8 +21,8 @@ _OUTBOX = 8  # messages that wait for a slow serial port; the oldest are dropped
 class MavlinkPoseSink:
     """A PoseSink that speaks MAVLink. Its thread sends heartbeats and answers TIMESYNC at once, from the same clock.
 
-    url: see MAVLINK_FORMS. T_b_f: (4,4) mounting, see mavlink_frames. clock: the one that stamps poses. Raises
-    LinkError.
+    url: see MAVLINK_FORMS. T_b_f: (4,4) mounting, see mavlink_frames. clock: the one that stamps poses. wanted:
+    takes what the controller says of its own velocity. Raises LinkError.
     """
 
     def __init__(
@@ -33,10 +35,11 @@ class MavlinkPoseSink:
         system: int = 1,
         signing: Signing | None = None,
         required: bool = True,
+        wanted: FromController | None = None,
     ) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._stream = OdometryStream(T_b_f, config, MavlinkCodec(system, signing=signing))
+        self._stream = OdometryStream(T_b_f, config, MavlinkCodec(system, signing=signing), wanted)
         self.refused = 0  # messages that nobody took
         self._wire = MavlinkWire(url, "mavlink", self._on_data, self._turn, _TICK_S, _OUTBOX, required=required)
         self._wire.start()
@@ -67,6 +70,11 @@ class MavlinkPoseSink:
         """The flight controller at the other end, or None while it is silent."""
         with self._lock:
             return self._stream.autopilot(self._clock.now_ns())
+
+    def take_odometry(self, t_ns: int) -> OdometryBatch | None:
+        """What the controller said of its velocity up to an instant of our clock; None where nobody asked."""
+        with self._lock:
+            return self._stream.take_odometry(t_ns)
 
     def close(self) -> None:
         """Stop, within a second. May be called twice."""

@@ -5,7 +5,7 @@ Write::
     log = LogWriter(path, {"role": "agent", "agent": "0"})      # metadata record "kiteline"
     log.rig(t_ns, source.rig, source.imu)                       # once, so that the log opens as a source again
     log.frame(frame)                                            # /left/image, /right/image, /depth/image
-    log.imu(IMU, t_ns, batch)
+    log.imu(IMU, t_ns, batch);  log.odometer(ODOMETER, t_ns, batch)
     log.blob("/packets/in", t_ns, packet)                       # opaque bytes
     log.json("/events", t_ns, {"reset": 1})
     log.transform("/tf", t_ns, "map", "body", T_map_body);  log.pose("/pose", t_ns, "world", T_w_b)
@@ -20,10 +20,10 @@ Read::
     with LogReader(path) as log:
         log.metadata["role"];  log.topics;  log.cut             # cut: None, or where a broken file ends
         for m in log.messages(["/packets/in", "/left/image"]):  # in the order in which they were written
-            m.topic, m.t_ns;  m.blob() | m.json() | m.image() | m.imu() | m.pose() | m.transform()
+            m.topic, m.t_ns;  m.blob() | m.json() | m.image() | m.imu() | m.odometry() | m.pose() | m.transform()
 
 `read_frame(images, t_ns, has_depth)` decodes logged images to the Frame that the source gave. The whole log is a source
-as well: `open_source("mcap:agent0/log.mcap")` yields the same Frames and ImuBatches.
+as well: `open_source("mcap:agent0/log.mcap")` yields the same Frames, ImuBatches and OdometryBatches.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from kiteline_core import se3
 from kiteline_core.cameras import CameraModel, CameraRig
-from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, Trajectory
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_hw import mcap_schemas as schemas
 from kiteline_hw.images import encode_depth, encode_image
 from kiteline_hw.mcap_log_read import LogMessage, LogReader, read_frame
@@ -49,10 +49,13 @@ from kiteline_hw.rig_json import LENS_NAMES, rig_to_json
 
 F64 = NDArray[np.float64]
 
-__all__ = ["DEPTH", "GROUND_TRUTH", "IMU", "LEFT", "RIG", "RIGHT", "LogMessage", "LogReader", "LogWriter", "read_frame"]
+__all__ = [
+    "DEPTH", "GROUND_TRUTH", "IMU", "LEFT", "ODOMETER", "RIG", "RIGHT", "LogMessage", "LogReader", "LogWriter",
+    "read_frame",
+]  # fmt: skip
 
 LEFT, RIGHT, DEPTH = "/left/image", "/right/image", "/depth/image"
-IMU, RIG, GROUND_TRUTH = "/imu", "/rig", "/ground_truth"
+IMU, ODOMETER, RIG, GROUND_TRUTH = "/imu", "/odometer", "/rig", "/ground_truth"
 
 CHUNK_BYTES = 64 * 1024  # bytes; an unfinished chunk is what a cut may lose
 FLUSH_NS = 1_000_000_000  # ns of flight time after which an unfinished chunk is written out
@@ -130,6 +133,14 @@ class LogWriter:
         message = schemas.Imu(
             t_ns=batch.t_ns.tolist(), gyro=batch.gyro.ravel().tolist(), accel=batch.accel.ravel().tolist()
         )
+        self._add(topic, t_ns, message)
+
+    def odometer(self, topic: str, t_ns: int, batch: OdometryBatch) -> None:
+        """A batch of velocities."""
+        message = schemas.Odometry(
+            t_ns=batch.t_ns.tolist(), velocity=batch.velocity.ravel().tolist(), rate=batch.rate.ravel().tolist(),
+            velocity_cov=batch.velocity_cov.ravel().tolist(), rate_cov=batch.rate_cov.ravel().tolist(),
+        )  # fmt: skip
         self._add(topic, t_ns, message)
 
     def ground_truth(self, truth: Trajectory) -> None:

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from kiteline_core import se3
-from kiteline_core.frame import EncodedImage, Frame, ImuBatch
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_hw import mcap_schemas as schemas
 from kiteline_hw.images import decode_depth, decode_grey
 from kiteline_hw.mcap_file import McapFile
@@ -57,6 +57,13 @@ class LogMessage:
         message = self._parse(schemas.Imu)
         gyro, accel = (np.array(rows, np.float64).reshape(-1, 3) for rows in (message.gyro, message.accel))
         return ImuBatch(np.array(message.t_ns, np.int64), gyro, accel)
+
+    def odometry(self) -> OdometryBatch:
+        """The batch of velocities."""
+        try:
+            return read_odometry(self._parse(schemas.Odometry))
+        except ValueError as error:
+            raise SourceError(f"{self.topic} at {self.t_ns} ns: damaged odometry ({error})") from error
 
     def pose(self) -> F64:
         """The pose (4,4)."""
@@ -123,6 +130,14 @@ def read_frame(images: Sequence[EncodedImage], t_ns: int, has_depth: bool = Fals
     except BadImage as error:
         raise SourceError(f"logged image at {t_ns} ns cannot be decoded: {error}") from error
     return Frame(t_ns, left, right, depth, tuple(images))
+
+
+def read_odometry(message: Any) -> OdometryBatch:
+    """The batch of a kiteline.Odometry message. Raises ValueError where its fields do not fit each other."""
+    n = len(message.t_ns)
+    velocity, rate = (np.array(v, np.float64).reshape(n, 3) for v in (message.velocity, message.rate))
+    covs = (np.array(v, np.float64).reshape(n, 3, 3) for v in (message.velocity_cov, message.rate_cov))
+    return OdometryBatch(np.array(message.t_ns, np.int64), velocity, rate, *covs)
 
 
 def _read_pose(position: Any, orientation: Any) -> F64:

@@ -19,8 +19,10 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 from numpy.typing import NDArray
 
 from kiteline_core import se3
-from kiteline_core.frame import EncodedImage
+from kiteline_core.frame import EncodedImage, OdometryBatch
 from kiteline_hw.images import sniff
+from kiteline_hw.mcap_log_read import read_odometry
+from kiteline_hw.odometer import RATE_SIGMA_RAD_S, VELOCITY_SIGMA_M_S, stated_variances
 from kiteline_hw.raw_pixels import BadImage, RawPixels
 
 F64 = NDArray[np.float64]
@@ -34,6 +36,7 @@ class Kind(Enum):
     IMU = 3
     TRANSFORM = 4
     POSE = 5
+    ODOMETRY = 6  # a pose, and velocities
 
 
 KINDS = {
@@ -51,7 +54,8 @@ KINDS = {
     "foxglove.FrameTransforms": Kind.TRANSFORM,
     "geometry_msgs/msg/PoseStamped": Kind.POSE,
     "geometry_msgs/msg/PoseWithCovarianceStamped": Kind.POSE,
-    "nav_msgs/msg/Odometry": Kind.POSE,
+    "nav_msgs/msg/Odometry": Kind.ODOMETRY,
+    "kiteline.Odometry": Kind.ODOMETRY,
     "foxglove.PoseInFrame": Kind.POSE,
 }
 
@@ -198,6 +202,27 @@ def imu_of(message: Any, otherwise_ns: int) -> list[ImuRow]:
             return list(zip(message.t_ns, rows, strict=True))
         w, a = message.angular_velocity, message.linear_acceleration
         return [(stamp_ns(message, otherwise_ns), (w.x, w.y, w.z, a.x, a.y, a.z))]
+
+
+def odometry_of(message: Any, otherwise_ns: int) -> OdometryBatch:
+    """The velocities of a message, in the axes of the frame that it names (`child_of`); our own are the body's."""
+    with _fields("odometry"):
+        if hasattr(message, "velocity_cov"):
+            return read_odometry(message)
+        v, w = message.twist.twist.linear, message.twist.twist.angular
+        diagonal = np.diagonal(np.array(message.twist.covariance, np.float64).reshape(6, 6))
+        return OdometryBatch(
+            np.array([stamp_ns(message, otherwise_ns)], np.int64),
+            np.array([[v.x, v.y, v.z]], np.float64),
+            np.array([[w.x, w.y, w.z]], np.float64),
+            stated_variances(diagonal[:3], VELOCITY_SIGMA_M_S)[None],
+            stated_variances(diagonal[3:], RATE_SIGMA_RAD_S)[None],
+        )
+
+
+def child_of(message: Any) -> str:
+    """The frame in which an odometry message gives its velocities."""
+    return str(getattr(message, "child_frame_id", "")).lstrip("/")
 
 
 def transforms_of(message: Any) -> list[Transform]:

@@ -48,13 +48,14 @@ class _Camera:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """The channels that make a frame, and the rig."""
+    """The channels that make a frame, and the rig. T_b_l: (4,4) of the frame that the left images name, in the body."""
 
     rig: CameraRig
     left: ImageTopic
     right: ImageTopic | None
     depth: ImageTopic | None
     imu_usable: bool
+    T_b_l: F64
     notes: tuple[str, ...]
 
 
@@ -120,7 +121,8 @@ def select(
     t_b_c, has_body, imu_usable = _body(left, tree, imu_frame, notes)
     model = right.model if right is not None else None
     rig = CameraRig(left.model, model, t_b_c, t_c_r, has_depth=depth is not None, has_body=has_body)
-    return Selection(rig, left.images, right.images if right else None, depth, imu_usable, tuple(notes))
+    t_b_l = t_b_c @ se3.inverse(left.T_c_i)
+    return Selection(rig, left.images, right.images if right else None, depth, imu_usable, t_b_l, tuple(notes))
 
 
 def _cameras(name: str, images: list[ImageTopic], calibrations: list[tuple[str, Calibration]]) -> list[_Camera]:

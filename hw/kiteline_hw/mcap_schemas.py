@@ -1,7 +1,9 @@
-"""The message types of our logs: Foxglove's protobuf schemas where one fits, and three small ones of our own.
+"""The message types of our logs: Foxglove's protobuf schemas where one fits, and small ones of our own.
 
 `kiteline.Blob` {bytes data}: opaque bytes. `kiteline.Imu` {sfixed64 t_ns[], double gyro[], double accel[]}: a batch of
-samples. Both are protobuf too, so that a viewer that does not know them still opens the log.
+samples. `kiteline.Odometry` {sfixed64 t_ns[], double velocity[], rate[], velocity_cov[], rate_cov[]}: a batch of what
+an odometer measured, in the body frame. All are protobuf too, so that a viewer that does not know them still opens the
+log.
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ Log = Log_pb2.Log
 _F = FieldDescriptorProto
 
 
-def _own_messages() -> tuple[Any, Any]:
+_OWN = ("Blob", "Imu", "Odometry")
+
+
+def _own_messages() -> tuple[Any, ...]:
     file = FileDescriptorProto(name="kiteline.proto", package="kiteline", syntax="proto3")
     blob = file.message_type.add(name="Blob")
     blob.field.add(name="data", number=1, type=_F.TYPE_BYTES, label=_F.LABEL_OPTIONAL)
@@ -43,12 +48,16 @@ def _own_messages() -> tuple[Any, Any]:
     imu.field.add(name="t_ns", number=1, type=_F.TYPE_SFIXED64, label=_F.LABEL_REPEATED)
     imu.field.add(name="gyro", number=2, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
     imu.field.add(name="accel", number=3, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
+    odometry = file.message_type.add(name="Odometry")
+    odometry.field.add(name="t_ns", number=1, type=_F.TYPE_SFIXED64, label=_F.LABEL_REPEATED)
+    for number, name in enumerate(("velocity", "rate", "velocity_cov", "rate_cov"), 2):
+        odometry.field.add(name=name, number=number, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
     pool = DescriptorPool()
     pool.Add(file)
-    return tuple(GetMessageClass(pool.FindMessageTypeByName(f"kiteline.{name}")) for name in ("Blob", "Imu"))
+    return tuple(GetMessageClass(pool.FindMessageTypeByName(f"kiteline.{name}")) for name in _OWN)
 
 
-Blob, Imu = _own_messages()
+Blob, Imu, Odometry = _own_messages()
 
 
 _schema_data: dict[str, bytes] = {}

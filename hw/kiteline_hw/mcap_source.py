@@ -13,15 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from kiteline_core import odometry
 from kiteline_core.cameras import CameraRig
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_hw.assemble import DEPTH_TOLERANCE_NS, PAIR_TOLERANCE_NS, Capture, deliver, pair_by_time
 from kiteline_hw.dataset_files import trajectory
 from kiteline_hw.images import ImageRef
 from kiteline_hw.imu import ImuStream, NoImu
 from kiteline_hw.mcap_file import McapFile, RawMessage
-from kiteline_hw.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, RIG, RIGHT
+from kiteline_hw.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, ODOMETER, RIG, RIGHT
 from kiteline_hw.mcap_messages import (
     KINDS,
     BadMessage,
@@ -30,15 +32,18 @@ from kiteline_hw.mcap_messages import (
     MessageReader,
     Transform,
     calibration_of,
+    child_of,
     frame_of,
     image_of,
     imu_of,
     is_depth,
+    odometry_of,
     pose_of,
     stamp_ns,
     transforms_of,
 )
-from kiteline_hw.mcap_rig import ImageTopic, TransformTree, select
+from kiteline_hw.mcap_rig import ImageTopic, Selection, TransformTree, select
+from kiteline_hw.odometer import OdometerStream, before_frames
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.raw_pixels import RawPixels
 from kiteline_hw.rig_json import rig_from_json
@@ -46,6 +51,7 @@ from kiteline_hw.rig_json import rig_from_json
 _HOLD_NS = 200_000_000  # ns; how long a message waits for older ones that were recorded later
 _HOLD_MOST_NS = 1_000_000_000  # ns; how long it waits for a stream that has fallen behind or silent
 _TRUTH_WORDS = ("truth", "ground", "gt", "vicon", "mocap", "optitrack", "leica")
+_SEEN_WORDS = ("vio", "visual", "vins", "slam", "kiteline", "lidar", "icp", "gps", "gnss")  # no wheels
 _GRAVITY_MESSAGES = 200  # messages that tell the unit of acceleration: a second or so
 STANDARD_GRAVITY = 9.80665  # m/s^2
 _DYNAMIC_MOST = 2000  # messages of moving transforms that are looked at when static ones do not connect the sensors
@@ -68,6 +74,8 @@ class McapSource:
         self._truth: Trajectory | None = None
         self._truth_read = False
         self._notes: tuple[str, ...] = ()
+        self._odometer_channel: int | None = None
+        self._T_b_d: NDArray[np.float64] | None = None  # the odometer's frame in the body; None: it speaks of the body
         rig_channel = self._by_schema("kiteline.Rig")
         if rig_channel is not None:
             self._open_own(rig_channel, mono)
@@ -104,15 +112,17 @@ class McapSource:
     def close(self) -> None:
         """Nothing is held open between two readings."""
 
-    def __iter__(self) -> Iterator[Frame | ImuBatch]:
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
         self.report.skipped.clear()
         self.report.notes.clear()
         self.report.notes.extend(self._notes)
         if self._file.cut:
             self.report.skip("file cut", self._file.cut)
         stream = ImuStream(self.report) if self.imu is not None else None
-        captures = self._captures(stream)
-        return deliver(captures, stream if stream is not None else NoImu(), self.rig, self.report, self.name)
+        odometer = OdometerStream(self.report)
+        captures = self._captures(stream, odometer)
+        items = deliver(captures, stream if stream is not None else NoImu(), self.rig, self.report, self.name)
+        return before_frames(items, odometer) if self._odometer_channel is not None else items
 
     # Opening
 
@@ -136,6 +146,7 @@ class McapSource:
         self._right = topics.get(RIGHT) if rig.right is not None else None
         self._depth = topics.get(DEPTH) if rig.has_depth else None
         self._imu_channel = topics.get(IMU)
+        self._odometer_channel = topics.get(ODOMETER)
         self._truth_topic: int | None = topics.get(GROUND_TRUTH)
         self._own = True
 
@@ -143,6 +154,8 @@ class McapSource:
         images, calibrations, imu_channel, imu_frame = self._discover()
         tree = TransformTree(self._transforms())
         found = select(self.name, images, calibrations, tree, imu_frame, mono)
+        self._truth_topic = None
+        self._own = False
         self.rig, self._notes = found.rig, found.notes
         self._left = found.left.channel
         self._right = found.right.channel if found.right is not None else None
@@ -154,8 +167,34 @@ class McapSource:
             self._in_g = self._accelerations_in_g(self._imu_channel)
             if self._in_g:
                 self._notes += ("accelerations were in g and are turned to m/s^2",)
-        self._truth_topic = None
-        self._own = False
+        self._choose_odometer(tree, found)
+
+    def _choose_odometer(self, tree: TransformTree, found: Selection) -> None:
+        """The odometer of a foreign recording: no truth, rather no other SLAM, and its place in the body is known."""
+        truth = self._truth_channel(named_only=True)
+        topics = [
+            c for c, kind in self._channels() if kind is Kind.ODOMETRY and c != truth and self._file.counts.get(c)
+        ]
+
+        def rank(channel: int) -> tuple[bool, bool, int]:
+            name = self._file.channels[channel].topic.lower()
+            return not any(word in name for word in _SEEN_WORDS), "wheel" in name, self._file.counts.get(channel, 0)
+
+        for channel in sorted(topics, key=rank, reverse=True):
+            topic, raw = self._file.channels[channel].topic, self._file.first(channel)
+            if raw is None or any(word in topic.lower() for word in _TRUTH_WORDS):
+                continue
+            try:
+                child = child_of(self._decode(raw))
+            except BadMessage:
+                continue
+            T_l_d = tree.between(found.left.frame_id, child)
+            if T_l_d is not None:
+                self._odometer_channel, self._T_b_d = channel, found.T_b_l @ T_l_d
+                self._notes += (f"odometry is that of {topic}",)
+                return
+            frames = f"its frame {child!r} and the camera's {found.left.frame_id!r}"
+            self._notes += (f"odometry of {topic} left out: no static transform between {frames}",)
 
     def _discover(self) -> tuple[list[ImageTopic], list[tuple[str, Calibration]], int | None, str | None]:
         images: list[ImageTopic] = []
@@ -211,14 +250,15 @@ class McapSource:
                     continue
         return out
 
-    def _truth_channel(self) -> int | None:
+    def _truth_channel(self, *, named_only: bool = False) -> int | None:
         if self._own:
             return self._truth_topic
-        poses = [c for c, kind in self._channels() if kind is Kind.POSE and self._file.counts.get(c)]
+        kinds = (Kind.POSE, Kind.ODOMETRY)
+        poses = [c for c, kind in self._channels() if kind in kinds and self._file.counts.get(c)]
         named = [c for c in poses if any(w in self._file.channels[c].topic.lower() for w in _TRUTH_WORDS)]
         if named:
             return max(named, key=lambda c: self._file.counts.get(c, 0))
-        return poses[0] if len(poses) == 1 else None
+        return poses[0] if len(poses) == 1 and not named_only else None
 
     def _channels(self) -> Iterator[tuple[int, Kind]]:
         for channel in sorted(self._file.channels):
@@ -243,7 +283,7 @@ class McapSource:
 
     # Reading
 
-    def _captures(self, imu: ImuStream | None) -> Iterator[Capture]:
+    def _captures(self, imu: ImuStream | None, odometer: OdometerStream) -> Iterator[Capture]:
         sides = {self._left: 0}
         partner = self._right if self._right is not None else self._depth
         if partner is not None:
@@ -256,6 +296,8 @@ class McapSource:
                 if channel == self._imu_channel:
                     assert imu is not None
                     imu.add(t_ns, (*item[:3], *(a * STANDARD_GRAVITY for a in item[3:])) if self._in_g else item)
+                elif channel == self._odometer_channel:
+                    odometer.add(item if self._T_b_d is None else odometry.in_body(item, self._T_b_d))
                 elif both and channel == self._depth:
                     depths.append((t_ns, item))
                 else:
@@ -283,6 +325,8 @@ class McapSource:
         wanted = [c for c in (self._left, self._right, self._depth) if c is not None]
         if with_imu and self._imu_channel is not None:
             wanted.append(self._imu_channel)
+        if self._odometer_channel is not None:
+            wanted.append(self._odometer_channel)
         newest = dict.fromkeys(wanted, 0)
         heap: list[tuple[int, int, int, int, Any]] = []
         order = 0
@@ -291,6 +335,9 @@ class McapSource:
                 message = self._decode(raw)
                 if raw.channel == self._imu_channel:
                     items: list[tuple[int, Any]] = list(imu_of(message, raw.log_ns))
+                elif raw.channel == self._odometer_channel:
+                    batch = odometry_of(message, raw.log_ns)
+                    items = [(int(batch.t_ns[-1]), batch)] if len(batch.t_ns) else []
                 else:
                     notes = self._file.channels[raw.channel].metadata
                     items = [(stamp_ns(message, raw.log_ns), image_of(message, notes))]
@@ -299,7 +346,8 @@ class McapSource:
                 continue
             for t_ns, item in items:
                 # At one instant: samples, then depth, then the eyes.
-                rank = 0 if raw.channel == self._imu_channel else 1 if raw.channel == self._depth else 2
+                sampled = raw.channel in (self._imu_channel, self._odometer_channel)
+                rank = 0 if sampled else 1 if raw.channel == self._depth else 2
                 heapq.heappush(heap, (t_ns, rank, order, raw.channel, item))
                 order += 1
                 newest[raw.channel] = max(newest[raw.channel], t_ns)

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kiteline_core.frame import OdometryBatch
 from kiteline_core.se3 import F64
 from kiteline_hw.mavlink_frames import body_rates, controller_covariance, local_covariance, local_pose, upper_triangle
 from kiteline_hw.mavlink_messages import Heartbeat, HighresImu, MavlinkCodec, Odometry, TimeSync
+from kiteline_hw.mavlink_odometry import FromController
 from kiteline_hw.ports import PoseSample
 
 _FARTHEST_M = 1e6  # m; beyond it something is broken, and a float32 has lost its centimetres
@@ -54,7 +56,11 @@ class OdometryCounters:
 class OdometryStream:
     """Poses in, MAVLink bytes out. T_b_f: (4,4) flight controller (FRD) in the body frame: mavlink_frames.mounting."""
 
-    def __init__(self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None) -> None:
+    def __init__(
+        self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None,
+        wanted: FromController | None = None,
+    ) -> None:  # fmt: skip
+        """wanted: takes what the controller says of its own velocity; None: nobody asks."""
         self.config = config or OdometryConfig()
         self.codec = codec or MavlinkCodec()
         self.counters = OdometryCounters()
@@ -65,6 +71,7 @@ class OdometryStream:
         self._past: deque[PoseSample] = deque()
         self._autopilot: tuple[Heartbeat, int] | None = None
         self._imu: list[HighresImu] = []
+        self._wanted = wanted
 
     def step(self, pose: PoseSample | None, now_ns: int) -> list[bytes]:
         """Messages to send now: a heartbeat if it is time, the pose (the newest, or None) if it is its turn."""
@@ -157,9 +164,12 @@ class OdometryStream:
             elif isinstance(message, Heartbeat):
                 if message.is_autopilot:
                     self._autopilot = message, now_ns
+                    out += [] if self._wanted is None else self._wanted.questions(self.codec, now_ns)
             elif isinstance(message, HighresImu):
                 self._imu.append(message)
                 del self._imu[: -self.config.imu_samples]
+            elif self._wanted is not None:
+                self._wanted.receive(message, now_ns)
         return out
 
     def autopilot(self, now_ns: int) -> Heartbeat | None:
@@ -167,6 +177,10 @@ class OdometryStream:
         if self._autopilot is None or now_ns - self._autopilot[1] > 3 * self.config.heartbeat_ns:
             return None
         return self._autopilot[0]
+
+    def take_odometry(self, t_ns: int) -> OdometryBatch | None:
+        """What the controller said of its velocity up to an instant, in the body frame; None where nobody asked."""
+        return None if self._wanted is None else self._wanted.take_until(t_ns)
 
     def take_imu(self) -> list[HighresImu]:
         """The controller's inertial samples since the last call."""

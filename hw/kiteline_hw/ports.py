@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.cameras import CameraRig
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 
 
 class SourceError(Exception):
@@ -37,7 +37,8 @@ class SourceReport:
 
 class FrameSource(Protocol):
     """A camera or a recording. Iterating yields samples in order of time; an ImuBatch holds all inertial samples
-    since the last one up to and including the time of the Frame that follows it.
+    since the last one up to and including the time of the Frame that follows it, and an OdometryBatch those of an
+    odometer, where there is one.
     """
 
     @property
@@ -55,7 +56,7 @@ class FrameSource(Protocol):
         """How many frames will come, for a progress bar; None when unknown."""
         ...
 
-    def __iter__(self) -> Iterator[Frame | ImuBatch]: ...
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]: ...
     def close(self) -> None: ...
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from kiteline_core.cameras import CameraRig
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_hw.ports import FrameSource, SourceReport
 
 
@@ -44,12 +44,12 @@ class _Reduced:
     def frame_count(self) -> int | None:
         return self._source.frame_count
 
-    def __iter__(self) -> Iterator[Frame | ImuBatch]:
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
         for item in self._source:
             if isinstance(item, ImuBatch):
                 if self._imu:
                     yield item
-            elif self._mono:
+            elif self._mono and isinstance(item, Frame):
                 yield Frame(item.t_ns, item.left, encoded=item.encoded[:1])
             else:
                 yield item

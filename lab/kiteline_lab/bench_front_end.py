@@ -22,7 +22,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracker import Tracker
 from kiteline_agent.warm import warm
-from kiteline_core.frame import Frame, ImuBatch, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch, Trajectory
 from kiteline_core.ids import AgentId
 from kiteline_hw.ports import FrameSource
 from kiteline_hw.sim.config import read_config
@@ -148,9 +148,11 @@ def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _from(items: Iterable[Frame | ImuBatch], first: int) -> Iterator[Frame | ImuBatch]:
-    """What comes after the first so many frames."""
+def _from(items: Iterable[Frame | ImuBatch | OdometryBatch], first: int) -> Iterator[Frame | ImuBatch]:
+    """Images and inertial samples after the first so many frames."""
     for item in items:
+        if isinstance(item, OdometryBatch):
+            continue
         if first == 0:
             yield item
         else:

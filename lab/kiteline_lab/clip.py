@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_agent.camera import joined
+from kiteline_core import odometry as odometer
 from kiteline_core.cameras import CameraRig
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_hw.mcap_log import GROUND_TRUTH, IMU, LogWriter
 from kiteline_hw.sources import open_source
 from kiteline_lab.simulate import encode
@@ -18,12 +19,13 @@ from kiteline_lab.simulate import encode
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Frames in order of time, each with the inertial samples since the one before."""
+    """Frames in order of time, each with the inertial samples since the one before. odometry: of the whole clip."""
 
     rig: CameraRig
     imu: ImuCalibration | None
     items: tuple[tuple[Frame, ImuBatch | None], ...]
     truth: Trajectory | None
+    odometry: OdometryBatch | None = None
 
     @property
     def period_ns(self) -> int:
@@ -103,7 +105,11 @@ def load(source: str, *, imu: bool = True, mono: bool = False, frames: int = 0) 
     opened = open_source(source, mono=mono, imu=imu)
     items: list[tuple[Frame, ImuBatch | None]] = []
     pending: list[ImuBatch] = []
+    driven: list[OdometryBatch] = []
     for item in opened:
+        if isinstance(item, OdometryBatch):
+            driven.append(item)
+            continue
         if isinstance(item, ImuBatch):
             pending.append(item)
             continue
@@ -111,6 +117,7 @@ def load(source: str, *, imu: bool = True, mono: bool = False, frames: int = 0) 
         pending = []
         if len(items) == frames:
             break
-    clip = Clip(opened.rig, opened.imu if imu else None, tuple(items), opened.ground_truth)
+    truth = opened.ground_truth
+    clip = Clip(opened.rig, opened.imu if imu else None, tuple(items), truth, odometer.joined(driven))
     opened.close()
     return clip

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from kiteline_core.frame import ImuBatch, Trajectory
-from kiteline_hw.mcap_log import GROUND_TRUTH, IMU, LogWriter
+from kiteline_core.frame import Frame, ImuBatch, Trajectory
+from kiteline_hw.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sources import open_source
 from kiteline_lab.out_file import whole_file
@@ -40,19 +40,22 @@ def main(argv: list[str]) -> int:
 
 def record(source: FrameSource, path: Path) -> tuple[int, int]:
     """Write all that a source delivers; how many frames and inertial samples. Raises SourceError."""
-    frames = samples = 0
+    frames, samples, begun = 0, 0, False
     truth = _Truth(source.ground_truth)
     with (
         LogWriter(path, {"role": "recording", "source": source.name}) as log,
         Progress("converting", source.frame_count, "frames") as progress,
     ):
         for item in source:
-            t_ns = int(item.t_ns[0]) if isinstance(item, ImuBatch) else item.t_ns
-            if not frames and not samples:
-                log.rig(t_ns, source.rig, source.imu)
+            if not begun:
+                log.rig(item.t_ns if isinstance(item, Frame) else int(item.t_ns[0]), source.rig, source.imu)
+                begun = True
             if isinstance(item, ImuBatch):
                 log.imu(IMU, int(item.t_ns[-1]), item)
                 samples += len(item.t_ns)
+                continue
+            if not isinstance(item, Frame):
+                log.odometer(ODOMETER, int(item.t_ns[-1]), item)
                 continue
             truth.write(log, item.t_ns)
             log.frame(item)

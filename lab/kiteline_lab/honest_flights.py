@@ -83,6 +83,8 @@ def flight(number: int, trajectories: Path, scratch: Path, scale: float = 1.0, s
         if isinstance(item, ImuBatch):
             pending = item
             continue
+        if not isinstance(item, Frame):
+            continue
         items.append(Shown(item, pending, source.ground_truth.T_w_b[len(items)]))
         pending = None
     return HonestFlight(source.rig, source.imu, tuple(items), options["rest"] == 0.0)

@@ -33,7 +33,7 @@ from kiteline_basestation.warm import warm as base_warm
 from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_codec.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
-from kiteline_core.frame import EncodedImage, ImuBatch
+from kiteline_core.frame import EncodedImage, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader, read_frame
 from kiteline_hw.mcap_mend import MENDED
@@ -117,7 +117,8 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
             frame = read_frame(images, step.head["frame_ns"], bool(step.of(DEPTH)))
         if step.head["imu"]:
             batch = _imu(step)
-        given = StepInput(frame, batch, step.blobs(agent_log.PACKETS_IN), step.head["cpu_ns"])
+        driven = _odometry(step) if step.head.get("odometer") else None
+        given = StepInput(frame, batch, step.blobs(agent_log.PACKETS_IN), step.head["cpu_ns"], driven)
         output = agent.step(given, step.head["now_ns"])
         logged = [m.json() for m in step.of(agent_log.ESTIMATE)]
         made = [] if output.estimate is None else [agent_log.estimate_to_json(output.estimate)]
@@ -146,6 +147,13 @@ def _imu(step: Step) -> ImuBatch:
     if len(batches) != 1:
         raise SourceError(f"step {step.number} of the log has {len(batches)} inertial batches, its head says one")
     return batches[0].imu()
+
+
+def _odometry(step: Step) -> OdometryBatch:
+    batches = step.of(agent_log.ODOMETER)
+    if len(batches) != 1:
+        raise SourceError(f"step {step.number} of the log has {len(batches)} batches of odometry, its head says one")
+    return batches[0].odometry()
 
 
 def _channel(

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import cv2
 
-from kiteline_core.frame import EncodedImage, Frame, ImuBatch
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_hw.images import encode_depth, encode_image
-from kiteline_hw.mcap_log import GROUND_TRUTH, IMU, LogWriter
+from kiteline_hw.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.config import SimConfig, read_config
 from kiteline_hw.sim.source import SimSource
@@ -45,10 +45,13 @@ def main(argv: list[str]) -> int:
     p.add_argument("--mono", action="store_true", default=None, help="no right eye")
     p.add_argument("--depth", action="store_true", default=None, help="true depth in place of the right eye")
     p.add_argument("--no-imu", dest="imu", action="store_false", default=None, help="no inertial samples")
+    p.add_argument("--odometry", metavar="HZ", type=float, help="record an odometer's velocities at this rate; options "
+                   "of SCENE make it worse: room?odometry_scale=1.05&odometry_slip=0.2&odometry_noise=0.1, or that of "
+                   "wheels: odometry_wheels=1")  # fmt: skip
     p.add_argument("--png", action="store_true", help=f"images without loss (default JPEG {JPEG_QUALITY})")
     p.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="threads that render (default: all cores)")
     o = p.parse_args(argv)
-    names = ("trajectory", "seed", "seconds", "start", "lens", "mono", "depth", "imu")
+    names = ("trajectory", "seed", "seconds", "start", "lens", "mono", "depth", "imu", "odometry")
     options: dict[str, object] = {name: getattr(o, name) for name in names if getattr(o, name) is not None}
     if o.also:
         options["also"] = tuple("" if name == COURSE else name for name in o.also)
@@ -88,6 +91,9 @@ def record(source: SimSource, path: Path, png: bool = False) -> int:
             if isinstance(item, ImuBatch):
                 log.imu(IMU, int(item.t_ns[-1]), item)
                 samples += len(item.t_ns)
+                continue
+            if isinstance(item, OdometryBatch):
+                log.odometer(ODOMETER, int(item.t_ns[-1]), item)
                 continue
             log.pose(GROUND_TRUTH, item.t_ns, "world", truth.T_w_b[frames])
             log.frame(replace(item, encoded=encode(item, png)))

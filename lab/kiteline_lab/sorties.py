@@ -166,6 +166,8 @@ def _frames(sortie: Sortie) -> Iterator[tuple[Frame, ImuBatch | None, F64]]:
             if isinstance(item, ImuBatch):
                 pending = item
                 continue
+            if not isinstance(item, Frame):
+                continue
             at_s = (item.t_ns - begin_ns) * 1e-9
             if at_s >= part.to_s:
                 break

@@ -27,7 +27,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.warm import warm
 from kiteline_codec.channel import coded_channel
-from kiteline_core.frame import Frame
+from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
 from kiteline_hw.sources import open_source
@@ -162,8 +162,9 @@ def _first_pose_s(source: str) -> float:
     agent = Agent(opened.rig, opened.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
     imu = None
     for item in opened:
-        if not isinstance(item, Frame):
+        if isinstance(item, ImuBatch):
             imu = item
+        if not isinstance(item, Frame):
             continue
         estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
         if estimate is not None and estimate.tracked:

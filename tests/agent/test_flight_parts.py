@@ -41,7 +41,7 @@ def no_clock() -> int:
 def test_frames_come_with_the_samples_before_them() -> None:
     camera = Camera(source(), None, no_clock)
     assert camera.next_ns == 100
-    frame, batch = camera.take()
+    frame, batch, _ = camera.take()
     assert frame.t_ns == 100
     assert batch is not None
     assert batch.t_ns.tolist() == [50, 100]
@@ -51,7 +51,7 @@ def test_frames_come_with_the_samples_before_them() -> None:
 def test_samples_of_a_dropped_frame_go_with_the_next() -> None:
     camera = Camera(source(), None, no_clock)
     camera.drop()
-    frame, batch = camera.take()
+    frame, batch, _ = camera.take()
     assert frame.t_ns == 200
     assert batch is not None
     assert batch.t_ns.tolist() == [50, 100, 150, 200]

@@ -21,7 +21,8 @@ from mcap_ros2.writer import Writer as Ros2Writer
 
 from kiteline_core import se3
 from kiteline_core.cameras import Lens
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
+from kiteline_hw.odometer import VELOCITY_SIGMA_M_S
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sources import open_source
 
@@ -57,6 +58,27 @@ std_msgs/Header header
 string child_frame_id
 geometry_msgs/Transform transform
 ================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+================================================================================
+MSG: geometry_msgs/PoseWithCovariance
+geometry_msgs/Pose pose
+float64[36] covariance
+================================================================================
+MSG: geometry_msgs/Twist
+geometry_msgs/Vector3 linear
+geometry_msgs/Vector3 angular
+================================================================================
+MSG: geometry_msgs/TwistWithCovariance
+geometry_msgs/Twist twist
+float64[36] covariance
+================================================================================
 MSG: sensor_msgs/RegionOfInterest
 uint32 x_offset
 uint32 y_offset
@@ -75,6 +97,8 @@ ROS2 = {
     "float64[9] orientation_covariance\n"
     "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
     "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance",
+    "nav_msgs/msg/Odometry": "std_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist",
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
 }
 T_B_L = se3.exp(np.array([0.02, -0.06, 0.01, 1.2, -1.2, 1.2]))
@@ -153,6 +177,16 @@ class Bag:
             linear_acceleration=xyz(np.array([0.0, 0.0, accel])), **zero,
         )  # fmt: skip
 
+    def odometry(self, t_ns: int, topic: str, child: str, velocity: list[float], rate: list[float]) -> None:
+        covariance = [0.0] * 36
+        covariance[0], covariance[7], covariance[35] = 0.04, 1e9, 0.0025  # ahead, sideways (not measured), yaw
+        pose = {"position": xyz(np.zeros(3)), "orientation": quaternion(np.eye(4))}
+        twist = {"linear": xyz(np.array(velocity)), "angular": xyz(np.array(rate))}
+        self.add(
+            t_ns, topic, "nav_msgs/msg/Odometry", "odom", child_frame_id=child,
+            pose={"pose": pose, "covariance": [0.0] * 36}, twist={"twist": twist, "covariance": covariance},
+        )  # fmt: skip
+
     def tf(self, t_ns: int, parent: str, child: str, t: np.ndarray) -> None:
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": parent}
         transform = {"translation": xyz(t[:3, 3]), "rotation": quaternion(t)}
@@ -223,6 +257,69 @@ def test_room_recording(data_dir: Path) -> None:
     assert source.ground_truth.T_w_b[0, :3, 3] == pytest.approx([-2.060154, -1.404402, 1.913249])
     assert not source.report.skipped
     source.close()
+
+
+# A rover's axle (forward, left, up) as its camera's IMU (right, down, forward) sees it: below it and behind it.
+AXLE = se3.from_rt(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, 0.2, -0.5]))
+
+
+def driven_bag(*topics: str, child: str = "base_link", tf: bool = True) -> Bag:
+    """1 m/s ahead and 0.5 rad/s to the left, told every 20 ms; a second topic says something else."""
+    bag = stereo_bag()
+    if tf:
+        bag.tf(START_NS, "imu", "base_link", AXLE)
+    for i in range(12):
+        for k, topic in enumerate(topics):
+            bag.odometry(START_NS + i * 20_000_000, topic, child, [1.0 + k, 0.0, 0.0], [0.0, 0.0, 0.5])
+    bag.messages.sort(key=lambda m: m[0])
+    return bag
+
+
+def test_wheel_odometry_of_a_bag_is_told_of_the_body(tmp_path: Path) -> None:
+    source = open_source(str(driven_bag("/wheels/odom").write(tmp_path / "a.mcap")))
+    items = list(source)
+    told = [item for item in items if isinstance(item, OdometryBatch)]
+    assert [len(b.t_ns) for b in told] == [1, 2, 3, 2, 3, 1]  # up to each frame
+    assert isinstance(items[items.index(told[0]) + 1], Frame)
+    # Half a metre ahead of the axle the camera moves to the left as well: right -0.25, down 0, forward 1 m/s.
+    np.testing.assert_allclose(told[1].velocity, [[-0.25, 0.0, 1.0]] * 2, atol=1e-4)
+    np.testing.assert_allclose(told[1].rate, [[0.0, -0.5, 0.0]] * 2, atol=1e-12)
+    # forward was stated, sideways is not measured, the rest is not known
+    assert told[1].velocity_cov[0, 2, 2] == pytest.approx(0.04, abs=3e-3)
+    assert told[1].velocity_cov[0, 0, 0] == pytest.approx(UNMEASURED, rel=1e-3)
+    assert told[1].velocity_cov[0, 1, 1] == pytest.approx(VELOCITY_SIGMA_M_S**2, rel=0.2)
+    assert told[1].rate_cov[0, 1, 1] == pytest.approx(0.0025)
+    assert "odometry is that of /wheels/odom" in source.report.notes
+    check_stereo(source)
+
+
+@pytest.mark.parametrize(
+    ("topics", "speed"),
+    [
+        (("/wheels/odom", "/vins/odometry"), 1.0),
+        (("/vio/odom", "/odom"), 2.0),
+        (("/ground_truth/odom", "/odom"), 2.0),
+        (("/odom", "/wheel/odometry"), 2.0),
+    ],
+)
+def test_wheels_go_before_what_others_saw_and_truth_is_never_used(
+    tmp_path: Path, topics: tuple[str, ...], speed: float
+) -> None:
+    source = open_source(str(driven_bag(*topics).write(tmp_path / "a.mcap")))
+    told = [item for item in source if isinstance(item, OdometryBatch)]
+    assert told[0].velocity[0, 2] == pytest.approx(speed, abs=1e-3)
+
+
+def test_truth_alone_is_no_odometry(tmp_path: Path) -> None:
+    source = open_source(str(driven_bag("/gt/odom").write(tmp_path / "a.mcap")))
+    assert not any(isinstance(item, OdometryBatch) for item in source)
+    assert source.ground_truth is not None
+
+
+def test_odometry_whose_place_nobody_knows_is_left_out_and_told_of(tmp_path: Path) -> None:
+    source = open_source(str(driven_bag("/odom", tf=False).write(tmp_path / "a.mcap")))
+    assert not any(isinstance(item, OdometryBatch) for item in source)
+    assert any("odometry of /odom left out: no static transform" in note for note in source.report.notes)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,12 @@ class SimConfig:
     mono: bool = False
     depth: bool = False  # depth in place of the right eye, like an RGB-D camera
     imu: bool = True
+    odometry: float = 0.0  # Hz of an odometer beside the cameras; 0: none
+    odometry_noise: float = 0.05  # m/s a sample, white
+    odometry_turn_noise: float = 0.01  # rad/s a sample, white
+    odometry_scale: float = 1.0  # times the true speed: tyres wear, flow sensors err in their height
+    odometry_slip: float = 0.0  # share of the time in which it reads up to 2.5 times the true speed
+    odometry_wheels: bool = False  # measures along the camera's view and about its vertical axis alone
     lens: str = "radtan"  # or equidistant, none
     baseline: float = 0.11  # m
     scale: float = 1.0  # of image size and focal length
@@ -57,6 +63,10 @@ def read_config(scene: str, **options: object) -> SimConfig:
         raise SourceError(f"agent {config.agent} has no trajectory: {1 + len(config.also)} are given")
     if config.seed < 0 or config.seconds < 0 or config.start < 0 or not 0.05 <= config.scale <= 4:
         raise SourceError("seed, seconds and start of a simulated scene cannot be negative; scale must be 0.05 to 4")
+    if not 0 <= config.odometry <= 1000 or config.odometry_noise < 0 or not 0 <= config.odometry_slip < 1:
+        raise SourceError(
+            "odometry of a simulated scene must be 0 to 1000 Hz, its noise not negative, its slip below 1"
+        )
     return config
 
 

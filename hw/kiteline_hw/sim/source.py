@@ -10,10 +10,12 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core import odometry
 from kiteline_core.cameras import CameraRig, Lens
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sim import imu as inertial
+from kiteline_hw.sim import odometer
 from kiteline_hw.sim.config import SimConfig, read_config
 from kiteline_hw.sim.lens import imperfect, make_rig
 from kiteline_hw.sim.paths import built_in, course_length_s
@@ -125,6 +127,13 @@ class SimSource:
         calibration = ImuCalibration(rate_hz=1e9 / IMU_NS)
         return inertial.measure(self.path, stamps, START_NS, calibration, self.config.seed * 64 + self.config.agent)
 
+    def odometry(self) -> OdometryBatch | None:
+        """All that the odometer measures on the flight, or None without one."""
+        if self.config.odometry <= 0.0:
+            return None
+        stamps = np.arange(START_NS, int(self._stamps[-1]) + 1, round(1e9 / self.config.odometry), dtype=np.int64)
+        return odometer.measure(self.path, stamps, START_NS, self.config, self._rig.T_b_c)
+
     def eyes(self) -> list[Eye]:
         """Fresh cameras in the world, left first."""
         rig = self._true_rig
@@ -146,14 +155,19 @@ class SimSource:
         right = images[1] if len(images) > 1 else None
         return Frame(int(self._stamps[k]), images[0], right, eyes[0].depth() if c.depth else None)
 
-    def __iter__(self) -> Iterator[Frame | ImuBatch]:
-        batch = self.inertial() if self.config.imu else None
-        done = 0
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
+        batch, driven = self.inertial() if self.config.imu else None, self.odometry()
+        done = driven_done = 0
         for frame in self._images():
             if batch is not None:
                 end = int(np.searchsorted(batch.t_ns, frame.t_ns, side="right"))
                 yield ImuBatch(batch.t_ns[done:end], batch.gyro[done:end], batch.accel[done:end])
                 done = end
+            if driven is not None:
+                end = int(np.searchsorted(driven.t_ns, frame.t_ns, side="right"))
+                if end > driven_done:
+                    yield odometry.chosen(driven, slice(driven_done, end))
+                driven_done = end
             yield frame
 
     def _images(self) -> Iterator[Frame]:

@@ -1,0 +1,84 @@
+"""Velocities of an odometer until a frame claims them: what is not finite, repeated or backwards in time is dropped,
+counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core import odometry
+from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
+from kiteline_hw.ports import SourceReport
+
+F64 = NDArray[np.float64]
+
+VELOCITY_SIGMA_M_S = 0.1  # of a device that does not say how well it measures
+RATE_SIGMA_RAD_S = 0.05  # likewise
+_NOTHING = 1e3  # variance from which on a device means that it measures nothing: ROS drivers write 1e3 to 1e9
+
+
+class OdometerSamples(Protocol):
+    """Where a source keeps the velocities that no frame has claimed yet."""
+
+    def take_until(self, t_ns: int) -> OdometryBatch | None:
+        """All samples not yet taken with a time <= t_ns, or None when there are none."""
+        ...
+
+
+class OdometerStream:
+    """Samples as they come in; bounded by what arrives between two frames."""
+
+    def __init__(self, report: SourceReport | None = None) -> None:
+        self._report = report
+        self._waiting: list[OdometryBatch] = []
+        self._last_ns = -(2**63)
+
+    def add(self, batch: OdometryBatch) -> None:
+        """Samples in the body frame."""
+        self._waiting.append(batch)
+
+    def take_until(self, t_ns: int) -> OdometryBatch | None:
+        batch = odometry.joined(self._waiting)
+        if batch is None:
+            return None
+        due = batch.t_ns <= t_ns
+        self._waiting = [] if due.all() else [odometry.chosen(batch, ~due)]
+        sound = odometry.usable(batch)
+        newest = np.maximum.accumulate(np.concatenate([[self._last_ns], np.where(due & sound, batch.t_ns, -(2**63))]))
+        late = batch.t_ns <= newest[:-1]
+        self._note("odometer sample not finite", batch.t_ns[due & ~sound])
+        self._note("odometer stamp not increasing", batch.t_ns[due & sound & late])
+        keep = due & sound & ~late
+        if not keep.any():
+            return None
+        self._last_ns = int(batch.t_ns[keep][-1])
+        return odometry.chosen(batch, keep)
+
+    def _note(self, reason: str, t_ns: NDArray[np.int64]) -> None:
+        if self._report is not None:
+            for t in t_ns:
+                self._report.skip(reason, f"at {t} ns")
+
+
+def before_frames(
+    items: Iterable[Frame | ImuBatch], samples: OdometerSamples
+) -> Iterator[Frame | ImuBatch | OdometryBatch]:
+    """The same items, each frame after the OdometryBatch that leads up to it."""
+    for item in items:
+        batch = samples.take_until(item.t_ns) if isinstance(item, Frame) else None
+        if batch is not None:
+            yield batch
+        yield item
+
+
+def stated_variances(diagonal: F64, sigma: float) -> F64:
+    """(3,3) of three variances as a device states them; one that it does not know (0 or below, not finite) is that of
+    `sigma`, and a huge one means that nothing is measured.
+    """
+    unknown = ~np.isfinite(diagonal) | (diagonal <= 0.0)
+    out = np.where(unknown, sigma * sigma, np.where(unknown, 1.0, diagonal))
+    return np.diag(np.where(out >= _NOTHING, UNMEASURED, out))
