@@ -212,6 +212,8 @@ class Agent:
         self._bridged = False
         self.work.fused = int(self._inertia.tracker is not None)
         fused = self._inertia.fuse(track, t_ns)
+        if self._inertia.tracker is not None:
+            self._certainty.fused(track.T_c_m, fused.T_c_m)
         self._events += self._inertia.news()
         return fused
 

@@ -1,11 +1,12 @@
 """How certain the pose is: noise that adds up from keyframe to keyframe, errors of the calibration, time flown blind.
 
-A pose errs in three ways. *Noise*: it errs as the keyframes at whose points it was measured, and on top as that
+A pose errs in four ways. *Noise*: it errs as the keyframes at whose points it was measured, and on top as that
 measurement; a vehicle that comes back to old points is as certain as they are. *Calibration*: what a good calibration
 leaves is the same error in every frame, so it does not average out but bends and stretches the whole map; its few
 parameters are not estimated, only what they do to each keyframe is carried along (S. F. Schmidt's consider filter,
-1966; as in J. Civera et al., "Drift-free real-time sequential mosaicing", for maps). *Blindness*: without images the
-IMU's own covariance, or accelerations that nobody knows.
+1966; as in J. Civera et al., "Drift-free real-time sequential mosaicing", for maps). *Pull*: what an IMU moves poses by
+from where the images see them; either may be right. *Blindness*: without images the IMU's own covariance, or
+accelerations that nobody knows.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.certainty_kernels import DISPARITY_SHAPES, SHAPES, adjoint_into, pose_covariance, sensitivity
+from kiteline_agent.certainty_kernels import (
+    CALIBRATION,
+    DISPARITY_SHAPES,
+    SHAPES,
+    adjoint_into,
+    pose_covariance,
+    sensitivity,
+)
 from kiteline_agent.config import CertaintyConfig
 from kiteline_agent.local_map import LocalMap
 from kiteline_agent.pose_state import PoseState
@@ -46,6 +54,7 @@ class Certainty:
         self._noise_k, self._shift_k = np.zeros((slots, 6, 6)), np.zeros((slots, 6, SHAPES))  # of each keyframe
         self._by_base = np.zeros(slots, np.bool_)
         self._calibration = np.full(SHAPES, config.calibration_px**2)
+        self._calibration[CALIBRATION] = config.pull_share**2
         self._calibration[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # two cameras make a disparity
         extrinsic = np.repeat([config.extrinsic_m, config.extrinsic_rad], 3) if has_body else np.zeros(6)
         a = adjoint(T_b_c)
@@ -53,6 +62,8 @@ class Certainty:
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))  # of the camera in m
         self._way: dict[SubmapId, F64] = {}  # T_o_m of the submaps that were left since all motion was last measured
         self._guided = False  # an IMU measures all motion
+        self._pull = np.zeros(6)  # what an IMU lately moves poses by from where images say, on the left of T_c_m
+        self._dispute = np.zeros((6, 6))  # covariance of that
         self._blind_s: float | None = 0.0  # that nothing measured motion; None: the last frame was measured
         self._blind = np.zeros((6, 6))  # [translation in m, rotation about the body's axes], since images were lost
         self._carried = np.zeros((6, 6))  # of the submap in o
@@ -88,6 +99,21 @@ class Certainty:
             return
         self._weigh(track)
 
+    def fused(self, seen_T_c_m: F64, T_c_m: F64) -> None:
+        """The images alone said seen_T_c_m (4,4), with the IMU it became T_c_m (4,4).
+
+        Were both as good as they claim, the two would hardly differ. What the IMU pulls the pose off the images, no
+        covariance of either tells, but it is seen here (as noise is in R. Mehra, "On the identification of variances
+        and adaptive Kalman filtering", 1970): its mean goes the same way in all keyframes and adds up, as an error of
+        the calibration does; the rest is noise.
+        """
+        X = T_c_m @ se3.inverse(seen_T_c_m)
+        d = np.array([X[0, 3], X[1, 3], X[2, 3], X[2, 1], X[0, 2], X[1, 0]])
+        share = 1.0 / self._config.dispute_frames
+        self._pull += share * (d - self._pull)
+        d -= self._pull
+        self._dispute += share * (np.outer(d, d) - self._dispute)
+
     def _weigh(self, track: Track) -> None:
         m = self._map
         sensitivity(
@@ -101,8 +127,9 @@ class Certainty:
         seen = np.bincount(track.rows[track.inlier] // m.births)
         slots = np.flatnonzero(seen)
         share = seen[slots] / max(int(seen.sum()), 1)
-        self._noise = a @ noise @ a.T + np.tensordot(share, self._noise_k[slots], 1)
+        self._noise = a @ (noise + self._dispute) @ a.T + np.tensordot(share, self._noise_k[slots], 1)
         self._shift = a @ (inverse @ self._g)
+        self._shift[:, CALIBRATION] -= a @ self._pull
         self._seen(track.inliers)
 
     def _seen(self, inliers: int) -> None:

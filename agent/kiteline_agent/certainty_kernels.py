@@ -11,13 +11,14 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-SHAPES = 10  # ways in which a calibration errs, see _bias: those of the disparity, then those of both eyes
+CALIBRATION = 10  # ways in which a calibration errs, see _bias: those of the disparity, then those of both eyes
 DISPARITY_SHAPES = 5
+SHAPES = CALIBRATION + 1  # what a whole flight shares: the last is how an IMU pulls poses off the images
 
 
 @njit
 def _bias(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
-    """out (3,10): by how much u, v and disparity are off for one pixel of each error, told at the image's edge.
+    """out (3,11): by how much u, v and disparity are off for one pixel of each error, told at the image's edge.
 
     Disparity (the eyes differ): constant, along x and y, with the square of the distance from the centre, distortion.
     Both eyes alike: focal length along x and y, principal point along x and y, distortion.
@@ -43,8 +44,8 @@ def sensitivity(
 
     T_c_m: (4,4). camera: fx, fy, cx, cy, bf. half_px: half the image's width. rows: (n,) slot * births + index.
     inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. born_at:
-    (K*births,2) px. rho: (K*births,) 1/m. of_keyframes: (K,6,10) what the errors did to the keyframes, as a left
-    perturbation of T_m_k. Out: h (6,6) information, g (6,10): the pose moves by -h^-1 g for a pixel of each error.
+    (K*births,2) px. rho: (K*births,) 1/m. of_keyframes: (K,6,11) what the errors did to the keyframes, as a left
+    perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a pixel of each error.
     """
     fx, fy, bf = camera[0], camera[1], camera[4]
     here, there = np.empty((3, SHAPES)), np.empty((3, SHAPES))
@@ -183,7 +184,7 @@ def pose_covariance(
 ) -> None:  # fmt: skip
     """Covariance of a body pose in a frame a (o or m itself), all parts together; see certainty.
 
-    noise (6,6), shift (6,10): of the camera in m, on the left. calibration: (10,) variances. carried: (6,6) of m in a.
+    noise (6,6), shift (6,11): of the camera in m, on the left. calibration: (11,) variances. carried: (6,6) of m in a.
     blind: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6) of the camera in the body. T_a_b0:
     where the frame began. Out: left (6,6) the first three parts on the left of T_a_b; out (6,6) all of it, [translation
     in a, rotation about the body's axes].

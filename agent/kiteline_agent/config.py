@@ -159,6 +159,8 @@ class CertaintyConfig:
     extrinsic_m: float = 1e-3  # likewise
     least_rms: float = 0.3  # whitened residual of a frame below which its noise is not believed to be smaller
     inflation: float = 1.0  # of the variance of a measured pose
+    dispute_frames: float = 10.0  # frames over which what an IMU pulls poses off the images is averaged
+    pull_share: float = 1.0  # of its mean, one deviation, that is wrong
     refined_share: float = 0.25  # of a keyframe's variance that is left when the base has optimised it
     blind_accel_m_s2: float = 2.0  # that an unseen vehicle may have: a multicopter that leans by twelve degrees
     blind_turn_rad_s2: float = 2.0  # likewise

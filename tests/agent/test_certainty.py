@@ -71,7 +71,7 @@ def tracked(local_map: LocalMap, observed: F64, guess: F64, sigma_px: float = 0.
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("shape", range(SHAPES))
+@pytest.mark.parametrize("shape", range(certainty_kernels.CALIBRATION))
 def test_what_an_error_of_calibration_does_to_a_pose_is_foreseen(shape: int) -> None:
     X = scene()
     T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
@@ -124,6 +124,33 @@ def test_noise_of_a_measured_pose_is_what_it_says() -> None:
         e = np.concatenate([good[:3, 3] - T[:3, 3], se3.so3_log(T[:3, :3].T @ good[:3, :3])])
         nees.append(e @ np.linalg.solve(certainty.of_poses(PoseState(), T)[0], e))
     assert 5.0 < np.mean(nees) < 7.2
+
+
+def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
+    X = scene()
+    clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
+    local_map = map_of(clean)
+    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(calibration_px=0.0), has_body=False, has_depth=True)
+    certainty.begin(np.eye(4))
+    track = tracked(local_map, clean, np.eye(4))
+    pull = np.array([0.0, 0.0, 0.004, 0.0, 0.001, 0.0])
+
+    def deviation() -> F64:
+        certainty._age = 100  # weighed anew
+        certainty.measured(track)
+        return np.sqrt(np.diag(certainty.of_poses(PoseState(), np.eye(4))[0]))
+
+    alone = deviation()
+    for _ in range(100):
+        certainty.fused(np.eye(4), se3.exp(pull))
+    np.testing.assert_allclose(deviation()[[2, 4]], pull[[2, 4]], rtol=0.05)
+    certainty.remember(KeyframeId(0))
+    np.testing.assert_allclose(deviation()[[2, 4]], 2.0 * pull[[2, 4]], rtol=0.05)
+    for sign in [1.0, -1.0] * 100:  # to and fro, it is noise, which adds up as squares
+        certainty.fused(np.eye(4), se3.exp(sign * pull))
+    certainty._noise_k[:], certainty._shift_k[:] = 0.0, 0.0
+    np.testing.assert_allclose(deviation()[[2, 4]], pull[[2, 4]], rtol=0.15)
+    assert alone[2] < 0.001
 
 
 def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
