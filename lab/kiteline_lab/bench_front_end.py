@@ -31,7 +31,7 @@ from kiteline_hw.sources import open_source
 from kiteline_hw.words import shipped_words
 from kiteline_lab import metrics
 from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
-from kiteline_lab.front_ends import DescriptorTracker, FlowTracker, OtherAgent
+from kiteline_lab.front_ends import DescriptorTracker, FlowTracker
 from kiteline_lab.simulate import record
 
 TITLE = "Front-end"
@@ -162,10 +162,7 @@ def _from(items: Iterable[Frame | ImuBatch | OdometryBatch], first: int) -> Iter
 def _agent(kind: str, source: FrameSource) -> Agent:
     config, identity, words = AgentConfig(), Identity(AgentId(0), 0), shipped_words()
     warm(source.rig, config)
-    tracker = KINDS[kind]
-    if issubclass(tracker, DescriptorTracker | FlowTracker):
-        return OtherAgent(tracker, source.rig, source.imu, config, identity, AloneChannel(), words)
-    return Agent(source.rig, source.imu, config, identity, AloneChannel(), words)
+    return Agent(source.rig, source.imu, config, identity, AloneChannel(), words, KINDS[kind])
 
 
 def _steps(agent: Agent, items: Iterable[Frame | ImuBatch]) -> tuple[F64, list[Estimate]]:

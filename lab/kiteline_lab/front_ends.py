@@ -15,19 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent import local_map_kernels
-from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost_model import Work
 from kiteline_agent.local_map import Candidates, LocalMap
-from kiteline_agent.recovery import Recovery
-from kiteline_agent.step import Identity
 from kiteline_agent.tracker import Track, Tracker, View
-from kiteline_codec.channel import RecordChannel
 from kiteline_core import features, matching, se3
-from kiteline_core.cameras import CameraRig
-from kiteline_core.frame import ImuCalibration
 from kiteline_core.ids import SEQUENCE_BITS
-from kiteline_core.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -219,15 +212,3 @@ class FlowTracker(_Follower):
         )  # fmt: skip
         self._rows, self._uv = rows[chosen[:n]], uv[chosen[:n]]
         self._ids = self._map.point_ids(self._rows)
-
-
-class OtherAgent(Agent):
-    """The agent with another tracker; all else is its own."""
-
-    def __init__(
-        self, kind: type[DescriptorTracker | FlowTracker], rig: CameraRig, imu: ImuCalibration | None,
-        config: AgentConfig, identity: Identity, channel: RecordChannel, words: Vocabulary | None = None,
-    ) -> None:  # fmt: skip
-        super().__init__(rig, imu, config, identity, channel, words)
-        self._tracker = kind(self.map, config, self.work)
-        self._recovery = Recovery(self.map, self._tracker, config, words, self.window, self._believes)
