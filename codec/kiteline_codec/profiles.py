@@ -113,6 +113,7 @@ PROFILES = {p.name: p for p in (WIFI, RADIO)}
 
 
 def _stepped_depths(inv_depth: F32, step: int) -> F32:
+    """To the nearest step, ties to the even one: always upwards, they would make the whole map 0.03 % too small."""
     codes = quantise.inverse_depth_codes(inv_depth)
-    stepped = np.clip((codes + step // 2) // step * step, step, quantise.DEPTH_CODES - step)
+    stepped = np.clip(np.rint(codes / step).astype(np.int64) * step, step, quantise.DEPTH_CODES - step)
     return quantise.inverse_depths(np.where(codes > 0, stepped, 0))

@@ -65,6 +65,18 @@ def test_what_is_shared(profile: Profile, births: int, sightings: int) -> None:
         assert np.abs(section.uv - seen.uv[at]).max() <= profile.pixel_step / 32 + 1e-4
 
 
+@pytest.mark.parametrize("profile", [WIFI, RADIO, EXACT], ids=lambda p: p.name)
+def test_coarser_depths_leave_the_scale(profile: Profile) -> None:
+    born, strength, seen = a_keyframe(1000, 1000)
+    born = replace(born, inv_depth=np.linspace(0.05, 1.0, 1000).astype(np.float32))
+    seen = replace(seen, inv_depth=born.inv_depth.copy())
+    parts, sections = replace(profile, births=1000, sightings=1000).choose(born, strength, seen)
+    ours = np.concatenate([np.log(p.inv_depth / born.inv_depth[p.index]) for p in parts])
+    theirs = np.concatenate([np.log(s.inv_depth / seen.inv_depth[s.index - 1000]) for s in sections])
+    assert len(ours) == len(theirs) == 1000
+    assert abs(ours.mean()) < 5e-5 and abs(theirs.mean()) < 5e-5
+
+
 def test_narrow_descriptors_are_compared_like_wide_ones() -> None:
     rng = np.random.default_rng(1)
     a = rng.integers(0, 256, (50, 32)).astype(np.uint8)
