@@ -35,7 +35,7 @@ from kiteline_basestation.restore import Restored, restore
 from kiteline_basestation.spec import BaseSpec, base_config, from_json, parser
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store import StoreError
-from kiteline_basestation.warm import warm
+from kiteline_basestation.warm import warm, warm_graphs
 from kiteline_basestation.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
@@ -106,6 +106,8 @@ class Ground:
         codec_warm.warm()
         words = place_words()
         warm(self.config, words)
+        if jobs is None and words is not None:
+            warm_graphs()
         self.station = Station(self.config, open_channel, words)
         self.jobs: LockstepJobs | Worker = LockstepJobs() if jobs is None else jobs
         self.phase = Phase.FLY

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import multiprocessing
 import signal
 import time
@@ -13,7 +14,7 @@ from multiprocessing.connection import Connection
 import cv2
 
 from kiteline_basestation.jobs import Job, JobDone, run_job
-from kiteline_basestation.warm import warm
+from kiteline_basestation.warm import warm, warm_graphs
 from kiteline_hw.cpu import return_large_arrays
 
 SAMPLES = 1 << 15  # newest CPU times that are kept: half an hour of steps, a megabyte
@@ -26,6 +27,8 @@ def _work(pipe: Connection) -> None:
     return_large_arrays()
     cv2.setNumThreads(1)
     warm()
+    if importlib.util.find_spec("gtsam") is not None:
+        warm_graphs()
     with contextlib.suppress(EOFError, OSError):
         while True:
             job = pipe.recv()

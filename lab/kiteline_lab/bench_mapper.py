@@ -14,7 +14,7 @@ from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.essential_graph import GraphInputs, optimise
 from kiteline_core import se3
 from kiteline_core.bundle import BundleConfig, BundleProblem, bundle
-from kiteline_lab import bench_store, logs, metrics, simulate, trajectories
+from kiteline_lab import base_memory, bench_store, logs, metrics, simulate, trajectories
 from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
 from kiteline_lab.fly import Options, fly
 
@@ -79,6 +79,13 @@ def _street(bench: Bench) -> list[Bar]:
     estimate = trajectories.read(str(bench.folder / "street" / "base" / "agent0.tum")).trajectory
     drift = metrics.kitti_drift(metrics.match(estimate, truth, metrics.Alignment.SE3))
     assert drift is not None
+    bench.say("weighing the base's parts")
+    weighed = base_memory.measured(bench.folder / "street" / "base" / "log.mcap")
+    peak = report["base"]["timing"]["rss_mib"]
+    bench.more.append(
+        "What the base of the street holds, measured as it runs again from its log. Pages of code and of libraries, "
+        f"about 270 MiB, are there from the start; at the most it had {peak:.0f} MiB.\n\n{base_memory.table(weighed)}"
+    )
     return [
         is_true("KITTI 06 in the street: loop", "closed", report["base"]["loops"] >= 1,
                 f"{report['base']['loops']} loops"),

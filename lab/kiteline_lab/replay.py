@@ -95,7 +95,7 @@ def steps(log: LogReader) -> Iterator[Step]:
 
 def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first: bool = True) -> Replayed:
     """Fly an agent again. Raises SourceError for a log that cannot be replayed."""
-    spec = _spec(log)
+    spec = spec_of_log(log)
     rig_message = next(log.messages((RIG,)), None)
     if rig_message is None:
         raise SourceError("this log holds no calibration on /rig: it was cut at its beginning, or is no agent's")
@@ -107,7 +107,7 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
     channel: RecordChannel = AloneChannel()
     if kind == "CodedChannel":
         spill = SpillFile(Path(tempfile.gettempdir())) if spec["log_name"] else None
-        channel = _channel(spec, spec["boot"] + 1, spec["up_bytes_s"], spill, bounded=True)
+        channel = channel_of_log(spec, spec["boot"] + 1, spec["up_bytes_s"], spill, bounded=True)
     agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_words())
     out = Replayed()
     for step in steps(log):
@@ -156,7 +156,7 @@ def _odometry(step: Step) -> OdometryBatch:
     return batches[0].odometry()
 
 
-def _channel(
+def channel_of_log(
     spec: dict[str, Any], session: int, budget_bytes: int, spill: SpillFile | None = None, bounded: bool = False
 ) -> RecordChannel:
     """One end of the codec as it was in flight."""
@@ -167,11 +167,11 @@ def _channel(
 
 def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first: bool = True) -> Replayed:
     """Run a base again. Raises SourceError for a log that cannot be replayed."""
-    spec = _spec(log)
+    spec = spec_of_log(log)
     config = configuration.apply(BaseConfig(), tomllib.loads(log.metadata["config"]))
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: what its agents handed over was no packet, and is not in it")
-    station = Station(config, lambda agent: _channel(spec, spec["session"], spec["down_bytes_s"]), place_words())
+    station = Station(config, lambda agent: channel_of_log(spec, spec["session"], spec["down_bytes_s"]), place_words())
     jobs: dict[int, Job] = {}
     out = Replayed()
     for kept in log.messages((base_log.RESTORED,)):
@@ -209,7 +209,7 @@ def _compare_packets(out: Replayed, step: Step, topic: str, made: tuple[bytes, .
         out.differs(step, f"{topic}: {len(made)} packets, {len(logged)} in the log, the first that differs is {first}")
 
 
-def _spec(log: LogReader) -> dict[str, Any]:
+def spec_of_log(log: LogReader) -> dict[str, Any]:
     known: dict[str, Any] = {}
     if log.metadata.get("role") == "agent":
         fields = AgentSpec.__dataclass_fields__

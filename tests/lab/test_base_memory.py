@@ -1,0 +1,42 @@
+"""What the parts of a base weigh."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import coded_channel
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from kiteline_lab.base_memory import Sample, bytes_of, parts_of, table
+
+
+def test_what_hangs_on_an_object_is_weighed_once_and_code_never() -> None:
+    array = np.zeros(10_000)
+    seen: set[int] = set()
+    assert 80_000 < bytes_of({"a": array, "part of a": array[:10], "code": bytes_of}, seen) < 82_000
+    assert bytes_of(array, seen) == 0
+
+
+def test_parts_of_a_base_grow_with_its_map() -> None:
+    station = Station(BaseConfig(), lambda _: coded_channel(1))
+    station.join(AgentId(0))
+    before = parts_of(station)
+    for k in range(100):
+        parent = NO_KEYFRAME if k == 0 else keyframe_id(submap_id(0, 0, 0), k - 1)
+        station.mapper.map.add_keyframe(keyframe_id(submap_id(0, 0, 0), k), k, parent, np.eye(4), 300)
+    after = parts_of(station)
+    assert after["map: keypoints"] - before["map: keypoints"] > 100 * 300 * 60
+    others = [name for name in after if not name.startswith("map: ") and after[name] - before[name] > 1000]
+    assert not others
+
+
+def test_the_table_tells_what_a_keyframe_more_takes() -> None:
+    samples = [
+        Sample(100, 200_000_000, 0, {"grid": 1_000_000, "rest": 500}),
+        Sample(300, 210_000_000, 0, {"grid": 2_000_000, "rest": 700}),
+    ]
+    lines = table(samples).splitlines()
+    assert lines[0].startswith("| keyframes 100 to 300")
+    assert "| grid | 5.0 kB |" in lines and "| all parts | 5.0 kB |" in lines
+    assert lines[-1].endswith("| 50.0 kB |") and len(lines) == 5
