@@ -6,37 +6,34 @@ behind a barrier (`fly_lockstep`), and live on real clocks (`fly_live`).
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.camera import Camera
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.cost import VirtualCpu
 from kiteline_agent.cost_model import cost_ns
-from kiteline_agent.flight_log import StepLog, write_step
+from kiteline_agent.cpu_account import CpuAccount
+from kiteline_agent.flight_record import FlightRecord, metadata
 from kiteline_agent.narrator import Narrator, summary
-from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json, parser
+from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json, parser, settled, spec_of
 from kiteline_agent.step import Identity, StepInput, StepOutput
-from kiteline_agent.tally import Tally, live_line, odometry_line
+from kiteline_agent.tally import Tally
 from kiteline_agent.warm import warm
-from kiteline_codec import record_log
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.framing import StreamFramer
 from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
-from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw import kernel_cache, process
@@ -54,18 +51,10 @@ from kiteline_hw.sources import open_source
 from kiteline_hw.spill_file import SpillFile
 from kiteline_hw.words import shipped_words
 
-_LINK_NS = 1_000_000_000  # ns between two words of the link in the log
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
 _QUIET_S = 1.0  # s that it has to stay so: the base may still be working on the last keyframe
 _PROGRESS_FRAMES = 10  # frames between two words to the parent; also between two looks at the memory
-
-
-def settled(channel: RecordChannel) -> tuple[bool, bool]:
-    """Whether a channel is quiet, and whether both sides were seen to hold the same."""
-    if isinstance(channel, CodedChannel):
-        return channel.endpoint.quiet, channel.endpoint.digest_equal
-    return True, True
 
 
 class Onboard:
@@ -82,7 +71,6 @@ class Onboard:
         self.channel = channel
         self.tally = Tally()
         self.flown: dict[str, int | float] | None = None  # the tally when the last frame had been flown
-        self.cpu_ms: list[float] = []
         self.rss_mib = 0.0
         config = agent_config(spec.config, spec.cpu_percent)
         if whole_process:
@@ -95,44 +83,35 @@ class Onboard:
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
         self.camera = Camera(source, until_ns, time.process_time_ns)
-        if spec.log_name and isinstance(channel, CodedChannel | AloneChannel):
-            channel.noting = True
+        self._files = ExitStack()
+        self._log_shift_ns = spec.start_ns  # log time minus the time handed to the agent: logs stand in source time
+        self._record = self._open_record(config) if spec.log_name else None
         self.agent = Agent(
             source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel, shipped_words()
         )
-        self._files = ExitStack()
-        self._log_shift_ns = spec.start_ns  # log time minus the time handed to the agent: logs stand in source time
-        self._log: StepLog | None = None
-        self._live: TextIO | None = None
-        self._odometry: TextIO | None = None
-        if spec.log_name:
-            folder = Path(spec.folder)
-            folder.mkdir(parents=True, exist_ok=True)
-            log = self._files.enter_context(
-                LogWriter(folder / spec.log_name, _log_metadata(spec, source, config, channel))
-            )
-            log.rig(self._log_shift_ns, source.rig, source.imu)
-            log.flush()  # an agent that dies at once leaves a log that can be read
-            self._log = log
-            self._live = self._open(folder / "live.tum")
-            self._odometry = self._open(folder / "odometry.tum")
         disorder = LinkModelConfig(
             loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder, delay_ns=round(spec.delay_s * 1e9)
         )  # fmt: skip
         self._wire = LinkModel(disorder, spec.seed)
         self._overhead_bytes = channel.endpoint.config.overhead_bytes if isinstance(channel, CodedChannel) else 0
-        self._whole = whole_process
-        self._mark_ns = time.process_time_ns()
-        self._decode_mark_ns = self.camera.decode_ns
-        self._spent_ns = 0
+        self._account = CpuAccount(time.process_time_ns, self.camera, whole_process)
         self._told_cpu_ns = 0  # what the last frame cost: modelled in lock-step, measured in a live flight
         self._live_clock = False
-        self._link_due_ns = 0
         self._core = VirtualCpu(spec.cpu_percent)
         self.output: StepOutput | None = None  # of the last step
 
-    def _open(self, path: Path) -> TextIO:
-        return self._files.enter_context(path.open("w", buffering=1))
+    def _open_record(self, config: AgentConfig) -> FlightRecord:
+        spec, source = self.spec, self.source
+        folder = Path(spec.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        about = metadata(spec, source.name, config, self.channel)
+        log = self._files.enter_context(LogWriter(folder / spec.log_name, about))
+        log.rig(self._log_shift_ns, source.rig, source.imu)
+        log.flush()  # an agent that dies at once leaves a log that can be read
+        live, odometry = (
+            self._files.enter_context((folder / name).open("w", buffering=1)) for name in ("live.tum", "odometry.tum")
+        )
+        return FlightRecord(log, live, odometry, spec.agent, self.channel)
 
     @property
     def next_ns(self) -> int | None:
@@ -187,15 +166,15 @@ class Onboard:
         driven: OdometryBatch | None = None,
     ) -> list[bytes]:  # fmt: skip
         """One step of the agent, logged and counted; the packets that leave for the wire."""
-        begin_ns = time.process_time_ns()
+        self._account.begin()
         step_input = StepInput(frame, imu, tuple(packets), self._told_cpu_ns, driven)
         self.output = output = self.agent.step(step_input, now_ns)
-        if self._log is not None:
-            write_step(self._log, step_input, output, now_ns, now_ns + self._log_shift_ns)
-            self._log_records(now_ns + self._log_shift_ns)
-            self._log_link(now_ns)
+        if self._record is not None:
+            self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
-            self._record(output)
+            self.tally.count(output.estimate)
+            if output.estimate is not None and self._record is not None:
+                self._record.pose(output.estimate)
             if not self._live_clock:
                 ops = cost_ns(self.agent.work)
                 self._core.spend(ops, now_ns)
@@ -205,42 +184,12 @@ class Onboard:
         sent = self._wire.deliver(now_ns)
         self.tally.bytes_up += sum(map(len, output.packets)) + len(output.packets) * self._overhead_bytes
         self.tally.bytes_down += sum(map(len, packets)) + len(packets) * self._overhead_bytes
-        self._account(begin_ns, frame is not None)
-        return sent
-
-    def _log_records(self, log_ns: int) -> None:
-        """What was shared, for a base that reads the log after landing: no link may have carried it."""
-        if self._log is not None and isinstance(self.channel, CodedChannel | AloneChannel):
-            for key, code in self.channel.take_noted().items():
-                record = record_log.write_record(AgentId(self.spec.agent), key, code)
-                self._log.blob(record_log.TOPIC, log_ns, record)
-
-    def _log_link(self, now_ns: int) -> None:
-        """The link as the agent sees it, once a second."""
-        if self._log is not None and isinstance(self.channel, CodedChannel) and now_ns >= self._link_due_ns:
-            self._link_due_ns = now_ns + _LINK_NS
-            self._log.json("/link", now_ns + self._log_shift_ns, self.channel.report())
-
-    def _record(self, output: StepOutput) -> None:
-        self.tally.count(output.estimate)
-        if output.estimate is not None and self._live is not None and self._odometry is not None:
-            self._live.write(live_line(output.estimate))
-            self._odometry.write(odometry_line(output.estimate))
-
-    def _account(self, begin_ns: int, with_frame: bool) -> None:
-        end_ns = time.process_time_ns()
-        self._spent_ns += end_ns - (self._mark_ns if self._whole else begin_ns)
-        if self._whole:
-            self._spent_ns -= self.camera.decode_ns - self._decode_mark_ns
-        self._mark_ns, self._decode_mark_ns = end_ns, self.camera.decode_ns
-        if not with_frame:
-            return
-        self.cpu_ms.append(self._spent_ns / 1e6)
-        if self._live_clock:
-            self._told_cpu_ns = self._spent_ns
-        self._spent_ns = 0
-        if len(self.cpu_ms) % _PROGRESS_FRAMES == 1:
+        self._account.end(frame is not None)
+        if frame is not None and self._live_clock:
+            self._told_cpu_ns = self._account.last_ns
+        if frame is not None and len(self._account.ms) % _PROGRESS_FRAMES == 1:
             self.rss_mib = max(self.rss_mib, rss_mib())
+        return sent
 
     def report(self) -> dict[str, Any]:
         """The agent's part of report.json, with raw samples in place of statistics."""
@@ -258,7 +207,7 @@ class Onboard:
             "time_offset": self.agent.time_offset_report(),
             "drain": {key: total[key] - self.flown[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
-                "cpu_ms_per_frame": self.cpu_ms,
+                "cpu_ms_per_frame": self._account.ms,
                 "decode_ms": self.camera.decode_ms,
                 "warm_up_s": round(self.warm_s, 3),
                 "rss_mib": round(self.rss_mib, 1),
@@ -268,18 +217,6 @@ class Onboard:
     def close(self) -> None:
         """Finish the files."""
         self._files.close()
-
-
-def _log_metadata(spec: AgentSpec, source: FrameSource, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
-    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
-    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
-    return {
-        "role": "agent",
-        "channel": type(channel).__name__,
-        "source": source.name,
-        "spec": json.dumps(plain),
-        "config": configuration.describe(config),
-    }
 
 
 def _spill(spec: AgentSpec) -> SpillFile | None:
@@ -437,13 +374,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         p.error("a SOURCE is required")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
     folder = (Path(a.log) if a.log else state) / f"agent{a.agent}"
-    boot = process.next_number(folder / "boot")
-    spec = AgentSpec(
-        source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
-        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
-        key=a.key, cpu_percent=a.cpu,
-        mavlink=a.mavlink, axes=a.axes,
-    )  # fmt: skip
+    spec = spec_of(a, folder, process.next_number(folder / "boot"))
     fly_live(spec, None, process.StopSignal())
     process.leave(0)
 

@@ -12,7 +12,7 @@ from typing import Any
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
 from kiteline_codec.archive import Spill
-from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 
@@ -45,6 +45,15 @@ class AgentSpec:
     kill_at_s: float = -1.0  # end like a crash at this flight time
     await_base_at_s: float = -1.0  # look for a base again at this flight time
     await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
+
+
+def spec_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentSpec:
+    """What the command line says. folder: for the log. boot: number of this start."""
+    return AgentSpec(
+        source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
+        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
+        key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
+    )  # fmt: skip
 
 
 def from_json(text: str) -> AgentSpec:
@@ -90,6 +99,13 @@ def channel_for(spec: AgentSpec, spill: Spill | None = None) -> RecordChannel:
         return AloneChannel()
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
     return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
+
+
+def settled(channel: RecordChannel) -> tuple[bool, bool]:
+    """Whether a channel is quiet, and whether both sides were seen to hold the same."""
+    if isinstance(channel, CodedChannel):
+        return channel.endpoint.quiet, channel.endpoint.digest_equal
+    return True, True
 
 
 def parser() -> argparse.ArgumentParser:

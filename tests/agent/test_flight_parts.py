@@ -11,6 +11,7 @@ import pytest
 
 from kiteline_agent.camera import Camera, joined
 from kiteline_agent.cost import VirtualCpu
+from kiteline_agent.cpu_account import CpuAccount
 from kiteline_agent.flight_log import estimate_from_json, estimate_to_json
 from kiteline_agent.spec import AgentSpec, agent_config, from_json
 from kiteline_agent.step import Estimate
@@ -70,6 +71,25 @@ def test_decoding_is_measured_apart() -> None:
     camera.take()
     assert camera.decode_ms == [3.0, 3.0]
     assert camera.decode_ns == 6_000_000
+
+
+def accounted(whole: bool) -> list[float]:
+    """Two steps without and three with a frame, at ticks of 1 ms: decoding takes one between two looks at the clock."""
+    ticks = iter(range(0, 10**9, 1_000_000))
+    camera = Camera(source(), None, lambda: next(ticks))
+    account = CpuAccount(lambda: next(ticks), camera, whole)
+    for with_frame in (True, False, True, False, True):
+        if with_frame:
+            camera.take()
+        account.begin()
+        account.end(with_frame)
+        assert account.last_ns == round(account.ms[-1] * 1e6)
+    return account.ms
+
+
+def test_a_frame_alone_in_its_process_costs_all_but_decoding() -> None:
+    assert accounted(whole=True) == [2.0, 3.0, 3.0]
+    assert accounted(whole=False) == [1.0, 2.0, 2.0]
 
 
 def test_nothing_joined_is_nothing() -> None:
