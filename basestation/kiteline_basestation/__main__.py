@@ -30,6 +30,7 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.keeper import Keeper, read_imports
 from kiteline_basestation.kept import Kept, pack
 from kiteline_basestation.management import Command
+from kiteline_basestation.narrator import Narrator
 from kiteline_basestation.outputs import counts, keyframe_poses, map_files
 from kiteline_basestation.restore import Restored, restore
 from kiteline_basestation.spec import BaseSpec, base_config, from_json, parser
@@ -267,7 +268,7 @@ class Ground:
 
 
 def _log_metadata(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
-    unlogged = ("folder", "config", "store", "imports", "web", "maps")
+    unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
     plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
     channel = "PlainChannel" if plain_channels else "CodedChannel"
@@ -357,7 +358,11 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         if parent is not None:
             parent.tell("ready")
         process.notify("READY=1")
-        stepped_ns = 0
+        narrator = Narrator(ground.station) if parent is None and not spec.quiet else None
+        begin_ns, stepped_ns = clock.now_ns(), 0
+        if narrator is not None:
+            kept = f", store {spec.store}" if spec.store else ", nothing is kept: no --store"
+            _say([f"base on {spec.link}, session {spec.session}{kept}"])
         while not stop:
             now_ns = clock.now_ns()
             packets = {agent: received for agent, link in hub.links().items() if (received := link.receive())}
@@ -371,16 +376,28 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
                 stepped_ns = now_ns
                 _send(hub, ground.outgoing(now_ns))
                 ground.compare(hub.alive())
+                if narrator is not None:
+                    stored = None if ground.keeper is None else ground.keeper.idle
+                    _say(narrator.lines(hub.alive(), now_ns - begin_ns, ground.rss_mib, stored))
             if page is not None:
                 page.renew(ground.station, now_ns)
             if parent is not None and parent.said() == "frames_over":
                 ground.frames_are_over()
             process.notify("WATCHDOG=1")
             stop.wait(_LIVE_WAIT_S)
+        if narrator is not None:
+            _say([f"over: {narrator.summary()}"])
         ground.frames_are_over()
         if parent is not None and ground.flown is not None:
             parent.tell("flown", keyframes=ground.flown.keyframes)
             parent.tell("result", report=ground.report(), keyframes=ground.snapshot().keyframes)
+
+
+def _say(lines: Sequence[str]) -> None:
+    """Lines for whoever looks on; without anyone, the flight goes on all the same."""
+    with contextlib.suppress(OSError):
+        for line in lines:
+            print(line, file=sys.stderr, flush=True)
 
 
 def _sealed(spec: BaseSpec, hub: LinkHub) -> LinkHub:
@@ -455,7 +472,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     spec = BaseSpec(
         folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
         config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
-        imports=tuple(a.imports), maps=a.maps,
+        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
     )  # fmt: skip
     fly_live(spec, None, process.StopSignal())
     process.leave(0)

@@ -7,7 +7,7 @@ undone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -89,6 +89,11 @@ class Atlas:
     def idle(self) -> bool:
         """Whether nothing is under way."""
         return not (self._graph_due or self._full_due or self._graphs or self._fulls or self._revisit)
+
+    @property
+    def proved(self) -> Sequence[Overlap]:
+        """Loops that were proved, oldest first."""
+        return self._edges
 
     @property
     def jobs_open(self) -> int:

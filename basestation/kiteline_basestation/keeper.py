@@ -47,6 +47,11 @@ class Keeper:
         self._thread.start()
         self.batches = 0
 
+    @property
+    def idle(self) -> bool:
+        """Whether all that was handed to the thread is written."""
+        return self._writing == 0
+
     def load(self) -> Kept:
         """What earlier bases kept."""
         return self._store.load()
@@ -59,7 +64,7 @@ class Keeper:
 
     def keep_at_times(self, station: Station, now_ns: int) -> None:
         """Hand a batch to the thread, if the last one is long ago and written."""
-        if now_ns - self._kept_ns >= KEEP_NS and self._writing == 0:
+        if now_ns - self._kept_ns >= KEEP_NS and self.idle:
             self._kept_ns = now_ns
             self._put(self._gather(station))
 

@@ -36,6 +36,7 @@ class BaseSpec:
     store: str = ""
     imports: tuple[str, ...] = ()
     web: str = ""
+    quiet: bool = False  # say nothing of how the flight goes
     maps: str = ""  # a Zenoh endpoint on which maps are managed; "": the agents' link
 
 
@@ -85,5 +86,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; hear no agent without a key in it")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--quiet", action="store_true", help="say nothing of how the flight goes")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p

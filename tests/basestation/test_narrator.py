@@ -1,0 +1,86 @@
+"""What a person at a base's terminal is told."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.narrator import Narrator
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.schema import Camera
+from kiteline_codec.sync import SyncConfig
+from kiteline_core import se3
+
+MakeFlight = Callable[..., Any]
+STEP_NS = 200_000_000
+ELSEWHERE = se3.from_rt(np.eye(3), np.array([1.0, -2.0, 0.0]))
+
+
+def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[list[str], Station, Narrator]:
+    """Flights through coded channels. away: steps at which the last agent is out of reach. restart: when the first one
+    begins anew.
+    """
+    ends = {f.agent: CodedChannel(SyncConfig(), 1) for f in flights}
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1), words)
+    narrator, lines = Narrator(station), []
+    done: tuple[JobDone, ...] = ()
+    for n in range(max(len(f.records) for f in flights) + 30):
+        if n == restart:
+            ends[flights[0].agent] = CodedChannel(SyncConfig(), 2)
+        here = {f.agent for f in flights[: -1 if n in away else None]}
+        packets = {}
+        for f in flights:
+            if n == 0:
+                ends[f.agent].put(Camera(f.agent, f.camera))
+            for record in f.records[n] if n < len(f.records) else ():
+                ends[f.agent].put(record)
+            packets[f.agent] = ends[f.agent].poll(n * STEP_NS)
+        output = station.step(packets, done, n * STEP_NS)
+        for agent, out in output.packets:
+            ends[agent].receive(out, n * STEP_NS)
+        done = tuple(run_job(job) for job in output.jobs)
+        lines += narrator.lines(here, n * STEP_NS, 230.0, n < 60)
+    return lines, station, narrator
+
+
+def test_agents_merges_and_the_state_are_told_once_each(make_flight: MakeFlight, words: Any) -> None:
+    a = make_flight(keyframes=40, turns=0.8)
+    b = make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
+    lines, station, narrator = told([a, b], words, range(45, 55), 65)
+    words_of = [line.split("s  ", 1)[1] for line in lines]
+    assert words_of[:2] == ["agent 0 is here", "agent 1 is here"]
+    assert sorted(words_of[2:4]) == ["agent 0 begins map 0.1.0", "agent 1 begins map 1.1.0"]
+    joined = [w for w in words_of if " joined to " in w]
+    assert len(joined) == 1 and re.fullmatch(r"map 1\.1\.0 \(\d+ keyframes\) joined to map 0\.1\.0", joined[0])
+    assert "agent 1 is out of reach; its map stays" in words_of
+    assert "agent 1 is here again after 2.0 s" in words_of
+    assert [w for w in words_of if "started again" in w] == ["agent 0 has started again; what it sent before is kept"]
+    status = [w for w in words_of if " at most; " in w]
+    assert len(status) == 1 and lines[words_of.index(status[0])].startswith("    10.0 s")
+    assert re.match(
+        r"1 agent here; \d+ keyframes and \d+ points in 1 map; 0 loops, 1 merge; \d+\.\d kB/s up", status[0]
+    )
+    assert status[0].endswith("230 MiB at most; all in the store")
+    atlas = station.mapper.atlas
+    assert atlas is not None
+    atlas.undo(atlas.merges[0])
+    assert [w.split("s  ", 1)[1] for w in narrator.lines((), 0, 0.0, None)][-1] == (
+        "map 1.1.0 is taken out of the map that it was laid into"
+    )
+    assert narrator.lines((), 0, 0.0, None) == []
+
+
+def test_a_loop_is_told_with_its_length_and_its_error(make_flight: MakeFlight, ring: Any, words: Any) -> None:
+    flight = make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.02, seed=3, noise_px=0.7, memory=2)
+    lines, _, _ = told([flight], words, range(0), -1)
+    loops = [line for line in lines if "loop closed" in line]
+    found = re.search(r"the 1st: off by (\d+\.\d\d) m after (\d+) m of way", loops[0])
+    assert found is not None
+    way_m = np.linalg.norm(np.diff(np.array(flight.true_T_w_k)[:, :3, 3], axis=0), axis=1).sum()
+    assert 0.02 < float(found[1]) < 5.0 and 0.5 * way_m < float(found[2]) < way_m
