@@ -203,7 +203,7 @@ class Agent:
         coasted = self._inertia.coast(predicted, t_ns)
         self._pose.T_m_c = coasted.T_m_c
         self._reference.refresh(self._pose.T_m_c)
-        self._certainty.blind(dt_s, coasted.cov)
+        self._certainty.blind(dt_s, coasted.cov, moves=self._pose.moves)
         return coasted.trusted
 
     def _look_up(self, t_ns: int) -> None:
@@ -263,6 +263,7 @@ class Agent:
             self._certainty.met(found.keyframe, found.T_c_m, found.track.inliers)
         else:
             self._certainty.measured(found.track)
+        self._certainty.returned()
         self._s.failures = 0
 
     @property

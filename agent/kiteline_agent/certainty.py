@@ -62,6 +62,9 @@ class Certainty:
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))  # of the camera in m
         self._way: dict[SubmapId, F64] = {}  # T_o_m of the submaps that were left since all motion was last measured
         self._guided = False  # an IMU measures all motion
+        self._metric = has_depth
+        self._strange = False  # the place that was found last is far from where the vehicle could be expected
+        self._doubt = 0  # frames for which such a place is doubted yet
         self._pull = np.zeros(6)  # what an IMU lately moves poses by from where images say, on the left of T_c_m
         self._dispute = np.zeros((6, 6))  # covariance of that
         self._blind_s: float | None = 0.0  # that nothing measured motion; None: the last frame was measured
@@ -93,6 +96,7 @@ class Certainty:
         What that is worth changes slowly from frame to frame, told as errors on the left: it is worked out for every
         keyframe, after what was no such frame, and now and then between.
         """
+        self._doubt = max(self._doubt - 1, 0)
         if self._blind_s is None and self._age < _EVERY and track.inliers >= _FEWER * self._inliers:
             self._age += 1
             self._track = track
@@ -144,9 +148,9 @@ class Certainty:
         slot = self._map.slot_of(keyframe)
         self._noise_k[slot], self._shift_k[slot], self._by_base[slot] = self._noise, self._shift, False
 
-    def blind(self, dt_s: float, inertial: F64 | None) -> None:
+    def blind(self, dt_s: float, inertial: F64 | None, *, moves: bool = True) -> None:
         """No image for another dt_s. inertial: (6,6) of the pose by the IMU, [translation in m, rotation about the
-        body's axes]; None where nothing measures motion.
+        body's axes]; None where nothing measures motion. moves: whether it was known when images were lost.
         """
         c = self._config
         before = self._blind_s or 0.0
@@ -155,9 +159,10 @@ class Certainty:
             self._blind = inertial
             return
         self._blind_s = before + dt_s
+        speed = (c.blind_velocity_m_s, c.blind_rate_rad_s) if moves else (c.blind_speed_m_s, c.blind_speed_rad_s)
         moved, turned = (
             (v * s + 0.5 * a * s * s for s in (before, self._blind_s))
-            for v, a in ((c.blind_velocity_m_s, c.blind_accel_m_s2), (c.blind_rate_rad_s, c.blind_turn_rad_s2))
+            for v, a in zip(speed, (c.blind_accel_m_s2, c.blind_turn_rad_s2), strict=True)
         )
         (m0, m1), (t0, t1) = moved, turned
         grown = np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3)
@@ -176,7 +181,7 @@ class Certainty:
 
     def carry(self, pose: PoseState, T_c_b: F64, submap: SubmapId) -> None:
         """The map of this submap is about to change under the camera, the odometry frame goes on as it is."""
-        if self._guided:
+        if self._guided or self._metric:
             self._way[submap] = pose.T_o_m
         T_m_b = pose.T_m_c @ T_c_b
         left, out = np.empty((6, 6)), np.empty((6, 6))
@@ -230,26 +235,42 @@ class Certainty:
     def guide(self, guided: bool) -> None:
         """Whether an IMU has measured the motion since the last frame."""
         self._guided = guided
-        if not guided:
-            self._way = {}
+        if not guided and not self._metric:
+            self._way = {}  # maps of one eye differ in scale
 
     def believes(
-        self, T_c_m: F64, submap: SubmapId, predicted_T_m_c: F64, pose: PoseState, T_c_b: F64, active: SubmapId
-    ) -> bool:
-        """Whether the camera may be at T_c_m (4,4) in a submap, by the way that an IMU measured since it was there."""
+        self, T_c_m: F64, submap: SubmapId, predicted_T_m_c: F64, pose: PoseState, T_c_b: F64, active: SubmapId,
+        *, found: bool,
+    ) -> bool:  # fmt: skip
+        """Whether the camera may be at T_c_m (4,4) in a submap, by the way that was measured since it was there, or,
+        where nothing measured it, by what a vehicle can fly meanwhile. found: by its looks, not where it was expected.
+        """
         T_o_m = pose.T_o_m if submap == active else self._way.get(submap)
-        if T_o_m is None or not self._guided:
+        if T_o_m is None or not (self._guided or (found and self._metric)):
             return True
+        self._strange = False
         c = self._config
         here, there = pose.T_o_m @ predicted_T_m_c, T_o_m @ se3.inverse(T_c_m)
         away_m = float(np.abs(there[:3, 3] - here[:3, 3]).sum())
         turned = 0.5 * (3.0 - float(np.vdot(here[:3, :3], there[:3, :3])))  # 1 - cos
         if away_m < c.surprise_m and turned < 0.5 * c.surprise_rad**2:
             return True
+        if not self._guided and submap == active and self._blind_s is None:
+            return True  # nothing is known yet of how it was lost
         here, there = here @ T_c_b, there @ T_c_b
         e = np.concatenate([there[:3, 3] - here[:3, 3], se3.so3_log(here[:3, :3].T @ there[:3, :3])])
         cov = self.of_poses(pose, pose.T_m_c @ T_c_b)[1] + np.diag(np.repeat([c.surprise_m, c.surprise_rad], 3) ** 2)
-        return float(e @ np.linalg.solve(cov, e)) < c.surprise**2
+        apart = math.sqrt(float(e @ np.linalg.solve(cov, e)))
+        if self._guided:
+            return apart < c.surprise
+        self._strange = apart >= c.strange
+        return apart < c.surprise_blind
+
+    def returned(self) -> None:
+        """The camera is where it was last believed to be found. If it came there strangely, that has to be seen for a
+        while.
+        """
+        self._doubt = self._config.doubt_frames if self._strange else 0
 
     def quality(self, cov: F64, inliers: int | None) -> int:
         """How likely, in percent and at least 1, a pose of covariance cov (6,6) is good, as the configuration says.
@@ -259,7 +280,8 @@ class Certainty:
         trust = 1.0
         if inliers is not None:
             trust = min(max((inliers - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
-        return max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad)))
+        most = 100 if self._doubt == 0 else c.flagged_below - 1
+        return min(max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad))), most)
 
 
 def probability_good(cov: F64, good_m: float, good_rad: float) -> float:

@@ -148,6 +148,10 @@ class RecoveryConfig:
     beside_frames: int = 20  # how long the search goes on beside a young submap: 1 s
     agree_ratio: float = 0.05  # of the depth: two results beside a young submap may differ by so much
     agree_rad: float = 0.035  # 2 degrees, the same for the turn
+    twins: int = 2  # further places of the same submap that are tried when one was found; each costs about 1 ms
+    twin_share: float = 0.6  # of its matches, with which another place is as likely
+    twin_ratio: float = 0.2  # of the depth, that two results of one place may differ: P3P by points of one side only
+    twin_rad: float = 0.15  # the same for the turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,12 +170,17 @@ class CertaintyConfig:
     blind_turn_rad_s2: float = 2.0  # likewise
     blind_velocity_m_s: float = 0.03  # error of the velocity between two frames
     blind_rate_rad_s: float = 0.02  # likewise
+    blind_speed_m_s: float = 5.0  # error of the velocity of a vehicle that was not seen to move: it just began
+    blind_speed_rad_s: float = 1.0  # likewise
     good_m: float = 0.2  # a pose counts as good within so much
     good_rad: float = 0.1745  # and so much: 10 degrees
     few_inliers: int = 10  # from which on points speak for a pose: so many agree by chance
     many_inliers: int = 30  # with which nothing speaks against it
     flagged_below: int = 50  # quality below which a pose is not to be relied on: it is as likely wrong as good
     surprise: float = 7.0  # deviations by which a place found again may differ from where the IMU says the vehicle is
+    surprise_blind: float = 10.0  # the same where nothing measured the way: two g, all the time
+    strange: float = 4.0  # the same, from which on a place is doubted at first: nearly one g
+    doubt_frames: int = 20  # for which it is: one second, in which a place that only resembles falls apart
     surprise_m: float = 0.1  # deviation of that beside the covariances: maps are corrected meanwhile
     surprise_rad: float = 0.05  # likewise
 

@@ -22,6 +22,7 @@ class PoseState:
         self.T_m_c: F64 = np.eye(4)
         self.T_o_m: F64 = np.eye(4)
         self.velocity: F64 = np.zeros(3)
+        self.moves = False
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame
         self._step_s = 0.0  # that the last motion took; 0: not known
 
@@ -46,14 +47,15 @@ class PoseState:
         self._step_s = dt_s
         if dt_s > 0.0:
             self.velocity = (T_m_c[:3, 3] - before[:3, 3]) / dt_s
+            self.moves = True
 
     def stand(self) -> None:
         """Nothing is known of the motion: the next frame is looked for where this one was."""
-        self._step_T, self.velocity = np.eye(4), np.zeros(3)
+        self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
 
     def go_on(self, step_T: F64, velocity: F64) -> None:
         """The motion is known otherwise. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
-        self._step_T, self.velocity = step_T, velocity
+        self._step_T, self.velocity, self.moves = step_T, velocity, True
 
     def move_map(self, T_m_c: F64) -> None:
         """The map moved under the camera: its pose in m is T_m_c (4,4) now, that in o stays."""

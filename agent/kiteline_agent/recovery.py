@@ -21,7 +21,7 @@ from kiteline_agent.window import Seen, Window
 from kiteline_core import features, matching, se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.place_index import PlaceIndex, Vocabulary
-from kiteline_core.pnp import solve_pnp
+from kiteline_core.pnp import PoseFit, solve_pnp
 
 F64 = NDArray[np.float64]
 
@@ -139,14 +139,35 @@ class Recovery:
             places = self._index.query(seen.descriptor, out, self._config.recovery.candidates)
             tried += [KeyframeId(k) for k in places.keys.tolist() if self._map.slot_of(k) >= 0]
         for keyframe in tried:
-            T_c_m = self._pose_by(keyframe, seen, frame_number)
-            if T_c_m is None:
+            fit = self._pose_by(keyframe, seen, frame_number)
+            if fit is None:
                 continue
-            track = self._confirm(view, T_c_m, frame_number, submap_of_keyframe(keyframe))
-            if track is not None and self._believes(track.T_c_m, submap_of_keyframe(keyframe)):
-                depth_m = float(np.median(track.depth_m[track.inlier]))
-                return Recovered(track.T_c_m, keyframe, track, depth_m)
+            track = self._confirm(view, fit.T_c_m, frame_number, submap_of_keyframe(keyframe))
+            if track is None or not self._believes(track.T_c_m, submap_of_keyframe(keyframe)):
+                continue
+            depth_m = float(np.median(track.depth_m[track.inlier]))
+            found = Recovered(track.T_c_m, keyframe, track, depth_m)
+            if self._has_twin(found, fit.inliers, seen, frame_number):
+                return None
+            return found
         return self._search_window(seen, frame_number, exclude)
+
+    def _has_twin(self, found: Recovered, inliers: int, seen: Seen, frame_number: int) -> bool:
+        """Whether the same submap shows all this at another place too: then nobody knows which of them it is."""
+        if self._index is None:
+            return False
+        limits = self._config.recovery
+        near = self._map.keyframe[np.unique(found.track.rows[found.track.inlier] // self._map.births)].tolist()
+        out = [k for k in self._index.keys if k in near or submap_of_keyframe(KeyframeId(k)) != found.submap]
+        for key in self._index.query(seen.descriptor, out, limits.twins).keys.tolist():
+            fit = self._pose_by(KeyframeId(key), seen, frame_number)
+            if fit is None or fit.inliers < limits.twin_share * inliers:
+                continue
+            apart = fit.T_c_m @ se3.inverse(found.T_c_m)
+            turned = float(np.linalg.norm(se3.so3_log(se3.orthonormalise(apart)[:3, :3])))
+            if np.linalg.norm(apart[:3, 3]) > limits.twin_ratio * found.depth_m or turned > limits.twin_rad:
+                return True
+        return False
 
     def _search_window(self, seen: Seen, frame_number: int, exclude: SubmapId | None) -> Recovered | None:
         """Try the base's copies, in every submap of which a keyframe is remembered: from that one it goes on."""
@@ -160,7 +181,7 @@ class Recovery:
         proof = without_points(met.T_c_m, len(met.corner))
         return Recovered(met.T_c_m, newest, proof, float(np.median(met.depth_m)), lent=True)
 
-    def _pose_by(self, keyframe: KeyframeId, seen: Seen, frame_number: int) -> F64 | None:
+    def _pose_by(self, keyframe: KeyframeId, seen: Seen, frame_number: int) -> PoseFit | None:
         """Match with all that a keyframe should see, also a little beyond its border, and solve for the pose."""
         limits = self._config.recovery
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
@@ -183,7 +204,7 @@ class Recovery:
         )  # fmt: skip
         if fit is None or fit.inliers < limits.min_pnp_inliers:
             return None
-        return fit.T_c_m
+        return fit
 
     def _confirm(self, view: View, T_c_m: F64, frame_number: int, submap: SubmapId) -> Track | None:
         """The tracker's own templates must agree with a pose."""

@@ -75,7 +75,7 @@ class Stages:
         self.mono = MonoStart(camera, config) if one_eye else None
         self.window = Window(camera, config.window, config.matching, config.ransac, words)
         self.base = FromBase(self.map, self.window, config.smoothing)
-        self.recovery = Recovery(self.map, self.tracker, config, words, self.window, self.believes)
+        self.recovery = Recovery(self.map, self.tracker, config, words, self.window, self._believes_found)
         self.frozen = FrozenEye(camera)
         self.events: list[str] = []
         self.frame = 0
@@ -84,8 +84,16 @@ class Stages:
         self.failures = 0
 
     def believes(self, T_c_m: F64, submap: SubmapId) -> bool:
-        """Whether the camera can be at T_c_m (4,4) in a submap, by what else is known of its way."""
-        return self.certainty.believes(T_c_m, submap, self.predicted, self.pose, self.T_c_b, self.submaps.active)
+        """Whether the camera, tracked at T_c_m (4,4) in a submap, can be there, by what else is known of its way."""
+        return self._believes(T_c_m, submap, found=False)
+
+    def _believes_found(self, T_c_m: F64, submap: SubmapId) -> bool:
+        return self._believes(T_c_m, submap, found=True)
+
+    def _believes(self, T_c_m: F64, submap: SubmapId, *, found: bool) -> bool:
+        return self.certainty.believes(
+            T_c_m, submap, self.predicted, self.pose, self.T_c_b, self.submaps.active, found=found
+        )  # fmt: skip
 
     def carry_certainty(self) -> None:
         """What is known of the pose so far is of a map that is left now."""

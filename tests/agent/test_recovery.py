@@ -18,7 +18,7 @@ from kiteline_codec.schema import Head, Record
 from kiteline_core import se3
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame
-from kiteline_core.ids import MAX_SUBMAPS, NO_KEYFRAME, AgentId, submap_of_keyframe
+from kiteline_core.ids import MAX_SUBMAPS, NO_KEYFRAME, AgentId, KeyframeId, submap_of_keyframe
 from kiteline_core.place_index import Vocabulary
 from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sources import open_source
@@ -223,3 +223,44 @@ def test_rooms_of_the_same_textures_are_kept_apart(words: Vocabulary) -> None:
     assert flown.said("submap: joined") == [] and set(flown.submaps[24:]) == {1}
     again = fly(rig, [*here[:16], *gap, *here[12:20]], words)
     assert back_after(again, 22) <= 2 and set(again.submaps) == {0}
+
+
+def test_a_place_that_the_map_shows_twice_is_not_believed(room: Recording, words: Vocabulary) -> None:
+    frames = room.show([*BEFORE, *[None] * 20, *range(200, 206)], 120.0)
+    for twice in (False, True):
+        agent = Agent(room.rig, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+        estimate = None
+        for k, frame in enumerate(frames):
+            if k == len(BEFORE) and twice:
+                copy_map(agent, np.array([30.0, 0.0, 0.0]))
+            estimate = agent.step(StepInput(replace(frame, t_ns=k * PERIOD_NS)), k * PERIOD_NS).estimate
+        assert estimate is not None and estimate.tracked
+        assert estimate.submap % MAX_SUBMAPS == int(twice)
+
+
+def copy_map(agent: Agent, shift_m: np.ndarray) -> None:
+    """All keyframes once more, somewhere else."""
+    m = agent.map
+    for slot in np.flatnonzero(m.keyframe != NO_KEYFRAME).tolist():
+        n = int(m.counts[slot])
+        rows = slice(slot * m.births, slot * m.births + n)
+        T_m_k = m.T_m_k[slot].copy()
+        T_m_k[:3, 3] += shift_m
+        copy = KeyframeId(int(m.keyframe[slot]) + 1000)
+        m.add(
+            Head(copy, 0, NO_KEYFRAME, T_m_k, n), T_m_k, m.uv[slot, :n].copy(), m.rho[slot, :n].copy(),
+            m.sigma_rho[slot, :n].copy(), m.octave[rows].copy(), m.angle[rows].copy(), m.descriptor[rows].copy(),
+            m.templates[rows].copy(), 0,
+        )  # fmt: skip
+        agent._recovery.remember(copy)
+
+
+def test_a_place_that_nothing_can_have_flown_to_is_not_believed(room: Recording, words: Vocabulary) -> None:
+    frames = room.show([*BEFORE, *[None] * 4, *range(200, 226)], 120.0)  # 2.5 m within a quarter of a second
+    flown = fly(room.rig, frames, words)
+    assert all(e.tracked for e in flown.estimates[37:]) and flown.submaps[-1] == 1
+    frames = room.show([*BEFORE, *WALL, *range(200, 226)], 120.0)  # within half a second: nearly one g
+    flown = fly(room.rig, frames, words)
+    limit = AgentConfig().certainty.flagged_below
+    assert set(flown.submaps) == {0} and all(0 < e.quality < limit for e in flown.estimates[41:60])
+    assert flown.estimates[-1].quality > limit
