@@ -61,7 +61,7 @@ class Agent:
         self._growth = MapGrowth(s)
         self._motion_depth = DepthFromMotion(s.map, config, s.work)
         self._glimpse = Glimpse(s.camera)
-        self._bridged = False  # the last pose is the IMU's alone
+        self._bridged = False  # the last pose is that of IMU or odometer alone
         self._lost = False  # the last frame had no pose
         channel.put(Camera(identity.agent, s.camera))
 
@@ -71,6 +71,7 @@ class Agent:
         """Take in what arrived, track the frame if there is one, say what is to be sent. Never waits."""
         self._s.events.clear()
         self._take_corrections(self._s.channel.receive(step_input.packets, now_ns))
+        self._inertia.hear(step_input.odometry)
         estimate = None
         self.work.clear()
         self.work.steps = 1
@@ -83,7 +84,7 @@ class Agent:
     def _process(self, frame: Frame, imu: ImuBatch | None) -> Estimate:
         # 1. Rectify and build pyramids.
         view = self._view(frame)
-        # 2. Predict from the IMU or from the last motion.
+        # 2. Predict from the IMU, from an odometer, or from the last motion.
         dt_s = 0.0 if self._s.last_t_ns is None else (frame.t_ns - self._s.last_t_ns) * 1e-9
         predicted = self._s.predicted = self._inertia.predict(frame.t_ns, imu, dt_s)
         self._certainty.guide(self._inertia.running)
@@ -285,6 +286,10 @@ class Agent:
         """InertialTracker.offset_report; None without an IMU."""
         return None if self._inertia.tracker is None else self._inertia.tracker.offset_report()
 
+    def odometer_report(self) -> dict[str, float | bool] | None:
+        """Odometer.report; None without one."""
+        return self._inertia.odometer.report()
+
     # what the base sends
 
     def _take_corrections(self, records: list[Record]) -> None:
@@ -302,7 +307,7 @@ class Agent:
         T_m_b = self._pose.T_m_c @ self._s.T_c_b
         cov_m, cov_o = self._certainty.of_poses(self._pose, T_m_b)
         quality = self._certainty.quality(cov_m if tracked else cov_o, inliers or None)
-        carried = self._submaps.any and self._inertia.running
+        carried = self._submaps.any and self._inertia.carried
         if not tracked and (not carried or quality < self._s.config.certainty.flagged_below):
             quality = -1
         keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from kiteline_agent.inertial_tracker import InertialConfig
+from kiteline_agent.odometer import OdometerConfig
 from kiteline_core.features import DetectorConfig
 from kiteline_core.matching import MatchConfig
 from kiteline_core.pnp import RansacConfig
@@ -255,6 +256,7 @@ class AgentConfig:
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
     inertial: InertialConfig = field(default_factory=InertialConfig)
+    odometer: OdometerConfig = field(default_factory=OdometerConfig)
     certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)
     motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)

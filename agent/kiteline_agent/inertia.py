@@ -1,4 +1,4 @@
-"""What the IMU adds to tracking, where there is one; without it, constant velocity and the images alone."""
+"""What IMU and odometer add to tracking, where there are any; without them, constant velocity and the images alone."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial_tracker import InertialConfig, InertialTracker
+from kiteline_agent.odometer import Odometer, OdometerConfig
 from kiteline_agent.pose_state import PoseState
 from kiteline_agent.tracker import Track
 from kiteline_core import se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.fixed_lag import VisualPoints
-from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
 
 F64 = NDArray[float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Coasted:
-    """A frame that no image placed. T_m_c: (4,4). cov: (6,6) of it, None without an IMU that knows. trusted: the IMU
-    has carried it for a short while only.
+    """A frame that no image placed. T_m_c: (4,4). cov: (6,6) of it, None where neither IMU nor odometer knows. trusted:
+    they have carried it for a short while only.
     """
 
     T_m_c: F64
@@ -30,11 +31,11 @@ class Coasted:
 
 
 class Inertia:
-    """Camera poses in, camera poses out, with an IMU or without."""
+    """Camera poses in, camera poses out, with an IMU and an odometer or without."""
 
     def __init__(
-        self, camera: RectifiedCamera, imu: ImuCalibration | None, config: InertialConfig, pose: PoseState, *,
-        metric: bool,
+        self, camera: RectifiedCamera, imu: ImuCalibration | None, config: InertialConfig, odometer: OdometerConfig,
+        pose: PoseState, *, metric: bool,
     ) -> None:  # fmt: skip
         """metric: whether the cameras alone measure in metres."""
         self._T_b_c, self._T_c_b = camera.T_b_c, se3.inverse(camera.T_b_c)
@@ -42,6 +43,7 @@ class Inertia:
         self._pose = pose
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
+        self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
 
     @property
     def running(self) -> bool:
@@ -49,36 +51,51 @@ class Inertia:
         return self.tracker is not None and self.tracker.running
 
     @property
+    def carried(self) -> bool:
+        """Whether something else than images tells where the vehicle goes."""
+        return self.running or self.odometer.carries
+
+    @property
     def metric(self) -> bool:
         """Whether lengths are metres."""
-        return self._metric or (self.tracker is not None and self.tracker.metric)
+        return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
+
+    def hear(self, driven: OdometryBatch | None) -> None:
+        """What an odometer said since the last step."""
+        self.odometer.hear(driven)
 
     def predict(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
-        """T_m_c of a frame: by the IMU where there is one that knows, else by constant velocity."""
+        """T_m_c of a frame: by an IMU that knows, else by an odometer that does, else by constant velocity."""
         known = None if self.tracker is None else self.tracker.predict(imu, t_ns)
         if known is not None:
             return se3.orthonormalise(known.T_m_b @ self._T_b_c)
-        return self._pose.predict(dt_s)
+        driven = self.odometer.predict(self._pose.T_m_c, t_ns)
+        return self._pose.predict(dt_s) if driven is None else driven
 
     def fuse(self, track: Track, t_ns: int) -> Track:
         """The track with the pose that images and IMU together give."""
-        if self.tracker is None:
-            return track
-        seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
-        state = self.tracker.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen)
-        if state is None:
-            return track
-        return replace(track, T_c_m=se3.inverse(state.T_m_b @ self._T_b_c))
+        state = None
+        if self.tracker is not None:
+            seen = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
+            driven = self.odometer.velocity(t_ns)
+            state = self.tracker.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, seen, driven)
+        if state is not None:
+            track = replace(track, T_c_m=se3.inverse(state.T_m_b @ self._T_b_c))
+        self.odometer.seen(se3.inverse(track.T_c_m), t_ns)
+        return track
 
     def news(self) -> list[str]:
         """What is worth an event since the last call."""
-        return [] if self.tracker is None else self.tracker.offset_news()
+        return self.odometer.news() + ([] if self.tracker is None else self.tracker.offset_news())
 
     def coast(self, predicted: F64, t_ns: int) -> Coasted:
         """A frame without images, predicted at T_m_c (4,4)."""
-        state = None if self.tracker is None else self.tracker.coast(t_ns)
+        state = None if self.tracker is None else self.tracker.coast(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
-            return Coasted(predicted, None, trusted=False)
+            cov = self.odometer.coasted(predicted, t_ns)
+            trusted = cov is not None and self.odometer.blind_s <= self._config.trusted_blind_s
+            return Coasted(predicted, cov, trusted)
+        self.odometer.coasted(state.T_m_b @ self._T_b_c, t_ns)
         trusted = self.tracker.blind_s <= self._config.trusted_blind_s
         return Coasted(state.T_m_b @ self._T_b_c, state.pose_cov, trusted)
 
@@ -86,14 +103,17 @@ class Inertia:
         """The pose was found again, or a new map began: the inertial state moves there."""
         if self.tracker is not None:
             self.tracker.begin_map(t_ns, self._pose.T_m_c @ self._T_c_b)
+        self.odometer.restart(self._pose.T_m_c, t_ns)
 
     def shift(self, T_new_old: F64) -> None:
         """The submap frame moved by (4,4)."""
         if self.tracker is not None:
             self.tracker.shift_map(T_new_old)
+        self.odometer.shift(T_new_old)
 
     def forget_unit(self) -> None:
         """A map in a unit of its own begins."""
+        self.odometer.change_unit(metric=False)
         if self.tracker is not None:
             self.tracker.reset()
             self.tracker.metric = False
@@ -102,13 +122,16 @@ class Inertia:
         """How many metres the map's unit is, once that is known to a relative deviation; None before, and where lengths
         are metres anyhow.
         """
-        if self.tracker is None or self.tracker.metric:
+        if self.metric:
             return None
-        scale = self.tracker.metric_scale()
-        return None if scale is None or scale[1] > sigma * scale[0] else scale[0]
+        for scale in (None if self.tracker is None else self.tracker.metric_scale(), self.odometer.unit_m()):
+            if scale is not None and scale[1] <= sigma * scale[0]:
+                return scale[0]
+        return None
 
     def begin_metres(self, unit_m: float, T_new_old: F64) -> None:
         """From now on lengths are metres, in a submap in which the old one lies at (4,4)."""
-        assert self.tracker is not None
-        self.tracker.rescale(unit_m)
-        self.tracker.shift_map(T_new_old)
+        if self.tracker is not None:
+            self.tracker.rescale(unit_m)
+            self.tracker.shift_map(T_new_old)
+        self.odometer.change_unit(metric=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kiteline_core import imu_alignment, se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.fixed_lag import (
+    BodyVelocity,
     FixedLagConfig,
     FixedLagSmoother,
     InertialState,
@@ -170,16 +171,19 @@ class InertialTracker:
         T[:3, :3] = T[:3, :3] @ motion.turn
         return Prediction(T, velocity, motion.turn)
 
-    def update(self, t_ns: int, T_m_b_visual: F64, points: VisualPoints) -> InertialState | None:
-        """A frame was measured: T_m_b_visual (4,4) by images alone, from `points`. The state that images and IMU
-        together give, or None while waiting for a start or where samples are missing (then the images alone hold).
+    def update(
+        self, t_ns: int, T_m_b_visual: F64, points: VisualPoints, driven: BodyVelocity | None = None
+    ) -> InertialState | None:
+        """A frame was measured: T_m_b_visual (4,4) by images alone, from `points`. driven: by an odometer. The state
+        that all together give, or None while waiting for a start or where samples are missing (then the images alone
+        hold).
         """
         samples = self._interval(t_ns)
         if samples is not None:
             self._watch_offset(t_ns, T_m_b_visual, samples)
         state = None
         if self._smoother.running:
-            state = self._advance(samples, points)
+            state = self._advance(samples, points, driven)
         if state is None:
             self._wait(_Pose(t_ns, T_m_b_visual.copy(), samples))
             self._note(t_ns, T_m_b_visual)
@@ -190,8 +194,10 @@ class InertialTracker:
         self._blind_s = 0.0
         return state
 
-    def coast(self, t_ns: int) -> InertialState | None:
-        """A frame without images: the IMU alone carries the state, its covariance grows. None when it cannot."""
+    def coast(self, t_ns: int, driven: BodyVelocity | None = None) -> InertialState | None:
+        """A frame without images: the IMU (and an odometer) carries the state, its covariance grows. None when it
+        cannot.
+        """
         samples = self._interval(t_ns)
         self._last_visual = None
         self._waiting = []
@@ -199,7 +205,7 @@ class InertialTracker:
             self._blind_s += (t_ns - self._last.t_ns) * 1e-9
         state = None
         if self._smoother.running and self._blind_s <= self._config.max_coast_s:
-            state = self._advance(samples, None)
+            state = self._advance(samples, None, driven)
         if state is None:
             self._smoother.stop()
             return None
@@ -273,11 +279,13 @@ class InertialTracker:
         self._last = _Pose(t_ns, T_m_b.copy(), None)
         self._ends_ns = t_ns + int(self._applied_s * 1e9)
 
-    def _advance(self, samples: Samples | None, points: VisualPoints | None) -> InertialState | None:
+    def _advance(
+        self, samples: Samples | None, points: VisualPoints | None, driven: BodyVelocity | None
+    ) -> InertialState | None:
         if samples is None:
             self._smoother.stop()
             return None
-        state = self._smoother.add(samples, points)
+        state = self._smoother.add(samples, points, driven)
         if state is not None:
             self._bias = state.bias
         return state

@@ -34,8 +34,9 @@ class OdometerConfig:
     floor_m_s: float = 0.02  # error of a velocity that no device states: its own axes, its place, its stamps
     floor_rad_s: float = 0.005  # the same of a turn rate
     correlation_s: float = 0.5  # over which its errors stay alike: a patch of slippery floor, a gust
-    compare_s: float = 0.2  # window of a comparison: long enough that images measure a velocity to a centimetre a second
+    compare_s: float = 0.2  # window of a comparison, in which images measure a velocity to a centimetre a second
     least_moved_m: float = 0.02  # moved in a window: less tells nothing of axes and scale
+    aligned: float = 0.9  # cosine between what it and what the images measured, from which on lengths are compared
     scale_start: float = 0.1  # relative deviation of its scale before it was compared
     scale_most: float = 0.25  # relative; a larger error is no matter of scale
     scale_floor: float = 0.01  # relative deviation below which its scale is never said to be known
@@ -57,7 +58,6 @@ class OdometerConfig:
     unit_windows: int = 40  # most of them that are kept
     unit_least: int = 8  # fewer cannot tell the unit
     unit_moved_m: float = 0.05  # by the odometer, within a window that counts
-    unit_aligned: float = 0.9  # cosine between both displacements from which on they agree
     unit_share: float = 0.7  # of the windows that have to agree
 
 
@@ -180,7 +180,7 @@ class Odometer:
         """The images (and an IMU) placed the camera at T_m_c (4,4)."""
         if self.heard:
             self._compare(T_m_c, t_ns)
-            if self._last is not None and t_ns > self._last[0]:
+            if self._last is not None and t_ns > self._last[0] and self.blind_s == 0.0 and self.metric:
                 self._note_motion(self._last[1], T_m_c, (t_ns - self._last[0]) * 1e-9)
         self._last = (t_ns, T_m_c)
         if self.blind_s > 0.0:
@@ -344,7 +344,8 @@ class Odometer:
             found = float(driven @ seen) / square
             var = (c.scale_sigma_m_s * dt) ** 2 / square
             off = found - self.scale
-            if off * off < 9.0 * (self._scale_var + var):
+            aligned = float(driven @ seen) > c.aligned * distance * float(np.sqrt(square))
+            if aligned and off * off < 9.0 * (self._scale_var + var):
                 gain = self._scale_var / (self._scale_var + var)
                 self.scale = float(np.clip(self.scale + gain * off, 1.0 - c.scale_most, 1.0 + c.scale_most))
                 self._scale_var = max((1.0 - gain) * self._scale_var, c.scale_floor**2)
@@ -366,7 +367,7 @@ class Odometer:
         if a < self._config.unit_moved_m or b <= 0.0:
             return
         along = float(driven @ seen)
-        self._units.append((along / (b * b), along > self._config.unit_aligned * a * b))
+        self._units.append((along / (b * b), along > self._config.aligned * a * b))
         del self._units[: -self._config.unit_windows]
 
 

@@ -59,7 +59,7 @@ class Stages:
         one_eye = rig.right is None and not rig.has_depth
         self.work = Work()  # of the last step
         self.pose = PoseState()
-        self.inertia = Inertia(camera, imu, config.inertial, self.pose, metric=not one_eye)
+        self.inertia = Inertia(camera, imu, config.inertial, config.odometer, self.pose, metric=not one_eye)
         self.levelling = Levelling(
             camera, self.inertia.tracker, config.inertial.askew_rad, config.inertial.level_patience_s
         )

@@ -31,6 +31,8 @@ class FixedLagConfig:
     iterations: int = 3  # Gauss-Newton steps; the prediction is near
     points: int = 320  # most points of a frame
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
+    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it counts less
+    velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity counts nothing, wheels slip
     visual_inflation: float = 16.0  # of variance: successive frames share errors of templates and points
     imu_inflation: float = 3.0  # of noise densities: vibration, scale and axes are not calibrated, and the map bends
     turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
@@ -64,6 +66,17 @@ class VisualPoints:
     observed: F64
     sigma_px: F64
     inlier: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class BodyVelocity:
+    """What an odometer measured. value: (3,) m/s of the body's origin in the body's axes. cov: (3,3) of it, huge where
+    nothing was measured. age_s: how long before the frame.
+    """
+
+    value: F64
+    cov: F64
+    age_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +125,7 @@ class FixedLagSmoother:
         self._sigma, self._use = np.ones((n, p)), np.zeros((n, p), np.bool_)
         self._vis_h, self._vis_b = np.zeros((n, 6, 6)), np.zeros((n, 6))
         self._vis_r, self._vis_p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+        self._vel, self._vel_info = np.zeros((n, 3)), np.zeros((n, 3, 3))
         self._cov = np.zeros((17, 17))
 
     @property
@@ -154,6 +168,7 @@ class FixedLagSmoother:
         self._counts[0] = 0
         self._vis_h[0], self._vis_b[0] = 0.0, 0.0
         self._vis_r[0], self._vis_p[0] = self._rot[0], self._state[0, :3]
+        self._vel_info[0] = 0.0
 
     def stop(self) -> None:
         """Forget everything."""
@@ -165,8 +180,11 @@ class FixedLagSmoother:
         motion = preintegrate(samples, state.bias, self._calibration, self._config.imu_inflation)
         return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)
 
-    def add(self, samples: Samples, points: VisualPoints | None) -> InertialState | None:
-        """One more frame: the samples since the last one, and what it saw (None: nothing, the IMU alone carries it).
+    def add(
+        self, samples: Samples, points: VisualPoints | None, driven: BodyVelocity | None = None
+    ) -> InertialState | None:
+        """One more frame: the samples since the last one, what it saw (None: nothing, the IMU alone carries it), and
+        what an odometer said.
 
         None when the system could not be solved; then nothing is believed any more, and `start` is needed.
         """
@@ -187,6 +205,7 @@ class FixedLagSmoother:
         self._rot[k] = se3.orthonormalise(T_m_b)[:3, :3]
         self._state[k] = np.concatenate([T_m_b[:3, 3], velocity, bias])
         self._put_points(k, points)
+        self._put_velocity(k, driven, motion)
         self._n = k + 1
         self._relinearise_biases()
         c = self._config
@@ -195,7 +214,8 @@ class FixedLagSmoother:
             self._imu_dt, self._imu_turn, self._imu_vp, self._imu_jac, self._imu_bias, self._imu_info, self._imu_walk,
             self._prior_h, self._prior_b, self._prior_r, self._prior_s, self._prior_tilt, self._r_cb, self._t_cb,
             self._intrinsics, self._counts, self._xyz, self._ray, self._observed, self._sigma, self._use, c.chi2,
-            self._scale, self._vis_h, self._vis_b, self._vis_r, self._vis_p, self._cov,
+            self._scale, self._vis_h, self._vis_b, self._vis_r, self._vis_p, self._vel,
+            self._vel_info, self._cov,
         )  # fmt: skip
         if not (cost >= 0.0 and np.isfinite(self._state[: self._n]).all()):
             self.stop()
@@ -275,6 +295,23 @@ class FixedLagSmoother:
         self._observed[k, :n], self._sigma[k, :n] = points.observed[:n], points.sigma_px[:n]
         self._use[k, :n] = points.inlier[:n]
 
+    def _put_velocity(self, k: int, driven: BodyVelocity | None, motion: Preintegrated) -> None:
+        """An odometer's velocity, brought to the frame by what the IMU felt since, unless it surprises."""
+        self._vel_info[k] = 0.0
+        if driven is None:
+            return
+        c, r, velocity = self._config, self._rot[k], self._state[k, 3:6]
+        change = (velocity - self._state[k - 1, 3:6]) * (driven.age_s / motion.dt_s)
+        turned = se3.so3_exp(se3.so3_log(motion.turn) * (driven.age_s / motion.dt_s))
+        value = turned.T @ driven.value + r.T @ change
+        cov = turned.T @ driven.cov @ turned
+        off = value - r.T @ velocity
+        square = float(off @ np.linalg.solve(cov + r.T @ self._cov[6:9, 6:9] @ r, off))
+        if not square < c.velocity_gate:
+            return
+        self._vel[k] = value
+        self._vel_info[k] = np.linalg.inv(cov) * min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
+
     def _relinearise_biases(self) -> None:
         """Integrate again where the bias has left the neighbourhood in which its first-order correction holds."""
         c = self._config
@@ -291,14 +328,14 @@ class FixedLagSmoother:
         ok = kernels.marginalise(
             self._rot[:2], self._state[:2], self._tilt, self._gravity, self._imu_dt[0], self._imu_turn[0],
             self._imu_vp[0], self._imu_jac[0], self._imu_bias[0], self._imu_info[0], self._imu_walk[0],
-            self._vis_h[0], self._vis_b[0], self._vis_r[0], self._vis_p[0], walk,
+            self._vis_h[0], self._vis_b[0], self._vis_r[0], self._vis_p[0], self._vel[0], self._vel_info[0], walk,
             self._prior_h, self._prior_b, self._prior_r, self._prior_s, self._prior_tilt,
         )  # fmt: skip
         n = self._n
         arrays: list[NDArray[np.generic]] = [
             self._rot, self._state, self._imu_dt, self._imu_turn, self._imu_vp, self._imu_jac, self._imu_bias,
             self._imu_info, self._imu_walk, self._counts, self._scale, self._vis_h, self._vis_b, self._vis_r,
-            self._vis_p,
+            self._vis_p, self._vel, self._vel_info,
         ]  # fmt: skip
         if self._config.fresh > 1:  # else nobody looks at the points of older frames again
             arrays += [self._xyz, self._ray, self._observed, self._sigma, self._use]

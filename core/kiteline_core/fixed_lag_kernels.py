@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.imu_kernels import mul33, mul33_tn, so3_exp, so3_log
-from kiteline_core.inertial_kernels import imu_terms, visual_terms
+from kiteline_core.inertial_kernels import imu_terms, velocity_terms, visual_terms
 from kiteline_core.jit import njit
 
 F64 = NDArray[np.float64]
@@ -133,14 +133,15 @@ def smooth(
     imu_dt: F64, imu_turn: F64, imu_vp: F64, imu_jac: F64, imu_bias: F64, imu_info: F64, imu_walk: F64,
     prior_h: F64, prior_b: F64, prior_r: F64, prior_s: F64, prior_tilt: F64,
     r_cb: F64, t_cb: F64, camera: F64, counts: I64, xyz: F64, ray: F64, observed: F64, sigma_px: F64, use: Bools,
-    chi2: float, scale: F64, vis_h: F64, vis_b: F64, vis_r: F64, vis_p: F64, cov: F64,
+    chi2: float, scale: F64, vis_h: F64, vis_b: F64, vis_r: F64, vis_p: F64, vel: F64, vel_info: F64, cov: F64,
 ) -> float:  # fmt: skip
     """Gauss-Newton over the n states of the window, in place.
 
     fresh: so many of the newest states have their points linearised anew at each iteration; older ones keep the term to
-    which their points were condensed (vis_*). imu_*[i] leads from state i to i + 1. cov: (17,17) covariance of the
-    newest state and the tilt, out. Returns the cost at the last linearisation, negative when the system could not be
-    solved.
+    which their points were condensed (vis_*). vel (n,3), vel_info (n,3,3): velocities in the body's axes that an
+    odometer measured, and what they are worth (0: nothing). imu_*[i] leads from state i to i + 1. cov: (17,17)
+    covariance of the newest state and the tilt, out. Returns the cost at the last linearisation, negative when the
+    system could not be solved.
     """
     blocks = np.zeros((n, _W, _W + 1))
     term, side = np.empty((_W, _W)), np.empty(_W)
@@ -171,6 +172,10 @@ def smooth(
                 blocks[f, i, _W] += out6[i]
                 for k in range(6):
                     blocks[f, i, k] += vis_h[f, i, k]
+            if vel_info[f].any():
+                cost += velocity_terms(
+                    rot[f], state[f, 3:6], vel[f], vel_info[f], blocks[f], blocks[f, :, _W], 0
+                )  # fmt: skip
             if f + 1 < n:
                 cost += _add_imu(
                     rot[f], state[f], rot[f + 1], state[f + 1], tilt, gravity, imu_dt[f], imu_turn[f], imu_vp[f],
@@ -256,8 +261,8 @@ def _invert(u: F64, cov: F64) -> None:
 @njit
 def marginalise(
     rot: F64, state: F64, tilt: F64, gravity: float, dt: float, turn: F64, vp: F64, jac: F64, bias: F64, info: F64,
-    walk: F64, vis_h: F64, vis_b: F64, vis_r: F64, vis_p: F64, tilt_walk: float, prior_h: F64, prior_b: F64,
-    prior_r: F64, prior_s: F64, prior_tilt: F64,
+    walk: F64, vis_h: F64, vis_b: F64, vis_r: F64, vis_p: F64, vel: F64, vel_info: F64, tilt_walk: float,
+    prior_h: F64, prior_b: F64, prior_r: F64, prior_s: F64, prior_tilt: F64,
 ) -> bool:  # fmt: skip
     """Turn the prior on state 0 (of the first two, rot (2,3,3), state (2,12)) into the prior on state 1, in place.
 
@@ -283,6 +288,8 @@ def marginalise(
         a[i, _W] += out6[i]
         for k in range(6):
             a[i, k] += vis_h[i, k]
+    if vel_info.any():
+        velocity_terms(rot[0], state[0, 3:6], vel, vel_info, a, a[:, _W], 0)
     if not eliminate(a, _D, _W):
         return False
     for i in range(_B):

@@ -147,6 +147,37 @@ def visual_terms(
 
 
 @njit
+def velocity_terms(r: F64, v: F64, measured: F64, info: F64, h: F64, b: F64, first: int) -> float:
+    """Add to the system h (w,w), b (w,) what a velocity in the body's axes says of a state whose 15 degrees of freedom
+    begin at row `first`. r (3,3): R_m_b. v: (3,) m/s in m. measured: (3,) m/s in b. info: (3,3). Returns the cost.
+    """
+    u, res, j = np.empty(3), np.empty(3), np.zeros((3, 6))  # by the rotation, by the velocity
+    for i in range(3):
+        u[i] = r[0, i] * v[0] + r[1, i] * v[1] + r[2, i] * v[2]
+        res[i] = u[i] - measured[i]
+        for k in range(3):
+            j[i, 3 + k] = r[k, i]
+    j[0, 1], j[0, 2] = -u[2], u[1]
+    j[1, 0], j[1, 2] = u[2], -u[0]
+    j[2, 0], j[2, 1] = -u[1], u[0]
+    cost = 0.0
+    for i in range(3):
+        s = info[i, 0] * res[0] + info[i, 1] * res[1] + info[i, 2] * res[2]
+        cost += res[i] * s
+        for a in range(6):
+            b[first + (a if a < 3 else 3 + a)] -= j[i, a] * s
+    for a in range(6):
+        row = first + (a if a < 3 else 3 + a)
+        for c in range(6):
+            s = 0.0
+            for i in range(3):
+                for k in range(3):
+                    s += j[i, a] * info[i, k] * j[k, c]
+            h[row, first + (c if c < 3 else 3 + c)] += s
+    return cost
+
+
+@njit
 def imu_terms(
     ri: F64, si: F64, rj: F64, sj: F64, tilt: F64, gravity: float, dt: float, turn: F64, vp: F64, jac: F64, bias: F64,
     res: F64, j: F64,
