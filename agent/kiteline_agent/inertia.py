@@ -124,10 +124,13 @@ class Inertia:
         """
         if self.metric:
             return None
-        for scale in (None if self.tracker is None else self.tracker.metric_scale(), self.odometer.unit_m()):
-            if scale is not None and scale[1] <= sigma * scale[0]:
-                return scale[0]
-        return None
+        felt = None if self.tracker is None else self.tracker.metric_scale()
+        driven = self.odometer.unit_m()
+        known = [(scale, dev / scale) for scale, dev in filter(None, (felt, driven)) if dev <= sigma * scale]
+        if not known or (driven is None and self.odometer.measures_unit):  # two witnesses are better than one
+            return None
+        weight = [1.0 / (dev * dev + self._config.unit_sigma**2) for _, dev in known]
+        return sum(w * scale for w, (scale, _) in zip(weight, known, strict=True)) / sum(weight)
 
     def begin_metres(self, unit_m: float, T_new_old: F64) -> None:
         """From now on lengths are metres, in a submap in which the old one lies at (4,4)."""

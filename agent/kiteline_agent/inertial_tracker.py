@@ -50,6 +50,7 @@ class InertialConfig:
     trusted_blind_s: float = 1.0  # so long the IMU alone counts as tracking
     askew_rad: float = 0.035  # a map that leans by more than two degrees is set upright
     max_coast_s: float = 20.0  # longer without images, a small IMU knows no more than that velocities change
+    unit_sigma: float = 0.03  # relative, of what IMU and odometer each do not know of their own scale
     offset_memory_s: float = 60.0  # a time offset drifts slowly
     offset_start_sigma_s: float = 0.02  # cameras without a trigger line
     offset_turn_sigma_rad: float = 6e-4  # error of a visual turn between two frames

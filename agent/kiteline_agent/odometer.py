@@ -21,6 +21,7 @@ from kiteline_core.frame import OdometryBatch
 
 F64 = NDArray[np.float64]
 
+_ANY = 100.0  # (m/s)^2 or (rad/s)^2; what is measured at all is measured far better
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
 
 
@@ -42,10 +43,11 @@ class OdometerConfig:
     scale_floor: float = 0.01  # relative deviation below which its scale is never said to be known
     scale_walk: float = 0.003  # relative, per sqrt(s): load and temperature change
     scale_sigma_m_s: float = 0.05  # noise of a window that is expected when its scale is measured
-    start_m_s: float = 0.15  # noise that is expected before it was compared
-    start_rad_s: float = 0.05  # likewise
-    rise: float = 0.5  # share by which a larger error raises the noise that is expected: trust is lost within 0.2 s
-    memory_s: float = 3.0  # over which smaller errors lower it again
+    start_m_s: float = 0.08  # noise that is expected before it was compared; it counts as one window
+    start_rad_s: float = 0.03  # likewise
+    memory_s: float = 3.0  # over which errors are averaged to the noise that is expected
+    unusual: float = 5.0  # times the expected square: beyond it something has happened
+    rise: float = 0.5  # share by which such an error counts at once: trust is lost within 0.2 s
     tolerance_m_s: float = 0.12  # expected noise above which it is not used; that of a good one is 0.05
     tolerance_share: float = 0.10  # of the speed, likewise
     proofs: int = 3  # windows in motion in which it agreed, before it is used
@@ -88,6 +90,7 @@ class Odometer:
         self._last: tuple[int, F64] | None = None  # T_m_c of the last frame, however it was come by
         self._velocity, self._rate = np.zeros(3), np.zeros(3)  # in b
         self._velocity_cov, self._rate_cov = np.eye(3), np.eye(3)
+        self._velocity_slow, self._rate_slow = np.eye(3), np.eye(3)  # what of them lasts over frames
         self._carried = False  # the last prediction rests on the odometer
         self._gain = np.zeros((3, 3))  # of that prediction, in b
         self.blind_s = 0.0
@@ -166,12 +169,14 @@ class Odometer:
             return None
         c, dt = self._config, (t_ns - before_ns) * 1e-9
         z = self.scale * driven.velocity
-        noise = driven.velocity_cov + (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
+        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
         prior = self._velocity_cov + (c.accel_m_s2 * dt) ** 2 * np.eye(3)
-        self._velocity, self._velocity_cov, self._gain = _blend(self._velocity, prior, z, noise, c.surprise)
-        noise = driven.rate_cov + (self._turn_noise + c.floor_rad_s**2) * np.eye(3)
+        told = _blend(self._velocity, prior, z, driven.velocity_cov, slow, c.surprise)
+        self._velocity, self._velocity_cov, self._velocity_slow, self._gain = told
+        slow = (self._turn_noise + c.floor_rad_s**2) * np.eye(3)
         prior = self._rate_cov + (c.turn_rad_s2 * dt) ** 2 * np.eye(3)
-        self._rate, self._rate_cov, _ = _blend(self._rate, prior, driven.rate, noise, c.surprise)
+        told = _blend(self._rate, prior, driven.rate, driven.rate_cov, slow, c.surprise)
+        self._rate, self._rate_cov, self._rate_slow, _ = told
         self._carried = True
         T_b0_b1 = se3.exp(dt * np.concatenate([self._velocity, self._rate]))
         return se3.orthonormalise(T_m_c @ self._T_c_b @ T_b0_b1 @ self._T_b_c)
@@ -201,9 +206,9 @@ class Odometer:
         r = T_m_c[:3, :3] @ self._T_c_b[:3, :3]
         relax = dt / self._config.correlation_s * (r @ self._gain @ r.T)
         self._way = self._way + (T_m_c[:3, 3] - before[1][:3, 3])
-        self._way_cross = self._way_cross + dt * (r @ self._velocity_cov @ r.T) - relax @ self._way_cross
+        self._way_cross = self._way_cross + dt * (r @ self._velocity_slow @ r.T) - relax @ self._way_cross
         self._way_cov = self._way_cov + dt * (self._way_cross + self._way_cross.T)
-        self._turn_cross = (1.0 - dt / self._config.correlation_s) * self._turn_cross + dt * self._rate_cov
+        self._turn_cross = (1.0 - dt / self._config.correlation_s) * self._turn_cross + dt * self._rate_slow
         self._turn_cov = self._turn_cov + dt * (self._turn_cross + self._turn_cross.T)
         arm = se3.skew(self._way)
         cov = np.zeros((6, 6))
@@ -223,8 +228,8 @@ class Odometer:
         if not mine.any():
             return None
         dt = (t_ns - before_ns) * 1e-9
-        value = self.scale * samples.velocity[mine].mean(axis=0)
         cov = samples.velocity_cov[mine].mean(axis=0)
+        value = self.scale * _measured(cov, _ANY) @ samples.velocity[mine].mean(axis=0)
         # errors last longer than a frame: so many frames count as one
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(value, value)
         cov = cov + max(1.0, 2.0 * c.correlation_s / dt) * slow
@@ -252,6 +257,11 @@ class Odometer:
         self._anchor = self._last = None
         self._units = []
         self._begin_sight()
+
+    @property
+    def measures_unit(self) -> bool:
+        """Whether it is about to tell the unit of one eye's map: most of what it says so far agrees with the images."""
+        return 0 < len(self._units) <= 2 * sum(agrees for _, agrees in self._units)
 
     def unit_m(self) -> tuple[float, float] | None:
         """Metres in a unit of the map, and one deviation; None while that is not known."""
@@ -297,9 +307,8 @@ class Odometer:
         values = np.concatenate([samples.velocity, samples.rate], axis=1)
         mean = np.array([weight @ np.interp(now, seconds, values[:, i]) for i in range(6)])
         some = slice(max(min(lo, hi - 1), 0), max(hi, 1))
-        return _Driven(
-            mean[:3], mean[3:], samples.velocity_cov[some].mean(axis=0), samples.rate_cov[some].mean(axis=0)
-        )  # fmt: skip
+        cov, rate_cov = samples.velocity_cov[some].mean(axis=0), samples.rate_cov[some].mean(axis=0)
+        return _Driven(_measured(cov, _ANY) @ mean[:3], _measured(rate_cov, _ANY) @ mean[3:], cov, rate_cov)
 
     def _compare(self, T_m_c: F64, t_ns: int) -> None:
         """Look at a window once it is long enough."""
@@ -323,12 +332,12 @@ class Odometer:
         turn = self._T_b_c[:3, :3] @ se3.so3_log(T_c0_c1[:3, :3])
         swung = (self._T_c_b @ se3.exp(np.concatenate([np.zeros(3), turn])) @ self._T_b_c)[:3, 3]
         moved = r_c_b @ se3.exp(np.concatenate([dt * driven.velocity, turn]))[:3, 3]
-        known = _WELL * np.linalg.inv(r_c_b @ driven.velocity_cov @ r_c_b.T + _WELL * np.eye(3))
+        known = _measured(r_c_b @ driven.velocity_cov @ r_c_b.T, _WELL)
         if not self.metric:
             self._note_unit(known @ (moved + swung), known @ T_c0_c1[:3, 3])
             return
         self._judge(known @ moved, known @ (T_c0_c1[:3, 3] - swung), float(np.trace(known)), dt)
-        known = _WELL * np.linalg.inv(driven.rate_cov + _WELL * np.eye(3))
+        known = _measured(driven.rate_cov, _WELL)
         error = known @ (driven.rate - turn / dt)
         square = float(error @ error) / max(float(np.trace(known)), 0.5)
         self._turn_noise = self._expected(self._turn_noise, square, dt)
@@ -358,7 +367,9 @@ class Odometer:
         self._trusted = self._proofs >= c.proofs and self._noise < worst**2
 
     def _expected(self, before: float, square: float, dt: float) -> float:
-        share = self._config.rise if square > before else 1.0 - float(np.exp(-dt / self._config.memory_s))
+        c = self._config
+        usual = max(1.0 - float(np.exp(-dt / c.memory_s)), 1.0 / (self._compared + 1.0))
+        share = max(usual, c.rise) if square > c.unusual * before else usual
         return before + share * (square - before)
 
     def _note_unit(self, driven: F64, seen: F64) -> None:
@@ -371,14 +382,22 @@ class Odometer:
         del self._units[: -self._config.unit_windows]
 
 
-def _blend(value: F64, cov: F64, measured: F64, noise: F64, surprise: float) -> tuple[F64, F64, F64]:
-    """The Kalman update of a vector (3,) with a measurement of all of it, whose noise grows where it surprises: value,
-    covariance and gain (3,3).
+def _measured(cov: F64, limit: float) -> F64:
+    """(3,3) that leaves of a vector what is measured: 1 where the variance is far below `limit`, 0 where far above."""
+    return np.asarray(limit * np.linalg.inv(cov + limit * np.eye(3)))
+
+
+def _blend(value: F64, cov: F64, measured: F64, fast: F64, slow: F64, surprise: float) -> tuple[F64, F64, F64, F64]:
+    """The Kalman update of a vector (3,) with a measurement of all of it, whose noise grows where it surprises.
+
+    fast, slow: (3,3) of its noise, from sample to sample and lasting. Value, covariance, what of the covariance lasts,
+    and gain (3,3).
     """
     off = measured - value
-    square = float(off @ np.linalg.solve(cov + noise, off))
+    square = float(off @ np.linalg.solve(cov + fast + slow, off))
     if square > surprise * surprise:
-        noise = noise * (square / (surprise * surprise))
-    gain = cov @ np.linalg.inv(cov + noise)
+        slow = slow + (square / (surprise * surprise) - 1.0) * (fast + slow)
+    gain = cov @ np.linalg.inv(cov + fast + slow)
     left = np.eye(3) - gain
-    return value + gain @ off, left @ cov @ left.T + gain @ noise @ gain.T, gain
+    lasting = left @ cov @ left.T + gain @ slow @ gain.T
+    return value + gain @ off, lasting + gain @ fast @ gain.T, lasting, gain

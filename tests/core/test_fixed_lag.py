@@ -14,6 +14,7 @@ from kiteline_core import fixed_lag_kernels as kernels
 from kiteline_core import inertial_kernels, se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.fixed_lag import (
+    BodyVelocity,
     FixedLagConfig,
     FixedLagSmoother,
     InertialState,
@@ -103,9 +104,11 @@ def error_of(state: InertialState, T: F64) -> F64:
 
 def fly(
     seed: int, frames: int, config: FixedLagConfig, noisy: bool = True, bias: F64 | None = None, tilt: float = 0.0,
-    blind: range = range(0),
+    blind: range = range(0), driven: F64 | None = None,
 ) -> tuple[Flight, list[InertialState], FixedLagSmoother]:  # fmt: skip
-    """A flight with noise that is what the calibration says. tilt: rad by which gravity is wrong at the start."""
+    """A flight with noise that is what the calibration says. tilt: rad by which gravity is wrong at the start.
+    driven: (3,) m/s, error of an odometer's velocities.
+    """
     rng = np.random.default_rng([seed, 1])
     flight = make_flight(seed, frames)
     bias = np.zeros(6) if bias is None else bias
@@ -123,7 +126,11 @@ def fly(
     states = []
     for k in range(frames):
         points = None if k + 1 in blind else see(flight, k + 1, rng, 0.3 if noisy else 0.0)
-        state = smoother.add(measured.samples(k), points)
+        velocity = None
+        if driven is not None:
+            true = flight.pose(k + 1)[:3, :3].T @ flight.velocity[(k + 1) * FRAME_STEPS]
+            velocity = BodyVelocity(true + driven + 0.05 * rng.normal(size=3), 0.05**2 * np.eye(3))
+        state = smoother.add(measured.samples(k), points, velocity)
         assert state is not None
         states.append(state)
     return flight, states, smoother
@@ -176,6 +183,31 @@ def test_imu_jacobian_agrees_with_differences(seed: int) -> None:
     numeric = np.column_stack([(residual(h * e)[0] - residual(-h * e)[0]) / (2 * h) for e in np.eye(32)])
     np.testing.assert_allclose(jac, numeric, atol=2e-7)
     assert np.abs(at).max() > 1e-3
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_velocity_terms_agree_with_a_plain_reference(seed: int) -> None:
+    """Information and right side of a body velocity whose Jacobian is taken by differences."""
+    rng = np.random.default_rng(seed)
+    r, state, measured = se3.so3_exp(rng.normal(size=3)), rng.normal(size=12), rng.normal(size=3)
+    half = rng.normal(size=(3, 3))
+    info = half @ half.T
+
+    def residual(x: F64) -> F64:
+        turned, moved = moved_by(r, state, x)
+        return np.asarray(turned.T @ moved[3:6] - measured)
+
+    e = 1e-6
+    jac = np.column_stack([(residual(e * d) - residual(-e * d)) / (2 * e) for d in np.eye(15)])
+    h, b = np.zeros((20, 20)), np.zeros(20)
+    cost = inertial_kernels.velocity_terms(r, state[3:6].copy(), measured, info, h, b, 2)
+    res = residual(np.zeros(15))
+    np.testing.assert_allclose(h[2:17, 2:17], jac.T @ info @ jac, atol=1e-7)
+    np.testing.assert_allclose(b[2:17], -jac.T @ info @ res, atol=1e-7)
+    assert cost == pytest.approx(res @ info @ res)
+    assert np.count_nonzero(h) == 36
+    assert np.count_nonzero(b) == 6
 
 
 @given(SEEDS)
@@ -305,6 +337,48 @@ def test_blind_the_imu_carries_and_the_covariance_grows() -> None:
     assert np.linalg.norm(e[3:]) < 0.15
     assert np.trace(after.cov[3:6, 3:6]) > 20.0 * np.trace(before.cov[3:6, 3:6])
     assert e[3:] @ np.linalg.solve(after.cov[3:6, 3:6], e[3:]) < 16.3  # 99.9 % of 3 degrees of freedom
+
+
+BLIND = range(21, 141)  # 6 s
+
+
+def test_an_odometer_keeps_a_blind_flight_together() -> None:
+    bias = np.array([0.01, 0.0, 0.0, 0.05, 0.0, 0.0])
+    off, plain = [], []
+    for seed in (8, 9, 10):
+        flight, states, _ = fly(seed, 140, FixedLagConfig(), bias=bias, blind=BLIND, driven=np.zeros(3))
+        _, without, _ = fly(seed, 140, FixedLagConfig(), bias=bias, blind=BLIND)
+        e = error_of(states[-1], flight.pose(140))
+        off.append(np.linalg.norm(e[3:]))
+        plain.append(np.linalg.norm(error_of(without[-1], flight.pose(140))[3:]))
+        assert e[3:] @ np.linalg.solve(states[-1].cov[3:6, 3:6], e[3:]) < 16.3
+        assert np.trace(states[-1].cov[3:6, 3:6]) < np.trace(without[-1].cov[3:6, 3:6])
+    assert max(off) < 0.15
+    assert np.mean(off) < 0.4 * np.mean(plain)
+
+
+def test_what_an_odometer_says_against_the_imu_is_passed_over() -> None:
+    """A slip of 1.5 m/s from the start on: the flight is the one without, to the last bit."""
+    _, states, _ = fly(8, 30, FixedLagConfig(), driven=np.array([1.5, 0.0, 0.0]))
+    _, without, _ = fly(8, 30, FixedLagConfig(), driven=np.array([9.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(states[-1].T_m_b, without[-1].T_m_b)
+
+
+def test_an_older_velocity_is_brought_to_the_frame() -> None:
+    """Told 40 ms late on a flight that accelerates by 4 m/s^2: with its age known it errs by millimetres a second."""
+    flight = make_flight(11, 12)
+    smoother = FixedLagSmoother(CAMERA, CALIBRATION, replace(EXACT, velocity_gate=1e9))
+    errors = []
+    for age_s in (0.04, 0.0):
+        smoother.start(flight.pose(0), flight.velocity[0], np.zeros(6), GRAVITY, StartDeviations())
+        for k in range(12):
+            late = (k + 1) * FRAME_STEPS - round(0.04 / STEP_S)
+            value = flight.T[late, :3, :3].T @ flight.velocity[late]
+            state = smoother.add(flight.samples(k), None, BodyVelocity(value, 1e-4**2 * np.eye(3), age_s))
+            assert state is not None
+        errors.append(float(np.linalg.norm(state.velocity - flight.velocity[12 * FRAME_STEPS])))
+    assert errors[0] < 0.01
+    assert errors[1] > 4.0 * errors[0]
 
 
 def test_a_moved_map_moves_everything() -> None:
