@@ -44,7 +44,7 @@ from kiteline_hw.links import open_link
 from kiteline_hw.lockstep_barrier import Barrier
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
-from kiteline_hw.ports import ByteLink, FrameSource, LinkError, PoseSample, PoseSink, SourceError
+from kiteline_hw.ports import ByteLink, ControllerLink, FrameSource, LinkError, PoseSample, SourceError
 from kiteline_hw.sealed_link import SealedLink
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
@@ -205,6 +205,7 @@ class Onboard:
             "notes": list(self.source.report.notes),
             "scale": "metric" if self.agent.metric else "own",
             "time_offset": self.agent.time_offset_report(),
+            "odometer": self.agent.odometer_report(),
             "drain": {key: total[key] - self.flown[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
                 "cpu_ms_per_frame": self._account.ms,
@@ -280,6 +281,7 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
             _tell([f"flying {source.name}, {_link_words(spec)}"])
         begin_ns = clock.now_ns()
         onboard.begin_at(begin_ns)
+        shift_ns = onboard.spec.start_ns - begin_ns
         while not stop and onboard.next_ns is not None:
             wait_s = (begin_ns + onboard.next_ns - clock.now_ns()) / 1e9
             if wait_s > 0.0 and stop.wait(min(wait_s, _IDLE_TICK_S)):
@@ -291,6 +293,8 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
                     break
                 captured_ns = begin_ns + onboard.next_ns
                 frame, imu, driven = onboard.camera.take()
+                told = None if sink is None else sink.take_odometry(captured_ns)
+                driven = driven if told is None else replace(told, t_ns=told.t_ns + shift_ns)
             for packet in onboard.step(frame, imu, link.receive(), now_ns, driven):
                 link.send(packet)
             e = onboard.output.estimate if onboard.output is not None else None
@@ -350,18 +354,26 @@ def _drain_live(
         process.notify("WATCHDOG=1")
 
 
-def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stack: ExitStack) -> PoseSink | None:
-    """Where poses for the flight controller go, if anywhere. Raises LinkError."""
+def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stack: ExitStack) -> ControllerLink | None:
+    """The flight controller that gets poses, if any. Raises LinkError."""
     if not spec.mavlink:
+        if spec.odometry:
+            raise LinkError("--odometry takes velocities from a flight controller: expected --mavlink URL beside it")
         return None
     from kiteline_hw.mavlink_frames import mounting  # the dialect takes 5 MiB: only where it is spoken
+    from kiteline_hw.mavlink_odometry import FromController, FromControllerConfig, told_of
     from kiteline_hw.mavlink_out import MavlinkPoseSink
 
     axes = spec.axes or ("flu" if source.rig.has_body else "rdf")
+    wanted = None
     try:
-        return stack.enter_context(MavlinkPoseSink(spec.mavlink, mounting(axes), clock, required=False))
+        T_b_f = mounting(axes)
+        if spec.odometry:
+            told, track_m = told_of(spec.odometry)
+            wanted = FromController(told, T_b_f, FromControllerConfig(track_m=track_m))
     except ValueError as error:
-        raise LinkError(f"--axes: {error}") from error
+        raise LinkError(f"--axes or --odometry: {error}") from error
+    return stack.enter_context(MavlinkPoseSink(spec.mavlink, T_b_f, clock, required=False, wanted=wanted))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -6,7 +6,14 @@ from kiteline_agent.step import StepOutput
 from kiteline_agent.tally import Tally, live_pose
 
 _EVERY_NS = 10_000_000_000  # between two lines while nothing happens
-_TOLD = ("submap", "recovered", "mono", "disparities", "governor: level")  # beginnings of the events worth a line
+_TOLD = (
+    "submap",
+    "recovered",
+    "mono",
+    "disparities",
+    "governor: level",
+    "odometer",
+)  # beginnings of the events worth a line
 
 
 class Narrator:

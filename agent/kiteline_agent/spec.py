@@ -42,6 +42,7 @@ class AgentSpec:
     cpu_percent: float = 0.0  # of one core; 0: all of it
     mavlink: str = ""  # URL of a flight controller
     axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
+    odometry: str = ""  # what to take from the flight controller: controller, wheels, wheels:TRACK_M; "": nothing
     kill_at_s: float = -1.0  # end like a crash at this flight time
     await_base_at_s: float = -1.0  # look for a base again at this flight time
     await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
@@ -53,6 +54,7 @@ def spec_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentSpec:
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
         key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
+        odometry=a.odometry,
     )  # fmt: skip
 
 
@@ -123,6 +125,11 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
     p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
+    p.add_argument(
+        "--odometry", metavar="WHAT", default="",
+        help="take velocities from the flight controller too: wheels, wheels:TRACK_M (wheels tell turns as well), or "
+        "controller (its filter's, where that does not live on our own poses); of a recording they are taken anyhow",
+    )  # fmt: skip
     p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")

@@ -123,6 +123,14 @@ class PoseSink(Protocol):
     def close(self) -> None: ...
 
 
+class ControllerLink(PoseSink, Protocol):
+    """A flight controller that is told of poses and may tell of its own velocity."""
+
+    def take_odometry(self, t_ns: int) -> OdometryBatch | None:
+        """What it said of its velocity since the last call, up to an instant of our clock; None for nothing."""
+        ...
+
+
 class Clock(Protocol):
     """A monotonic clock."""
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from kiteline_core.frame import Frame, OdometryBatch
 from kiteline_hw.mcap_file import McapFile
-from kiteline_hw.mcap_log import LogReader
+from kiteline_hw.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.mcap_mend import mend
 from kiteline_hw.ports import SourceError
+from kiteline_hw.sources import open_source
 from kiteline_lab.fly import Options, fly
 from kiteline_lab.replay import main, replay_agent
 
@@ -54,6 +57,38 @@ def rewritten(log: Path, to: Path, topic: str, number: int, change: bytes) -> Pa
 def test_a_flight_replays_bit_for_bit(flown: Path, half: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(flown / half / "log.mcap"), "--verify"]) == 0
     assert "every output as in the log" in capsys.readouterr().out
+
+
+def test_a_flight_with_odometry_replays_bit_for_bit(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    driven = tmp_path / "driven.mcap"
+    with LogWriter(driven, {"role": "recording"}) as log:
+        done = 0
+        for item in (source := open_source(str(recording))):
+            assert isinstance(item, Frame)
+            if not done:
+                log.rig(item.t_ns, source.rig, None)
+            n = 3  # the camera slides to its right with 0.4 m/s
+            stamps = item.t_ns - np.array([40_000_000, 20_000_000, 0], np.int64)
+            cov = np.tile(0.02**2 * np.eye(3), (n, 1, 1))
+            told = OdometryBatch(stamps, np.tile([0.4, 0.0, 0.0], (n, 1)), np.zeros((n, 3)), cov, cov)
+            log.odometer(ODOMETER, item.t_ns, told)
+            log.frame(item)
+            done += 1
+    report, _ = fly(Options((str(driven),), tmp_path / "out", "local"), quiet=True)
+    odometer = dict(report)["agents"][0]["odometer"]  # type: ignore[index]
+    assert odometer["trusted"]
+    assert odometer["scale"] == pytest.approx(1.0, abs=0.05)
+    log_file = tmp_path / "out" / "agent0" / "log.mcap"
+    assert main([str(log_file), "--verify"]) == 0
+    with LogReader(log_file) as reader:
+        assert reader.topics["/odometer"] == done
+    # what it says matters: with one variance 65536 times as large the flight is another one
+    wrong = rewritten(log_file, tmp_path / "log.mcap", "/odometer", done - 4, b"@")
+    capsys.readouterr()
+    assert main([str(wrong), "--verify"]) == 1
+    assert "the estimate has another" in capsys.readouterr().out
 
 
 def test_trajectories_of_a_replay_are_those_of_the_flight(flown: Path, tmp_path: Path) -> None:
