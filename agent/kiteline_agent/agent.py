@@ -110,11 +110,14 @@ class Agent:
             self._growth.find_scale(view, track, frame.t_ns)
             tracked = True
         else:
-            # 5. Lost: the IMU carries on for a while; search the old map; with texture in view and two failed tries,
-            # open a new submap.
+            # 5. Lost: the IMU carries on for a while, and the map with it; search the old map; with texture in view and
+            # two failed tries, open a new submap.
             self._bridged = self._coast(predicted, frame.t_ns, dt_s)
-            track = None if frozen else self._recover(view, frame.t_ns)
-            found = track is not None or (not frozen and self._growth.begin_submap(view, frame.t_ns, imu))
+            goes_on = self._bridged and not frozen and self._growth.go_on(view, frame.t_ns)
+            track = None if frozen or goes_on else self._recover(view, frame.t_ns)
+            found = track is not None or (
+                not frozen and not goes_on and self._growth.begin_submap(view, frame.t_ns, imu)
+            )
             if found:
                 self._bridged = False
                 self._inertia.restart(frame.t_ns)

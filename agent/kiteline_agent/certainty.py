@@ -168,6 +168,19 @@ class Certainty:
         grown = np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3)
         self._blind = self._blind + np.diag(grown)
 
+    def blind_within(self, m: float, rad: float) -> bool:
+        """Whether what was flown blind has a deviation of no more than m, in any direction, and rad, about any axis."""
+        largest = (float(np.linalg.eigvalsh(block)[-1]) for block in (self._blind[:3, :3], self._blind[3:, 3:]))
+        return all(value <= limit**2 for value, limit in zip(largest, (m, rad), strict=True))
+
+    def bridge(self, T_m_b: F64) -> None:
+        """The map goes on with a keyframe at T_m_b (4,4), which was come by blindly."""
+        back = np.eye(6)
+        back[:3, 3:], back[3:, 3:] = se3.skew(T_m_b[:3, 3]) @ T_m_b[:3, :3], T_m_b[:3, :3]
+        self._noise = self._noise + back @ self._blind @ back.T
+        self._seen(0)
+        self._blind_s = 0.0
+
     def met(self, keyframe: KeyframeId, T_c_m: F64, points: int) -> None:
         """The pose is T_c_m (4,4) by so many points that are not in the local map, beside this keyframe."""
         slot = self._map.slot_of(keyframe)

@@ -145,6 +145,8 @@ class RecoveryConfig:
     min_pnp_inliers: int = 12  # of P3P; chance matches reach 8
     min_inliers: int = 30  # of the tracker from that pose
     min_share: float = 0.4  # of the points that the tracker looked for: a place that only resembles has fewer
+    carried_m: float = 0.08  # deviation of a pose by the IMU alone up to which the map goes on: well below what is good
+    carried_rad: float = 0.02  # likewise: a degree
     failures: int = 2  # tries, with texture in view, to find the old map before a new one opens
     beside_frames: int = 20  # how long the search goes on beside a young submap: 1 s
     agree_ratio: float = 0.05  # of the depth: two results beside a young submap may differ by so much
@@ -236,7 +238,7 @@ class GovernorConfig:
     blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
     doubt: float = 0.1  # how much dearer than expected a frame may be
     learning: float = 0.15  # gain of the expectations of frames
-    keyframe_memory_s: float = 2.0  # s over which keyframes are counted
+    keyframe_learning: float = 0.4  # gain of how often keyframes are asked for
     first_keyframes: float = 2.0  # in a second, before it was seen
     first_frame_ms: float = 3.5  # of a tracked frame at full effort, before it was seen: 752x480 on a laptop
     first_period_s: float = 0.05  # between frames, before it was seen

@@ -66,7 +66,7 @@ class Extra(Enum):
 
 _LONGER = 1.03  # growth of the expected period a frame, should the camera be slower than thought
 _FIRST_LONGER = 2.5  # the same between the first two frames; more, and the core was busy with the first
-_GUESS = 3.0  # usual frames that something dear costs, before it was seen
+_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0}  # usual frames that it costs, before it was seen
 _OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
 _LEAST = 0.1  # of the budget is for frames, whatever keyframes cost
 
@@ -126,8 +126,9 @@ class Governor:
         self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
         self._idle_ns = 0.0  # what a frame costs that is not tracked
         self._extra_ns = dict.fromkeys(Extra, 0.0)  # what each adds to a frame
-        self._keyframes_s = config.first_keyframes  # in a second
-        self._made = 0  # keyframes since the last frame
+        self._keyframes_s = config.first_keyframes  # that are asked for in a second
+        self._keyframe_t_ns = 0  # of the last one
+        self._asked_t_ns: int | None = None  # when the next one was first asked for
         self._period_ns = config.first_period_s * 1e9  # between frames
         self._first_t_ns = 0
         self._last_t_ns: int | None = None
@@ -193,6 +194,8 @@ class Governor:
         urgent: without it the track may be lost; then half of the doubt is enough.
         """
         if self.on:
+            if extra is Extra.KEYFRAME and self._asked_t_ns is None:
+                self._asked_t_ns = self._last_t_ns
             if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
                 return False
             if not self._room_for(extra, 1.0 + (0.5 if urgent else 1.0) * self._config.doubt):
@@ -220,7 +223,8 @@ class Governor:
             known_ns = self._extra_ns[self._last_extra]
             more_ns = max(cpu_ns - self._frame_ns, 0.0)
             self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * gain if known_ns else 1.0)
-            self._made += self._last_extra is Extra.KEYFRAME
+            if self._last_extra is not Extra.SEARCH:
+                self._count_keyframe(self._last_t_ns)
         elif self._measured:
             cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # a frame that was lost and found says little
             # Quicker to believe that frames are dear than that they are cheap.
@@ -244,17 +248,23 @@ class Governor:
             self._period_ns = passed_ns
         elif self._last_t_ns > self._first_t_ns:
             self._period_ns *= longer
-        forgotten = min(passed_ns / (self._config.keyframe_memory_s * 1e9), 1.0)
-        self._keyframes_s += self._made / self._config.keyframe_memory_s - self._keyframes_s * forgotten
-        self._made = 0
+        if self._asked_t_ns is None:  # none was needed for so long
+            self._keyframes_s = min(self._keyframes_s, 1e9 / max(t_ns - self._keyframe_t_ns, 1))
         self._turn += self._share() * passed_ns / self._period_ns
+
+    def _count_keyframe(self, t_ns: int) -> None:
+        """A keyframe was made: how many are asked for, whether there was room for them at once or not."""
+        asked_t_ns = t_ns if self._asked_t_ns is None else self._asked_t_ns
+        apart_ns = max(asked_t_ns - self._keyframe_t_ns, self._period_ns)
+        if self._keyframe_t_ns:
+            self._keyframes_s += (1e9 / apart_ns - self._keyframes_s) * self._config.keyframe_learning
+        self._keyframe_t_ns, self._asked_t_ns = t_ns, None
 
     def _affordable(self, t_ns: int, lost: bool) -> bool:
         """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
         if lost:
             return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._config.doubt)
-        keyframe_first = self._waiting is Extra.KEYFRAME and self._ladder is CARRIED
-        if keyframe_first and not self._blind_for(t_ns, self._config.max_gap_s):
+        if self._waiting is Extra.KEYFRAME and not self._blind_for(t_ns, self._gap_s):
             return self._room_for(Extra.KEYFRAME, 1.0 + 0.5 * self._config.doubt)  # it goes before more frames
         cost_ns = self._frame_ns * (1.0 + self._config.doubt)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
@@ -267,9 +277,9 @@ class Governor:
         """Whether a frame with something dear fits, were it dearer than expected; what never fits is done when little
         else was.
         """
-        need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS * self._frame_ns)
+        need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS[extra] * self._frame_ns)
         if self._last_extra is not None and self._last_extra is not extra:  # done in this very frame
-            need_ns += self._extra_ns[self._last_extra] or _GUESS * self._frame_ns
+            need_ns += self._extra_ns[self._last_extra] or _GUESS[self._last_extra] * self._frame_ns
         if self._window_ns + dearer * need_ns <= self._budget_ns:
             return True
         if self._last_extra not in (None, extra):

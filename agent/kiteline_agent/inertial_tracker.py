@@ -44,6 +44,7 @@ class InertialConfig:
     level_error: float = 0.03  # relative, of gravity's length as found then: its direction is as good
     level_patience_s: float = 2.0  # so long a flight controller waits at most for level poses
     motion_window_s: float = 0.7  # window of the alignment in motion
+    motion_frames: int = 7  # of that window at least, where frames are few: with five, noise would do for accelerations
     window_frames: int = 60  # most frames that are kept while waiting; a scale needs some seconds
     max_residual_m: float = 0.02  # of the alignment: above it the poses do not fit the IMU, wait on
     max_gravity_error: float = 0.12  # relative, of its length as found without knowing it
@@ -375,7 +376,7 @@ class InertialTracker:
     def _start_in_motion(self, last: _Pose) -> bool:
         config = self._config
         recent = sum((last.t_ns - p.t_ns) * 1e-9 <= config.motion_window_s + 0.3 for p in self._waiting)
-        poses, motions = self._window(recent)
+        poses, motions = self._window(max(recent, config.motion_frames))
         gyro = imu_alignment.gyro_bias(poses, motions)
         bias = np.concatenate([gyro, self._bias[3:]])
         found = imu_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)

@@ -83,6 +83,24 @@ class MapGrowth:
         self._s.recovery.remember(self._reference.keyframe)
         self._certainty.remember(self._reference.keyframe)
 
+    def go_on(self, view: View, t_ns: int) -> bool:
+        """No point of the map was found, but the IMU knows well where the camera is: the map goes on with a keyframe
+        there. Returns whether that is so, even where the keyframe has to wait for CPU time.
+        """
+        limits = self._s.config.recovery
+        if self._mono is not None or not self._certainty.blind_within(limits.carried_m, limits.carried_rad):
+            return False
+        if not self._s.governor.may(Extra.KEYFRAME, urgent=True):
+            self._s.events.append("governor: keyframe put off")
+            return True
+        if not self._maker.enough(view, self._s.config.local_map.first_points):
+            return False
+        self._s.events.append("keyframe: carried by the IMU")
+        self._certainty.bridge(self._pose.T_m_c @ self._s.T_c_b)
+        self._reference.add(view, None, t_ns, self._s.frame, self._submaps.active, self._pose.T_m_c)
+        self._note_keyframe(view, Extra.KEYFRAME)
+        return True
+
     def begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
         first = not self._submaps.any

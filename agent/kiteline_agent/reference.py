@@ -60,9 +60,10 @@ class Reference:
         return keyframes.Wish(why, urgent=thin, waits=waits)
 
     def add(self, view: View, track: Track | None, t_ns: int, frame: int, submap: SubmapId, T_m_c: F64) -> None:
-        """Make a keyframe of this frame. Without a track, the submap begins with it."""
-        parent, T_p_k = (NO_KEYFRAME, T_m_c) if track is None else (self.keyframe, self.T_k_c)
-        sequence = 0 if track is None else self._sequence[submap] + 1
+        """Make a keyframe of this frame. Without a track it sees nothing again; a submap's first one begins it."""
+        begins = submap not in self._sequence
+        parent, T_p_k = (NO_KEYFRAME, T_m_c) if begins else (self.keyframe, self.T_k_c)
+        sequence = 0 if begins else self._sequence[submap] + 1
         self._sequence[submap] = sequence
         keyframe = keyframe_id(submap, sequence)
         T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, frame)
