@@ -216,6 +216,7 @@ class CodedChannel:
 _LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
 _RADIOS = ("serial", "mavlink")
 _SPILLED_BYTES = 2 << 20  # of memory for values of keyframes: some 140 of them, three times what a local map holds
+_SPILLED_INBOX_BYTES = 1 << 20  # the same of what the peer says of keyframes: some 400 of them
 _UNSPILLED_BYTES = 7 << 20  # the same where old values are lost: five minutes without a link
 
 
@@ -244,6 +245,7 @@ def coded_channel(
         overhead_bytes=_LINK_BYTES.get(kind, shape.overhead_bytes) + seal_bytes,
         budget_bytes=budget_bytes,
         heartbeat_ns=shape.heartbeat_ns,
+        resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else 0,
         resident_bytes=0 if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
     )
     return CodedChannel(config, session, named, spill)

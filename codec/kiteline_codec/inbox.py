@@ -1,4 +1,8 @@
-"""What one session of the peer wrote, as far as it has arrived."""
+"""What one session of the peer wrote, as far as it has arrived.
+
+Memory is bounded where a bound and a place beside it are given: what the peer says of keyframes that it did not touch
+for long waits there, and comes back when it is asked for or replaced.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,15 @@ import heapq
 from dataclasses import dataclass
 
 from kiteline_codec import ranges
-from kiteline_codec.digest import Digest
+from kiteline_codec.archive import Archive, Row, Spill
+from kiteline_codec.digest import MODULUS, Digest, hash_value
 from kiteline_codec.packet import MASK_BITS, Item
-from kiteline_codec.schema import Key
+from kiteline_codec.resident import Resident
+from kiteline_codec.schema import Key, Kind
 
 _MASK = (1 << MASK_BITS) - 1
+_BULK_KINDS = frozenset({int(k) for k in (Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED)})
+_VALUE_BYTES = 350  # of memory that a value takes beside its code, about
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +39,11 @@ class _Assembly:
 class Inbox:
     """Packet numbers, values, removals and unfinished values of one session of the peer."""
 
-    def __init__(self) -> None:
-        self.values: dict[Key, tuple[int, bytes]] = {}
+    def __init__(self, resident_bytes: int = 0, spill: Spill | None = None) -> None:
+        """resident_bytes: of memory for what the peer says of keyframes, about; 0, or without a spill: any number."""
+        self._values: dict[Key, tuple[int, bytes]] = {}
+        self._archive = Archive(spill)
+        self._resident = Resident(0 if spill is None else resident_bytes, _BULK_KINDS, _VALUE_BYTES)
         self.digest = Digest()
         self.value_bytes = 0
         self.assembly_bytes = 0
@@ -43,6 +54,28 @@ class Inbox:
         self._assemblies: dict[Key, _Assembly] = {}
         self._last = 0
         self._seen = 0  # bit i: packet last - 1 - i has arrived
+
+    def __len__(self) -> int:
+        return len(self._values) + self._archive.values
+
+    def held(self, key: Key) -> tuple[int, bytes] | None:
+        """Version and code of a value, None when there is none."""
+        if key.kind in _BULK_KINDS and key.id in self._archive:
+            self._fetch(key.id)
+            self._make_room(key.id)
+        return self._values.get(key)
+
+    def codes(self) -> dict[Key, bytes]:
+        """The codes of all values."""
+        self._fetch_all()
+        out = {key: code for key, (_, code) in self._values.items()}
+        self._make_room()
+        return out
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory that takes what the peer says of keyframes, about; 0 where it is not bounded."""
+        return self._resident.bytes + self._archive.resident_bytes
 
     @property
     def assembling(self) -> int:
@@ -101,7 +134,8 @@ class Inbox:
 
     def reset(self, version: int) -> list[Key]:
         """The peer voids its values up to a version. Returns their keys."""
-        void = sorted(k for k, (v, _) in self.values.items() if v <= version)
+        self._fetch_all()
+        void = sorted(k for k, (v, _) in self._values.items() if v <= version)
         for key in void:
             self._drop_value(key)
         self.raise_watermark(version)
@@ -112,7 +146,7 @@ class Inbox:
         """Take in an item. Returns what became known by it, if anything."""
         key, version = item.key, item.version
         self.newest = max(self.newest, version)
-        held = self.values.get(key)
+        held = self.held(key)
         known = held[0] if held is not None else max(self._removed.get(key, 0), self.watermark)
         if version <= known:
             return None
@@ -128,9 +162,11 @@ class Inbox:
         self._drop_assembly(key, version)
         self._drop_value(key)
         self._removed.pop(key, None)
-        self.values[key] = (version, data)
+        self._values[key] = (version, data)
         self.value_bytes += len(data)
         self.digest.add(key, version, data)
+        self._resident.count(key, len(data))
+        self._make_room(key.id)
         return Update(key, data)
 
     def _assemble(self, item: Item) -> bytes | None:
@@ -157,7 +193,52 @@ class Inbox:
             del self._assemblies[key]
 
     def _drop_value(self, key: Key) -> None:
-        held = self.values.pop(key, None)
+        held = self._values.pop(key, None)
         if held is not None:
             self.digest.discard(key, *held)
             self.value_bytes -= len(held[1])
+            self._resident.uncount(key, len(held[1]))
+
+    # ---- memory
+
+    def _make_room(self, wanted: int = -1) -> None:
+        """Beyond the bound, archive what was not touched for long, down to 3/4; never the id that is wanted now."""
+        if not self._resident.full:
+            return
+        for id_ in self._resident.ids():
+            if self._resident.roomy or (id_ != wanted and not self._to_archive(id_)):
+                return
+
+    def _to_archive(self, id_: int) -> bool:
+        """Move the values of an id out of memory. False where they cannot be kept elsewhere: then all stay here."""
+        keys = self._resident.keys(id_)
+        rows, hashes = [], 0
+        for key in keys:
+            version, code = self._values[key]
+            rows.append(Row(key.kind, key.part, version, True, True, False, len(code), code))
+            hashes += hash_value(key, version, code)
+        self._archive.put(id_, rows, hashes % MODULUS)
+        if not self._archive.readable(id_):
+            self._archive.take(id_)
+            self._resident.unbound()
+            return False
+        for key in keys:
+            self._resident.uncount(key, len(self._values.pop(key)[1]))
+        return True
+
+    def _fetch_all(self) -> None:
+        for id_ in list(self._archive):
+            self._fetch(id_)
+
+    def _fetch(self, id_: int) -> None:
+        """Take the values of an id back into memory. Where they are lost, digests differ, and the peer sends again."""
+        hashes = self._archive.hashes(id_)
+        rows = self._archive.take(id_)
+        if any(row.code is None for row in rows):
+            self.digest.leave(hashes)
+            self.value_bytes -= sum(row.size for row in rows)
+            return
+        for row in rows:
+            key, code = Key(row.kind, id_, row.part), row.code or b""
+            self._values[key] = row.version, code
+            self._resident.count(key, len(code))

@@ -6,7 +6,6 @@ they are to be sent. Where it cannot keep them, the least valuable of the old se
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
 
 from kiteline_codec import ranges
@@ -16,6 +15,7 @@ from kiteline_codec.entries import Entry, Order, Waiting, item_of
 from kiteline_codec.flights import Carried, Flight, Flights
 from kiteline_codec.packet import write_item
 from kiteline_codec.packing import Writer
+from kiteline_codec.resident import Resident
 from kiteline_codec.schema import Key, Kind
 
 Known = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value of ours that the peer holds
@@ -50,7 +50,6 @@ class Outbox:
         self._basis = basis
         self._known_state = 0  # counts changes of what of the basis the peer is known to hold
         self._leant = False  # whether a tight form was built upon values of the same packet
-        self._limit_bytes = resident_bytes
         self.digest = Digest()
         self.newest = 0  # versions number all changes of all values
         self.pending = 0  # values that the peer is not known to hold
@@ -58,8 +57,7 @@ class Outbox:
         self.dropped = 0  # values given up for want of memory
         self.flights = Flights()
         self.archive = Archive(spill)
-        self._bulk: OrderedDict[int, set[Key]] = OrderedDict()  # may be archived, by id, longest untouched first
-        self._bulk_bytes = 0  # of memory
+        self._resident = Resident(resident_bytes, _BULK_KINDS, _ENTRY_BYTES)
         self._entries: dict[Key, Entry] = {}
         self._waiting = Waiting(self._entries)
 
@@ -69,7 +67,7 @@ class Outbox:
     @property
     def resident_bytes(self) -> int:
         """Memory that values of keyframes take, about."""
-        return self._bulk_bytes + self.archive.resident_bytes
+        return self._resident.bytes + self.archive.resident_bytes
 
     @property
     def clean(self) -> bool:
@@ -130,7 +128,7 @@ class Outbox:
         self._known_state += key.kind in self._basis
         self.pending -= 1
         self.pending_bytes -= entry.size
-        self._uncount(key, entry)
+        self._resident.uncount(key, entry.size)
         del self._entries[key]
 
     def _change(self, key: Key, code: bytes | None, order: Order) -> None:
@@ -143,7 +141,7 @@ class Outbox:
         else:
             if entry.code is not None:
                 self.digest.leave(entry.hashed)
-                self._uncount(key, entry)
+                self._resident.uncount(key, entry.size)
             self.pending += entry.clean
             self.pending_bytes -= 0 if entry.clean else entry.size
             entry.version, entry.code, entry.order = self.newest, code, order
@@ -154,7 +152,7 @@ class Outbox:
         if code is not None:
             entry.hashed = hash_value(key, entry.version, code)
             self.digest.join(entry.hashed)
-            self._count(key, entry)
+            self._resident.count(key, entry.size)
         self._waiting.note_version(key, entry)
         self._waiting.add(key, entry)
 
@@ -204,43 +202,27 @@ class Outbox:
 
     # ---- memory
 
-    def _count(self, key: Key, entry: Entry) -> None:
-        """A value of a keyframe takes memory."""
-        if self._limit_bytes and key.kind in _BULK_KINDS:
-            self._bulk.setdefault(key.id, set()).add(key)
-            self._bulk.move_to_end(key.id)
-            self._bulk_bytes += entry.size + _ENTRY_BYTES
-
-    def _uncount(self, key: Key, entry: Entry) -> None:
-        keys = self._bulk.get(key.id)
-        if keys is not None and key in keys:
-            self._bulk_bytes -= entry.size + _ENTRY_BYTES
-            keys.discard(key)
-            if not keys:
-                del self._bulk[key.id]
-
     def _make_room(self) -> None:
         """Beyond the bound, archive what was not touched for long, else give up what is worth least, down to 3/4."""
-        if self._bulk_bytes <= self._limit_bytes:
+        if not self._resident.full:
             return
-        enough = self._limit_bytes * 3 // 4
         refused = False
-        for id_ in list(self._bulk):
-            if self._bulk_bytes <= enough:
+        for id_ in self._resident.ids():
+            if self._resident.roomy:
                 return
             refused |= not self._archive(id_)
-        if self._bulk_bytes <= self._limit_bytes or not refused:
+        if not (self._resident.full and refused):
             return
         idle = [k for k, e in self._entries.items() if k.kind in _BULK_KINDS and e.still and not e.clean]
         for key in sorted(idle, key=lambda k: (-self._entries[k].order[0], k.id, -k.part)):
-            if self._bulk_bytes <= enough:
+            if self._resident.roomy:
                 return
             self.remove(key)
             self.dropped += 1
 
     def _archive(self, id_: int) -> bool:
         """Move the values of an id to the archive, if nothing of them is on its way. Returns False when refused."""
-        entries = [(key, self._entries[key]) for key in sorted(self._bulk[id_])]
+        entries = [(key, self._entries[key]) for key in self._resident.keys(id_)]
         if not all(e.still and e.order == self._order(k) for k, e in entries):
             return True
         rows = [
@@ -249,7 +231,7 @@ class Outbox:
         if not self.archive.put(id_, rows, sum(e.hashed for _, e in entries) % MODULUS):
             return False
         for key, entry in entries:
-            self._uncount(key, entry)
+            self._resident.uncount(key, entry.size)
             del self._entries[key]
         return True
 
@@ -274,12 +256,11 @@ class Outbox:
             entry = Entry(row.version, row.code, self._order(key), todo, acked, row.sent, plain=row.plain)
             entry.hashed = hash_value(key, row.version, row.code)
             self._entries[key] = entry
-            self._count(key, entry)
+            self._resident.count(key, entry.size)
             if not row.clean:
                 self._waiting.note_version(key, entry)
                 self._waiting.add(key, entry)
-        if id_ in self._bulk:
-            self._bulk.move_to_end(id_, last=False)
+        self._resident.goes_first(id_)
 
     # ---- sending
 
@@ -310,7 +291,7 @@ class Outbox:
         if there is not None:
             self._make_room()
             self._fetch(there[1])
-            idle = [k for k in self._bulk.get(there[1], ()) if self._entries[k].todo]
+            idle = [k for k in self._resident.keys(there[1]) if self._entries[k].todo]
             if idle:
                 return min(idle)
         return self._waiting.oldest()

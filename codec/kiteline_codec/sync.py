@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import replace
 
 from kiteline_codec import remembered
 from kiteline_codec.archive import Spill
 from kiteline_codec.budget import SlidingBudget
 from kiteline_codec.entries import Order
+from kiteline_codec.grown import grown
 from kiteline_codec.inbox import Inbox, Update
 from kiteline_codec.outbox import Known, Outbox
 from kiteline_codec.packet import (
@@ -28,6 +28,7 @@ from kiteline_codec.packet import (
     write_header,
 )
 from kiteline_codec.packing import Writer
+from kiteline_codec.round_trip import RoundTrip
 from kiteline_codec.schema import Key, WireError
 from kiteline_codec.sync_config import MIN_PACKET_BYTES, SyncConfig, SyncStats, default_order
 from kiteline_codec.throughput import Throughput
@@ -63,7 +64,8 @@ class Endpoint:
             config.order, config.oldest_every, self._shrink if tightener else None, BASIS_KINDS, config.resident_bytes,
             spill,
         )  # fmt: skip
-        self._in = Inbox()
+        self._spill = spill
+        self._in = Inbox(config.resident_inbox_bytes, spill)
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self._peer = 0
         self._legacy: dict[Key, bytes] = {}
@@ -80,8 +82,7 @@ class Endpoint:
         self._owed_since_ns = 0
         self._told_ns = -(1 << 62)  # when a packet last left
         self._digest_sent: tuple[int, int] = (-1, 0)  # version, when
-        self._rtt_ns = self._rtt_var_ns = 0
-        self._backoff = 0
+        self._round_trip = RoundTrip(config)
         self._window = Window(config.window_packets)
         self._throughput = Throughput()
         self.throughput_bytes_s: int | None = None  # what the link delivers; None while nothing has to wait
@@ -113,7 +114,7 @@ class Endpoint:
 
     def peer_values(self) -> dict[Key, bytes]:
         """What the peer's session wrote, by key; a copy."""
-        return {key: code for key, (_, code) in self._in.values.items() if key.kind != remembered.KIND}
+        return {key: code for key, code in self._in.codes().items() if key.kind != remembered.KIND}
 
     def own_value(self, key: Key) -> bytes | None:
         """The code of a value that this side shares; None where there is none."""
@@ -122,7 +123,7 @@ class Endpoint:
 
     def peer_value(self, key: Key) -> bytes | None:
         """The code of a value that the peer's session wrote; None where there is none."""
-        held = self._in.values.get(key)
+        held = self._in.held(key)
         return None if held is None else held[1]
 
     def legacy_values(self) -> dict[Key, bytes]:
@@ -166,9 +167,9 @@ class Endpoint:
         out, flights = self._out, self._out.flights
         return SyncStats(
             self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, flights.lost,
-            self._duplicates, sum(n for _, n in reasons), reasons, self._rtt_ns, out.pending, flights.in_flight,
-            len(self._in.values), len(self._legacy), self._peer, self._restarts, self._mismatches, self.backlog_bytes,
-            out.resident_bytes, out.archive.values, out.dropped, self.throughput_bytes_s or 0,
+            self._duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
+            flights.in_flight, len(self._in), len(self._legacy), self._peer, self._restarts, self._mismatches,
+            self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped, self.throughput_bytes_s or 0,
             self.config.budget_bytes,
         )  # fmt: skip
 
@@ -237,7 +238,7 @@ class Endpoint:
         form = remembered.form_of(key, code, self._remembered)
         if form is not None:
             return form
-        return self._tightener.shrink(key, code, lambda k: self._in.values.get(k) or known(k), self._out.held)
+        return self._tightener.shrink(key, code, lambda k: self._in.held(k) or known(k), self._out.held)
 
     def _grown(self, items: list[Item]) -> list[Item]:
         """The items with codes in place of tight forms. Raises WireError where a form builds upon what is not held."""
@@ -245,24 +246,7 @@ class Endpoint:
             return items
         if self._tightener is None:
             raise WireError("a tight form, which this side does not read")
-        grown: list[Item] = []
-        along: dict[Key, tuple[int, bytes]] = {}
-
-        def held(key: Key) -> tuple[int, bytes] | None:
-            return along.get(key) or self._in.values.get(key) or self._out.held(key)
-
-        for item in items:
-            if item.tight and len(item.data) == remembered.FORM_BYTES:
-                before = self._legacy.get(item.key) or (held(item.key) or (0, None))[1]
-                code = remembered.code_of(item.data, before)
-                item = replace(item, data=code, total=len(code), tight=False)
-            elif item.tight:
-                code = self._tightener.grow(item.key, item.data, held)
-                item = replace(item, data=code, total=len(code), tight=False)
-            if item.whole:
-                along[item.key] = item.version, item.data
-            grown.append(item)
-        return grown
+        return grown(items, self._tightener, lambda key: self._in.held(key) or self._out.held(key), self._legacy)
 
     def _hear(self, update: Update) -> None:
         """The peer tells what it remembers."""
@@ -280,7 +264,7 @@ class Endpoint:
             self._restarts += 1
         self._peer = session
         self._legacy.update(self.peer_values())
-        self._in = Inbox()
+        self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
         self._remembered.clear()
         self._out.restart()
         if self._tightener is not None:
@@ -289,7 +273,7 @@ class Endpoint:
         self._peer_verified = self._verified = self._resync = -1
         self._reset = None
         self._digest_sent = (-1, 0)
-        self._backoff = self._overtaken = 0
+        self._round_trip.doublings = self._overtaken = 0
         self._window = Window(self.config.window_packets)
 
     def _owe(self, now_ns: int) -> None:
@@ -303,9 +287,8 @@ class Endpoint:
             sent_ns, number = self._out.acknowledge(*header.ack)
             self._throughput.acked(self._out.flights.acked_bytes - before, now_ns)
             if number:
-                self._measure(now_ns - sent_ns)
+                self._round_trip.measured(now_ns - sent_ns)
                 self._window.measured(now_ns - sent_ns, on_way - self._out.flights.in_flight, on_way, now_ns)
-                self._backoff = 0
                 self._overtaken = max(self._overtaken, number - self.config.reorder_packets)
                 if self._reset is not None and number >= self._reset[1]:
                     self._reset = None
@@ -344,20 +327,6 @@ class Endpoint:
             self._verified = version
         self._owe(now_ns)
 
-    def _measure(self, rtt_ns: int) -> None:
-        """Smoothed round trip and its deviation (RFC 6298)."""
-        if not self._rtt_ns:
-            self._rtt_ns, self._rtt_var_ns = max(1, rtt_ns), rtt_ns // 2
-            return
-        self._rtt_var_ns += (abs(rtt_ns - self._rtt_ns) - self._rtt_var_ns) // 4
-        self._rtt_ns = max(1, self._rtt_ns + (rtt_ns - self._rtt_ns) // 8)
-
-    @property
-    def _rto_ns(self) -> int:
-        c = self.config
-        base = self._rtt_ns + 4 * self._rtt_var_ns + c.ack_delay_ns if self._rtt_ns else c.first_rto_ns
-        return min(max(base, c.min_rto_ns) << self._backoff, c.max_rto_ns)
-
     # ---- sending
 
     @property
@@ -370,13 +339,13 @@ class Endpoint:
         c = self.config
         self._throughput.busy(self._out.has_work(), now_ns)
         self.throughput_bytes_s = self._throughput.bytes_s(now_ns)
-        self._out.give_up(now_ns - self._rtt_ns - max(self._rtt_ns // 4, 2 * self._rtt_var_ns), self._overtaken)
-        if self._out.give_up(now_ns - self._rto_ns):
-            self._backoff = min(self._backoff + 1, 6)
+        self._out.give_up(now_ns - self._round_trip.overdue_ns, self._overtaken)
+        if self._out.give_up(now_ns - self._round_trip.timeout_ns):
+            self._round_trip.missed()
         left = self._budget.left(now_ns) - c.overhead_bytes
         if (
             self._peer
-            and self._out.flights.window_open(max(1, self._most_packets >> self._backoff))
+            and self._out.flights.window_open(max(1, self._most_packets >> self._round_trip.doublings))
             and self._out.has_work()
         ):
             if left < c.filled_bytes:
@@ -397,7 +366,7 @@ class Endpoint:
         if not self._peer or not out.clean or self._peer_verified == out.newest:
             return False
         version, sent_ns = self._digest_sent
-        return version != out.newest or now_ns - sent_ns >= self._rto_ns
+        return version != out.newest or now_ns - sent_ns >= self._round_trip.timeout_ns
 
     def _packet(self, now_ns: int, values: bool, digest: bool) -> bytes:
         out = self._out

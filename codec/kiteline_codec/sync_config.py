@@ -69,6 +69,7 @@ class SyncConfig:
     max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
     max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
     resident_bytes: int = 0  # of memory for values of keyframes, their pages in the archive apart; 0: any number
+    resident_inbox_bytes: int = 0  # the same of what the peer says of keyframes, where there is a spill
     order: Callable[[Key], Order] = default_order
 
     def __post_init__(self) -> None:

@@ -26,6 +26,7 @@ from kiteline_codec.flights import Flight
 from kiteline_codec.inbox import Inbox, Update
 from kiteline_codec.outbox import Outbox
 from kiteline_codec.packet import Item
+from kiteline_codec.round_trip import RoundTrip
 from kiteline_codec.schema import Key
 from kiteline_codec.sync import Endpoint, SyncConfig
 
@@ -268,10 +269,28 @@ class OutOfMemory(TwoEnds):
             assert end.stats.resident_bytes <= 3000 + 16 * 1300 + on_its_way
 
 
+class ManyCorrections(TwoEnds):
+    """The same with what is said of keyframes, of which only a few fit into the inbox."""
+
+    def begin(self, session: int) -> Endpoint:
+        return Endpoint(replace(CONFIG, resident_inbox_bytes=1500), session, spill=Memory())
+
+    def key(self, key: Key) -> Key:
+        return Key({2: 16, 22: 17}[key.kind], 3 * key.id + (self.writes % 3), key.part)
+
+    @invariant()
+    def memory_is_bounded(self) -> None:
+        for end in self.ends:
+            newest = 4 * (350 + 300)  # of one keyframe
+            assert end._in.resident_bytes <= 1500 + newest + 6 * 300 + 24 * 20
+
+
 TwoEnds.TestCase.settings = settings(max_examples=300, stateful_step_count=40)
 TestAgreement = TwoEnds.TestCase
 OutOfMemory.TestCase.settings = settings(max_examples=150, stateful_step_count=40)
 TestOutOfMemory = OutOfMemory.TestCase
+ManyCorrections.TestCase.settings = settings(max_examples=100, stateful_step_count=40)
+TestManyCorrections = ManyCorrections.TestCase
 FarApart.TestCase.settings = settings(max_examples=150, stateful_step_count=30)
 TestFarApart = FarApart.TestCase
 
@@ -280,7 +299,7 @@ def older_versions_win(monkeypatch: pytest.MonkeyPatch) -> None:
     apply = Inbox.apply
 
     def planted(self: Inbox, item: Item) -> Update | None:
-        if item.whole and item.key in self.values:
+        if item.whole and item.key in self._values:
             self._drop_value(item.key)
         return apply(self, item)
 
@@ -337,19 +356,19 @@ def the_budget_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def silence_is_forever(monkeypatch: pytest.MonkeyPatch) -> None:
-    rto = Endpoint._rto_ns.fget
+    rto = RoundTrip.timeout_ns.fget
 
-    def planted(self: Endpoint) -> int:
-        return 1 << 62 if self._backoff >= 4 else int(rto(self))  # type: ignore[misc]
+    def planted(self: RoundTrip) -> int:
+        return 1 << 62 if self.doublings >= 4 else int(rto(self))  # type: ignore[misc]
 
-    monkeypatch.setattr(Endpoint, "_rto_ns", property(planted))
+    monkeypatch.setattr(RoundTrip, "timeout_ns", property(planted))
 
 
 def late_packets_count_as_new(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Inbox, "is_new", lambda self, number: True)
 
     def planted(self: Inbox, item: Item) -> Update | None:
-        self.values.pop(item.key, None) if item.whole and item.version > self.watermark else None
+        self._values.pop(item.key, None) if item.whole and item.version > self.watermark else None
         return apply(self, item)
 
     apply = Inbox.apply

@@ -313,9 +313,9 @@ def test_states_that_differ_are_found_and_mended(end: int, loss: float) -> None:
     values = [fill(pair.a, 1, 20, Kind.BIRTHS), fill(pair.b, 2, 20, Kind.POSE, 30)]
     pair.settle()
     inbox = pair.ends[end]._in
-    first = min(inbox.values)
+    first = min(inbox._values)
     inbox._drop_value(first)  # as if memory had been damaged
-    inbox.values[Key(60, 1)] = (3, b"never sent")
+    inbox._values[Key(60, 1)] = (3, b"never sent")
     pair.ends[1 - end].put(Key(Kind.LIVE, 2), b"anything new makes them compare")
     values[1 - end][Key(Kind.LIVE, 2)] = b"anything new makes them compare"
     inbox.digest.add(Key(60, 1), 3, b"never sent")

@@ -1,0 +1,105 @@
+"""What the base says of keyframes, over hours: beyond a bound it waits beside memory, and nothing of it is lost."""
+
+from __future__ import annotations
+
+import random
+
+from kiteline_codec.schema import Key, Kind
+from kiteline_codec.sync import Endpoint, SyncConfig
+
+TICK_NS = 50_000_000
+LIMIT = 100_000
+KINDS = (Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED)
+
+
+class Memory:
+    """A Spill. It takes no more than `room` bytes, and from `forgetful` on gives none back."""
+
+    def __init__(self, room: int = 1 << 40) -> None:
+        self.data: list[bytes] = []
+        self.room = room
+        self.forgetful = False
+
+    def put(self, data: bytes) -> int | None:
+        if sum(map(len, self.data)) + len(data) > self.room:
+            return None
+        self.data.append(data)
+        return len(self.data) - 1
+
+    def get(self, where: int, n_bytes: int) -> bytes | None:
+        return None if self.forgetful else self.data[where]
+
+
+class Line:
+    """Base (a) and agent (b)."""
+
+    def __init__(self, spill: Memory | None) -> None:
+        self.spill = spill
+        self.a, self.b = Endpoint(SyncConfig(), 1), self.agent(1)
+        self.draw = random.Random(1)
+        self.now_ns = 0
+
+    def agent(self, session: int) -> Endpoint:
+        return Endpoint(SyncConfig(resident_inbox_bytes=LIMIT), session, spill=self.spill)
+
+    def say(self, keyframe: int) -> None:
+        for kind in KINDS:
+            self.a.put(Key(int(kind), keyframe), self.draw.randbytes(self.draw.randrange(400)))
+        self.settle()
+
+    def settle(self, ticks: int = 400) -> None:
+        for _ in range(ticks):
+            self.now_ns += TICK_NS
+            for end, other in ((self.a, self.b), (self.b, self.a)):
+                while (packet := end.poll(self.now_ns)) is not None:
+                    other.receive(packet, self.now_ns)
+            if self.a.digest_equal and self.b.digest_equal:
+                return
+        raise AssertionError("the two ends do not agree")
+
+
+def test_memory_is_bounded_and_the_two_sides_agree() -> None:
+    line = Line(Memory())
+    most = 0
+    for keyframe in range(300):
+        line.say(keyframe)
+        most = max(most, line.b._in.resident_bytes)
+    pages = 300 * (300 + 5 * 20)
+    assert most <= LIMIT + pages
+    assert line.b.stats.values == 1500
+    line.say(3)  # an old one is corrected
+    assert line.b.peer_value(Key(int(Kind.DEPTHS), 3)) == line.a.own_value(Key(int(Kind.DEPTHS), 3))
+    line.a.remove(Key(int(Kind.FOUND), 7))
+    line.settle()
+    assert line.b.peer_values() == line.a.own_values()
+    assert line.b._in.resident_bytes <= LIMIT + pages
+
+
+def test_a_new_base_is_told_what_the_old_one_said() -> None:
+    line = Line(Memory())
+    for keyframe in range(100):
+        line.say(keyframe)
+    held = line.b.peer_values()
+    line.a = Endpoint(SyncConfig(), 2)
+    line.settle()
+    assert line.b.legacy_values() == held
+
+
+def test_a_full_disk_loses_nothing() -> None:
+    line = Line(Memory(room=20_000))
+    for keyframe in range(200):
+        line.say(keyframe)
+    assert line.b.peer_values() == line.a.own_values()
+    assert line.b.stats.mismatches == line.a.stats.mismatches == 0
+
+
+def test_what_a_disk_has_lost_is_sent_again() -> None:
+    spill = Memory()
+    line = Line(spill)
+    for keyframe in range(200):
+        line.say(keyframe)
+    spill.forgetful = True
+    line.say(3)
+    spill.forgetful = False
+    line.settle()
+    assert line.b.peer_values() == line.a.own_values()
