@@ -27,7 +27,7 @@ from kiteline_codec.schema import (
     Removed,
     Tile,
 )
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.ids import SubmapId
 
 F64 = NDArray[float64]
@@ -40,7 +40,7 @@ class FromBase:
         self._map = local_map
         self._window = window
         self._smoothing = Smoothing(smoothing)
-        self._T_w_m: dict[SubmapId, F64] = {}
+        self._S_w_m: dict[SubmapId, F64] = {}
         self.tiles: dict[tuple[int, int], Tile] = {}
 
     def take(self, records: Sequence[Record], removed: Sequence[Key], events: list[str]) -> bool:
@@ -50,7 +50,7 @@ class FromBase:
             if isinstance(record, Pose | Depths | Found | Removed | Culled):
                 touched |= self._map.apply(record)
             elif isinstance(record, Placement):
-                self._T_w_m[record.submap] = record.T_w_m
+                self._S_w_m[record.submap] = record.S_w_m
             elif isinstance(record, Copy | Copied):
                 self._window.take(record)
             elif isinstance(record, Calibration) and self._map.camera.stereo:
@@ -61,21 +61,24 @@ class FromBase:
         self._window.take_back(removed)
         for key in removed:
             if key.kind == Kind.PLACEMENT:  # the map was taken out of a larger one, and has no place any more
-                self._T_w_m.pop(SubmapId(key.id), None)
+                self._S_w_m.pop(SubmapId(key.id), None)
         if touched:
             self._map.settle()
         return touched
 
     def set_upright(self, level: Level) -> None:
         """Where a submap lies until the base says so, who sets it upright too; over a thin link that takes seconds."""
-        self._T_w_m.setdefault(level.submap, level.T_l_m)
+        self._S_w_m.setdefault(level.submap, level.T_l_m)
 
     def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int) -> F64 | None:
-        """T_w_b (4,4) as it is told: corrections arrive at once, or slowly. None where the submap has no place yet."""
-        T_w_m = self._T_w_m.get(submap)
-        if T_w_m is None:
+        """T_w_b (4,4) as it is told: corrections arrive at once, or slowly. None where the submap has no place yet.
+
+        Odometry has the unit of length of the submap; where one eye's is not the world's, its place says the scale.
+        """
+        S_w_m = self._S_w_m.get(submap)
+        if S_w_m is None:
             return None
         if not self._smoothing.on:
-            return T_w_m @ T_m_b
+            return sim3.place(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b
-        return self._smoothing.follow(T_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns) @ T_o_b
+        return sim3.place(self._smoothing.follow(S_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns), T_o_b)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 
 F64 = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ class Smoothing:
 
     def follow(self, T_w_o: F64, here_o: F64, t_ns: int) -> F64:
         """T_w_o (4,4) to be told at a time, where it should be this one. here_o: (3,) m, where the vehicle is in o:
-        about it the frame turns, and there its motion is measured.
+        about it the frame turns, and there its motion is measured. With a scale where w has another unit of length
+        than o; that is told at once, about where the vehicle is.
         """
         dt_s, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
         limits = self._config
@@ -35,7 +36,7 @@ class Smoothing:
             return T_w_o
         held = self._T_w_o
         moved = se3.transform(T_w_o, here_o[None])[0] - se3.transform(held, here_o[None])[0]
-        turned = se3.so3_log(se3.orthonormalise(T_w_o)[:3, :3] @ held[:3, :3].T)
+        turned = se3.so3_log(sim3.rigid(T_w_o)[:3, :3] @ sim3.rigid(held)[:3, :3].T)
         way, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(turned))
         if way > limits.snap_m:
             self._T_w_o = T_w_o
@@ -48,7 +49,8 @@ class Smoothing:
         if share >= 1.0:
             self._T_w_o = T_w_o
             return T_w_o
-        R = se3.so3_exp(share * turned) @ held[:3, :3]
+        R = se3.so3_exp(share * turned) @ sim3.rigid(held)[:3, :3]
         at = se3.transform(held, here_o[None])[0] + share * moved
-        self._T_w_o = se3.orthonormalise(se3.from_rt(R, at - R @ here_o))
+        scale = sim3.scale_of(T_w_o)
+        self._T_w_o = sim3.normalise(sim3.of(scale, se3.from_rt(R, at - scale * R @ here_o)))
         return self._T_w_o

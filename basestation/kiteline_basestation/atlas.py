@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation import disparity, refind
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.correction import graph_of, keyframes_of, move_keyframes
+from kiteline_basestation.correction import gauge, graph_of, keyframes_of, move_keyframes, rescale
 from kiteline_basestation.covisibility import Window, covisible_keyframes, window
 from kiteline_basestation.essential_graph import GraphResult
 from kiteline_basestation.jobs import BundleInputs, Job, JobDone
@@ -28,7 +28,7 @@ from kiteline_basestation.memory import (
     matrix,
     parsed,
     plain,
-    pose_of,
+    similarity_of,
     slots_of,
     votes_entry,
     votes_of,
@@ -36,9 +36,10 @@ from kiteline_basestation.memory import (
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
-from kiteline_basestation.refinement import apply_bundle
+from kiteline_basestation.refinement import apply_bundle, keep_units
+from kiteline_basestation.votes import rescaled, similarity
 from kiteline_codec.schema import Kind
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.bundle import BundleConfig, BundleResult
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH
@@ -50,7 +51,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(slots=True)
 class Merge:
-    """A map that was laid into another. moved: its submaps and where they lay before (T_w_m)."""
+    """A map that was laid into another. moved: its submaps and where they lay before, and how long (S_w_m)."""
 
     eldest: SubmapId
     into: SubmapId
@@ -233,7 +234,7 @@ class Atlas:
         for (submap,), votes in parsed(texts, "fresh"):
             self._fresh[SubmapId(int(submap))] = votes_of(sparse_map, votes)
         for _, m in parsed(texts, "merge"):
-            moved = {SubmapId(s): pose_of(T) for s, T in m["moved"]}
+            moved = {SubmapId(s): similarity_of(S) for s, S in m["moved"]}
             fused = [(int(a), int(b)) for a, b in zip(*slots_of(sparse_map, *m["fused"]))]
             self.merges.append(Merge(SubmapId(m["eldest"]), SubmapId(m["into"]), moved, fused))
         for _, value in parsed(texts, "atlas"):
@@ -276,13 +277,15 @@ class Atlas:
 
     def _needs_graph(self, finding: Finding) -> bool:
         """Whether fusing points and bundling would not do: the correction reaches further than they look."""
+        limits = self._config.loops
         for vote in finding.votes:
-            T_w_old, T_w_new = self._map.world_pose(vote.old), self._map.world_pose(vote.new)
-            assert T_w_old is not None and T_w_new is not None
-            error = se3.inverse(T_w_new) @ T_w_old @ vote.T_old_new
-            if np.linalg.norm(error[:3, 3]) > self._config.loops.small_m:
+            S_w_new = similarity(self._map, vote.new)
+            error = sim3.inverse(S_w_new) @ similarity(self._map, vote.old) @ sim3.of(vote.scale, vote.T_old_new)
+            if sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]) > limits.small_m:
                 return True
-            if np.linalg.norm(se3.so3_log(se3.orthonormalise(error)[:3, :3])) > self._config.loops.small_rad:
+            if np.linalg.norm(se3.so3_log(sim3.rigid(error)[:3, :3])) > limits.small_rad:
+                return True
+            if abs(np.log(sim3.scale_of(error))) > limits.small_scale:
                 return True
         return False
 
@@ -296,7 +299,7 @@ class Atlas:
         self._fresh.setdefault(finding.older, []).extend(self._fresh.pop(finding.newer, []))
         merge = Merge(finding.newer, finding.older, {s: sparse_map.frame(s) for s in submaps})
         for submap in submaps:
-            sparse_map.move_submap(submap, se3.orthonormalise(finding.T_older_newer @ merge.moved[submap]))
+            sparse_map.move_submap(submap, sim3.normalise(finding.S_older_newer @ merge.moved[submap]))
             sparse_map.islands[submap] = finding.older
         self.merges.append(merge)
         self.moved |= {finding.older, finding.newer}
@@ -306,10 +309,24 @@ class Atlas:
 
     def _bend(self, island: SubmapId, result: GraphResult) -> None:
         targets = {KeyframeId(k): T for k, T in zip(result.keyframes.tolist(), result.T_w_k)}
+        growth = {KeyframeId(k): s for k, s in zip(result.keyframes.tolist(), result.scale.tolist())}
+        held = gauge(self._map, island, growth)
+        if held is not None:
+            for T in targets.values():
+                T[:3, 3] = held[1] + (T[:3, 3] - held[1]) / held[0]
+            growth = {k: s / held[0] for k, s in growth.items()}
+        self._stretch(rescale(self._map, island, growth, self._publisher))
         move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
         self.moved.add(island)
         self._fuse_fresh(island)
         self._full_due.add(island)
+
+    def _stretch(self, grown: Mapping[KeyframeId, float]) -> None:
+        """Lengths have grown before some keyframes: so have those of what was proved there."""
+        if grown:
+            self._edges = [rescaled(v, grown) for v in self._edges]
+            self._fresh = {s: [rescaled(v, grown) for v in votes] for s, votes in self._fresh.items()}
+            self.finder.rescale(grown)
 
     def _fuse_fresh(self, island: SubmapId) -> None:
         """Points that votes proved to be one, then what the neighbours on both sides see of each other."""
@@ -357,6 +374,8 @@ class Atlas:
             return False
         if self._contradicted(island, part, result):
             return False
+        if self.fits(island):
+            result = keep_units(self._map, island, part, result)
         rows = part.rows[part.problem.free]
         poses = np.linalg.inv(result.T_c_m[part.problem.free])
         keyframes = self._map.keyframes.id[rows].tolist()
@@ -378,9 +397,9 @@ class Atlas:
         self.finder.asked.add((min(newer, older), max(newer, older)))
         self._revisit.extend(k for k in keyframes_of(self._map, newer) if k not in self._revisit)
 
-    def join(self, newer: SubmapId, older: SubmapId, T_older_newer: F64) -> None:
+    def join(self, newer: SubmapId, older: SubmapId, S_older_newer: F64) -> None:
         """A person says how two maps lie to each other: (4,4) moves the newer, in w, onto the older."""
-        self._join(Finding(newer, older, T_older_newer, ()))
+        self._join(Finding(newer, older, S_older_newer, ()))
         self._void(older)
         self._full_due.add(older)
 

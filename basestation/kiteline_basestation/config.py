@@ -105,6 +105,9 @@ class LoopConfig:
     min_inliers_all: int = 35  # the same with the neighbours' points: to join maps
     min_inliers_loop: int = 40  # the same, within one map
     min_share: float = 0.25  # of what both maps should see here: less is a thing that stands in two places
+    scale_points: int = 20  # with depth in both maps, that tell the scale between maps of which one has its own unit
+    scale_spread: float = 0.2  # of the logarithms of their depths' ratios: more, and they do not say one thing
+    scale_sigma: float = 0.02  # deviation of what they say together: the bundle after it is good to a few percent
     columns: int = 6  # parts of the image: a poster that hangs twice fills few of them
     rows: int = 4
     cell_points: int = 2  # inliers that fill a part
@@ -116,12 +119,16 @@ class LoopConfig:
     agree_depth: float = 0.04  # of the median depth, and
     agree_path: float = 0.02  # of the way between the two keyframes
     agree_rad: float = 0.05  # between two votes
+    agree_scale: float = 0.05  # of the logarithms of the scales of two votes
     drift_m: float = 0.3  # correction of a loop that drift explains: this, and
     drift_path: float = 0.02  # this share of the way flown since
     drift_rad: float = 0.1  # this turn, and
     drift_rad_m: float = 0.002  # this turn for each metre
+    own_drift_path: float = 0.2  # the same share where the unit of length drifts as well: one eye without a metre
+    own_drift_scale: float = 0.7  # logarithm by which that unit may drift along a loop: a factor of two
     small_m: float = 0.02  # correction that needs no pose graph: fusing points is enough
     small_rad: float = 0.005
+    small_scale: float = 0.005  # of its logarithm
     off_plane: float = 0.03  # of the median depth: so far from a plane lies what is no part of it
     min_off_plane: float = 0.15  # share of the points that join maps and lie off their plane: a wallpaper has copies
     twin_m: float = 1.0  # places of one map that look the same and lie further apart than this are twins
@@ -135,10 +142,13 @@ class GraphConfig:
     sigma_m: float = 0.005  # of an edge between neighbours, and
     sigma_path: float = 0.01  # this share of its length
     sigma_rad: float = 0.003
+    sigma_scale: float = 0.003  # of an edge between neighbours whose unit of length may drift
+    loop_sigma_scale: float = 0.01
     loop_sigma_depth: float = 0.005  # of a loop's edge: this share of the median depth
     loop_sigma_rad: float = 0.003
     huber: float = 3.0  # deviations beyond which an edge counts less
     iterations: int = 8
+    scaled_iterations: int = 30  # with scales, in which the graph is bent farther
     stop: float = 1e-4  # relative gain below which more iterations change nothing
     max_full: int = 800  # keyframes that a full bundle moves, in 0.4 s; of a larger map, those around the loop
     robust_trials: int = 6  # of the full bundle before the outlier test
@@ -200,6 +210,7 @@ class SupplyConfig:
     keep: float = 1.5  # how much more a copy that is there counts than one that would have to be sent
     pose_m: float = 0.002  # a copy that moved less stays where it is: half a pixel at 2 m
     pose_rad: float = 0.0005  # a quarter of a pixel at 500 px of focal length
+    length: float = 0.01  # relative change of the reader's unit of length from which on copies are lent anew
 
 
 @dataclass(frozen=True, slots=True)

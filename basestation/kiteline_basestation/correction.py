@@ -9,15 +9,19 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig, PublishConfig
 from kiteline_basestation.covisibility import covisible_keyframes
-from kiteline_basestation.essential_graph import GraphInputs
+from kiteline_basestation.essential_graph import GraphInputs, Scaled
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
+from kiteline_basestation.votes import depth_of, edge_of
 from kiteline_codec.schema import Kind
-from kiteline_core import se3
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+from kiteline_core import se3, sim3
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.map_tables import BIRTH
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
+
+_SAME = 1e-4  # relative: what lengths may grow by before it is worth saying, a fifth of an inverse depth's code
 
 
 def keyframes_of(sparse_map: SparseMap, island: SubmapId) -> list[KeyframeId]:
@@ -48,17 +52,26 @@ def graph_of(
     length = np.linalg.norm(between[:, :3, 3], axis=1)
     sigma = np.column_stack([config.sigma_m + config.sigma_path * length, np.full(len(edges), config.sigma_rad)])
     inside = [v for v in loops if v.old in number and v.new in number]
+    edged = [edge_of(sparse_map, v) for v in inside]
     far = np.array([[number[v.old], number[v.new]] for v in inside], np.int64).reshape(-1, 2)
-    measured = np.array([v.T_old_new for v in inside]).reshape(-1, 4, 4)
+    measured = np.array([T for T, _ in edged]).reshape(-1, 4, 4)
     doubt = np.array(
-        [[config.sigma_m + config.loop_sigma_depth * v.depth_m, config.loop_sigma_rad] for v in inside]
+        [[config.sigma_m + config.loop_sigma_depth * depth_of(sparse_map, v), config.loop_sigma_rad] for v in inside]
     ).reshape(-1, 2)  # fmt: skip
     held = np.zeros(len(keyframes), np.bool_)
     held[number[KeyframeId(sparse_map.submaps[sparse_map.island_of(island)][0])]] = True
+    own = {s for s in sparse_map.island(island) if sparse_map.own_unit(s)}
+    scaled = None
+    if own:
+        free = np.array([submap_of_keyframe(k) in own for k in keyframes])
+        scaled = Scaled(
+            free, np.concatenate([np.ones(len(edges)), [scale for _, scale in edged]]),
+            np.repeat([config.sigma_scale, config.loop_sigma_scale], [len(edges), len(far)]),
+        )  # fmt: skip
     return GraphInputs(
         np.array(keyframes, np.int64), poses, held, np.concatenate([edges, far]), np.concatenate([between, measured]),
         np.concatenate([np.round(sigma, 4), np.round(doubt, 4)]),
-        np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(far), np.bool_)]), config,
+        np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(far), np.bool_)]), config, scaled,
     )  # fmt: skip
 
 
@@ -90,7 +103,8 @@ def move_keyframes(
         first = sparse_map.submaps[submap][0]
         T_m_k = sparse_map.pose(first)
         if T_m_k is not None and submap != sparse_map.island_of(island):
-            sparse_map.move_submap(submap, se3.orthonormalise(goal[first] @ se3.inverse(T_m_k)))
+            unit = sparse_map.unit(submap)
+            sparse_map.move_submap(submap, sim3.normalise(sim3.of(unit, goal[first]) @ se3.inverse(T_m_k)))
     firsts = {sparse_map.submaps[s][0] for s in sparse_map.island(island)}
     for keyframe in keyframes:
         if keyframe in firsts:
@@ -104,3 +118,53 @@ def move_keyframes(
             sparse_map.set_world_pose(keyframe, goal[keyframe])
             publisher.touch(Kind.POSE, keyframe)
     return largest
+
+
+def gauge(
+    sparse_map: SparseMap, island: SubmapId, growth: Mapping[KeyframeId, float]
+) -> tuple[float, F64] | None:  # fmt: skip
+    """By what a map whose unit is its own has to shrink, and about which point (3,) of w, so that lengths before the
+    newest keyframe of its eldest submap stay; None where it is metric.
+    """
+    eldest = sparse_map.island_of(island)
+    known = [k for k in sparse_map.submaps[eldest] if k in growth]
+    if not known or not sparse_map.own_unit(eldest):
+        return None
+    about = sparse_map.world_pose(sparse_map.submaps[eldest][0])
+    assert about is not None
+    return growth[known[-1]], about[:3, 3]
+
+
+def rescale(
+    sparse_map: SparseMap, island: SubmapId, growth: Mapping[KeyframeId, float], publisher: Publisher
+) -> dict[KeyframeId, float]:  # fmt: skip
+    """Lengths before keyframes grow in w by `growth`; where one eye flew, its submap's unit grows as they do before the
+    newest keyframe, so that nothing changes where the agent is. Points hang on their keyframes: those of older ones
+    take on the rest. Where the keyframes lie is for `move_keyframes`. Returns by what lengths grew in the submaps.
+    """
+    left: dict[KeyframeId, float] = {}
+    for submap in sparse_map.island(island):
+        if not sparse_map.own_unit(submap):
+            continue
+        known = [k for k in sparse_map.submaps[submap] if k in growth]
+        if not known:
+            continue
+        newest = growth[known[-1]]
+        sparse_map.move_submap(submap, sim3.of(newest, sparse_map.frame(submap)))
+        for keyframe in known:
+            more = growth[keyframe] / newest
+            if abs(more - 1.0) > _SAME:
+                left[keyframe] = more
+                _grow(sparse_map, keyframe, more, publisher)
+    return left
+
+
+def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher: Publisher) -> None:
+    """The points born in a keyframe lie so many times as far away."""
+    table, slots = sparse_map.keypoints, sparse_map.slots_of(keyframe)
+    offset = table.offset[slots]
+    inverse = sparse_map.inverse_depths(slots)
+    known = (table.kind[slots] == BIRTH) & (inverse > 0.0)
+    if known.any():
+        sparse_map.set_depths(slots[known], (inverse[known] / factor).astype(np.float32), offset[known])
+        publisher.touch(Kind.DEPTHS, keyframe)

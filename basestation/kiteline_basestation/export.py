@@ -53,14 +53,21 @@ def tum(t_ns: I64, poses: F64) -> bytes:
     return "".join(line(int(t), pose) for t, pose in zip(t_ns, poses, strict=True)).encode()
 
 
-def g2o(keyframes: I64, poses: F64, edges: I64, weights: F64 | None = None) -> bytes:
+def g2o(
+    keyframes: I64, poses: F64, edges: I64, weights: F64 | None = None, scale: F64 | None = None
+) -> bytes:  # fmt: skip
     """A pose graph for g2o and its readers. keyframes: (n,) ids. poses: (n,4,4) T_w_k. edges: (e,2) rows of poses.
 
     Vertices are numbered by row, for many readers hold 32 bits only; a comment names each keyframe. An edge
     measures the relative pose as it stands. weights: (e,) of the edges' information, else 1. The first vertex is fixed.
+    scale: (n,) units of w in one of those in which a keyframe's agent measures; the comment tells it where it is not 1.
     """
+    scale = np.ones(len(keyframes)) if scale is None else scale
     weights = np.ones(len(edges)) if weights is None else weights
-    lines = [f"# vertex {i} is keyframe {k}\n" for i, k in enumerate(keyframes)]
+    lines = [
+        f"# vertex {i} is keyframe {k}{'' if s == 1.0 else f', scale {s:.9g}'}\n"
+        for i, (k, s) in enumerate(zip(keyframes, scale, strict=True))
+    ]
     lines += [f"VERTEX_SE3:QUAT {i} {_pose_text(pose)}\n" for i, pose in enumerate(poses)]
     if len(poses):
         lines.append("FIX 0\n")

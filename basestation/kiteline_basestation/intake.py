@@ -8,7 +8,7 @@ import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.memory import Json, matrix, pose_of
-from kiteline_codec.schema import Births, Camera, Head, Level, Live, Record, Sightings
+from kiteline_codec.schema import Births, Camera, Head, Level, Live, Record, Sightings, Unit
 from kiteline_core.ids import (
     NO_KEYFRAME,
     SEQUENCE_BITS,
@@ -40,6 +40,7 @@ class Intake:
         self.last_of: dict[SubmapId, Live] = {}  # the last that was heard in each submap
         self.tracked_ns: dict[SubmapId, int] = {}  # stamp of the last pose in each submap that was no guess
         self.levels: dict[SubmapId, Level] = {}  # what agents say of which way is up
+        self.units: dict[SubmapId, float] = {}  # metres in one unit of it, as far as agents know
         self.last_seen_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # of which nothing is wanted any more
         self.refused = 0  # records that contradict what is known
@@ -64,6 +65,10 @@ class Intake:
                 self._take_head(record, now_ns)
             elif isinstance(record, Level):
                 self.levels[record.submap] = record
+            elif isinstance(record, Unit):
+                self.units[record.submap] = record.metres
+                if record.metres == 1.0:
+                    self._map.metric.add(record.submap)
             elif isinstance(record, Births | Sightings):
                 if record.keyframe in self._map:
                     self._take_section(record)
@@ -175,4 +180,4 @@ def _age(live: Live) -> tuple[int, int]:
 def _submap_of(record: Record) -> SubmapId | None:
     if isinstance(record, Head | Births | Sightings | Live):
         return submap_of_keyframe(record.keyframe)
-    return record.submap if isinstance(record, Level) else None
+    return record.submap if isinstance(record, Level | Unit) else None

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.memory import Memory, parsed, plain, votes_entry, votes_of
 from kiteline_basestation.overlap import Overlap, View, find_overlap, view_of
-from kiteline_core import se3
+from kiteline_basestation.votes import depth_of, motion_of, rescaled
+from kiteline_core import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.place_index import PlaceIndex, Vocabulary
 from kiteline_core.sparse_map import SparseMap
@@ -25,14 +26,15 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Enough votes. newer, older: islands (the same one: a loop). T_older_newer: (4,4) how the newer has to move.
+    """Enough votes. newer, older: islands (the same one: a loop). S_older_newer: (4,4) how the newer has to move, in w:
+    a rigid motion where both have one unit of length.
 
     votes: those that agree. against: submaps of one map whose places contradict how they were joined.
     """
 
     newer: SubmapId
     older: SubmapId
-    T_older_newer: F64
+    S_older_newer: F64
     votes: tuple[Overlap, ...]
     against: tuple[SubmapId, SubmapId] | None = None
 
@@ -123,6 +125,10 @@ class LoopFinder:
             self.apart = [(frozenset(map(SubmapId, a)), frozenset(map(SubmapId, b))) for a, b in value["apart"]]
             self.asked = {(SubmapId(a), SubmapId(b)) for a, b in value["asked"]}
 
+    def rescale(self, factor: Mapping[KeyframeId, float]) -> None:
+        """Lengths before keyframes, in their submaps, have been multiplied by `factor`: so are those of open votes."""
+        self._votes = {key: [rescaled(v, factor) for v in votes] for key, votes in self._votes.items()}
+
     def _kept_apart(self, a: SubmapId, b: SubmapId) -> bool:
         return any((a in x and b in y) or (b in x and a in y) for x, y in self.apart)
 
@@ -140,6 +146,8 @@ class LoopFinder:
             for other in sparse_map.submaps[submap]:
                 if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
                     continue
+                if sparse_map.own_unit(new) or sparse_map.own_unit(submap):
+                    continue  # how long the unit of the one is in the other, nobody says
                 if self._doubts.get((min(new, submap), max(new, submap)), 0) or self._kept_apart(new, submap):
                     continue
                 nothing = np.empty(0, np.int32)
@@ -224,7 +232,7 @@ class LoopFinder:
         xyz = xyz[known]
         if len(xyz) < self._config.min_inliers:
             return False
-        limit = self._config.off_plane * float(np.median([v.depth_m for v in votes]))
+        limit = self._config.off_plane * float(np.median([depth_of(self._map, v) for v in votes]))
         inside = np.ones(len(xyz), np.bool_)
         distance = np.zeros(len(xyz))
         for _ in range(4):
@@ -236,11 +244,12 @@ class LoopFinder:
 
     def _finding(self, best: Overlap, chosen: list[Overlap]) -> Finding:
         islands = tuple(self._map.island_of(submap_of_keyframe(k)) for k in (best.new, best.old))
-        older = self.eldest(islands)
+        metric = [i for i in islands if not self._map.own_unit(i)]
+        older = metric[0] if len(metric) == 1 else self.eldest(islands)  # who knows the metre keeps it
         newer = islands[1] if older == islands[0] else islands[0]
-        X = self._motion(best)  # island of old from island of new
+        X = motion_of(self._map, best)  # island of old from island of new
         if older != islands[1]:
-            X = se3.inverse(X)
+            X = sim3.inverse(X)
         return Finding(newer, older, X, tuple(chosen))
 
     def _recent(self, vote: Overlap, newest: Overlap) -> bool:
@@ -251,40 +260,42 @@ class LoopFinder:
         same = self._map.submaps[submap_of_keyframe(vote.new)]
         return abs(same.index(vote.new) - same.index(newest.new)) <= self._config.memory
 
-    def _motion(self, vote: Overlap) -> F64:
-        """How the island of the new keyframe would have to lie in that of the old: T_old_new by this vote."""
-        T_w_old, T_w_new = self._map.world_pose(vote.old), self._map.world_pose(vote.new)
-        assert T_w_old is not None and T_w_new is not None
-        return se3.orthonormalise(T_w_old @ vote.T_old_new @ se3.inverse(T_w_new))
-
     def _agree(self, a: Overlap, b: Overlap) -> bool:
         """Whether two votes say the same of how two maps lie, as far as drift between them allows."""
         config = self._config
-        Xa, Xb = self._motion(a), self._motion(b)
+        Xa, Xb = motion_of(self._map, a), motion_of(self._map, b)
         if submap_of_keyframe(a.new) != submap_of_keyframe(b.new):
-            Xa = se3.inverse(Xa)
+            Xa = sim3.inverse(Xa)
+        if abs(np.log(sim3.scale_of(Xa) / sim3.scale_of(Xb))) > config.agree_scale:
+            return False
         at_a, at_b = self._map.world_pose(a.new), self._map.world_pose(b.new)
         assert at_a is not None and at_b is not None
         spot = at_b[:3, 3]
         apart = float(np.linalg.norm(se3.transform(Xa, spot[None])[0] - se3.transform(Xb, spot[None])[0]))
-        turned = float(np.linalg.norm(se3.so3_log(Xa[:3, :3].T @ Xb[:3, :3])))
+        turned = _turn(Xa, Xb)
         way = float(np.linalg.norm(at_a[:3, 3] - spot)) if submap_of_keyframe(a.new) == submap_of_keyframe(b.new) else 0
-        limit = config.agree_m + config.agree_depth * max(a.depth_m, b.depth_m) + config.agree_path * way
+        deep = max(depth_of(self._map, a), depth_of(self._map, b))
+        limit = config.agree_m + config.agree_depth * deep + config.agree_path * way
         return apart <= limit and turned <= config.agree_rad
 
     def _drift_explains(self, vote: Overlap) -> bool:
         """Whether a loop's correction is what flying that far may have added up to."""
         config = self._config
-        X = self._motion(vote)
+        X = motion_of(self._map, vote)
         pose = self._map.world_pose(vote.new)
         assert pose is not None
         moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
-        turned = float(np.linalg.norm(se3.so3_log(X[:3, :3])))
+        turned = _turn(np.eye(4), X)
         way = self._way_m(vote.old, vote.new)
-        limit_m = config.drift_m + config.drift_path * way
-        explained = moved <= limit_m and turned <= config.drift_rad + config.drift_rad_m * way
+        explained = moved <= self._drift_m(vote, way) and turned <= config.drift_rad + config.drift_rad_m * way
+        explained = explained and abs(float(np.log(sim3.scale_of(X)))) <= config.own_drift_scale
         self.refused += not explained
         return explained
+
+    def _drift_m(self, vote: Overlap, way: float) -> float:
+        """By how much the end of a way may be off."""
+        own = any(self._map.own_unit(submap_of_keyframe(k)) for k in (vote.new, vote.old))
+        return self._config.drift_m + (self._config.own_drift_path if own else self._config.drift_path) * way
 
     def _way_m(self, a: KeyframeId, b: KeyframeId) -> float:
         """Length of the way flown between two keyframes of one map."""
@@ -315,8 +326,9 @@ class LoopFinder:
             T_other = sparse_map.world_pose(other)
             if sparse_map.island_of(submap_of_keyframe(other)) != island or T_other is None:
                 continue
+            own = sparse_map.own_unit(submap_of_keyframe(keyframe))
             way = self._way_m(other, keyframe)
-            limit = config.twin_m + config.drift_path * way
+            limit = config.twin_m + (config.own_drift_path if own else config.drift_path) * way
             if float(np.linalg.norm(T_other[:3, 3] - T[:3, 3])) <= limit and (T_other[:3, 2] @ T[:3, 2]) > 0.5:
                 continue  # the same place seen from near by
             looked += 1
@@ -325,7 +337,12 @@ class LoopFinder:
             overlap = find_overlap(sparse_map, keyframe, other, config, view)
             if overlap is None:
                 continue
-            X = self._motion(overlap)
+            X = motion_of(sparse_map, overlap)
             if float(np.linalg.norm(se3.transform(X, T[None, :3, 3])[0] - T[:3, 3])) > limit:
                 return True
         return False
+
+
+def _turn(Sa: F64, Sb: F64) -> float:
+    """Angle in rad between two similarities (4,4)."""
+    return float(np.linalg.norm(se3.so3_log(se3.orthonormalise(sim3.inverse(Sa) @ Sb)[:3, :3])))

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kiteline_basestation.memory import matrix, pose_of
-from kiteline_core import se3
+from kiteline_basestation.memory import matrix, similarity_of
+from kiteline_core import sim3
 from kiteline_core.ids import (
     BOOT_BITS,
     KEYPOINT_BITS,
@@ -97,7 +97,7 @@ def _get(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
     island = _map(mapper, given, "map")
     out = _overview(mapper, island, _points(mapper))
     for submap, told in zip(mapper.map.island(island), out["submaps"], strict=True):
-        told["T_map_m"] = matrix(se3.inverse(mapper.map.frame(island)) @ mapper.map.frame(submap))
+        told["T_map_m"] = matrix(sim3.inverse(mapper.map.frame(island)) @ mapper.map.frame(submap))
         told["poses"] = [
             {"id": int(k), "t_ns": int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]), "T_m_k": matrix(pose)}
             for k in mapper.map.submaps[submap]
@@ -130,11 +130,15 @@ def _merge(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
         atlas.look_for(other, into)
         return {"merged": False, "looking": len([k for s in mapper.map.island(other) for k in mapper.map.submaps[s]])}
     try:
-        T = pose_of(given["T_into_map"])
+        S = similarity_of(given["T_into_map"])
     except (TypeError, ValueError) as error:
-        raise _Refused('"T_into_map" is a rigid motion: 16 numbers, the rows of a 4x4 matrix') from error
+        raise _Refused(
+            '"T_into_map" is a rigid motion, or with a scale where one eye mapped: 16 numbers, the rows of a 4x4 matrix'
+        ) from error
+    if sim3.scale_of(S) != 1.0 and not mapper.map.own_unit(other):
+        raise _Refused(f"{called(other)} is in metres: it is laid into another map as long as it is")
     frames = mapper.map.frame(into), mapper.map.frame(other)
-    atlas.join(other, into, se3.orthonormalise(frames[0] @ T @ se3.inverse(frames[1])))
+    atlas.join(other, into, sim3.normalise(frames[0] @ S @ sim3.inverse(frames[1])))
     return {"merged": True, **_overview(mapper, into, _points(mapper))}
 
 
@@ -238,6 +242,8 @@ def _overview(mapper: Mapper, island: SubmapId, points: Mapping[int, int]) -> Js
                 "points": points.get(submap, 0),
                 "first_t_ns": min(stamps),
                 "last_t_ns": max(stamps),
+                "unit": "own" if mapper.map.own_unit(submap) else "metre",
+                "scale": mapper.map.unit(submap),
                 "T_w_m": matrix(mapper.placements.get(submap)),
             }
         )
@@ -245,6 +251,7 @@ def _overview(mapper: Mapper, island: SubmapId, points: Mapping[int, int]) -> Js
         "id": called(island),
         "name": mapper.names.get(island, ""),
         "placed": island in mapper.placements,
+        "unit": "own" if mapper.map.own_unit(island) else "metre",
         "agents": sorted({s["agent"] for s in told}),
         "keyframes": sum(s["keyframes"] for s in told),
         "points": sum(s["points"] for s in told),

@@ -5,7 +5,7 @@ Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -19,13 +19,13 @@ from kiteline_basestation.grid import Grid, GridMap
 from kiteline_basestation.intake import Intake
 from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.management import Answer, Command
-from kiteline_basestation.memory import Json, Memory, matrix, parsed, plain, pose_of
+from kiteline_basestation.memory import Json, Memory, matrix, parsed, plain, similarity_of
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
 from kiteline_basestation.world_view import world_view
 from kiteline_codec.schema import Calibration, Key, Kind, Live, Record
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH, CULLED
@@ -77,8 +77,8 @@ class Mapper:
         self.config = config or BaseConfig()
         self.map = SparseMap()
         self.grid = Grid(self.config.grid)
-        self.placements: dict[SubmapId, F64] = {}  # T_w_m of placed submaps
-        self._carried: dict[SubmapId, F64] = {}  # T_w_m of those that have a place by themselves
+        self.placements: dict[SubmapId, F64] = {}  # S_w_m of placed submaps: a similarity where w has another unit
+        self._carried: dict[SubmapId, F64] = {}  # S_w_m of those that have a place by themselves
         self._withdrawn: list[tuple[AgentId, Key]] = []
         self.names: dict[SubmapId, str] = {}  # what people call maps, by their eldest submap
         self.counts = MapperCounts()
@@ -181,7 +181,7 @@ class Mapper:
             if value["island"] is not None:
                 self.map.islands[submap] = SubmapId(value["island"])
             if value["frame"] is not None:
-                self.map.move_submap(submap, pose_of(value["frame"]))
+                self.map.move_submap(submap, similarity_of(value["frame"]))
             if value["name"] is not None:
                 self.names[submap] = value["name"]
             self._intake.recall(submap, value)
@@ -194,13 +194,13 @@ class Mapper:
         for _, value in parsed(texts, "base"):
             self.counts = MapperCounts(**value["counts"])
             for submap in map(SubmapId, value["placed"]):
-                self.placements[submap] = pose_of(submaps[submap]["T_w_m"])
+                self.placements[submap] = similarity_of(submaps[submap]["T_w_m"])
             for submap, waiting in value["stale"]:
                 if here := [KeyframeId(k) for k in waiting if k in self.map]:
                     self._stale[SubmapId(submap)] = here
             unused = {KeyframeId(k) for k in value["unused"]}
             self._calibrate_at = value["calibrate_at"]
-            self._carried = {SubmapId(s): pose_of(T) for s, T in value["carried"]}
+            self._carried = {SubmapId(s): similarity_of(S) for s, S in value["carried"]}
             self._intake.deleted = {SubmapId(s) for s in value["deleted"]}
         self._intake.keep_unused(unused)
         self._grid_due = len(self.map)  # the grid is made anew
@@ -287,15 +287,27 @@ class Mapper:
         """Turn the world when the agent of its first submap says which way is up; all that is placed moves along."""
         first = next(iter(self.placements), None)
         level = None if first is None else self._intake.levels.get(first)
-        if first is None or level is None or np.array_equal(level.T_l_m, self.placements[first]):
+        if first is None or level is None or np.allclose(level.T_l_m, sim3.rigid(self.placements[first]), 0.0, 1e-12):
             return
-        T_new_old = level.T_l_m @ se3.inverse(self.placements[first])
-        self._carried = {s: se3.orthonormalise(T_new_old @ T_w_m) for s, T_w_m in self._carried.items()}
-        for submap, T_w_m in self.placements.items():
-            upright = level.T_l_m if submap == first else se3.orthonormalise(T_new_old @ T_w_m)
-            self.placements[submap] = upright
-            self._publisher.place(submap, upright)
+        unit = sim3.scale_of(self.placements[first])
+        self._move_world(sim3.of(unit, level.T_l_m) @ sim3.inverse(self.placements[first]))
+
+    def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
+        """Turn or stretch the world with all that is placed in it, but for some; metres stay metres."""
+        self._carried = {s: self._moved(s, S_new_old, S) for s, S in self._carried.items()}
+        for submap, S_w_m in self.placements.items():
+            if submap not in but:
+                self.placements[submap] = self._moved(submap, S_new_old, S_w_m)
+                self._publisher.place(submap, self.placements[submap])
         self._grid_due = max(self._grid_due, len(self.map.rows))  # the grid is made anew
+
+    def _moved(self, submap: SubmapId, S_new_old: F64, S_w_m: F64) -> F64:
+        """Where a submap lies in a world that moved: where its first keyframe does, as long as it is in metres."""
+        if sim3.scale_of(S_new_old) == 1.0 or self.map.own_unit(submap):
+            return sim3.normalise(S_new_old @ S_w_m)
+        begin = self.map.pose(self.map.submaps[submap][0]) if submap in self.map.submaps else None
+        begin = np.eye(4) if begin is None else begin
+        return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, begin)) @ se3.inverse(begin))
 
     def _place(self, keyframe: KeyframeId) -> None:
         """The first submap of all is the world. A later one of the same flight begins where the last was left."""
@@ -304,21 +316,23 @@ class Mapper:
             return
         if not self.placements:
             level = self._intake.levels.get(submap)
-            T_w_m = np.eye(4) if level is None else level.T_l_m
+            S_w_m = np.eye(4) if level is None else level.T_l_m
         else:
             before = SubmapId(submap - 1)
-            live, T_w_before = self._intake.last_of.get(before), self.placements.get(before)
+            live, S_w_before = self._intake.last_of.get(before), self.placements.get(before)
             first = self.map.submaps[submap][0]
             begin = self.map.pose(first)
             left = self.map.pose(live.keyframe) if live else None
-            if live is None or T_w_before is None or left is None or begin is None:
+            if live is None or S_w_before is None or left is None or begin is None:
                 return
             tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
             if self.map.keyframes.t_ns[self.map.rows[first]] - tracked_ns > self.config.intake.carry_s * 1e9:
                 return  # a place that it reached unseen: it is found when it is recognised
-            T_w_m = se3.orthonormalise(T_w_before @ left @ live.T_k_c @ se3.inverse(begin))
-        self.placements[submap] = self._carried[submap] = T_w_m
-        self._publisher.place(submap, T_w_m)
+            there = sim3.place(S_w_before, left @ live.T_k_c)
+            unit = sim3.scale_of(S_w_before) if self.map.own_unit(submap) else 1.0
+            S_w_m = sim3.normalise(sim3.of(unit, there) @ se3.inverse(begin))
+        self.placements[submap] = self._carried[submap] = S_w_m
+        self._publisher.place(submap, S_w_m)
 
     def _finish(self, done: JobDone) -> None:
         if self.atlas is not None and self.atlas.finish(done):
@@ -390,18 +404,29 @@ class Mapper:
                 self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.PLACEMENT), int(submap), 0)))
 
     def _place_island(self, island: SubmapId) -> None:
-        """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place."""
+        """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place. A map in
+        metres keeps them: where the world had another unit, it takes on this one.
+        """
         submaps = self.map.island(island)
-        anchor = next((s for s in [self.map.island_of(island), *submaps] if s in self.placements), None)
-        if anchor is None:
+        eldest = self.map.island_of(island)
+        first = next(iter(self.placements), None)
+        anchor = next((s for s in [first, eldest, *submaps] if s in self.placements and s in submaps), None)
+        if first is None or anchor is None:
             return
-        T_w_i = self.placements[anchor] @ se3.inverse(self.map.frame(anchor))
+        S_w_i = sim3.normalise(self.placements[anchor] @ sim3.inverse(self.map.frame(anchor)))
+        unit = sim3.scale_of(S_w_i)
+        if unit != 1.0 and not self.map.own_unit(eldest):
+            at = self.placements[anchor][:3, 3]
+            stretch = sim3.of(1.0 / unit, se3.from_rt(np.eye(3), at - at / unit))
+            if anchor == first or self.map.own_unit(self.map.island_of(first)):
+                self._move_world(stretch, submaps)
+            S_w_i = sim3.normalise(stretch @ S_w_i)
         for submap in submaps:
-            T_w_m = se3.orthonormalise(T_w_i @ self.map.frame(submap))
+            S_w_m = sim3.normalise(S_w_i @ self.map.frame(submap))
             held = self.placements.get(submap)
-            if submap != anchor and (held is None or not np.allclose(held, T_w_m, rtol=0.0, atol=1e-5)):
-                self.placements[submap] = T_w_m
-                self._publisher.place(submap, T_w_m)
+            if held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
+                self.placements[submap] = S_w_m
+                self._publisher.place(submap, S_w_m)
 
     def _next_job(self) -> int:
         self._last_job += 1
@@ -438,15 +463,13 @@ class Mapper:
         self._grid_due = 0
         view = world_view(self.map, self.placements)
         self._grid_job = self._next_job()
-        return [
-            Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.observations))
-        ]
+        return [Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.rays))]
 
     def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
         live = self._intake.live.get(agent)
         pose = self.map.pose(live.keyframe) if live else None
-        T_w_m = self.placements.get(submap_of_keyframe(live.keyframe)) if live else None
-        if live is None or pose is None or T_w_m is None:
+        S_w_m = self.placements.get(submap_of_keyframe(live.keyframe)) if live else None
+        if live is None or pose is None or S_w_m is None:
             return None
-        out: list[list[float]] = (T_w_m @ pose @ live.T_k_c).tolist()
+        out: list[list[float]] = sim3.place(S_w_m, pose @ live.T_k_c).tolist()
         return out

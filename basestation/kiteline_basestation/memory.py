@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.overlap import Overlap
+from kiteline_core import sim3
 from kiteline_core.ids import KeyframeId
 from kiteline_core.sparse_map import SparseMap
 
@@ -75,9 +76,21 @@ def pose_of(numbers: Sequence[float]) -> F64:
     return pose
 
 
+def similarity_of(numbers: Sequence[float]) -> F64:
+    """The same of a pose with a scale. Raises ValueError when it is no similarity."""
+    S = np.array(numbers, np.float64).reshape(4, 4)
+    scale = sim3.scale_of(S) if np.isfinite(S).all() else 0.0
+    if scale <= 0.0:
+        raise ValueError("no similarity")
+    pose_of((S if scale == 1.0 else sim3.rigid(S)).ravel().tolist())
+    if scale != 1.0 and np.abs(S[:3, :3] @ S[:3, :3].T / scale**2 - np.eye(3)).max() > 1e-6:
+        raise ValueError("no similarity")
+    return S
+
+
 def votes_entry(sparse_map: SparseMap, votes: Sequence[Overlap], points: bool) -> Entry:
     """Evidence. points: with the points that are one; without them it only says how keyframes lie to each other."""
-    mark = tuple((v.new, v.old, v.inliers, v.T_old_new.tobytes(), len(v.mine)) for v in votes)
+    mark = tuple((v.new, v.old, v.inliers, v.T_old_new.tobytes(), v.scale, len(v.mine)) for v in votes)
     return Entry(mark, lambda: [_vote(sparse_map, v, points) for v in votes])
 
 
@@ -85,7 +98,8 @@ def _vote(sparse_map: SparseMap, vote: Overlap, points: bool) -> Json:
     pairs = [vote.mine, vote.theirs] if points else [vote.mine[:0], vote.theirs[:0]]
     return {
         "new": int(vote.new), "old": int(vote.old), "T": matrix(vote.T_old_new), "inliers": int(vote.inliers),
-        "depth_m": float(vote.depth_m), "points": [sparse_map.point_ids(slots).tolist() for slots in pairs],
+        "scale": float(vote.scale), "depth_m": float(vote.depth_m),
+        "points": [sparse_map.point_ids(slots).tolist() for slots in pairs],
     }  # fmt: skip
 
 
@@ -97,7 +111,8 @@ def votes_of(sparse_map: SparseMap, value: Json) -> list[Overlap]:
         if sparse_map.pose(new) is None or sparse_map.pose(old) is None:
             continue
         mine, theirs = slots_of(sparse_map, *vote["points"])
-        out.append(Overlap(new, old, pose_of(vote["T"]), vote["inliers"], mine, theirs, vote["depth_m"]))
+        T, scale = pose_of(vote["T"]), vote.get("scale", 1.0)  # stores of protocol 2 knew no scale
+        out.append(Overlap(new, old, T, vote["inliers"], mine, theirs, vote["depth_m"], scale))
     return out
 
 

@@ -61,7 +61,8 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointCo
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[keyframe]
     made = 0
-    inverse = sparse_map.inverse_depths(sparse_map.points_of(keyframe))
+    seen = sparse_map.points_of(keyframe)
+    inverse = sparse_map.inverse_depths(seen) / keyframes.unit[table.row[seen]]
     inverse = inverse[inverse > 0]
     here = _open_births(sparse_map, keyframe)
     for other in covisible_keyframes(sparse_map, keyframe, 1)[: config.keyframes]:

@@ -15,20 +15,20 @@ F64 = NDArray[np.float64]
 
 
 def keyframe_poses(mapper: Mapper) -> dict[KeyframeId, F64]:
-    """T_w_k (4,4) of every keyframe of a placed submap that has a pose."""
+    """S_w_k (4,4) of every keyframe of a placed submap that has a pose: T_w_k, with the scale of its submap in w."""
     poses: dict[KeyframeId, F64] = {}
-    for submap, T_w_m in sorted(mapper.placements.items()):
+    for submap, S_w_m in sorted(mapper.placements.items()):
         for keyframe in mapper.map.submaps.get(submap, []):
             pose = mapper.map.pose(keyframe)
             if pose is not None:
-                poses[keyframe] = T_w_m @ pose
+                poses[keyframe] = S_w_m @ pose
     return poses
 
 
 def map_files(mapper: Mapper) -> dict[str, bytes]:
     """map.ply, grid.pgm and grid.yaml of the map as it stands."""
     view = world_view(mapper.map, mapper.placements)
-    grid = build(mapper.config.grid, view.positions, view.points, view.observations)
+    grid = build(mapper.config.grid, view.positions, view.points, view.rays)
     seen = np.bincount(view.observations[:, 1], minlength=len(view.points)).astype(np.int64)
     return {
         "map.ply": map_ply(view.points, grid.labels, seen),

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.covisibility import covisible_keyframes
 from kiteline_basestation.refind import foresee
-from kiteline_core import matching, pnp, se3
+from kiteline_core import matching, pnp, se3, sim3
 from kiteline_core.descriptors import comparable
-from kiteline_core.ids import KeyframeId, agent_of_keyframe
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH
 from kiteline_core.pose_kernels import optimise_pose
 from kiteline_core.sparse_map import SparseMap
@@ -52,9 +52,10 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """A keyframe `new` that proved to see what `old` saw. T_old_new: (4,4) m. inliers: points that agree.
+    """A keyframe `new` that proved to see what `old` saw. T_old_new: (4,4). inliers: points that agree.
 
-    mine, theirs: (k,) slots of points of the new and of the old that are one. depth_m: median depth of them.
+    mine, theirs: (k,) slots of points of the new and of the old that are one. depth_m: median depth of them. Lengths
+    are in units of the old one's submap. scale: how many of these one unit of the new one's is, where the two stand.
     """
 
     new: KeyframeId
@@ -64,6 +65,7 @@ class Overlap:
     mine: I32
     theirs: I32
     depth_m: float
+    scale: float = 1.0
 
 
 def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
@@ -79,7 +81,8 @@ def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
     angle = (table.angle[from_birth].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
     xyz, known = sparse_map.positions(points)
     bf = sparse_map.keyframes.camera[row, 4]
-    measured = np.where((table.inv_depth[slots] > 0) & (bf > 0), bf * table.inv_depth[slots].astype(np.float64), -1.0)
+    ranged = (table.inv_depth[slots] > 0) & (bf > 0) & (not sparse_map.own_unit(submap_of_keyframe(keyframe)))
+    measured = np.where(ranged, bf * table.inv_depth[slots].astype(np.float64), -1.0)
     return View(
         slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle.astype(np.uint8),
         table.descriptor[from_birth], xyz, known,
@@ -100,14 +103,13 @@ def find_overlap(
     a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
     if len(a) < config.min_inliers:
         return None
-    camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
-    observed = np.column_stack([mine.uv, mine.disparity])
-    rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
-    seed = int(new) ^ (int(old) << 1)
-    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, seed, config.ransac)
-    if fit is None or fit.inliers < config.min_inliers:
+    free = any(sparse_map.own_unit(submap_of_keyframe(k)) for k in (new, old))
+    find = _with_scale if free else _rigid
+    start = find(sparse_map, new, old, mine, theirs, a, b, config)
+    if start is None:
         return None
-    found = _with_neighbours(sparse_map, new, old, mine, observed, camera, fit.T_c_m, config)
+    observed = np.column_stack([mine.uv, np.full(len(mine.uv), -1.0) if free else mine.disparity])
+    found = _with_neighbours(sparse_map, new, old, mine, observed, *start, config)
     if found is None:
         return None
     T_c_w, which, points, share = found
@@ -115,12 +117,81 @@ def find_overlap(
         return None
     if not spread_out(sparse_map, new, mine.uv[which], config):
         return None
-    T_old_new = se3.orthonormalise(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[old]]) @ se3.inverse(T_c_w))
     xyz, _ = sparse_map.positions(points)
     depth = se3.transform(T_c_w, xyz)[:, 2]
-    if not _one_unit(sparse_map, new, mine, which, depth):
+    T_old_new = se3.orthonormalise(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[old]]) @ se3.inverse(T_c_w))
+    if not free:
+        if not _one_unit(sparse_map, new, mine, which, depth):
+            return None
+        return Overlap(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
+    scale = depth_scale(_own_depth(sparse_map, new, mine, which), depth[mine.known[which]], config)
+    if scale is None:
         return None
-    return Overlap(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
+    unit_new, unit_old = (float(sparse_map.keyframes.unit[sparse_map.rows[k]]) for k in (new, old))
+    return Overlap(
+        new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), mine.points[which], points,
+        float(np.median(depth)) / unit_old, scale * unit_new / unit_old,
+    )  # fmt: skip
+
+
+def _rigid(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
+    config: LoopConfig,
+) -> tuple[F64, float] | None:  # fmt: skip
+    """T_c_w (4,4) of the new camera in the old map where both have one unit of length, and 1."""
+    rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
+    observed = np.column_stack([mine.uv, mine.disparity])
+    camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
+    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old), config.ransac)
+    return None if fit is None or fit.inliers < config.min_inliers else (fit.T_c_m, 1.0)
+
+
+def _with_scale(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
+    config: LoopConfig,
+) -> tuple[F64, float] | None:  # fmt: skip
+    """T_c_w (4,4) of the new camera in the old map, and how much longer that map has what the new one's has: by points
+    that both maps have, in either's image (B. Horn, 1987, in RANSAC, as ORB-SLAM does for one eye).
+    """
+    both = mine.known[a]
+    a, b = a[both], b[both]
+    if len(a) < config.min_inliers:
+        return None
+    rows = [sparse_map.rows[k] for k in (old, new)]
+    T_old, T_new = sparse_map.keyframes.T_w_k[rows]
+    lens_old, lens_new = sparse_map.keyframes.camera[rows]
+    fit = pnp.align_views(
+        se3.transform(se3.inverse(T_old), theirs.xyz[b]), theirs.uv[b], theirs.octave[b], lens_old,
+        se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
+        True, _seed(new, old), config.ransac,
+    )  # fmt: skip
+    if fit is None or fit.inliers < config.min_inliers or not np.isfinite(fit.S_a_b).all():
+        return None
+    return se3.inverse(se3.orthonormalise(T_old @ sim3.rigid(fit.S_a_b))), fit.scale
+
+
+def _seed(new: KeyframeId, old: KeyframeId) -> int:
+    return int(new) ^ (int(old) << 1)
+
+
+def _own_depth(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32) -> F64:
+    """Depths (k,) in the new camera, by its own map in w, of those rows of its view that have one."""
+    xyz = mine.xyz[which[mine.known[which]]]
+    return se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[new]]), xyz)[:, 2]
+
+
+def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
+    """How much longer one map has what another has, by the depths (n,) of the same points in both; None where these do
+    not say one thing, well enough.
+    """
+    if len(own) < config.scale_points:
+        return None
+    ratio = np.log(np.maximum(other, 1e-3) / np.maximum(own, 1e-3))
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    if spread > config.scale_spread or 1.2533 * spread > config.scale_sigma * np.sqrt(len(ratio)):
+        return None
+    return float(np.exp(middle))
 
 
 def _one_unit(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32, depth: F64) -> bool:
@@ -131,7 +202,7 @@ def _one_unit(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32, de
     known = mine.known[which]
     if np.count_nonzero(known) < _UNIT_POINTS:
         return True
-    own = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[new]]), mine.xyz[which[known]])[:, 2]
+    own = _own_depth(sparse_map, new, mine, which)
     ratio = float(np.median(depth[known] / np.maximum(own, 1e-3)))
     return 1.0 / _UNIT_RATIO < ratio < _UNIT_RATIO
 
@@ -146,18 +217,20 @@ def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: Loo
 
 
 def _with_neighbours(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, observed: F64, camera: F64, T_c_w: F64,
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, observed: F64, T_c_w: F64, scale: float,
     config: LoopConfig,
 ) -> tuple[F64, I32, I32, float] | None:  # fmt: skip
     """Look for all that the old keyframe and its neighbours saw, twice, the second time closer.
 
-    Returns the pose, rows of `mine` and points (k,) that agree, and the share of what should be seen that is.
+    scale: how much longer the old map has what the new one's has. Returns the pose, rows of `mine` and points
+    (k,) that agree, and the share of what should be seen that is.
     """
     around = [old, *covisible_keyframes(sparse_map, old, 1)[: config.neighbours]]
     points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in around]))
     _, known = sparse_map.positions(points)
     points = points[known]
     size = sparse_map.cameras[agent_of_keyframe(new)]
+    camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
     T = T_c_w
     for radius in (config.radius_px, 0.5 * config.radius_px):
         seen, uv, octave, _, _ = foresee(sparse_map, points, new, se3.inverse(T))
@@ -183,15 +256,17 @@ def _with_neighbours(
             return None
     # Of what the new keyframe measured with depth inside the old views, how much is one with what they saw?
     first, unique = np.unique(a[inlier], return_index=True)
-    share = len(first) / max(1, min(len(seen), _inside(sparse_map, mine, T, new, around)))
+    share = len(first) / max(1, min(len(seen), _inside(sparse_map, mine, T, scale, new, around)))
     return T, first.astype(np.int32), np.asarray(b[inlier][unique]), share
 
 
-def _inside(sparse_map: SparseMap, mine: View, T_c_w: F64, new: KeyframeId, around: list[KeyframeId]) -> int:
+def _inside(
+    sparse_map: SparseMap, mine: View, T_c_w: F64, scale: float, new: KeyframeId, around: list[KeyframeId]
+) -> int:
     """How many points of the new keyframe should lie inside the image of one of the old keyframes."""
     row = sparse_map.rows[new]
     local = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[row]), mine.xyz)
-    xyz = se3.transform(se3.inverse(T_c_w), local)[mine.known]
+    xyz = se3.transform(se3.inverse(T_c_w), scale * local)[mine.known]
     inside = np.zeros(len(xyz), np.bool_)
     for keyframe in around:
         other = sparse_map.rows[keyframe]
@@ -211,4 +286,5 @@ def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig
     ray = xyz - pose[:, :3, 3]
     depth = np.maximum(np.einsum("ni,ni->n", pose[:, :3, 2], ray), 1e-3)
     bf = np.maximum(sparse_map.keyframes.camera[rows, 4], 1.0)
-    return np.ascontiguousarray(ray * (config.sigma_disparity_px * depth / bf)[:, None])
+    own = depth / sparse_map.keyframes.unit[rows]
+    return np.ascontiguousarray(ray * (config.sigma_disparity_px * own / bf)[:, None])

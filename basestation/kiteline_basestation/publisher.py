@@ -33,9 +33,9 @@ class Publisher:
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
             self.touch(kind, KeyframeId(keyframe))
 
-    def place(self, submap: SubmapId, T_w_m: F64) -> None:
-        """A submap has a new place in the world."""
-        self._records.append((agent_of_submap(submap), Placement(submap, T_w_m)))
+    def place(self, submap: SubmapId, S_w_m: F64) -> None:
+        """A submap has a new place in the world, or another unit of length in it."""
+        self._records.append((agent_of_submap(submap), Placement(submap, S_w_m)))
 
     def forget_place(self, submap: SubmapId) -> None:
         """A submap has no place any more: what is not said yet is not to be said."""

@@ -46,7 +46,7 @@ def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig
     covisible = covisible_keyframes(sparse_map, keyframe, 1)[: config.keyframes]
     table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
     points = sparse_map.points_of(keyframe)
-    inverse = sparse_map.inverse_depths(points)
+    inverse = sparse_map.inverse_depths(points) / table.unit[sparse_map.keypoints.row[points]]
     inverse = inverse[inverse > 0]
     if len(inverse) == 0:
         return covisible
@@ -77,7 +77,8 @@ def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: Refi
         return 0
     row = sparse_map.rows[target]
     bf = sparse_map.keyframes.camera[row, 4]
-    measured = np.where(table.inv_depth[slots] > 0, bf * table.inv_depth[slots], -1.0).astype(np.float64)
+    ranged = (table.inv_depth[slots] > 0) & (not sparse_map.own_unit(submap_of_keyframe(target)))
+    measured = np.where(ranged, bf * table.inv_depth[slots], -1.0).astype(np.float64)
     best = np.empty(len(points), np.int32)
     distance = np.zeros(len(points), np.int32)
     wanted, offered = descriptors(sparse_map, points, slots)

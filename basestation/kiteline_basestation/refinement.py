@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,14 +11,17 @@ from kiteline_basestation.config import CullConfig, PublishConfig
 from kiteline_basestation.covisibility import Window
 from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.bundle import BundleResult
-from kiteline_core.ids import KeyframeId
+from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
+
+_NEWEST = 8  # keyframes of a submap before which its agent flies
+_ENOUGH = 20  # points that tell how much lengths have grown there
 
 
 def apply_bundle(
@@ -104,6 +109,47 @@ def _points(
     if len(moved):
         sparse_map.set_depths(moved, inv[change > publish.depth_px], offset[change > publish.depth_px])
         publisher.touch_slots(Kind.DEPTHS, moved)
+
+
+def keep_units(sparse_map: SparseMap, island: SubmapId, window: Window, result: BundleResult) -> BundleResult:
+    """What a bundle of a whole map did to the units of one eye's submaps is said by their scale, as far as it did it
+    before the newest keyframes: lengths there stay as the agent has them. A map without a metre keeps its unit.
+    """
+    growth: dict[SubmapId, float] = {}
+    for submap in sparse_map.island(island):
+        if sparse_map.own_unit(submap):
+            growth[submap] = _growth(sparse_map, submap, window, result)
+    eldest = sparse_map.island_of(island)
+    if eldest in growth:
+        whole = growth[eldest]
+        about = sparse_map.world_pose(sparse_map.submaps[eldest][0])
+        assert about is not None
+        centre = about[:3, 3]
+        poses = np.linalg.inv(result.T_c_m)
+        poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
+        result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
+        growth = {submap: more / whole for submap, more in growth.items()}
+    for submap, more in growth.items():
+        if submap != eldest:
+            sparse_map.move_submap(submap, sim3.of(more, sparse_map.frame(submap)))
+    return result
+
+
+def _growth(sparse_map: SparseMap, submap: SubmapId, window: Window, result: BundleResult) -> float:
+    """By what a bundle stretched depths before the newest keyframes of a submap: the median."""
+    table = sparse_map.keyframes
+    newest = {sparse_map.rows[k] for k in sparse_map.submaps[submap][-_NEWEST:]}
+    anchors = sparse_map.keypoints.row[window.points]
+    number = np.full(len(sparse_map), -1, np.int64)
+    number[window.rows] = np.arange(len(window.rows))
+    here = np.isin(anchors, list(newest)) & (number[anchors] >= 0)
+    if np.count_nonzero(here) < _ENOUGH:
+        return 1.0
+    T = result.T_c_m[number[anchors[here]]]
+    after = np.einsum("nj,nj->n", T[:, 2, :3], result.points[here]) + T[:, 2, 3]
+    inverse = sparse_map.inverse_depths(window.points[here]) / table.unit[anchors[here]]
+    good = (after > 0.0) & (inverse > 0.0)
+    return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _ENOUGH else 1.0
 
 
 def drop_points(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:

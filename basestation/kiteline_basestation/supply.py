@@ -16,7 +16,7 @@ from kiteline_basestation.loops import Shares
 from kiteline_codec import messages
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Copied, Copy, Key, Kind, Live
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.ids import (
     SUBMAP_BITS,
     AgentId,
@@ -35,10 +35,13 @@ I64 = NDArray[np.int64]
 
 @dataclass(slots=True)
 class _Lent:
-    """A keyframe that an agent holds a copy of: where it was last said to be, and the keys under which it went."""
+    """A keyframe that an agent holds a copy of: where it was last said to be, the keys under which it went, and how
+    many of the reader's units of length were one of its own.
+    """
 
     copy: Copy
     keys: list[Key]
+    length: float
 
 
 @dataclass(slots=True)
@@ -143,7 +146,7 @@ class Supply:
     def _depth_m(self, submap: SubmapId, here: F64) -> float:
         """How far the points of the agent's newest keyframes are, roughly."""
         slots = np.concatenate([self._map.slots_of(k) for k in self._map.submaps[submap][-3:]])
-        inverse = self._map.inverse_depths(slots)
+        inverse = self._map.inverse_depths(slots) / self._map.unit(submap)
         inverse = inverse[inverse > 0.0]
         return 1.0 / float(np.median(inverse)) if len(inverse) else 1.0
 
@@ -173,6 +176,7 @@ class Supply:
             k
             for k, lent in reader.lent.items()
             if island(submap_of_keyframe(k)) != island(lent.copy.submap)
+            or abs(self._length(k, submap) / lent.length - 1.0) > self._config.length
             or (k not in wanted and not _arrived(lent, channel))
         ]
         new = sum(k not in reader.lent for k in wanted)
@@ -205,19 +209,26 @@ class Supply:
         room = self._config.copies - len(reader.lent)
         for keyframe in [k for k in wanted if k not in reader.lent][: max(0, min(ahead, room))]:
             copy = self._copy(keyframe, submap)
-            points, strength = self._copied(agent, keyframe)
+            points, strength = self._copied(agent, keyframe, self._length(keyframe, submap))
             records: list[Copy | Copied] = [copy, *channel.profile.copies(points, strength)]
             for record in records:
                 channel.put(record)
-            reader.lent[keyframe] = _Lent(copy, [messages.key(record) for record in records])
+            keys = [messages.key(record) for record in records]
+            reader.lent[keyframe] = _Lent(copy, keys, self._length(keyframe, submap))
 
     def _copy(self, keyframe: KeyframeId, submap: SubmapId) -> Copy:
         T_w_k = self._map.world_pose(keyframe)
         assert T_w_k is not None
-        return Copy(keyframe, submap, se3.orthonormalise(se3.inverse(self._map.frame(submap)) @ T_w_k))
+        return Copy(keyframe, submap, se3.orthonormalise(sim3.place(sim3.inverse(self._map.frame(submap)), T_w_k)))
 
-    def _copied(self, agent: AgentId, keyframe: KeyframeId) -> tuple[Copied, F64]:
-        """A keyframe's points as the reader's camera would see them, and how often each was seen."""
+    def _length(self, keyframe: KeyframeId, submap: SubmapId) -> float:
+        """How many units of a submap one of a keyframe's is."""
+        return self._map.unit(submap_of_keyframe(keyframe)) / self._map.unit(submap)
+
+    def _copied(self, agent: AgentId, keyframe: KeyframeId, length: float) -> tuple[Copied, F64]:
+        """A keyframe's points as the reader's camera would see them, its lengths so many times as long, and how often
+        each was seen.
+        """
         points, table = self._points(keyframe), self._map.keypoints
         fx, fy, cx, cy = self._map.keyframes.camera[self._map.rows[keyframe], :4]
         camera = self._map.cameras[agent]
@@ -232,7 +243,7 @@ class Supply:
             0,
             self._map.keypoint_of(points).astype(np.uint16),
             uv.astype(np.float32),
-            self._map.inverse_depths(points).astype(np.float32),
+            (self._map.inverse_depths(points) / length).astype(np.float32),
             table.octave[points].copy(),
             table.angle[points].copy(),
             table.descriptor[points].copy(),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core import se3
+from kiteline_core import sim3
 from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, SubmapId
 from kiteline_core.sparse_map import SparseMap
 
@@ -21,6 +21,7 @@ class GridView:
     """The placed part of the map as `grid.build` takes it, and what its rows mean.
 
     keyframes: (n,) ids of the rows of positions. point_ids: (m,). observations: (k,2) rows of positions and of points.
+    metric: (n,) keyframes of maps in metres.
     """
 
     keyframes: I64
@@ -28,18 +29,25 @@ class GridView:
     point_ids: I64
     points: F64
     observations: I64
+    metric: NDArray[np.bool_]
+
+    @property
+    def rays(self) -> I64:
+        """Observations from which cells can be made: a map in a unit of its own says nothing of metres."""
+        return self.observations[self.metric[self.observations[:, 0]]]
 
 
 def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> GridView:
     """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
-    rows, positions = [], []
+    rows, positions, metric = [], [], []
     for submap in sorted(placements):
-        T_w_m = placements[submap]
+        S_w_m, metres = placements[submap], not sparse_map.own_unit(sparse_map.island_of(submap))
         for keyframe in sparse_map.submaps.get(submap, []):
             pose = sparse_map.pose(keyframe)
             if pose is not None:
                 rows.append(sparse_map.rows[keyframe])
-                positions.append((T_w_m @ pose)[:3, 3])
+                positions.append((S_w_m @ pose)[:3, 3])
+                metric.append(metres)
     number = np.full(len(sparse_map), -1, np.int64)
     number[rows] = np.arange(len(rows))
     points = sparse_map.roots()
@@ -55,7 +63,7 @@ def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Gri
     points, xyz = points[seen >= 2], xyz[seen >= 2]
     for submap in sorted(placements):
         inside = sparse_map.point_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
-        T = placements[submap] @ se3.inverse(sparse_map.frame(submap))
+        T = placements[submap] @ sim3.inverse(sparse_map.frame(submap))
         xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
     return GridView(
         sparse_map.keyframes.id[rows].copy(),
@@ -63,4 +71,5 @@ def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Gri
         sparse_map.point_ids(points),
         xyz,
         pairs,
+        np.array(metric, np.bool_),
     )

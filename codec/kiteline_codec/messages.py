@@ -33,9 +33,10 @@ from kiteline_codec.schema import (
     Removed,
     Sightings,
     Tile,
+    Unit,
     WireError,
 )
-from kiteline_core import descriptors, disparity_offset
+from kiteline_core import descriptors, disparity_offset, sim3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.descriptors import DESCRIPTOR_BYTES, NARROW_BYTES
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, AgentId, KeyframeId, SubmapId
@@ -87,6 +88,30 @@ def _read_pose(source: Reader) -> NDArray[np.float64]:
         return quantise.pose((*moved, *turned))
     except ValueError as e:
         raise WireError(str(e)) from None
+
+
+def _write_scale(out: Writer, scale: float) -> None:
+    if not quantise.MIN_SCALE <= scale <= quantise.MAX_SCALE:
+        raise ValueError(f"found scale {scale}: expected a rigid motion, or a scale of 2^-20 to 2^20")
+    out.f32(scale)
+
+
+def _read_scale(source: Reader) -> float:
+    scale = source.f32()
+    if not quantise.MIN_SCALE <= scale <= quantise.MAX_SCALE:
+        raise WireError(f"found scale {scale}: expected 2^-20 to 2^20")
+    return scale
+
+
+def _write_placement(out: Writer, record: Placement) -> None:
+    scale = sim3.scale_of(record.S_w_m)
+    _write_scale(out, scale)
+    _write_pose(out, sim3.rigid(record.S_w_m))
+
+
+def _read_placement(source: Reader, key: Key) -> Placement:
+    scale = _read_scale(source)
+    return Placement(SubmapId(key.id), sim3.of(scale, _read_pose(source)))
 
 
 def _write_camera(out: Writer, record: Camera) -> None:
@@ -298,6 +323,11 @@ _TABLE = (
         lambda source, key: Level(SubmapId(key.id), _read_pose(source)),
     ),
     _Coder(
+        Kind.UNIT, Unit, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
+        lambda out, r: _write_scale(out, r.metres),
+        lambda source, key: Unit(SubmapId(key.id), _read_scale(source)),
+    ),
+    _Coder(
         Kind.POSE, Pose, MAX_KEYFRAME_ID, 1, _of_keyframe,
         lambda out, r: _write_pose(out, r.T_m_k),
         lambda source, key: Pose(KeyframeId(key.id), _read_pose(source)),
@@ -316,8 +346,7 @@ _TABLE = (
     _Coder(Kind.CULLED, Culled, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_culled, _read_culled),
     _Coder(
         Kind.PLACEMENT, Placement, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
-        lambda out, r: _write_pose(out, r.T_w_m),
-        lambda source, key: Placement(SubmapId(key.id), _read_pose(source)),
+        _write_placement, _read_placement,
     ),
     _Coder(Kind.CALIBRATION, Calibration, 63, 1, _of_agent, _write_calibration, _read_calibration),
     _Coder(Kind.TILE, Tile, (1 << 2 * _TILE_BITS) - 1, 1, lambda r: (_tile_id(r),), _write_tile, _read_tile),

@@ -9,7 +9,7 @@ from kiteline_codec.digest import DIGEST_BYTES
 from kiteline_codec.packing import Reader, Writer
 from kiteline_codec.schema import Key, WireError
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 CRC_BYTES = 4
 MASK_BITS = 64  # packets before the last one that an acknowledgement covers
 MAX_HEADER_BYTES = 64  # of a packet with values, checksum included

@@ -37,6 +37,8 @@ TRANSLATION_CODES = 1 << 40  # +-1.1e8 m
 ROTATION_STEPS = 1 << 19  # per unit of the modified Rodrigues parameters: error <= 2 sqrt(3) / 2^19 = 6.7e-6 rad
 _ROTATION_LIMIT = (1 << 38) - (1 << 12)  # squared length kept below that of half a turn, where two codes would meet
 
+MIN_SCALE, MAX_SCALE = 2.0**-20, 2.0**20  # of one unit of length over another; an IEEE single: error <= 6e-8 of it
+
 OCCUPANCY_STEPS = 14  # over 0..100 percent: error <= 3.6 percent
 
 

@@ -37,6 +37,7 @@ class Kind(IntEnum):
     BIRTHS = 4
     SIGHTINGS = 5
     LEVEL = 6
+    UNIT = 7
     POSE = 16
     DEPTHS = 17
     FOUND = 18
@@ -120,6 +121,16 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
+class Unit:
+    """What one eye's agent has learnt of a submap's unit of length. metres: of one unit; a submap begun in metres has
+    1. Of a submap of which nothing is said the unit is its own.
+    """
+
+    submap: SubmapId
+    metres: float
+
+
+@dataclass(frozen=True, slots=True)
 class Pose:
     """The base's pose of a keyframe. T_m_k: (4,4) camera in the submap frame."""
 
@@ -169,10 +180,10 @@ class Culled:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a submap lies. T_w_m: (4,4)."""
+    """Where a submap lies, and in which unit of length. S_w_m: (4,4) similarity: a rigid motion where that is w's."""
 
     submap: SubmapId
-    T_w_m: F64
+    S_w_m: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +242,7 @@ Record = (
     | Births
     | Sightings
     | Level
+    | Unit
     | Pose
     | Depths
     | Found

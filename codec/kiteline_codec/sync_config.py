@@ -15,6 +15,7 @@ _RANKS = {
     Kind.CAMERA: 0,  # nothing can be made of keypoints without it
     Kind.PLACEMENT: 0,  # few bytes, and all that a pose in the world is wrong by
     Kind.LEVEL: 0,
+    Kind.UNIT: 0,
     Kind.POSE: 1,
     Kind.DEPTHS: 1,
     Kind.FOUND: 1,

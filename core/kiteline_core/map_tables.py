@@ -35,6 +35,7 @@ class KeyframeTable:
     filled: I32  # number of keypoints that have arrived
     culled: U8  # 1: its observations no longer count
     camera: F64  # (n,5) fx fy cx cy bf in px and px*m
+    unit: F64  # (n,) units of w in one of its submap: 1 but where a submap of one eye lies in a map of another unit
 
 
 @dataclass(slots=True)
@@ -72,7 +73,7 @@ def empty_keyframes() -> KeyframeTable:
     """A table without rows."""
     i64, u8, i32 = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int32)
     t = np.zeros((0, 4, 4))
-    return KeyframeTable(i64, i64, i64, t, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)))
+    return KeyframeTable(i64, i64, i64, t, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)), np.zeros(0))
 
 
 def empty_keypoints() -> KeypointTable:

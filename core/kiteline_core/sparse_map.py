@@ -14,7 +14,7 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core import sparse_map_kernels as kernels
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -26,6 +26,7 @@ from kiteline_core.ids import (
     KeyframeId,
     SubmapId,
     agent_of_keyframe,
+    agent_of_submap,
     submap_of_keyframe,
 )
 from kiteline_core.map_tables import (
@@ -62,9 +63,11 @@ class SparseMap:
         self.slots = 0
         self.rows: dict[KeyframeId, int] = {}
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes of each submap in order of id
-        self.frames: dict[SubmapId, F64] = {}  # T_w_m of each submap that does not lie as it was begun
+        self.frames: dict[SubmapId, F64] = {}  # S_w_m of each submap that does not lie as it was begun: a similarity
+        self._units: dict[SubmapId, float] = {}  # the scales of these
         self.islands: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
         self.cameras: dict[AgentId, RectifiedCamera] = {}
+        self.metric: set[SubmapId] = set()  # of one eye, whose agent knows the metre
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # what an agent's disparities are too large by, see the base
         self.disparity_known: set[AgentId] = set()  # agents whose offset is known well
@@ -109,6 +112,7 @@ class SparseMap:
             table.id[row] = keyframe
             table.start[row] = self._allocate(row, keypoints)
             table.count[row] = keypoints
+            table.unit[row] = 1.0
             camera = self.cameras.get(agent_of_keyframe(keyframe))
             if camera is not None:
                 table.camera[row] = _parameters(camera)
@@ -185,12 +189,13 @@ class SparseMap:
     def set_world_pose(self, keyframe: KeyframeId, T_w_k: F64) -> None:
         """The base's pose of a keyframe, said in w; its submap stays where it is."""
         frame = self.frames.get(submap_of_keyframe(keyframe))
-        self.set_pose(keyframe, T_w_k if frame is None else se3.orthonormalise(se3.inverse(frame) @ T_w_k))
+        self.set_pose(keyframe, T_w_k if frame is None else se3.orthonormalise(sim3.place(sim3.inverse(frame), T_w_k)))
 
-    def move_submap(self, submap: SubmapId, T_w_m: F64) -> None:
-        """Lay a submap, with all that hangs on it, at T_w_m (4,4)."""
-        if submap in self.frames or not np.array_equal(T_w_m, np.eye(4)):
-            self.frames[submap] = np.array(T_w_m)
+    def move_submap(self, submap: SubmapId, S_w_m: F64) -> None:
+        """Lay a submap, with all that hangs on it, at S_w_m (4,4): a rigid motion, or with another unit of length."""
+        if submap in self.frames or not np.array_equal(S_w_m, np.eye(4)):
+            self.frames[submap] = np.array(S_w_m)
+            self._units[submap] = sim3.scale_of(S_w_m)
         for keyframe in self.submaps.get(submap, []):
             self._follow(self.rows[keyframe])
 
@@ -309,7 +314,9 @@ class SparseMap:
         return bool(kernels.share_keyframe(a, b, table.first, table.next, table.row, table.usable))
 
     def inverse_depths(self, points: I32) -> F64:
-        """Inverse depth (n,) in 1/m of points in their anchors: refined, else as seen; 0 unknown."""
+        """Inverse depth (n,) in 1/m of points in their anchors: refined, else as seen; 0 unknown. A metre is the unit
+        of the anchor's submap.
+        """
         table = self.keypoints
         refined = table.flags[points] & REFINED != 0
         return np.where(refined, table.refined[points], table.inv_depth[points]).astype(np.float64)
@@ -320,7 +327,7 @@ class SparseMap:
         rows = table.row[points]
         inv = self.inverse_depths(points)
         valid = (inv > 0) & (self.keyframes.pose_source[rows] != NO_POSE) & (table.kind[points] == BIRTH)
-        z = 1.0 / np.where(valid, inv, 1.0)
+        z = self.keyframes.unit[rows] / np.where(valid, inv, 1.0)  # in units of w
         fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
         uv = table.uv[points].astype(np.float64) + table.offset[points]
         local = np.stack(
@@ -339,7 +346,7 @@ class SparseMap:
         fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
         u, v = fx * local[:, 0] * inv + cx, fy * local[:, 1] * inv + cy
         offset = np.stack([u, v], 1) - self.keypoints.uv[points]
-        return inv.astype(np.float32), offset.astype(np.float32), ahead
+        return (inv * self.keyframes.unit[rows]).astype(np.float32), offset.astype(np.float32), ahead
 
     def pose(self, keyframe: KeyframeId) -> F64 | None:
         """T_m_k (4,4) of a keyframe, or None when it is unknown or its parents are missing."""
@@ -356,9 +363,20 @@ class SparseMap:
         return np.asarray(self.keyframes.T_w_k[row]).copy()
 
     def frame(self, submap: SubmapId) -> F64:
-        """T_w_m (4,4) of a submap."""
+        """S_w_m (4,4) of a submap: a rigid motion, or a similarity where its unit of length is not that of w."""
         held = self.frames.get(submap)
         return np.eye(4) if held is None else held.copy()
+
+    def unit(self, submap: SubmapId) -> float:
+        """How many units of w one of a submap is."""
+        return self._units.get(submap, 1.0)
+
+    def own_unit(self, submap: SubmapId) -> bool:
+        """Whether a submap's unit of length is its own: one eye saw it, that knows no metre."""
+        agent = agent_of_submap(submap)
+        camera = self.cameras.get(agent)
+        deep = camera is None or camera.stereo or agent in self.measures_depth
+        return not (deep or submap in self.metric)
 
     def island_of(self, submap: SubmapId) -> SubmapId:
         """The eldest of the submaps that are one map with this one."""
@@ -461,8 +479,12 @@ class SparseMap:
     def _follow(self, row: int) -> None:
         """Where a keyframe lies in w, from its place in m."""
         table = self.keyframes
-        frame = self.frames.get(submap_of_keyframe(KeyframeId(int(table.id[row]))))
+        submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
+        frame, unit = self.frames.get(submap), self._units.get(submap, 1.0)
+        table.unit[row] = unit
         table.T_w_k[row] = table.T_m_k[row] if frame is None else frame @ table.T_m_k[row]
+        if unit != 1.0:
+            table.T_w_k[row, :3, :3] /= unit
 
     def _compose_children(self, keyframe: KeyframeId) -> None:
         table = self.keyframes

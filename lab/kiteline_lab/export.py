@@ -21,6 +21,7 @@ from kiteline_basestation.store import StoreError, read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError
 from kiteline_codec.sync import SyncConfig
+from kiteline_core import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
 
 I64 = NDArray[np.int64]
@@ -71,7 +72,7 @@ def _trajectory(mapper: Mapper, agent: int | None) -> bytes:
     mine = [k for k in poses if agent is None or agent_of_keyframe(k) == AgentId(agent)]
     stamps = np.array([mapper.map.keyframes.t_ns[mapper.map.rows[k]] for k in mine], np.int64)
     order = np.argsort(stamps, kind="stable")
-    return tum(stamps[order], np.array([poses[mine[i]] for i in order]).reshape(-1, 4, 4))
+    return tum(stamps[order], np.array([sim3.rigid(poses[mine[i]]) for i in order]).reshape(-1, 4, 4))
 
 
 def _graph(mapper: Mapper) -> bytes:
@@ -84,7 +85,9 @@ def _graph(mapper: Mapper) -> bytes:
         near += covisible_keyframes(mapper.map, k, ESSENTIAL_POINTS)
         pairs |= {(min(i, number[n]), max(i, number[n])) for n in near if n in number}
     edges: I64 = np.array(sorted(pairs), np.int64).reshape(-1, 2)
-    return g2o(np.array(list(poses), np.int64), np.array(list(poses.values())).reshape(-1, 4, 4), edges)
+    scale = np.array([sim3.scale_of(S) for S in poses.values()])
+    rigid = np.array([sim3.rigid(S) for S in poses.values()]).reshape(-1, 4, 4)
+    return g2o(np.array(list(poses), np.int64), rigid, edges, scale=scale)
 
 
 def main(argv: Sequence[str]) -> int:

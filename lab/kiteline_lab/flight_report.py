@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.step import Estimate
-from kiteline_core import se3, tum
+from kiteline_core import se3, sim3, tum
 
 F64 = NDArray[np.float64]
 Report = dict[str, Any]
@@ -27,7 +27,8 @@ BASE_TIMINGS = ("bundle_ms", "grid_ms", "rss_mib")
 
 
 def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) -> list[tuple[int, F64]]:
-    """Every tracked frame in w: (t_ns, T_w_b), from the agent's frames and the base's keyframe poses (camera in w).
+    """Every tracked frame in w: (t_ns, T_w_b), from the agent's frames and the base's keyframe poses (camera in w, with
+    the scale of the agent's unit of length in w where that is another).
 
     Where the base moved the keyframe that follows, the frames up to it take on their share of that correction, so that
     the path has no step where the reference changes. A frame whose keyframe the base does not hold (still on its way
@@ -49,7 +50,7 @@ def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) ->
                 if bend is not None:
                     known = known @ se3.exp((frame.t_ns - begin_ns) / (bend[0] - begin_ns) * bend[1])
                 T_w_b = known @ frame.T_k_c @ T_c_b
-                placed[submap] = T_w_b @ se3.inverse(frame.T_m_b)
+                placed[submap] = sim3.normalise(T_w_b @ se3.inverse(frame.T_m_b))
                 early = waiting.pop(submap, ())
                 poses.extend((t_ns, placed[submap] @ T_m_b) for t_ns, T_m_b in early)
                 poses.append((frame.t_ns, T_w_b))
@@ -58,7 +59,7 @@ def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) ->
             else:
                 waiting.setdefault(submap, []).append((frame.t_ns, frame.T_m_b))
     poses.sort(key=lambda pose: pose[0])
-    return [(t_ns, se3.orthonormalise(T_w_b)) for t_ns, T_w_b in poses]
+    return [(t_ns, sim3.rigid(T_w_b)) for t_ns, T_w_b in poses]
 
 
 def _runs(
@@ -91,8 +92,8 @@ def _bend(last: Estimate, born: Estimate, T_w_k: Mapping[int, F64], T_b_c: F64) 
     if old is None or new is None:
         return None
     step = se3.inverse(last.T_o_b @ T_b_c) @ born.T_o_b @ T_b_c  # of the camera, as the agent saw it
-    change = se3.inverse(old) @ new @ born.T_k_c @ se3.inverse(last.T_k_c @ step)
-    return born.t_ns, se3.log(se3.orthonormalise(change))
+    change = sim3.inverse(old) @ new @ born.T_k_c @ se3.inverse(last.T_k_c @ step)
+    return born.t_ns, se3.log(sim3.rigid(change))
 
 
 def write_tum(path: Path, poses: Iterable[tuple[int, F64]]) -> None:

@@ -53,14 +53,20 @@ def table(answer: Mapping[str, Any]) -> str:
     """An answer for people."""
     if "maps" not in answer and "id" not in answer:
         return json.dumps(answer)
-    lines = [f"{'map':10} {'name':16} {'agents':8} {'keyframes':>9} {'points':>8}  placed  submaps"]
+    lines = [f"{'map':10} {'name':16} {'agents':8} {'keyframes':>9} {'points':>8}  placed  unit   submaps"]
     for m in answer.get("maps", [answer]):
-        agents, submaps = ",".join(map(str, m["agents"])), " ".join(s["id"] for s in m["submaps"])
+        agents, submaps = ",".join(map(str, m["agents"])), " ".join(map(_submap, m["submaps"]))
         placed = "yes" if m["placed"] else "no"
         lines.append(
-            f"{m['id']:10} {m['name'][:16]:16} {agents:8} {m['keyframes']:9} {m['points']:8}  {placed:6}  {submaps}"
+            f"{m['id']:10} {m['name'][:16]:16} {agents:8} {m['keyframes']:9} {m['points']:8}  {placed:6}  "
+            f"{m['unit']:5}  {submaps}"
         )
     return "\n".join(lines)
+
+
+def _submap(told: Mapping[str, Any]) -> str:
+    """A submap's id, and its scale where that is not 1."""
+    return str(told["id"]) if told["scale"] == 1.0 else f"{told['id']} (x{told['scale']:.4g})"
 
 
 def main(argv: list[str]) -> int:

@@ -66,7 +66,7 @@ def test_two_agents_in_one_room_get_one_map(make_flight: MakeFlight, words: Any)
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
     last = [r for r in published if isinstance(r, Placement) and r.submap == submap_of_keyframe(b.keyframes[0])][-1]
-    assert np.allclose(last.T_w_m, ELSEWHERE, atol=0.03)
+    assert np.allclose(last.S_w_m, ELSEWHERE, atol=0.03)
 
 
 @pytest.mark.parametrize("rooms", ["papered", "half_papered"])

@@ -35,9 +35,10 @@ from kiteline_codec.schema import (
     Removed,
     Sightings,
     Tile,
+    Unit,
     WireError,
 )
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
@@ -69,12 +70,13 @@ def some_records(seed: int, n: int) -> list[Record]:
         ),
         Sightings(keyframe, 2, rng.permutation(index), uv, inv_depth, octave, point),
         Level(submap, pose),
+        Unit(submap, 0.73),
         Pose(keyframe, pose),
         Depths(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
         Found(keyframe, index, point),
         Removed(keyframe, index),
         Culled(keyframe, index, int(rng.integers(2))),
-        Placement(submap, pose),
+        Placement(submap, sim3.of(1.0 + 0.37 * n, pose)),
         Calibration(AgentId(3), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0),
         Tile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
         Copy(keyframe, submap_id(2, 1, 7), pose),

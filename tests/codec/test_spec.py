@@ -106,8 +106,15 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         z = s.varint() - 1
         out["parent"] = -1 if z < 0 else id_ - (-(z + 1) // 2 if z % 2 else z // 2)
         out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
-    elif kind in (6, 16, 21):
-        out[{6: "T_l_m", 16: "T_m_k", 21: "T_w_m"}[kind]] = s.pose()
+    elif kind in (6, 16):
+        out[{6: "T_l_m", 16: "T_m_k"}[kind]] = s.pose()
+    elif kind == 7:
+        out["metres"] = struct.unpack("<f", s.raw(4))[0]
+    elif kind == 21:
+        scale = struct.unpack("<f", s.raw(4))[0]
+        S = np.array(s.pose())
+        S[:3, :3] *= scale
+        out["S_w_m"] = S
     elif kind == 23:
         out["submap"] = s.varint()
         out["T_m_k"] = s.pose()
@@ -200,7 +207,7 @@ def test_packets() -> None:
     for name, packet in wire:
         assert zlib.crc32(packet[:-4]) == int.from_bytes(packet[-4:], "little")
         s = Source(packet[:-4])
-        assert s.u8() == PROTOCOL_VERSION == 2
+        assert s.u8() == PROTOCOL_VERSION == 3
         flags = s.u8()
         assert s.varint() == {"agent": 5, "base": 700}[name]
         assert s.varint() in (0, {"agent": 700, "base": 5}[name])
