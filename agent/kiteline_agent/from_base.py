@@ -79,6 +79,13 @@ class FromBase:
         if S_w_m is None:
             return None
         if not self._smoothing.on:
-            return sim3.place(S_w_m, T_m_b)
+            return self._in_unit(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b
-        return sim3.place(self._smoothing.follow(S_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns), T_o_b)
+        return self._in_unit(self._smoothing.follow(S_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns), T_o_b)
+
+    def _in_unit(self, S_w_x: F64, T_x_b: F64) -> F64:
+        """T_w_b (4,4) of a body; the arm from eye to body is in metres, whatever the unit in which the eye measures."""
+        if sim3.scale_of(S_w_x) == 1.0:
+            return S_w_x @ T_x_b
+        T_b_c = self._map.camera.T_b_c
+        return sim3.place(S_w_x, T_x_b @ T_b_c) @ se3.inverse(T_b_c)

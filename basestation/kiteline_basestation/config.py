@@ -106,7 +106,8 @@ class LoopConfig:
     min_inliers_loop: int = 40  # the same, within one map
     min_share: float = 0.25  # of what both maps should see here: less is a thing that stands in two places
     scale_points: int = 20  # with depth in both maps, that tell the scale between maps of which one has its own unit
-    scale_spread: float = 0.2  # of the logarithms of their depths' ratios: more, and they do not say one thing
+    scale_spread: float = 0.2  # of the logarithm of a ratio of depths, within which
+    scale_share: float = 0.7  # of them have to say the same: two things that lie unlike each other say no scale
     scale_sigma: float = 0.02  # deviation of what they say together: the bundle after it is good to a few percent
     columns: int = 6  # parts of the image: a poster that hangs twice fills few of them
     rows: int = 4

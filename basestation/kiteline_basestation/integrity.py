@@ -28,6 +28,7 @@ from kiteline_codec.schema import (
     Record,
     Removed,
     Sightings,
+    Unit,
     WireError,
 )
 from kiteline_core.ids import (
@@ -82,7 +83,7 @@ def sound(kept: Kept) -> Checked:
                 if (why := _wrong_section(record, heads)) is not None:
                     faults.append(f"{_name(key)} of agent {agent} {why}: left out")
                     del received[key]
-            elif isinstance(record, Level):
+            elif isinstance(record, Level | Unit):
                 awaited += record.submap not in submaps
         for key, record in list(own.items()):
             if (why := _wrong_own(record, agent, heads, submaps)) is not None:

@@ -101,6 +101,7 @@ class Mapper:
         for agent, records in given.arrivals:
             self._intake.take(agent, records, now_ns)  # sections -> map, whatever their order
         self._set_upright()  # where an agent has learnt which way is up
+        self._set_metric()  # where one eye has learnt how long its first map is
         for done in given.done:
             self._finish(done)  # refined poses and points, outliers, grid
         answers = tuple(management.answer(self, command, now_ns) for command in given.commands)
@@ -291,6 +292,15 @@ class Mapper:
             return
         unit = sim3.scale_of(self.placements[first])
         self._move_world(sim3.of(unit, level.T_l_m) @ sim3.inverse(self.placements[first]))
+
+    def _set_metric(self) -> None:
+        """Stretch the world when the agent of its first submap says how long a unit of it is, which nobody knew."""
+        first = next(iter(self.placements), None)
+        metres = None if first is None else self._intake.units.get(first)
+        if first is None or metres is None or not self.map.own_unit(self.map.island_of(first)):
+            return
+        if sim3.scale_of(self.placements[first]) == 1.0 and metres != 1.0:
+            self._move_world(sim3.of(metres, np.eye(4)))
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
         """Turn or stretch the world with all that is placed in it, but for some; metres stay metres."""

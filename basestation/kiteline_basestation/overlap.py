@@ -6,7 +6,7 @@ must also fill the image, stand in several depths, and be found where it is fore
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,12 +104,14 @@ def find_overlap(
     if len(a) < config.min_inliers:
         return None
     free = any(sparse_map.own_unit(submap_of_keyframe(k)) for k in (new, old))
-    find = _with_scale if free else _rigid
-    start = find(sparse_map, new, old, mine, theirs, a, b, config)
+    if free:
+        mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # of another metre than the old map's
+    start = _with_scale(sparse_map, new, old, mine, theirs, a, b, config) if free else None
+    start = start or _by_pixels(sparse_map, new, old, mine, theirs, a, b, config)
     if start is None:
         return None
-    observed = np.column_stack([mine.uv, np.full(len(mine.uv), -1.0) if free else mine.disparity])
-    found = _with_neighbours(sparse_map, new, old, mine, observed, *start, config)
+    observed = np.column_stack([mine.uv, mine.disparity])
+    found = _with_neighbours(sparse_map, new, old, mine, observed, start[0], start[1] if free else 1.0, config)
     if found is None:
         return None
     T_c_w, which, points, share = found
@@ -134,16 +136,23 @@ def find_overlap(
     )  # fmt: skip
 
 
-def _rigid(
+def _by_pixels(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
     config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
-    """T_c_w (4,4) of the new camera in the old map where both have one unit of length, and 1."""
+    """T_c_w (4,4) of the new camera in the old map, by the old map's points, and how much longer that map has what the
+    new one's has, roughly.
+    """
     rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
     observed = np.column_stack([mine.uv, mine.disparity])
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
     fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old), config.ransac)
-    return None if fit is None or fit.inliers < config.min_inliers else (fit.T_c_m, 1.0)
+    if fit is None or fit.inliers < config.min_inliers:
+        return None
+    a, b = a[fit.inlier], b[fit.inlier]
+    other = se3.transform(fit.T_c_m, theirs.xyz[b])[mine.known[a], 2]
+    ratio = other / np.maximum(_own_depth(sparse_map, new, mine, a), 1e-3)
+    return fit.T_c_m, float(np.median(ratio)) if len(ratio) else 1.0
 
 
 def _with_scale(
@@ -151,7 +160,8 @@ def _with_scale(
     config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map, and how much longer that map has what the new one's has: by points
-    that both maps have, in either's image (B. Horn, 1987, in RANSAC, as ORB-SLAM does for one eye).
+    that both maps have, in either's image (B. Horn, 1987, in RANSAC, as ORB-SLAM does for one eye). Where too few are
+    known to both, pixels say the pose, and the scale follows from what the neighbours know.
     """
     both = mine.known[a]
     a, b = a[both], b[both]
@@ -188,8 +198,10 @@ def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
         return None
     ratio = np.log(np.maximum(other, 1e-3) / np.maximum(own, 1e-3))
     middle = float(np.median(ratio))
-    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
-    if spread > config.scale_spread or 1.2533 * spread > config.scale_sigma * np.sqrt(len(ratio)):
+    apart = np.abs(ratio - middle)
+    close = apart < config.scale_spread
+    sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # of a median
+    if float(np.mean(close)) < config.scale_share or sigma > config.scale_sigma:
         return None
     return float(np.exp(middle))
 

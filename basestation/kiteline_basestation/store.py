@@ -25,7 +25,7 @@ from kiteline_core.ids import SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
 _APPLICATION = 0x6B6C6D70  # "klmp"
-_VERSION = 1  # of the tables; a store of another version is refused
+_VERSION = 2  # of the tables; a store of another version is refused
 _OF_KEYFRAMES = (
     Kind.HEAD, Kind.BIRTHS, Kind.SIGHTINGS, Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED,
 )  # fmt: skip

@@ -37,7 +37,7 @@ def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) ->
     holds nothing have no place in w: left out.
     """
     poses: list[tuple[int, F64]] = []
-    placed: dict[int, F64] = {}  # submap -> T_w_m that its latest known keyframe implies
+    placed: dict[int, F64] = {}  # submap -> S_w_m that its latest known keyframe implies
     waiting: dict[int, list[tuple[int, F64]]] = {}
     T_c_b = se3.inverse(T_b_c)
     for run, bend in _runs(frames, T_w_k, T_b_c):
@@ -49,17 +49,18 @@ def compose(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) ->
             if known is not None:
                 if bend is not None:
                     known = known @ se3.exp((frame.t_ns - begin_ns) / (bend[0] - begin_ns) * bend[1])
-                T_w_b = known @ frame.T_k_c @ T_c_b
-                placed[submap] = sim3.normalise(T_w_b @ se3.inverse(frame.T_m_b))
+                S_w_c = known @ frame.T_k_c
+                placed[submap] = sim3.normalise(S_w_c @ se3.inverse(frame.T_m_b @ T_b_c))
                 early = waiting.pop(submap, ())
-                poses.extend((t_ns, placed[submap] @ T_m_b) for t_ns, T_m_b in early)
-                poses.append((frame.t_ns, T_w_b))
+                poses.extend((t_ns, placed[submap] @ T_m_c) for t_ns, T_m_c in early)
+                poses.append((frame.t_ns, S_w_c))
             elif submap in placed:
-                poses.append((frame.t_ns, placed[submap] @ frame.T_m_b))
+                poses.append((frame.t_ns, placed[submap] @ frame.T_m_b @ T_b_c))
             else:
-                waiting.setdefault(submap, []).append((frame.t_ns, frame.T_m_b))
+                waiting.setdefault(submap, []).append((frame.t_ns, frame.T_m_b @ T_b_c))
     poses.sort(key=lambda pose: pose[0])
-    return [(t_ns, sim3.rigid(T_w_b)) for t_ns, T_w_b in poses]
+    # The arm from eye to body is in metres, whatever the unit in which the eye measures.
+    return [(t_ns, se3.orthonormalise(sim3.rigid(S_w_c) @ T_c_b)) for t_ns, S_w_c in poses]
 
 
 def _runs(

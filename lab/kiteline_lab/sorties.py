@@ -43,7 +43,7 @@ class Part:
 @dataclass(frozen=True, slots=True)
 class Sortie:
     """One start of one agent. parts: what it sees, one after another; with more than one it has no IMU. deaf: times of
-    the whole flight, in s, between which its link is down.
+    the whole flight, in s, between which its link is down. mono: with one eye, and without IMU.
     """
 
     source: str
@@ -52,6 +52,7 @@ class Sortie:
     begin_s: float = 0.0
     parts: tuple[Part, ...] = (Part(0.0, 1e9),)
     deaf: tuple[tuple[float, float], ...] = ()
+    mono: bool = False
 
 
 @dataclass(slots=True)
@@ -122,7 +123,7 @@ class _Crew:
         self._deaf = sortie.deaf
         self._frames = _frames(sortie)
         self._next = next(self._frames, None)
-        source = open_source(sortie.source, imu=len(sortie.parts) == 1)
+        source = open_source(sortie.source, mono=sortie.mono, imu=_has_imu(sortie))
         self._channel: CodedChannel = coded_channel(sortie.boot + 1, bytes_s, profile)
         identity = Identity(self.agent, sortie.boot)
         self._box = Agent(source.rig, source.imu, config, identity, self._channel, shipped_words())
@@ -153,12 +154,16 @@ class _Crew:
         return output.packets
 
 
+def _has_imu(sortie: Sortie) -> bool:
+    return len(sortie.parts) == 1 and not sortie.mono
+
+
 def _frames(sortie: Sortie) -> Iterator[tuple[Frame, ImuBatch | None, F64]]:
     """The frames of all parts, with stamps that go on."""
     alone = len(sortie.parts) == 1
     t_ns = 0
     for part in sortie.parts:
-        source = open_source(sortie.source, imu=alone)
+        source = open_source(sortie.source, mono=sortie.mono, imu=_has_imu(sortie))
         assert source.ground_truth is not None
         begin_ns = int(source.ground_truth.t_ns[0])
         pending: ImuBatch | None = None

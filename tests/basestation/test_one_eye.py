@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.integrity import contradictions
 from kiteline_basestation.jobs import BundleInputs, Job, JobDone, run_job
+from kiteline_basestation.management import _list
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_codec.schema import Camera, Head, Record
+from kiteline_basestation.overlap import depth_scale
+from kiteline_basestation.world_view import world_view
+from kiteline_codec.schema import Camera, Head, Live, Placement, Record, Unit
 from kiteline_core import se3, sim3
 from kiteline_core.bundle import BundleResult
-from kiteline_core.ids import submap_of_keyframe
+from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.pnp import align_points
 
 F64 = NDArray[np.float64]
@@ -83,3 +89,172 @@ def error_m(found: F64, true: F64) -> tuple[float, float]:
     S = align_points(true, found, with_scale=True)
     assert S is not None
     return float(np.sqrt(np.mean(np.sum((se3.transform(S, found) - true) ** 2, axis=1)))), sim3.scale_of(S)
+
+
+def the_other_eye(make_flight: MakeFlight) -> Any:
+    return in_own_unit(
+        make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=False), 0.37
+    )
+
+
+def lengths(mapper: Mapper, flight: Any) -> F64:
+    """How long each step is in the world, over what it is in truth."""
+    ours, true = placed(mapper, flight), true_places(flight)
+    return np.asarray(np.linalg.norm(np.diff(ours, axis=0), axis=1) / np.linalg.norm(np.diff(true, axis=0), axis=1))
+
+
+@pytest.mark.parametrize("growth", [0.001, 0.003])
+def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: Any, words: Any, growth: float) -> None:
+    flight = in_own_unit(
+        make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.002, seed=4, noise_px=0.5, memory=3, stereo=False),
+        0.4, growth,
+    )  # fmt: skip
+    blind, mapper = Mapper(BaseConfig()), Mapper(BaseConfig(), words)
+    feed(blind, [flight], drift=True)
+    published = feed(mapper, [flight], drift=True)
+    assert mapper.summary()["loops"] >= 1
+    before, after = (error_m(placed(m, flight), true_places(flight))[0] for m in (blind, mapper))
+    assert after < 0.15 * before
+    drifted, mended = (lengths(m, flight) for m in (blind, mapper))
+    assert np.median(drifted[-8:]) / np.median(drifted[:8]) > 1.0 + 60 * growth
+    assert abs(np.median(mended[-8:]) / np.median(mended[:8]) - 1.0) < 0.04
+    # Where the agent flies nothing was stretched, and nothing is said of a scale: its own unit is the world's.
+    assert abs(np.median(mended[-8:]) / np.median(drifted[-8:]) - 1.0) < 0.01
+    assert all(sim3.scale_of(r.S_w_m) == 1.0 for r in published if isinstance(r, Placement))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_one_eye_takes_on_the_metre_of_a_pair(make_flight: MakeFlight, words: Any, late: bool) -> None:
+    pair = make_flight(keyframes=40, turns=0.8)
+    eye = the_other_eye(make_flight)
+    flights = [eye, pair] if late else [pair, eye]  # whose map is the world at first
+    mapper = Mapper(BaseConfig(), words)
+    published = feed(mapper, flights, [0, 20] if late else [])
+    assert mapper.summary()["merges"] == 1
+    found = np.concatenate([placed(mapper, f) for f in flights])
+    error, scale = error_m(found, np.concatenate([true_places(f) for f in flights]))
+    assert error < 0.01
+    assert abs(scale - 1.0) < 0.005
+    of = {submap_of_keyframe(f.keyframes[0]): f for f in flights}
+    last = {r.submap: r.S_w_m for r in published if isinstance(r, Placement)}
+    assert set(last) == set(of)
+    for submap, S_w_m in last.items():
+        assert np.array_equal(S_w_m, mapper.placements[submap])
+        assert (sim3.scale_of(S_w_m) == 1.0) == of[submap].camera.stereo
+    assert abs(sim3.scale_of(last[submap_of_keyframe(eye.keyframes[0])]) * 0.37 - 1.0) < 0.05
+    told = _list(mapper, {}, 0)["maps"]
+    assert [m["unit"] for m in told] == ["metre"]
+    assert {s["unit"] for s in told[0]["submaps"]} == {"own", "metre"}
+
+
+def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: MakeFlight, words: Any) -> None:
+    a = in_own_unit(make_flight(keyframes=40, turns=0.8, stereo=False), 2.0)
+    b = the_other_eye(make_flight)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [a, b])
+    assert mapper.summary()["merges"] == 1
+    both = np.concatenate([placed(mapper, a), placed(mapper, b)])
+    assert error_m(both, np.concatenate([true_places(a), true_places(b)]))[0] < 0.01
+    assert world_view(mapper.map, mapper.placements).observations.size > 0
+    assert world_view(mapper.map, mapper.placements).rays.size == 0  # no metre, no grid
+    young = submap_of_keyframe(b.keyframes[0])
+    assert abs(mapper.map.unit(young) * 0.37 / 2.0 - 1.0) < 0.1
+    assert mapper.atlas is not None
+    mapper.atlas.undo(mapper.atlas.merges[0])
+    mapper.step(MapperInput(((a.agent, ()),)), 10**12)
+    assert mapper.map.unit(young) == 1.0
+    assert young not in mapper.placements
+    assert contradictions(mapper) == []
+    alone = np.array([mapper.map.world_pose(k)[:3, 3] for k in b.keyframes])  # type: ignore[index]
+    error, scale = error_m(alone, true_places(b))
+    assert error < 0.01
+    assert abs(scale * 0.37 - 1.0) < 0.1
+
+
+@pytest.mark.parametrize("rooms", ["papered", "half_papered"])
+def test_rooms_with_one_wallpaper_stay_two_for_one_eye_too(
+    make_flight: MakeFlight, request: pytest.FixtureRequest, words: Any, rooms: str
+) -> None:
+    one, other = request.getfixturevalue(rooms)
+    for stereo in (True, False):
+        a = make_flight(keyframes=40, turns=1.0, scene=one, stereo=stereo)
+        a = a if stereo else in_own_unit(a, 1.7)
+        b = in_own_unit(make_flight(keyframes=40, turns=1.0, scene=other, variant=1, agent=1, stereo=False), 0.6)
+        mapper = Mapper(BaseConfig(), words)
+        feed(mapper, [a, b])
+        assert mapper.summary()["merges"] == 0
+
+
+def test_a_corridor_that_repeats_fools_one_eye_neither(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
+    a = make_flight(keyframes=40, turns=0.6, scene=corridor)
+    b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1, stereo=False)
+    b = in_own_unit(b, 0.6)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [a, b])
+    assert mapper.summary()["merges"] == 0
+    lone = Mapper(BaseConfig(), words)
+    feed(lone, [in_own_unit(make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4, stereo=False), 0.6)])
+    assert lone.summary()["loops"] == 0
+
+
+def test_depths_that_do_not_say_one_length_say_none() -> None:
+    rng = np.random.default_rng(0)
+    config, own = BaseConfig().loops, rng.uniform(1.0, 8.0, 60)
+    told = depth_scale(own, 2.5 * own * np.exp(rng.normal(0.0, 0.05, 60)), config)
+    assert told is not None
+    assert abs(told / 2.5 - 1.0) < 0.03
+    assert depth_scale(own[:10], 2.5 * own[:10], config) is None
+    assert depth_scale(own, own * np.exp(rng.normal(0.0, 0.4, 60)), config) is None
+    halves = np.where(np.arange(60) < 31, 1.0, 2.0)
+    assert depth_scale(own, halves * own, config) is None
+
+
+def test_what_a_base_remembers_of_units_is_known_to_the_next(make_flight: MakeFlight, words: Any) -> None:
+    pair = make_flight(keyframes=40, turns=0.8)
+    eye = the_other_eye(make_flight)
+    mapper = Mapper(BaseConfig(), words)
+    published = feed(mapper, [eye, pair])
+    again = Mapper(BaseConfig(), words)
+    for flight in (eye, pair):
+        own = [r for r in published if agent_of_record(r) == flight.agent]
+        again.restore(flight.agent, tuple(flight.all_records()), tuple(own), 0)
+    again.recall({name: json.dumps(entry.make()) for name, entry in mapper.memory().items()})
+    for flight in (eye, pair):
+        assert np.allclose(placed(again, flight), placed(mapper, flight), atol=1e-9)
+        for k in flight.keyframes:
+            assert np.allclose(again.map.world_pose(k), mapper.map.world_pose(k), atol=1e-9)
+    points = mapper.map.point_ids(mapper.map.roots())
+    here, there = mapper.map.find_points(points), again.map.find_points(points)
+    assert np.allclose(mapper.map.positions(here)[0], again.map.positions(there)[0], atol=1e-6)
+    assert again.atlas is not None and mapper.atlas is not None
+    assert [v.scale for v in again.atlas._edges] == [v.scale for v in mapper.atlas._edges]
+    assert sorted(again.atlas.merges[0].moved) == sorted(mapper.atlas.merges[0].moved)
+
+
+def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched(make_flight: MakeFlight) -> None:
+    flight = in_own_unit(make_flight(keyframes=8, turns=0.15, stereo=False), 0.5)
+    later = make_flight(keyframes=8, turns=0.15, start=0.15, submap=1, stereo=False)
+    before, after = (submap_of_keyframe(f.keyframes[0]) for f in (flight, later))
+    t_ns = later.records[0][0].t_ns - 10**8
+    left = Live(flight.agent, t_ns, flight.keyframes[-1], np.eye(4), 80)
+    for first in (True, False):  # whether the unit is heard of before the new map
+        mapper = Mapper()
+        said: list[Record] = [Unit(before, 2.0), Unit(after, 1.0)]
+        batches = [[Camera(flight.agent, flight.camera)], *flight.records, [left]]
+        batches += [said, *later.records] if first else [*later.records, said]
+        placed_at: dict[int, F64] = {}
+        for n, batch in enumerate([*batches, [], []]):
+            output = mapper.step(MapperInput(((flight.agent, tuple(batch)),)), n * STEP_NS)
+            for _, out in output.publish:
+                placed_at |= {r.submap: r.S_w_m for r in out if isinstance(r, Placement)}
+        assert np.isclose(sim3.scale_of(placed_at[before]), 2.0)
+        assert sim3.scale_of(placed_at[after]) == 1.0
+        begin, end = mapper.map.pose(later.keyframes[0]), mapper.map.pose(flight.keyframes[-1])
+        assert begin is not None and end is not None
+        assert np.allclose((placed_at[after] @ begin)[:3, 3], 2.0 * end[:3, 3], atol=1e-6)  # where it was left
+
+
+def agent_of_record(record: Any) -> int:
+    if isinstance(record, Placement):
+        return int(agent_of_submap(record.submap))
+    return int(agent_of_keyframe(record.keyframe)) if hasattr(record, "keyframe") else -1

@@ -104,7 +104,7 @@ def test_another_version_is_told(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / FILE) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(StoreError, match="version 99, expected version 1"):
+    with pytest.raises(StoreError, match="version 99, expected version 2"):
         Store(tmp_path)
 
 
