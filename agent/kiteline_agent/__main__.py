@@ -299,7 +299,8 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
                 link.send(packet)
             e = onboard.output.estimate if onboard.output is not None else None
             if sink is not None and e is not None and e.T_l_b is not None:
-                sink.push(PoseSample(captured_ns, e.T_l_b, e.tracked, e.quality, spec.boot, e.cov_l), clock.now_ns())
+                quality = onboard.agent.odometry_quality(e)
+                sink.push(PoseSample(captured_ns, e.T_l_b, e.tracked, quality, spec.boot, e.cov_l), clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is None:
                 _tell(narrator.lines(onboard.output, onboard.tally, now_ns - begin_ns) if onboard.output else ())

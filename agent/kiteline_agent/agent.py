@@ -285,6 +285,10 @@ class Agent:
         """Whether the active submap's lengths are metres; one eye alone measures in a unit of its own."""
         return self._inertia.metric
 
+    def odometry_quality(self, estimate: Estimate) -> int:
+        """`quality` of T_o_b, which no map corrects: what a flight controller is to be told."""
+        return min(estimate.quality, self._certainty.quality(estimate.cov_o, None))
+
     def time_offset_report(self) -> dict[str, float] | None:
         """InertialTracker.offset_report; None without an IMU."""
         return None if self._inertia.tracker is None else self._inertia.tracker.offset_report()
@@ -309,7 +313,8 @@ class Agent:
     def _estimate(self, t_ns: int, inliers: int, *, tracked: bool) -> Estimate:
         T_m_b = self._pose.T_m_c @ self._s.T_c_b
         cov_m, cov_o = self._certainty.of_poses(self._pose, T_m_b)
-        quality = self._certainty.quality(cov_m if tracked else cov_o, inliers or None)
+        placed = tracked and self._s.knows_place()
+        quality = self._certainty.quality(cov_m if placed else cov_o, inliers or None)
         carried = self._submaps.any and self._inertia.carried
         if not tracked and (not carried or quality < self._s.config.certainty.flagged_below):
             quality = -1

@@ -135,6 +135,8 @@ class MapGrowth:
             return self._open_from_two_views(view, t_ns, opening)
         self._certainty.begin(self._pose.T_m_c @ self._s.T_c_b)
         self._submaps.open_from_pair(view, t_ns, self._s.frame)
+        if not first:
+            self._s.base.begins(self._submaps.active, se3.inverse(self._s.T_o_first))
         self._note_keyframe(view, Extra.SUBMAP)
         return True
 

@@ -37,8 +37,9 @@ class Stages:
     """What tracking and the growth of the map share. T_c_b: (4,4) body in the camera.
 
     config: at the effort on which the governor decided. frame: number of the last one. last_t_ns: its stamp, once it
-    was processed. predicted: T_m_c (4,4) of it. failures: tries since the old map was lost that had texture in view.
-    events: of this step. mono: how one eye begins; None with more than that.
+    was processed. predicted: T_m_c (4,4) of it. T_o_first: (4,4) of the first submap, as the camera left it last.
+    failures: tries since the old map was lost that had texture in view. events: of this step. mono: how one eye begins;
+    None with more than that.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Stages:
         self.frame = 0
         self.last_t_ns: int | None = None
         self.predicted: F64 = np.eye(4)
+        self.T_o_first: F64 = np.eye(4)
         self.failures = 0
 
     def believes(self, T_c_m: F64, submap: SubmapId) -> bool:
@@ -97,7 +99,16 @@ class Stages:
 
     def carry_certainty(self) -> None:
         """What is known of the pose so far is of a map that is left now."""
+        if self.submaps.active == self.submaps.first:
+            self.T_o_first = self.pose.T_o_m
         self.certainty.carry(self.pose, self.T_c_b, self.submaps.active)
+
+    def knows_place(self) -> bool:
+        """Whether it is known by more than odometry how the submap lies to the flight's first; always, of one eye's
+        maps: each has its own unit.
+        """
+        active = self.submaps.active
+        return self.mono is not None or active == self.submaps.first or self.base.has_placed(active)
 
     def move_map(self, T_m_c: F64) -> None:
         """The camera is at T_m_c (4,4) in the submap, and moved in no other frame."""

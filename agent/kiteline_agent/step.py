@@ -42,7 +42,8 @@ class Estimate:
     T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
     keyframe, T_k_c: the same pose relative to a keyframe's camera. T_w_b: (4,4) in the world, once the base has placed
     the submap; before that in the submap set upright, where it began askew.
-    quality: how likely, in percent, the pose is good (CertaintyConfig), at least 1; -1: nothing measures the motion.
+    quality: how likely, in percent, the pose is good (CertaintyConfig) against where the flight began, at least 1; -1:
+    nothing measures the motion. A later submap lies there as odometry says, until it is found how it truly lies.
     cov_m: (6,6) of T_m_b against where its submap began, [translation in m, rotation about the body's axes], m and rad.
     cov_o: (6,6) of T_o_b against where the flight began, [translation in o, rotation about the body's axes].
     R_l_o: (3,3) sets the odometry frame upright, the same for good once it is known; None before, where a flight begins

@@ -49,6 +49,11 @@ class Submaps:
         """The submap in which the agent tracks (the first one before it has begun)."""
         return submap_id(self._identity.agent, self._identity.boot, max(self._number, 0))
 
+    @property
+    def first(self) -> SubmapId:
+        """The submap in which the flight begins."""
+        return submap_id(self._identity.agent, self._identity.boot, 0)
+
     def open_from_pair(self, view: View, t_ns: int, frame: int) -> None:
         """The first keyframe gives depth by itself. Where the camera is has been set."""
         self._next()

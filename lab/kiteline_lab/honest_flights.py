@@ -192,8 +192,8 @@ FAULTS: dict[str, Callable[[list[Shown]], list[Shown]]] = {
 @dataclass(frozen=True, slots=True)
 class Judged:
     """One frame. error: (6,) of T_o_b against the flight's start, as cov_o tells of it. off_m, off_rad: of the pose
-    that is claimed: T_m_b against where its submap began, T_o_b where there is none. tilt_rad: of T_l_b, nan while it
-    is held back.
+    that is claimed, T_m_b or where there is none T_o_b, against the flight's start: all submaps begin in the axes of o.
+    tilt_rad: of T_l_b, nan while it is held back.
     """
 
     estimate: Estimate
@@ -214,7 +214,6 @@ def fly(
     """Fly and judge each frame."""
     agent = Agent(rig, imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
     begin: tuple[F64, F64] | None = None
-    submaps: dict[int, tuple[F64, F64]] = {}
     for item in items:
         step = StepInput(item.frame, item.imu if imu is not None else None)
         e = agent.step(step, item.frame.t_ns).estimate
@@ -224,7 +223,7 @@ def fly(
         error = _error(begin, e.T_o_b, item.truth)
         claimed = error
         if e.T_m_b is not None:
-            claimed = _error(submaps.setdefault(int(e.submap), (e.T_m_b, item.truth)), e.T_m_b, item.truth)
+            claimed = _error(begin, e.T_m_b, item.truth)
         tilt = float("nan")
         if e.T_l_b is not None:
             tilt = float(np.arccos(np.clip((e.T_l_b[:3, :3] @ item.truth[:3, :3].T)[2, 2], -1.0, 1.0)))

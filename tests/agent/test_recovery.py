@@ -154,6 +154,8 @@ def test_out_of_the_wall_at_another_place(room: Recording, words: Vocabulary, re
     assert flown.submaps[-1] == 1 and flown.submaps[30] == 0
     assert flown.said("submap: joined") == []
     assert room.error_m(flown, shown, 1) < 0.04
+    young = [e.quality for e in flown.estimates if e.tracked and e.submap % MAX_SUBMAPS == 1]
+    assert max(young) < AgentConfig().certainty.flagged_below, "nobody knows how it lies to where the flight began"
     opened = next(h for h in flown.heads if h.keyframe >> 20 == flown.estimates[-1].submap)
     assert opened.parent == NO_KEYFRAME
 
