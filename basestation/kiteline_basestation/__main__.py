@@ -8,42 +8,38 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import os
 import signal
 import sys
 import threading
 import time
-import tomllib
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 
 from kiteline_basestation.combine import combine
-from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.flight_log import RESTORED, write_step
+from kiteline_basestation.flight_log import RESTORED, metadata_of, station_of, write_step
+from kiteline_basestation.flown import Flown, as_flown, settled, timings
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.keeper import Keeper, read_imports
 from kiteline_basestation.kept import Kept, pack
 from kiteline_basestation.management import Command
 from kiteline_basestation.narrator import Narrator
-from kiteline_basestation.outputs import counts, keyframe_poses, map_files
+from kiteline_basestation.outputs import counts, map_files
 from kiteline_basestation.restore import Restored, restore
-from kiteline_basestation.spec import BaseSpec, base_config, from_json, parser
+from kiteline_basestation.spec import BaseSpec, base_config, coded_channels, from_json, of_arguments, parser
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store import StoreError
 from kiteline_basestation.warm import warm, warm_graphs
 from kiteline_basestation.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_codec import warm as codec_warm
-from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
+from kiteline_codec.channel import RecordChannel
 from kiteline_codec.framing import StreamFramer
 from kiteline_codec.schema import WireError
-from kiteline_codec.seal import Direction, Opener, Sealer, seal_bytes, suite_for
-from kiteline_core import config as configuration
+from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core.ids import AgentId
 from kiteline_core.place_index import Vocabulary
 from kiteline_hw import process
@@ -55,7 +51,7 @@ from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, LinkHub, SourceError
 from kiteline_hw.sealed_link import SealedHub
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sim.link_model import LinkModelConfig, LinkModels
 from kiteline_hw.words import shipped_words
 from kiteline_hw.zenoh_link import ZenohHub
 from kiteline_hw.zenoh_lockstep import LockstepServer
@@ -71,21 +67,6 @@ _LIVE_WAIT_S = 0.005  # s between two looks at the links of a live base: small b
 _LIVE_STEP_NS = 50_000_000  # ns between two steps without news: keeps acknowledgements and heartbeats moving
 _SESSION_S = 1_735_689_600  # s of Unix time at which 2025 began: sessions are counted in seconds since then
 _MEMORY_STEPS = 10  # steps between two looks at the memory
-
-
-def settled(channel: RecordChannel) -> tuple[bool, bool]:
-    """Whether a channel is quiet, and whether both sides were seen to hold the same."""
-    if isinstance(channel, CodedChannel):
-        return channel.endpoint.quiet, channel.endpoint.digest_equal
-    return True, True
-
-
-@dataclass(slots=True)
-class Flown:
-    """The base at one moment: its counts, and where its keyframes are (T_w_k as 16 numbers by keyframe id)."""
-
-    counts: dict[str, int]
-    keyframes: dict[str, list[float]]
 
 
 class Ground:
@@ -125,11 +106,14 @@ class Ground:
         self._log: LogWriter | None = None
         if spec.log_name:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._log = LogWriter(self._folder / spec.log_name, _log_metadata(spec, self.config, plain))
+            self._log = LogWriter(self._folder / spec.log_name, metadata_of(spec, self.config, plain))
             self._log.text("/log", spec.start_ns, "info", f"base, session {spec.session}")
             self._log.flush()  # a base that dies at once leaves a log that can be read
         self._log_shift_ns = spec.start_ns
-        self._wires: dict[AgentId, LinkModel] = {}
+        disorder = LinkModelConfig(
+            loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder, delay_ns=round(spec.delay_s * 1e9)
+        )  # fmt: skip
+        self._wires = LinkModels(disorder, spec.seed * 64 + 32)
         self.keeper: Keeper | None = None
         self._imports: list[Import] = []
 
@@ -145,7 +129,7 @@ class Ground:
         """
         self.keeper = Keeper(Path(self.spec.store)) if self.spec.store else None
         held = kept = Kept() if self.keeper is None else self.keeper.load()
-        maps, self._imports = read_imports(self.spec.imports, station_of_log)
+        maps, self._imports = read_imports(self.spec.imports, lambda metadata: station_of(metadata, place_words()))
         for other in maps:
             kept = combine(kept, other)
         restored = None
@@ -198,8 +182,7 @@ class Ground:
 
     def snapshot(self) -> Flown:
         """The base as it stands."""
-        poses = keyframe_poses(self.station.mapper)
-        return Flown(counts(self.station.mapper), {str(k): pose.ravel().tolist() for k, pose in poses.items()})
+        return as_flown(self.station.mapper)
 
     def step(
         self,
@@ -219,8 +202,7 @@ class Ground:
         if self.keeper is not None:
             self.keeper.keep_at_times(self.station, now_ns)
         for agent, out in output.packets:
-            for packet in out:
-                self._wire(agent).send(packet, now_ns)
+            self._wires.send(agent, out, now_ns)
         self.step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
         self.jobs.add(output.jobs, now_ns)
         self.steps += 1
@@ -228,36 +210,22 @@ class Ground:
             self.rss_mib = max(self.rss_mib, rss_mib())
         return output
 
-    def _wire(self, agent: AgentId) -> LinkModel:
-        """The modelled link to an agent, made at first use."""
-        if agent not in self._wires:
-            spec = self.spec
-            model = LinkModelConfig(
-                loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder, delay_ns=round(spec.delay_s * 1e9)
-            )  # fmt: skip
-            self._wires[agent] = LinkModel(model, spec.seed * 64 + 32 + agent)
-        return self._wires[agent]
-
     def outgoing(self, now_ns: int) -> dict[AgentId, tuple[bytes, ...]]:
         """What leaves the modelled links by now."""
-        return {agent: tuple(wire.deliver(now_ns)) for agent, wire in sorted(self._wires.items())}
+        return {AgentId(agent): packets for agent, packets in self._wires.deliver(now_ns).items()}
 
     def report(self) -> dict[str, Any]:
         """The base's part of report.json, with raw samples in place of statistics."""
         self.frames_are_over()
         assert self.flown is not None
+        rss = max(self.rss_mib, rss_mib())
+        timing = {**timings(self.jobs.cpu_ms, self.step_ms), "rss_mib": round(rss, 1)}
+        drained = {"flight_ms": self.drained_ns // 1_000_000, **counts(self.station.mapper)}
+        lost = sorted(self.agents_lost)
         return {
-            **self.flown.counts,
-            "digest_equal": self.digest_equal,
-            "agents_lost": sorted(self.agents_lost),
-            "drain": {"flight_ms": self.drained_ns // 1_000_000, **counts(self.station.mapper)},
-            "timing": {
-                "bundle_ms": list(self.jobs.cpu_ms["bundle"]),
-                "grid_ms": list(self.jobs.cpu_ms["grid"]),
-                "step_ms": list(self.step_ms),
-                "rss_mib": round(max(self.rss_mib, rss_mib()), 1),
-            },
-        }
+            **self.flown.counts, "digest_equal": self.digest_equal, "agents_lost": lost, "drain": drained,
+            "timing": timing,
+        }  # fmt: skip
 
     def close(self) -> None:
         """Finish the store and the log."""
@@ -265,14 +233,6 @@ class Ground:
             self.keeper.close(self.station)
         if self._log is not None:
             self._log.close()
-
-
-def _log_metadata(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
-    unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
-    plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
-    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
-    channel = "PlainChannel" if plain_channels else "CodedChannel"
-    return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
 
 
 def place_words() -> Vocabulary | None:
@@ -283,20 +243,6 @@ def place_words() -> Vocabulary | None:
         )
         return None
     return shipped_words()
-
-
-def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
-    """Opens our end of the codec to an agent."""
-    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
-    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)
-
-
-def station_of_log(metadata: Mapping[str, str]) -> Station:
-    """A station as the one of a base's log was."""
-    config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
-    logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseSpec.__dataclass_fields__}
-    spec = from_json(json.dumps({"folder": "", **logged}))
-    return Station(config, coded_channels(replace(spec, link=spec.link + ":")), place_words())
 
 
 def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
@@ -354,7 +300,13 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         stack.callback(ground.close)
         _tell(ground.begin(clock.now_ns()), parent)
         questions = _questions(spec, plain, stack)
-        page = _page(spec, ground, clock.now_ns(), stack) if spec.web else None
+        page: StatusPage | None = None
+        if spec.web:
+            from kiteline_basestation.web.status_page import open_page  # the plain install lacks what it needs
+
+            page = open_page(spec.web, clock.now_ns())
+            stack.callback(page.close)
+            print(f"status page: {page.url}", file=sys.stderr)
         if parent is not None:
             parent.tell("ready")
         process.notify("READY=1")
@@ -445,19 +397,6 @@ def _questions(spec: BaseSpec, hub: LinkHub, stack: contextlib.ExitStack) -> Que
     return server
 
 
-def _page(spec: BaseSpec, ground: Ground, now_ns: int, stack: contextlib.ExitStack) -> StatusPage:
-    """The status page, served until the stack ends. Raises LinkError."""
-    from kiteline_basestation.web.status_page import StatusPage  # the plain install lacks what it needs
-
-    try:
-        page = StatusPage(spec.web, now_ns)
-    except ValueError as error:
-        raise LinkError(f"--web: {error}") from error
-    stack.callback(page.close)
-    print(f"status page: {page.url}", file=sys.stderr)
-    return page
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """`kiteline base`, and a child of `kiteline fly` (with --spec); the exit status."""
     p = parser()
@@ -469,11 +408,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline" / "base"
     # Seconds, so that a base on another machine, which knows nothing of this one, begins a later session all the same.
     session = process.next_number((Path(a.store) if a.store else state) / "session", int(time.time()) - _SESSION_S)
-    spec = BaseSpec(
-        folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
-        config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
-        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
-    )  # fmt: skip
+    spec = of_arguments(a, session)
     fly_live(spec, None, process.StopSignal())
     process.leave(0)
 

@@ -7,19 +7,42 @@ from the same inputs and hands it in at the same step.
 from __future__ import annotations
 
 import hashlib
+import json
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.kept import Codes, Kept, pack, unpack
 from kiteline_basestation.management import Command
-from kiteline_basestation.station import Import, StationOutput
+from kiteline_basestation.spec import BaseSpec, coded_channels, from_json
+from kiteline_basestation.station import Import, Station, StationOutput
+from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
+from kiteline_core.place_index import Vocabulary
 
 STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/import", "/command", "/answer"
+
+
+def metadata_of(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
+    """What a log says of its base, so that it can be run again."""
+    unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
+    plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
+    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
+    channel = "PlainChannel" if plain_channels else "CodedChannel"
+    return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
+
+
+def station_of(metadata: Mapping[str, str], words: Vocabulary | None) -> Station:
+    """A station as the one of a base's log was."""
+    config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
+    logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseSpec.__dataclass_fields__}
+    spec = from_json(json.dumps({"folder": "", **logged}))
+    return Station(config, coded_channels(replace(spec, link=spec.link + ":")), words)
 
 
 class StepLog(Protocol):

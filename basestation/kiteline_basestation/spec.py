@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
+from kiteline_core.ids import AgentId
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,3 +93,18 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--quiet", action="store_true", help="say nothing of how the flight goes")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
+
+
+def of_arguments(a: argparse.Namespace, session: int) -> BaseSpec:
+    """What `kiteline base` was told on the command line."""
+    return BaseSpec(
+        folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
+        config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
+        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
+    )  # fmt: skip
+
+
+def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
+    """Opens our end of the codec to an agent."""
+    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)

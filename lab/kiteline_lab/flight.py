@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from kiteline_agent.__main__ import Onboard
 from kiteline_agent.alone import AloneChannel
 from kiteline_agent.spec import AgentSpec
-from kiteline_basestation.__main__ import Ground, coded_channels
-from kiteline_basestation.spec import BaseSpec
+from kiteline_basestation.__main__ import Ground
+from kiteline_basestation.spec import BaseSpec, coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_hw import process
 from kiteline_hw.lockstep_messages import Down, Phase

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig, LinkModels
 
 chances = st.floats(0.0, 1.0)
 configs = st.builds(
@@ -129,3 +129,18 @@ def test_bursts_are_long() -> None:
 def test_settings_that_are_none(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         LinkModelConfig(**bad)  # type: ignore[arg-type]
+
+
+def test_each_receiver_has_a_link_of_its_own() -> None:
+    config = LinkModelConfig(loss=0.5, delay_ns=10)
+    links, alone = LinkModels(config, 40), LinkModel(config, 43)
+    assert links.deliver(0) == {}
+    packets = [bytes([k]) for k in range(100)]
+    links.send(3, packets, 0)
+    links.send(1, packets, 0)
+    for packet in packets:
+        alone.send(packet, 0)
+    assert links.deliver(5) == {1: (), 3: ()}
+    delivered = links.deliver(10)
+    assert list(delivered) == [1, 3]
+    assert delivered[3] == tuple(alone.deliver(10)) != delivered[1]

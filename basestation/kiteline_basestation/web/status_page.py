@@ -5,6 +5,7 @@ from __future__ import annotations
 from kiteline_basestation.station import Station
 from kiteline_basestation.web.overview import nothing, overview
 from kiteline_basestation.web.server import address, serve
+from kiteline_hw.ports import LinkError
 
 _PERIOD_NS = 400_000_000  # ns between two snapshots: a little faster than the page asks for them
 
@@ -32,3 +33,11 @@ class StatusPage:
     def close(self) -> None:
         """Stop serving."""
         self._handle.close()
+
+
+def open_page(where: str, now_ns: int) -> StatusPage:
+    """A page at HOST:PORT. Raises LinkError."""
+    try:
+        return StatusPage(where, now_ns)
+    except ValueError as error:
+        raise LinkError(f"--web: {error}") from error

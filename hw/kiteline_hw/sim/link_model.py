@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import random
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
 
@@ -141,3 +142,24 @@ class LinkModel:
     def next_ns(self) -> int | None:
         """When the next packet arrives, or None when nothing is under way."""
         return self._air[0][0] if self._air else None
+
+
+class LinkModels:
+    """One direction of a link to each of any number of receivers, each made at its first packet."""
+
+    def __init__(self, config: LinkModelConfig, seed: int) -> None:
+        """seed: of the link to receiver 0; each further one has the next."""
+        self._config = config
+        self._seed = seed
+        self._links: dict[int, LinkModel] = {}
+
+    def send(self, to: int, packets: Iterable[bytes], now_ns: int) -> None:
+        """Packets leave for a receiver."""
+        for packet in packets:
+            if to not in self._links:
+                self._links[to] = LinkModel(self._config, self._seed + to)
+            self._links[to].send(packet, now_ns)
+
+    def deliver(self, now_ns: int) -> dict[int, tuple[bytes, ...]]:
+        """What has arrived by now, by receiver; those without a link are left out."""
+        return {to: tuple(link.deliver(now_ns)) for to, link in sorted(self._links.items())}
