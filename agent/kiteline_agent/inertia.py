@@ -93,7 +93,7 @@ class Inertia:
         state = None if self.tracker is None else self.tracker.coast(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
             cov = self.odometer.coasted(predicted, t_ns)
-            trusted = cov is not None and self.odometer.blind_s <= self._config.trusted_blind_s
+            trusted = self.odometer.sure and self.odometer.blind_s <= self._config.trusted_blind_s
             return Coasted(predicted, cov, trusted)
         self.odometer.coasted(state.T_m_b @ self._T_b_c, t_ns)
         trusted = self.tracker.blind_s <= self._config.trusted_blind_s

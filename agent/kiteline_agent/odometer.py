@@ -51,7 +51,8 @@ class OdometerConfig:
     tolerance_m_s: float = 0.12  # expected noise above which it is not used; that of a good one is 0.05
     tolerance_share: float = 0.10  # of the speed, likewise
     proofs: int = 3  # windows in motion in which it agreed, before it is used
-    surprise: float = 4.0  # deviations from what was expected beyond which a single sample counts less
+    surprise: float = 4.0  # deviations from what was expected, beyond which it counts nothing: 8 m/s^2
+    settled: float = 0.4  # share of such a jump below which it has to fall again before it is used in the dark
     accel_m_s2: float = 2.0  # that a vehicle may have which only its odometer sees: leaning by twelve degrees
     turn_rad_s2: float = 2.0  # likewise
     seen_m_s: float = 0.05  # error of a velocity between two frames
@@ -91,6 +92,8 @@ class Odometer:
         self._velocity, self._rate = np.zeros(3), np.zeros(3)  # in b
         self._velocity_cov, self._rate_cov = np.eye(3), np.eye(3)
         self._velocity_slow, self._rate_slow = np.eye(3), np.eye(3)  # what of them lasts over frames
+        self._jump = 0.0  # m/s, of what it said in the dark and no vehicle does; 0: it may be believed
+        self._alone_s = 0.0  # since it was last believed
         self._carried = False  # the last prediction rests on the odometer
         self._gain = np.zeros((3, 3))  # of that prediction, in b
         self.blind_s = 0.0
@@ -112,6 +115,11 @@ class Odometer:
     def trusted(self) -> bool:
         """Whether it has agreed with the images of late."""
         return self._trusted
+
+    @property
+    def sure(self) -> bool:
+        """Whether it was believed in the last prediction."""
+        return self._carried and self._alone_s == 0.0
 
     @property
     def carries(self) -> bool:
@@ -165,21 +173,36 @@ class Odometer:
             return None
         before_ns = self._last[0]
         driven = self._between(before_ns, t_ns)
-        if driven is None:
+        if driven is None and self.blind_s == 0.0:
             return None
         c, dt = self._config, (t_ns - before_ns) * 1e-9
-        z = self.scale * driven.velocity
-        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
-        prior = self._velocity_cov + (c.accel_m_s2 * dt) ** 2 * np.eye(3)
-        told = _blend(self._velocity, prior, z, driven.velocity_cov, slow, c.surprise)
-        self._velocity, self._velocity_cov, self._velocity_slow, self._gain = told
-        slow = (self._turn_noise + c.floor_rad_s**2) * np.eye(3)
-        prior = self._rate_cov + (c.turn_rad_s2 * dt) ** 2 * np.eye(3)
-        told = _blend(self._rate, prior, driven.rate, driven.rate_cov, slow, c.surprise)
-        self._rate, self._rate_cov, self._rate_slow, _ = told
+        grown = dt * (dt + 2.0 * self._alone_s) * np.eye(3)  # what nobody measures changes for longer and longer
+        prior, rate_prior = self._velocity_cov + c.accel_m_s2**2 * grown, self._rate_cov + c.turn_rad_s2**2 * grown
+        if driven is None or not self._take(driven, prior, rate_prior):
+            self._alone_s += dt
+            self._velocity_cov = self._velocity_slow = prior
+            self._rate_cov = self._rate_slow = rate_prior
+            self._gain = np.zeros((3, 3))
         self._carried = True
         T_b0_b1 = se3.exp(dt * np.concatenate([self._velocity, self._rate]))
         return se3.orthonormalise(T_m_c @ self._T_c_b @ T_b0_b1 @ self._T_b_c)
+
+    def _take(self, driven: _Driven, prior: F64, rate_prior: F64) -> bool:
+        """Let what was measured change the velocity; False where no vehicle moves like that: it slips, or is dead."""
+        c = self._config
+        z = self.scale * driven.velocity
+        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
+        told = _blend(self._velocity, prior, z, driven.velocity_cov, slow, c.surprise)
+        jump = float(np.linalg.norm(z - self._velocity))
+        if not told.expected or jump > c.settled * self._jump > 0.0:
+            self._jump = max(self._jump, jump) if self.blind_s > 0.0 else 0.0
+            return False
+        self._jump = self._alone_s = 0.0
+        self._velocity, self._velocity_cov, self._velocity_slow, self._gain = told.value, told.cov, told.slow, told.gain
+        slow = (self._turn_noise + c.floor_rad_s**2) * np.eye(3)
+        told = _blend(self._rate, rate_prior, driven.rate, driven.rate_cov, slow, c.surprise)
+        self._rate, self._rate_cov, self._rate_slow = told.value, told.cov, told.slow
+        return True
 
     def seen(self, T_m_c: F64, t_ns: int) -> None:
         """The images (and an IMU) placed the camera at T_m_c (4,4)."""
@@ -232,9 +255,9 @@ class Odometer:
         value = self.scale * _measured(cov, _ANY) @ samples.velocity[mine].mean(axis=0)
         # errors last longer than a frame: so many frames count as one
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(value, value)
-        cov = cov + max(1.0, 2.0 * c.correlation_s / dt) * slow
+        counted = cov + max(1.0, 2.0 * c.correlation_s / dt) * slow
         age_s = float(np.mean(t_ns - samples.t_ns[mine])) * 1e-9
-        return BodyVelocity(value, cov, age_s)
+        return BodyVelocity(value, cov + slow, counted, age_s)
 
     # the map changes
 
@@ -276,7 +299,7 @@ class Odometer:
     # parts
 
     def _begin_sight(self) -> None:
-        self.blind_s = 0.0
+        self.blind_s = self._jump = self._alone_s = 0.0
         self._way, self._way_cov, self._way_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
         self._turn_cov, self._turn_cross = np.zeros((3, 3)), np.zeros((3, 3))
 
@@ -387,17 +410,26 @@ def _measured(cov: F64, limit: float) -> F64:
     return np.asarray(limit * np.linalg.inv(cov + limit * np.eye(3)))
 
 
-def _blend(value: F64, cov: F64, measured: F64, fast: F64, slow: F64, surprise: float) -> tuple[F64, F64, F64, F64]:
-    """The Kalman update of a vector (3,) with a measurement of all of it, whose noise grows where it surprises.
+@dataclass(slots=True)
+class _Blended:
+    """A vector (3,), its covariance (3,3), what of that lasts over frames, the gain (3,3); whether it was expected."""
 
-    fast, slow: (3,3) of its noise, from sample to sample and lasting. Value, covariance, what of the covariance lasts,
-    and gain (3,3).
+    value: F64
+    cov: F64
+    slow: F64
+    gain: F64
+    expected: bool
+
+
+def _blend(value: F64, cov: F64, measured: F64, fast: F64, slow: F64, surprise: float) -> _Blended:
+    """The Kalman update of a vector (3,) with a measurement of all of it, unless that surprises.
+
+    fast, slow: (3,3) of its noise, from sample to sample and lasting.
     """
     off = measured - value
-    square = float(off @ np.linalg.solve(cov + fast + slow, off))
-    if square > surprise * surprise:
-        slow = slow + (square / (surprise * surprise) - 1.0) * (fast + slow)
+    if float(off @ np.linalg.solve(cov + fast + slow, off)) > surprise * surprise:
+        return _Blended(value, cov, cov, np.zeros((3, 3)), False)
     gain = cov @ np.linalg.inv(cov + fast + slow)
     left = np.eye(3) - gain
     lasting = left @ cov @ left.T + gain @ slow @ gain.T
-    return value + gain @ off, lasting + gain @ fast @ gain.T, lasting, gain
+    return _Blended(value + gain @ off, lasting + gain @ fast @ gain.T, lasting, gain, True)

@@ -71,11 +71,13 @@ class VisualPoints:
 @dataclass(frozen=True, slots=True)
 class BodyVelocity:
     """What an odometer measured. value: (3,) m/s of the body's origin in the body's axes. cov: (3,3) of it, huge where
-    nothing was measured. age_s: how long before the frame.
+    nothing was measured. counted: (3,3) as what it counts beside those of other frames, whose errors are alike. age_s:
+    how long before the frame.
     """
 
     value: F64
     cov: F64
+    counted: F64
     age_s: float = 0.0
 
 
@@ -310,7 +312,8 @@ class FixedLagSmoother:
         if not square < c.velocity_gate:
             return
         self._vel[k] = value
-        self._vel_info[k] = np.linalg.inv(cov) * min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
+        weight = min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
+        self._vel_info[k] = weight * np.linalg.inv(turned.T @ driven.counted @ turned)
 
     def _relinearise_biases(self) -> None:
         """Integrate again where the bias has left the neighbourhood in which its first-order correction holds."""

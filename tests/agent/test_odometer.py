@@ -186,12 +186,26 @@ def test_a_slip_ends_the_trust_at_once_and_it_comes_back() -> None:
     assert flown.odometer.scale == pytest.approx(1.0, abs=0.02)  # a slip is no matter of scale
 
 
-def test_a_slip_while_blind_counts_less_than_what_is_likely() -> None:
+def test_a_short_slip_while_blind_is_passed_over() -> None:
     batch = driven(6.0)
     velocity = batch.velocity.copy()
     velocity[(batch.t_ns > 4.5e9) & (batch.t_ns < 4.7e9)] *= 4.0  # 0.2 s: 0.8 m too far
     slipped = Flown(replace(batch, velocity=velocity), 6.0, blind_from_s=4.0)
-    assert np.linalg.norm(slipped.error(6.0)[:3]) < 0.4
+    assert np.linalg.norm(slipped.error(6.0)[:3]) < 0.15
+    assert slipped.odometer.sure
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.6, 3.0])
+def test_a_slip_while_blind_that_lasts_is_not_followed(factor: float) -> None:
+    batch = driven(6.0)
+    velocity = batch.velocity.copy()
+    velocity[batch.t_ns > 4.2e9] *= factor
+    slipped = Flown(replace(batch, velocity=velocity), 6.0, blind_from_s=4.0)
+    plain = Flown(None, 6.0, blind_from_s=4.0)
+    error = slipped.error(6.0)
+    assert np.linalg.norm(error[:3]) < np.linalg.norm(plain.error(6.0)[:3])
+    assert error @ np.linalg.solve(slipped.cov, error) < 22.5  # 99.9 % of 6 degrees of freedom
+    assert not slipped.odometer.sure
 
 
 def test_stamps_of_another_clock_are_told_of() -> None:
@@ -205,6 +219,10 @@ def test_an_odometer_that_falls_silent_is_not_guessed_at() -> None:
     batch = driven(6.0)
     flown = Flown(odometry.chosen(batch, batch.t_ns < 4_000_000_000), 6.0)
     assert flown.trusted[70]
+    blind = Flown(odometry.chosen(batch, batch.t_ns < 4_500_000_000), 6.0, blind_from_s=4.0)
+    assert not blind.odometer.sure
+    error = blind.error(6.0)
+    assert error @ np.linalg.solve(blind.cov, error) < 22.5
     assert flown.odometer.predict(flown.pose, 6_000_000_000) is None
     assert not flown.odometer.carries
 

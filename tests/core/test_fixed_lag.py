@@ -129,7 +129,8 @@ def fly(
         velocity = None
         if driven is not None:
             true = flight.pose(k + 1)[:3, :3].T @ flight.velocity[(k + 1) * FRAME_STEPS]
-            velocity = BodyVelocity(true + driven + 0.05 * rng.normal(size=3), 0.05**2 * np.eye(3))
+            cov = 0.05**2 * np.eye(3)
+            velocity = BodyVelocity(true + driven + 0.05 * rng.normal(size=3), cov, cov)
         state = smoother.add(measured.samples(k), points, velocity)
         assert state is not None
         states.append(state)
@@ -374,7 +375,9 @@ def test_an_older_velocity_is_brought_to_the_frame() -> None:
         for k in range(12):
             late = (k + 1) * FRAME_STEPS - round(0.04 / STEP_S)
             value = flight.T[late, :3, :3].T @ flight.velocity[late]
-            state = smoother.add(flight.samples(k), None, BodyVelocity(value, 1e-4**2 * np.eye(3), age_s))
+            state = smoother.add(
+                flight.samples(k), None, BodyVelocity(value, 1e-8 * np.eye(3), 1e-8 * np.eye(3), age_s)
+            )
             assert state is not None
         errors.append(float(np.linalg.norm(state.velocity - flight.velocity[12 * FRAME_STEPS])))
     assert errors[0] < 0.01
