@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core import odometry, se3
+from kiteline_agent.odometer_samples import Driven, OdometerSamples, measured
+from kiteline_core import se3
 from kiteline_core.fixed_lag import BodyVelocity
 from kiteline_core.frame import OdometryBatch
 
 F64 = NDArray[np.float64]
 
-_ANY = 100.0  # (m/s)^2 or (rad/s)^2; what is measured at all is measured far better
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
 
 
@@ -64,16 +64,6 @@ class OdometerConfig:
     unit_share: float = 0.7  # of the windows that have to agree
 
 
-@dataclass(slots=True)
-class _Driven:
-    """Means over an interval, in b: velocity (3,) m/s, rate (3,) rad/s, covariances (3,3) of one sample."""
-
-    velocity: F64
-    rate: F64
-    velocity_cov: F64
-    rate_cov: F64
-
-
 class Odometer:
     """Once a frame: `predict`, then `seen` with the measured pose or `coasted` without one. Pure; no clocks."""
 
@@ -82,7 +72,7 @@ class Odometer:
         self._T_b_c, self._T_c_b = T_b_c, se3.inverse(T_b_c)
         self._config = config
         self.metric = metric
-        self._samples: OdometryBatch | None = None
+        self._samples = OdometerSamples(config.keep_s, config.max_gap_s)
         self.scale, self._scale_var = 1.0, config.scale_start**2  # true velocity = scale * measured
         self._noise, self._turn_noise = config.start_m_s**2, config.start_rad_s**2  # variances
         self._proofs = 0
@@ -109,7 +99,7 @@ class Odometer:
     @property
     def heard(self) -> bool:
         """Whether there is an odometer at all."""
-        return self._samples is not None
+        return self._samples.any
 
     @property
     def trusted(self) -> bool:
@@ -153,18 +143,9 @@ class Odometer:
     # once a frame
 
     def hear(self, batch: OdometryBatch | None) -> None:
-        """Take in samples; those not newer than the newest, or not finite, are passed over."""
-        if batch is None or not self._config.use or len(batch.t_ns) == 0:
-            return
-        good = odometry.usable(batch)
-        if self._samples is not None and len(self._samples.t_ns):
-            good &= batch.t_ns > self._samples.t_ns[-1]
-        joined = odometry.joined([b for b in (self._samples, odometry.chosen(batch, good)) if b is not None])
-        assert joined is not None
-        if len(joined.t_ns):
-            first = int(np.searchsorted(joined.t_ns, joined.t_ns[-1] - int(self._config.keep_s * 1e9)))
-            joined = odometry.chosen(joined, slice(first, len(joined.t_ns)))
-        self._samples = joined
+        """Take in samples."""
+        if self._config.use:
+            self._samples.hear(batch)
 
     def predict(self, T_m_c: F64, t_ns: int) -> F64 | None:
         """T_m_c (4,4) at t_ns from the pose (4,4) of the last frame; None where the odometer cannot tell."""
@@ -172,7 +153,7 @@ class Odometer:
         if not self.heard or not self._trusted or not self.metric or self._last is None:
             return None
         before_ns = self._last[0]
-        driven = self._between(before_ns, t_ns)
+        driven = self._samples.between(before_ns, t_ns)
         if driven is None and self.blind_s == 0.0:
             return None
         c, dt = self._config, (t_ns - before_ns) * 1e-9
@@ -187,7 +168,7 @@ class Odometer:
         T_b0_b1 = se3.exp(dt * np.concatenate([self._velocity, self._rate]))
         return se3.orthonormalise(T_m_c @ self._T_c_b @ T_b0_b1 @ self._T_b_c)
 
-    def _take(self, driven: _Driven, prior: F64, rate_prior: F64) -> bool:
+    def _take(self, driven: Driven, prior: F64, rate_prior: F64) -> bool:
         """Let what was measured change the velocity; False where no vehicle moves like that: it slips, or is dead."""
         c = self._config
         z = self.scale * driven.velocity
@@ -227,11 +208,13 @@ class Odometer:
         if not self._carried:
             return None
         r = T_m_c[:3, :3] @ self._T_c_b[:3, :3]
-        relax = dt / self._config.correlation_s * (r @ self._gain @ r.T)
+        ended = min(dt / self._config.correlation_s, 1.0)  # share of errors that gave way to others
+        relax = ended * (r @ self._gain @ r.T)
         self._way = self._way + (T_m_c[:3, 3] - before[1][:3, 3])
         self._way_cross = self._way_cross + dt * (r @ self._velocity_slow @ r.T) - relax @ self._way_cross
         self._way_cov = self._way_cov + dt * (self._way_cross + self._way_cross.T)
-        self._turn_cross = (1.0 - dt / self._config.correlation_s) * self._turn_cross + dt * self._rate_slow
+        turn_cross = self._turn_cross if self._alone_s > 0.0 else (1.0 - ended) * self._turn_cross
+        self._turn_cross = turn_cross + dt * self._rate_slow
         self._turn_cov = self._turn_cov + dt * (self._turn_cross + self._turn_cross.T)
         arm = se3.skew(self._way)
         cov = np.zeros((6, 6))
@@ -245,18 +228,15 @@ class Odometer:
         c = self._config
         if not self.heard or not self._trusted or not self.metric or self._last is None:
             return None
-        samples, before_ns = self._samples, self._last[0]
-        assert samples is not None
-        mine = (samples.t_ns > before_ns) & (samples.t_ns <= t_ns)
-        if not mine.any():
+        before_ns = self._last[0]
+        told = self._samples.within(before_ns, t_ns)
+        if told is None:
             return None
+        value, cov, age_s = self.scale * told[0], told[1], told[2]
         dt = (t_ns - before_ns) * 1e-9
-        cov = samples.velocity_cov[mine].mean(axis=0)
-        value = self.scale * _measured(cov, _ANY) @ samples.velocity[mine].mean(axis=0)
         # errors last longer than a frame: so many frames count as one
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(value, value)
         counted = cov + max(1.0, 2.0 * c.correlation_s / dt) * slow
-        age_s = float(np.mean(t_ns - samples.t_ns[mine])) * 1e-9
         return BodyVelocity(value, cov + slow, counted, age_s)
 
     # the map changes
@@ -310,29 +290,6 @@ class Odometer:
         self._velocity, self._rate = twist[:3], twist[3:]
         self._velocity_cov, self._rate_cov = c.seen_m_s**2 * np.eye(3), c.seen_rad_s**2 * np.eye(3)
 
-    def _between(self, from_ns: int, to_ns: int) -> _Driven | None:
-        """Means over an interval, the ends interpolated (held beyond the newest sample); None with a hole."""
-        samples, gap_ns = self._samples, int(self._config.max_gap_s * 1e9)
-        if samples is None or len(samples.t_ns) == 0 or to_ns <= from_ns:
-            return None
-        t = samples.t_ns
-        lo, hi = int(np.searchsorted(t, from_ns, "right")), int(np.searchsorted(t, to_ns, "left"))
-        inside = t[max(lo - 1, 0) : hi + 1]
-        ends = np.concatenate([[max(from_ns, int(inside[0]))], inside[(inside > from_ns) & (inside < to_ns)], [to_ns]])
-        if t[0] > from_ns + gap_ns or t[-1] < to_ns - gap_ns or np.diff(inside).max(initial=0) > gap_ns:
-            return None
-        at = np.concatenate([[from_ns], ends[1:-1], [to_ns]])
-        weight = np.zeros(len(at))
-        steps = np.diff(at) / (to_ns - from_ns)
-        weight[:-1] += 0.5 * steps
-        weight[1:] += 0.5 * steps
-        seconds, now = (t - from_ns) * 1e-9, (at - from_ns) * 1e-9
-        values = np.concatenate([samples.velocity, samples.rate], axis=1)
-        mean = np.array([weight @ np.interp(now, seconds, values[:, i]) for i in range(6)])
-        some = slice(max(min(lo, hi - 1), 0), max(hi, 1))
-        cov, rate_cov = samples.velocity_cov[some].mean(axis=0), samples.rate_cov[some].mean(axis=0)
-        return _Driven(_measured(cov, _ANY) @ mean[:3], _measured(rate_cov, _ANY) @ mean[3:], cov, rate_cov)
-
     def _compare(self, T_m_c: F64, t_ns: int) -> None:
         """Look at a window once it is long enough."""
         c = self._config
@@ -344,7 +301,7 @@ class Odometer:
         if dt < (c.compare_s if self.metric else c.unit_window_s) - 1e-3:
             return
         self._anchor = (t_ns, T_m_c)
-        driven = self._between(before_ns, t_ns)
+        driven = self._samples.between(before_ns, t_ns)
         if driven is None:
             self._unmatched += self._compared == 0
             return
@@ -355,12 +312,12 @@ class Odometer:
         turn = self._T_b_c[:3, :3] @ se3.so3_log(T_c0_c1[:3, :3])
         swung = (self._T_c_b @ se3.exp(np.concatenate([np.zeros(3), turn])) @ self._T_b_c)[:3, 3]
         moved = r_c_b @ se3.exp(np.concatenate([dt * driven.velocity, turn]))[:3, 3]
-        known = _measured(r_c_b @ driven.velocity_cov @ r_c_b.T, _WELL)
+        known = measured(r_c_b @ driven.velocity_cov @ r_c_b.T, _WELL)
         if not self.metric:
             self._note_unit(known @ (moved + swung), known @ T_c0_c1[:3, 3])
             return
         self._judge(known @ moved, known @ (T_c0_c1[:3, 3] - swung), float(np.trace(known)), dt)
-        known = _measured(driven.rate_cov, _WELL)
+        known = measured(driven.rate_cov, _WELL)
         error = known @ (driven.rate - turn / dt)
         square = float(error @ error) / max(float(np.trace(known)), 0.5)
         self._turn_noise = self._expected(self._turn_noise, square, dt)
@@ -403,11 +360,6 @@ class Odometer:
         along = float(driven @ seen)
         self._units.append((along / (b * b), along > self._config.aligned * a * b))
         del self._units[: -self._config.unit_windows]
-
-
-def _measured(cov: F64, limit: float) -> F64:
-    """(3,3) that leaves of a vector what is measured: 1 where the variance is far below `limit`, 0 where far above."""
-    return np.asarray(limit * np.linalg.inv(cov + limit * np.eye(3)))
 
 
 @dataclass(slots=True)

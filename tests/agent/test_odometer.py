@@ -227,6 +227,22 @@ def test_an_odometer_that_falls_silent_is_not_guessed_at() -> None:
     assert not flown.odometer.carries
 
 
+def test_one_stamp_of_the_future_does_not_silence_it() -> None:
+    batch = driven(6.0)
+    t_ns = batch.t_ns.copy()
+    t_ns[120] += 3_600_000_000_000
+    flown = Flown(None, 0.0)
+    odometer = flown.odometer
+    odometer.restart(camera_at(0.0), 0)
+    for k in range(1, 120):
+        now_ns = k * FRAME_NS
+        mine = (batch.t_ns > now_ns - FRAME_NS) & (batch.t_ns <= now_ns)
+        odometer.hear(odometry.chosen(replace(batch, t_ns=t_ns), mine))
+        odometer.seen(camera_at(now_ns * 1e-9), now_ns)
+    assert odometer.trusted
+    assert odometer.predict(camera_at(5.95), 6_000_000_000) is not None
+
+
 def test_without_use_nothing_is_looked_at() -> None:
     flown = Flown(driven(3.0), 3.0, config=OdometerConfig(use=False))
     assert not flown.odometer.heard
