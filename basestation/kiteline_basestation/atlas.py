@@ -82,6 +82,7 @@ class Atlas:
         self._graph_due: set[SubmapId] = set()
         self._full_due: set[SubmapId] = set()
         self._plain: set[SubmapId] = set()  # of those, the ones whose disparities are to be taken as they are
+        self._doubted: dict[SubmapId, int] = {}  # keyframes of maps at which offsets were last looked for in vain
         self._graphs: dict[int, SubmapId] = {}  # open jobs
         self._fulls: dict[int, tuple[SubmapId, Window, tuple[AgentId, ...]]] = {}  # whose disparities are found, too
         self._revisit: list[KeyframeId] = []  # keyframes of merged maps that have not looked around in the other yet
@@ -109,6 +110,11 @@ class Atlas:
     def fits(self, island: SubmapId) -> bool:
         """Whether one bundle can hold a whole map."""
         return len(keyframes_of(self._map, island)) <= self._config.graph.max_full
+
+    def _keeps_disparities(self, island: SubmapId) -> bool:
+        """Whether offsets were looked for in vain just now, or in a map that was hardly smaller."""
+        enough = self._config.disparity.again * self._doubted.get(island, 0)
+        return island in self._plain or len(keyframes_of(self._map, island)) < enough
 
     def bundle_all(self, island: SubmapId) -> None:
         """Bundle a whole map anew."""
@@ -161,7 +167,7 @@ class Atlas:
             part = self._whole(island)
             if part is not None:
                 agents: tuple[AgentId, ...] = ()
-                if self.fits(island) and island not in self._plain:
+                if self.fits(island) and not self._keeps_disparities(island):
                     problem, agents = disparity.with_border(
                         self._map, part.slots, part.problem, self._config.disparity
                     )  # fmt: skip
@@ -186,9 +192,11 @@ class Atlas:
             result = without_links(part, done.result)
             if agents and not disparity.stands_out(result, self._config.disparity):
                 disparity.forget(self._map, agents)
+                self._doubted[island] = len(keyframes_of(self._map, island))
                 self._plain.add(island)  # nothing is known to be off: the same again, with disparities as they are
                 self._full_due.add(island)
-            elif self._settle(island, part, result):
+            elif self._settle(island, part, result) and agents:
+                self._doubted.pop(island, None)
                 disparity.take(self._map, agents, part.problem, result, self._config.disparity)
             return True
         return False
@@ -206,6 +214,7 @@ class Atlas:
                 "loops": self.loops,
                 "undone": self.undone,
                 "returned": [[int(s), at] for s, at in self._returned.items()],
+                "doubted": [[int(s), size] for s, size in sorted(self._doubted.items())],
                 "graphs": sorted({int(s) for s in self._graph_due | set(self._graphs.values())}),
                 "fulls": sorted({int(s) for s in self._full_due | {full[0] for full in self._fulls.values()}}),
                 "revisit": [int(k) for k in self._revisit],
@@ -240,6 +249,7 @@ class Atlas:
         for _, value in parsed(texts, "atlas"):
             self.loops, self.undone = value["loops"], value["undone"]
             self._returned = {SubmapId(s): at for s, at in value["returned"]}
+            self._doubted = {SubmapId(s): size for s, size in value.get("doubted", [])}
             self._graph_due = {SubmapId(s) for s in value["graphs"] if s in sparse_map.submaps}
             self._full_due = {SubmapId(s) for s in value["fulls"] if s in sparse_map.submaps}
             self._revisit = [KeyframeId(k) for k in value["revisit"] if k in sparse_map]

@@ -151,6 +151,8 @@ class GraphConfig:
     iterations: int = 8
     scaled_iterations: int = 30  # with scales, in which the graph is bent farther
     stop: float = 1e-4  # relative gain below which more iterations change nothing
+    first_full: int = 12  # keyframes after which a whole map is first bundled
+    full_share: float = 0.03  # of the worker's time that bundles of whole maps may take: for 100 keyframes every 3 s
     max_full: int = 800  # keyframes that a full bundle moves, in 0.4 s; of a larger map, those around the loop
     robust_trials: int = 6  # of the full bundle before the outlier test
     final_trials: int = 6  # after it
@@ -162,8 +164,7 @@ class GraphConfig:
 class DisparityConfig:
     """What an agent's disparities are off by, found by bundles of a whole map."""
 
-    first: int = 12  # keyframes after which such a bundle is first asked for
-    growth: float = 1.25  # of the number of keyframes from one to the next: each knows the map better
+    again: float = 1.1  # growth of the map after which an offset that was not believed is looked for again
     prior_px: float = 0.1  # one deviation of a constant offset: what calibrations are good to
     prior_rad: float = 3e-4  # of the turn of a right camera (times the focal length: px where x or y is 1)
     inflation: float = 3.0  # of deviations of what is found: the lens bends what motion tells of depths, too

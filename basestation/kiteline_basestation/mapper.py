@@ -23,6 +23,7 @@ from kiteline_basestation.memory import Json, Memory, matrix, parsed, plain, sim
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
+from kiteline_basestation.whole_maps import WholeMaps
 from kiteline_basestation.world_view import world_view
 from kiteline_codec.schema import Calibration, Key, Kind, Live, Record
 from kiteline_core import se3, sim3
@@ -89,7 +90,7 @@ class Mapper:
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
         self._told: dict[AgentId, F64] = {}  # offsets of disparities as agents have them
-        self._calibrate_at = self.config.disparity.first  # keyframes, when offsets of disparities are next looked at
+        self._whole = WholeMaps(self.config.graph)
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
         self.atlas: Atlas | None = None
@@ -103,7 +104,7 @@ class Mapper:
         self._set_upright()  # where an agent has learnt which way is up
         self._set_metric()  # where one eye has learnt how long its first map is
         for done in given.done:
-            self._finish(done)  # refined poses and points, outliers, grid
+            self._finish(done, now_ns)  # refined poses and points, outliers, grid
         answers = tuple(management.answer(self, command, now_ns) for command in given.commands)
         for keyframe in self._intake.ready(now_ns):
             self._place(keyframe)  # the first submap is the world
@@ -119,7 +120,7 @@ class Mapper:
             self._grid_due += 1
             self.counts.keyframes += 1
         self._go_on_with_atlas()
-        self._calibrate()
+        self._bundle_whole_maps(now_ns)
         self._tell_calibrations()
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.atlas is not None:
@@ -158,7 +159,7 @@ class Mapper:
                 "placed": [int(s) for s in self.placements],
                 "stale": [[int(s), sorted({int(k) for k in waiting})] for s, waiting in sorted(stale.items())],
                 "unused": [int(k) for k in self._intake.unused],
-                "calibrate_at": self._calibrate_at,
+                "bundled": [[int(s), size] for s, size in sorted(self._whole.bundled.items())],
                 "carried": [[int(s), matrix(T)] for s, T in self._carried.items()],
                 "deleted": sorted(int(s) for s in self.deleted),
             }
@@ -200,7 +201,7 @@ class Mapper:
                 if here := [KeyframeId(k) for k in waiting if k in self.map]:
                     self._stale[SubmapId(submap)] = here
             unused = {KeyframeId(k) for k in value["unused"]}
-            self._calibrate_at = value["calibrate_at"]
+            self._whole.bundled = {SubmapId(s): size for s, size in value.get("bundled", [])}
             self._carried = {SubmapId(s): similarity_of(S) for s, S in value["carried"]}
             self._intake.deleted = {SubmapId(s) for s in value["deleted"]}
         self._intake.keep_unused(unused)
@@ -241,7 +242,7 @@ class Mapper:
     @property
     def idle(self) -> bool:
         """Whether no job is open and nothing is left to be done with what came."""
-        settled = self.atlas is None or self.atlas.idle
+        settled = self.atlas is None or (self.atlas.idle and not self._whole.waiting(self._sizes()))
         return settled and not (self._intake.backlog or self._windows or self._stale or self._grid_job)
 
     def summary(self) -> dict[str, object]:
@@ -344,8 +345,10 @@ class Mapper:
         self.placements[submap] = self._carried[submap] = S_w_m
         self._publisher.place(submap, S_w_m)
 
-    def _finish(self, done: JobDone) -> None:
+    def _finish(self, done: JobDone, now_ns: int) -> None:
         if self.atlas is not None and self.atlas.finish(done):
+            if isinstance(done.result, BundleResult):
+                self._whole.done(done.cost_ops, now_ns)
             return
         if isinstance(done.result, BundleResult):
             opened = self._windows.pop(done.id, None)
@@ -385,14 +388,21 @@ class Mapper:
             self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
         self.atlas.moved.clear()
 
-    def _calibrate(self) -> None:
-        """Now and then, bundle whole maps, in which the offsets of disparities show."""
-        if self.atlas is None or self.counts.keyframes == 0 or len(self.map) < self._calibrate_at:
-            return
-        self._calibrate_at = round(len(self.map) * self.config.disparity.growth)
-        for island in sorted({self.map.island_of(s) for s in self.map.submaps}):
-            if self.atlas.fits(island) and not self.atlas.busy_with(island):
-                self.atlas.bundle_all(island)
+    def _bundle_whole_maps(self, now_ns: int) -> None:
+        """Bundle a whole map that has grown, when there is time for it."""
+        if self.atlas is not None:
+            sizes = self._sizes()
+            chosen = self._whole.next(sizes, [m for m in sizes if self.atlas.busy_with(m)], now_ns)
+            if chosen is not None:
+                self.atlas.bundle_all(chosen)
+
+    def _sizes(self) -> dict[SubmapId, int]:
+        """The number of keyframes of each map that one bundle can hold."""
+        out: dict[SubmapId, int] = {}
+        for submap, keyframes in self.map.submaps.items():
+            island = self.map.island_of(submap)
+            out[island] = out.get(island, 0) + len(keyframes)
+        return {island: size for island, size in out.items() if size <= self.config.graph.max_full}
 
     def _tell_calibrations(self) -> None:
         """Agents track better on disparities without the offset that was found."""

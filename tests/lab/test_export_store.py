@@ -100,7 +100,7 @@ def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.Ca
                 "placed": [submap_id(0, 1, 0)],
                 "stale": [],
                 "unused": [],
-                "calibrate_at": 0,
+                "bundled": [],
                 "carried": [],
                 "deleted": [],
             }
