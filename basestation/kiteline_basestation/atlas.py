@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation import disparity, refind
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.correction import gauge, graph_of, keyframes_of, move_keyframes, rescale
+from kiteline_basestation.correction import graph_of, keyframes_of, move_keyframes, rescale
 from kiteline_basestation.covisibility import Window, covisible_keyframes, window
 from kiteline_basestation.essential_graph import GraphResult
 from kiteline_basestation.jobs import BundleInputs, Job, JobDone
@@ -75,6 +75,7 @@ class Atlas:
         self.merges: list[Merge] = []
         self.undone = 0
         self.moved: set[SubmapId] = set()  # maps (eldest submap) that moved as a whole since the mapper last asked
+        self.grown: dict[SubmapId, float] = {}  # by what units grew in their maps since the mapper last asked
         self.parted: set[SubmapId] = set()  # submaps that were taken out of a map since the mapper last asked
         self._returned: dict[SubmapId, int] = {}  # where in each submap the way last was where it had been before
         self._edges: list[Overlap] = []  # proved loops, edges of the pose graph
@@ -320,16 +321,17 @@ class Atlas:
     def _bend(self, island: SubmapId, result: GraphResult) -> None:
         targets = {KeyframeId(k): T for k, T in zip(result.keyframes.tolist(), result.T_w_k)}
         growth = {KeyframeId(k): s for k, s in zip(result.keyframes.tolist(), result.scale.tolist())}
-        held = gauge(self._map, island, growth)
-        if held is not None:
-            for T in targets.values():
-                T[:3, 3] = held[1] + (T[:3, 3] - held[1]) / held[0]
-            growth = {k: s / held[0] for k, s in growth.items()}
-        self._stretch(rescale(self._map, island, growth, self._publisher))
+        units, lengths = rescale(self._map, island, growth, self._publisher)
+        self._note_growth(units)
+        self._stretch(lengths)
         move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
         self.moved.add(island)
         self._fuse_fresh(island)
         self._full_due.add(island)
+
+    def _note_growth(self, units: Mapping[SubmapId, float]) -> None:
+        for submap, more in units.items():
+            self.grown[submap] = self.grown.get(submap, 1.0) * more
 
     def _stretch(self, grown: Mapping[KeyframeId, float]) -> None:
         """Lengths have grown before some keyframes: so have those of what was proved there."""
@@ -385,7 +387,8 @@ class Atlas:
         if self._contradicted(island, part, result):
             return False
         if self.fits(island):
-            result = keep_units(self._map, island, part, result)
+            result, units = keep_units(self._map, island, part, result)
+            self._note_growth(units)
         rows = part.rows[part.problem.free]
         poses = np.linalg.inv(result.T_c_m[part.problem.free])
         keyframes = self._map.keyframes.id[rows].tolist()

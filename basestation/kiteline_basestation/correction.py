@@ -102,7 +102,8 @@ def move_keyframes(
     for submap in sparse_map.island(island):
         first = sparse_map.submaps[submap][0]
         T_m_k = sparse_map.pose(first)
-        if T_m_k is not None and submap != sparse_map.island_of(island):
+        stays = submap == sparse_map.island_of(island) and not sparse_map.own_unit(submap)
+        if T_m_k is not None and not stays:
             unit = sparse_map.unit(submap)
             sparse_map.move_submap(submap, sim3.normalise(sim3.of(unit, goal[first]) @ se3.inverse(T_m_k)))
     firsts = {sparse_map.submaps[s][0] for s in sparse_map.island(island)}
@@ -120,28 +121,15 @@ def move_keyframes(
     return largest
 
 
-def gauge(
-    sparse_map: SparseMap, island: SubmapId, growth: Mapping[KeyframeId, float]
-) -> tuple[float, F64] | None:  # fmt: skip
-    """By what a map whose unit is its own has to shrink, and about which point (3,) of w, so that lengths before the
-    newest keyframe of its eldest submap stay; None where it is metric.
-    """
-    eldest = sparse_map.island_of(island)
-    known = [k for k in sparse_map.submaps[eldest] if k in growth]
-    if not known or not sparse_map.own_unit(eldest):
-        return None
-    about = sparse_map.world_pose(sparse_map.submaps[eldest][0])
-    assert about is not None
-    return growth[known[-1]], about[:3, 3]
-
-
 def rescale(
     sparse_map: SparseMap, island: SubmapId, growth: Mapping[KeyframeId, float], publisher: Publisher
-) -> dict[KeyframeId, float]:  # fmt: skip
+) -> tuple[dict[SubmapId, float], dict[KeyframeId, float]]:  # fmt: skip
     """Lengths before keyframes grow in w by `growth`; where one eye flew, its submap's unit grows as they do before the
     newest keyframe, so that nothing changes where the agent is. Points hang on their keyframes: those of older ones
-    take on the rest. Where the keyframes lie is for `move_keyframes`. Returns by what lengths grew in the submaps.
+    take on the rest. Where the keyframes lie is for `move_keyframes`. Returns by what units grew, and lengths in the
+    submaps.
     """
+    units: dict[SubmapId, float] = {}
     left: dict[KeyframeId, float] = {}
     for submap in sparse_map.island(island):
         if not sparse_map.own_unit(submap):
@@ -149,14 +137,14 @@ def rescale(
         known = [k for k in sparse_map.submaps[submap] if k in growth]
         if not known:
             continue
-        newest = growth[known[-1]]
-        sparse_map.move_submap(submap, sim3.of(newest, sparse_map.frame(submap)))
+        newest = units[submap] = growth[known[-1]]
+        sparse_map.stretch_submap(submap, newest)
         for keyframe in known:
             more = growth[keyframe] / newest
             if abs(more - 1.0) > _SAME:
                 left[keyframe] = more
                 _grow(sparse_map, keyframe, more, publisher)
-    return left
+    return units, left
 
 
 def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher: Publisher) -> None:

@@ -289,7 +289,9 @@ class Mapper:
         """Turn the world when the agent of its first submap says which way is up; all that is placed moves along."""
         first = next(iter(self.placements), None)
         level = None if first is None else self._intake.levels.get(first)
-        if first is None or level is None or np.allclose(level.T_l_m, sim3.rigid(self.placements[first]), 0.0, 1e-12):
+        if first is None or level is None:
+            return
+        if np.allclose(level.T_l_m[:3, :3], sim3.rigid(self.placements[first])[:3, :3], 0.0, 1e-9):
             return
         unit = sim3.scale_of(self.placements[first])
         self._move_world(sim3.of(unit, level.T_l_m) @ sim3.inverse(self.placements[first]))
@@ -378,6 +380,15 @@ class Mapper:
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
         self._unplace(self.atlas.parted)
         self.atlas.parted.clear()
+        for submap, more in self.atlas.grown.items():  # what the map made of them stays as long in the world as it was
+            begin = self.map.pose(self.map.submaps[submap][0])
+            assert begin is not None
+            if submap in self.placements:
+                self.placements[submap] = sim3.grown(self.placements[submap], more, begin)
+                self._publisher.place(submap, self.placements[submap])
+            if submap in self._carried:
+                self._carried[submap] = sim3.grown(self._carried[submap], more, begin)
+        self.atlas.grown.clear()
         for island in sorted(self.atlas.moved):
             for job, (submap, _) in list(self._windows.items()):
                 if self.map.island_of(submap) == island:

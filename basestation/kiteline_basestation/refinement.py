@@ -11,7 +11,7 @@ from kiteline_basestation.config import CullConfig, PublishConfig
 from kiteline_basestation.covisibility import Window
 from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
-from kiteline_core import se3, sim3
+from kiteline_core import se3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
@@ -20,7 +20,7 @@ from kiteline_core.sparse_map import SparseMap
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-_NEWEST = 8  # keyframes of a submap before which its agent flies
+_AROUND = 8  # keyframes of a submap before which its agent flies, or where it began
 _ENOUGH = 20  # points that tell how much lengths have grown there
 
 
@@ -111,17 +111,18 @@ def _points(
         publisher.touch_slots(Kind.DEPTHS, moved)
 
 
-def keep_units(sparse_map: SparseMap, island: SubmapId, window: Window, result: BundleResult) -> BundleResult:
+def keep_units(
+    sparse_map: SparseMap, island: SubmapId, window: Window, result: BundleResult
+) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
     """What a bundle of a whole map did to the units of one eye's submaps is said by their scale, as far as it did it
-    before the newest keyframes: lengths there stay as the agent has them. A map without a metre keeps its unit.
+    before the newest keyframes: lengths there stay as the agent has them. In a map without a metre, lengths before the
+    oldest keyframes stay as they were in w. Returns the result so, and by what units grew.
     """
-    growth: dict[SubmapId, float] = {}
-    for submap in sparse_map.island(island):
-        if sparse_map.own_unit(submap):
-            growth[submap] = _growth(sparse_map, submap, window, result)
+    own = [submap for submap in sparse_map.island(island) if sparse_map.own_unit(submap)]
+    growth = {s: _growth(sparse_map, sparse_map.submaps[s][-_AROUND:], window, result) for s in own}
     eldest = sparse_map.island_of(island)
     if eldest in growth:
-        whole = growth[eldest]
+        whole = _growth(sparse_map, sparse_map.submaps[eldest][:_AROUND], window, result)
         about = sparse_map.world_pose(sparse_map.submaps[eldest][0])
         assert about is not None
         centre = about[:3, 3]
@@ -130,19 +131,18 @@ def keep_units(sparse_map: SparseMap, island: SubmapId, window: Window, result: 
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
         growth = {submap: more / whole for submap, more in growth.items()}
     for submap, more in growth.items():
-        if submap != eldest:
-            sparse_map.move_submap(submap, sim3.of(more, sparse_map.frame(submap)))
-    return result
+        sparse_map.stretch_submap(submap, more)
+    return result, growth
 
 
-def _growth(sparse_map: SparseMap, submap: SubmapId, window: Window, result: BundleResult) -> float:
-    """By what a bundle stretched depths before the newest keyframes of a submap: the median."""
+def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: Window, result: BundleResult) -> float:
+    """By what a bundle stretched depths before keyframes: the median."""
     table = sparse_map.keyframes
-    newest = {sparse_map.rows[k] for k in sparse_map.submaps[submap][-_NEWEST:]}
+    rows = [sparse_map.rows[k] for k in keyframes]
     anchors = sparse_map.keypoints.row[window.points]
     number = np.full(len(sparse_map), -1, np.int64)
     number[window.rows] = np.arange(len(window.rows))
-    here = np.isin(anchors, list(newest)) & (number[anchors] >= 0)
+    here = np.isin(anchors, rows) & (number[anchors] >= 0)
     if np.count_nonzero(here) < _ENOUGH:
         return 1.0
     T = result.T_c_m[number[anchors[here]]]

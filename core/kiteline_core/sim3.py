@@ -50,6 +50,12 @@ def normalise(S: F64) -> F64:
     return se3.orthonormalise(S) if scale == 1.0 else of(scale, rigid(S))
 
 
+def grown(S_a_b: F64, factor: float, T_b_k: F64) -> F64:
+    """The similarity (4,4) with so many times the scale, by which a body at T_b_k (4,4) stands where it stood."""
+    there = of(scale_of(S_a_b) * factor, rigid(place(S_a_b, T_b_k)))
+    return normalise(there @ se3.inverse(T_b_k))
+
+
 def place(S_a_b: F64, T_b_k: F64) -> F64:
     """Where bodies that stand at rigid motions T_b_k (4,4) or (n,4,4) stand in a: rigid motions again."""
     scale = scale_of(S_a_b)

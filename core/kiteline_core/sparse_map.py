@@ -169,6 +169,12 @@ class SparseMap(MapView):
         for keyframe in self.submaps.get(submap, []):
             self._follow(self.rows[keyframe])
 
+    def stretch_submap(self, submap: SubmapId, factor: float) -> None:
+        """Let lengths of a submap be so many times as long in w; its first keyframe stays where it is."""
+        begin = self.pose(self.submaps[submap][0])
+        assert begin is not None
+        self.move_submap(submap, sim3.grown(self.frame(submap), factor, begin))
+
     def set_depths(self, slots: I32, inv_depth: F32, offset: F32) -> None:
         """The base's positions of the points born at `slots` (n,): inv_depth (n,) 1/m, offset (n,2) px."""
         self.keypoints.refined[slots] = inv_depth

@@ -46,6 +46,14 @@ def test_group(A: F64, B: F64, T: F64, a: float, b: float) -> None:
     assert np.allclose(sim3.place(Sa, np.stack([T, A]))[0], sim3.place(Sa, T))
 
 
+@given(rigid_motions(), rigid_motions(), scales, scales)
+def test_what_grows_about_a_body_leaves_it_there(A: F64, T: F64, a: float, factor: float) -> None:
+    S = sim3.of(a, A)
+    longer = sim3.grown(S, factor, T)
+    assert np.isclose(sim3.scale_of(longer), a * factor, rtol=1e-9)
+    assert np.allclose(sim3.place(longer, T), sim3.place(S, T), atol=1e-6 * max(1.0, a * factor))
+
+
 @given(rigid_motions(), rigid_motions())
 def test_rigid_motions_are_treated_as_ever(A: F64, T: F64) -> None:
     assert sim3.scale_of(A) == 1.0
