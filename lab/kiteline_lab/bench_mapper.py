@@ -14,7 +14,7 @@ from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.essential_graph import GraphInputs, optimise
 from kiteline_core import se3
 from kiteline_core.bundle import BundleConfig, BundleProblem, bundle
-from kiteline_lab import base_memory, bench_store, logs, metrics, simulate, trajectories
+from kiteline_lab import base_memory, bench_one_eye, bench_store, logs, metrics, simulate, trajectories
 from kiteline_lab.benchmark import Bar, Bench, at_most, is_true
 from kiteline_lab.fly import Options, fly
 
@@ -94,6 +94,13 @@ def _street(bench: Bench) -> list[Bar]:
         at_most("memory of the base for each keyframe after the first 30 s",
                 further_kb(start["base"], report["base"]), 100.0, "kB", 1),
     ]  # fmt: skip
+
+
+def _one_eye(bench: Bench) -> list[Bar]:
+    """The loop in the street and the two flights in the hall, with one eye."""
+    (street,) = _recorded(bench, "street", "street", ["KITTI_06.txt"])
+    hall = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
+    return bench_one_eye.bars(bench, _fly(bench, [str(street)], "street_one_eye", mono=True, imu=False), hall)
 
 
 def _fly(bench: Bench, sources: Sequence[str], folder: str, **options: Any) -> dict[str, Any]:
@@ -290,5 +297,6 @@ PARTS = {
     "recordings": ("The base's mapper", _recordings),
     "hall": (f"The base's mapper: a hall, two agents, losses (the first {_HALL_S:g} s of both flights)", _hall),
     "street": ("The base's mapper: a street, a loop", _street),
+    "one-eye": ("The base's mapper: one eye without IMU", _one_eye),
     "store": ("The base's store", bench_store.run),
 }
