@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.smoothing import Smoothing
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 
 TICK_NS = 50_000_000
 
@@ -46,3 +46,16 @@ def test_another_place_is_taken_at_once() -> None:
     smoothing.follow(np.eye(4), np.zeros(3), 0)
     far = se3.from_rt(np.eye(3), np.array([9.0, 0.0, 0.0]))
     assert np.array_equal(smoothing.follow(far, np.zeros(3), TICK_NS), far)
+
+
+def test_another_unit_of_length_is_told_at_once_and_the_vehicle_does_not_jump() -> None:
+    smoothing = Smoothing(SmoothingConfig(snap_m=5.0, max_m_s=0.5, max_rad_s=0.2))
+    here = np.array([3.0, -1.0, 0.5])
+    smoothing.follow(np.eye(4), here, 0)
+    goal = sim3.of(1.1, se3.from_rt(np.eye(3), np.array([0.2, 0.1, 0.0])))
+    told = smoothing.follow(goal, here, TICK_NS)
+    assert np.isclose(sim3.scale_of(told), 1.1)
+    assert np.linalg.norm(se3.transform(told, here[None])[0] - here) <= 0.5 * 0.05 + 1e-9
+    for n in range(2, 200):
+        told = smoothing.follow(goal, here, n * TICK_NS)
+    assert np.allclose(told, goal, atol=1e-9)

@@ -68,4 +68,6 @@ def test_g2o_is_read_by_gtsam_and_has_no_error(tmp_path: Path) -> None:
     assert graph.size() == 4 and values.size() == 4
     assert graph.error(values) < 1e-12
     np.testing.assert_allclose(values.atPose3(2).matrix(), truth[2], atol=1e-8)
-    assert f"# vertex 0 is keyframe {2**50}" in data.decode()
+    assert f"# vertex 0 is keyframe {2**50}\n" in data.decode()
+    noted = export.g2o(np.array([5, 6, 7, 8]), truth, edges, scale=np.array([1.0, 1.0, 2.5, 2.5])).decode()
+    assert "# vertex 1 is keyframe 6\n" in noted and "# vertex 2 is keyframe 7, scale 2.5\n" in noted

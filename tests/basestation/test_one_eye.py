@@ -16,6 +16,7 @@ from kiteline_basestation.integrity import contradictions
 from kiteline_basestation.jobs import BundleInputs, Job, JobDone, run_job
 from kiteline_basestation.management import _list
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.outputs import keyframe_poses
 from kiteline_basestation.overlap import depth_scale
 from kiteline_basestation.world_view import world_view
 from kiteline_codec.schema import Camera, Head, Live, Placement, Record, Unit
@@ -151,6 +152,9 @@ def test_one_eye_takes_on_the_metre_of_a_pair(make_flight: MakeFlight, words: An
     told = _list(mapper, {}, 0)["maps"]
     assert [m["unit"] for m in told] == ["metre"]
     assert {s["unit"] for s in told[0]["submaps"]} == {"own", "metre"}
+    poses = keyframe_poses(mapper)
+    assert np.allclose([poses[k][:3, 3] for k in eye.keyframes], placed(mapper, eye))
+    assert all(abs(sim3.scale_of(poses[k]) * 0.37 - 1.0) < 0.05 for k in eye.keyframes)
 
 
 def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: MakeFlight, words: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_lab import flight_report
 from kiteline_lab.flight_report import check_contract, compose, statistic, table, without_timing, write_tum
@@ -51,6 +51,18 @@ def test_frames_follow_their_refined_keyframe() -> None:
     ((t_ns, T_w_b),) = compose([flown(5, at(0, 0, 0, 0, 0, 0), near, 7)], {7: refined}, T_b_c)
     assert t_ns == 5
     np.testing.assert_allclose(T_w_b, refined @ near @ T_c_b, atol=1e-12)
+
+
+def test_one_eye_s_frames_are_as_long_as_the_world_says_and_the_arm_stays_in_metres() -> None:
+    refined, near = at(1.0, 2.0, 3.0, 0.1, 0.2, 0.3), at(0.05, 0.0, 0.02, 0.0, 0.01, 0.0)
+    begin, late = at(0, 0, 0, 0, 0, 0), at(0.3, 0, 0, 0, 0, 0.1)
+    frames = [flown(5, begin, near, 7), flown(6, late, near, 8), flown(7, late, near, 9)]
+    poses = dict(compose(frames, {7: sim3.of(2.5, refined), 8: sim3.of(2.5, refined @ late)}, T_b_c))
+    np.testing.assert_allclose(poses[5], sim3.place(sim3.of(2.5, refined), near) @ T_c_b, atol=1e-12)
+    for T in poses.values():
+        assert sim3.scale_of(T) == 1.0
+    # The frame whose keyframe the base lacks hangs on the submap, as long as it was at the last one known.
+    np.testing.assert_allclose(poses[7], poses[6], atol=1e-9)
 
 
 def test_frames_bend_towards_the_next_keyframe_and_the_path_has_no_step() -> None:
