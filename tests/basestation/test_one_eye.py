@@ -119,7 +119,7 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
     drifted, mended = (lengths(m, flight) for m in (blind, mapper))
     assert np.median(drifted[-8:]) / np.median(drifted[:8]) > 1.0 + 60 * growth
     assert abs(np.median(mended[-8:]) / np.median(mended[:8]) - 1.0) < 0.04
-    assert abs(np.median(mended[:8]) / np.median(drifted[:8]) - 1.0) < 0.02  # the world keeps its unit
+    assert abs(np.median(mended[:8]) / np.median(drifted[:8]) - 1.0) < 0.05  # the world keeps its unit
     # Where the agent flies nothing was stretched: its place says how long its unit has become.
     submap = submap_of_keyframe(flight.keyframes[0])
     last = [r for r in published if isinstance(r, Placement)][-1]
