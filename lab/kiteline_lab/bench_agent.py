@@ -17,7 +17,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Trajectory
 from kiteline_core.ids import AgentId
-from kiteline_lab import bench_governor, metrics, simulate, trials
+from kiteline_lab import bench_agent_odometry, bench_governor, metrics, simulate, trials
 from kiteline_lab.bench_agent_faults import estimates, fault_bars, loss_bars
 from kiteline_lab.benchmark import Bar, Bench, at_most
 from kiteline_lab.clip import Clip, load
@@ -38,7 +38,7 @@ def run(bench: Bench) -> list[Bar]:
     bench.say("compiling kernels, so that the flights measure flying")
     subprocess.run([sys.executable, "-m", "kiteline_cli", "doctor", "--warm"], check=False, capture_output=True)
     bars: list[Bar] = []
-    for part in (_room, _kitti, _simulated, _mono, _governor, _losses, _faults, _first_pose, _soak):
+    for part in (_room, _kitti, _simulated, _mono, _odometry, _governor, _losses, _faults, _first_pose, _soak):
         bars += part(bench)
     return bars
 
@@ -165,6 +165,15 @@ def _off(found: metrics.Evaluation | None) -> float:
 
 
 # the rest
+
+
+def _odometry(bench: Bench) -> list[Bar]:
+    flights = {}
+    for name, (scene, trajectory, start_s, seed) in _SIMULATED.items():
+        path = bench.source(f"trajectories/{trajectory}")
+        options = {"trajectory": path, "start": start_s, "seed": seed, "seconds": _SIM_SECONDS}
+        flights[name] = bench_agent_odometry.Simulated(_rendered(bench, name), scene, options)
+    return bench_agent_odometry.bars(bench, flights)
 
 
 def _governor(bench: Bench) -> list[Bar]:
