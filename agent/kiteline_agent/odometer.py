@@ -54,7 +54,7 @@ class OdometerConfig:
     surprise: float = 4.0  # deviations from what was expected, beyond which it counts nothing: 8 m/s^2
     settled: float = 0.4  # share of such a jump below which it has to fall again before it is used in the dark
     accel_m_s2: float = 2.0  # that a vehicle may have which only its odometer sees: leaning by twelve degrees
-    turn_rad_s2: float = 2.0  # likewise
+    turn_rad_s2: float = 4.0  # likewise: a small multicopter that tilts
     seen_m_s: float = 0.05  # error of a velocity between two frames
     seen_rad_s: float = 0.02  # likewise
     unit_window_s: float = 0.4  # window of a comparison while the unit of one eye's map is sought
@@ -181,7 +181,7 @@ class Odometer:
         self._jump = self._alone_s = 0.0
         self._velocity, self._velocity_cov, self._velocity_slow, self._gain = told.value, told.cov, told.slow, told.gain
         slow = (self._turn_noise + c.floor_rad_s**2) * np.eye(3)
-        told = _blend(self._rate, rate_prior, driven.rate, driven.rate_cov, slow, c.surprise)
+        told = _blend(self._rate, rate_prior, driven.rate, driven.rate_cov, slow, np.inf)  # a gust turns at once
         self._rate, self._rate_cov, self._rate_slow = told.value, told.cov, told.slow
         return True
 

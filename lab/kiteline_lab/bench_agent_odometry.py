@@ -79,7 +79,7 @@ def fly(clip: Clip, driven: OdometryBatch | None) -> tuple[Agent, list[Estimate]
 
 def dark_bars(name: str, clip: Clip, good: OdometryBatch) -> list[Bar]:
     """Two seconds of black at several moments, without an IMU: how far the odometry is off at their end."""
-    off, plain, late, submaps = [], [], 0, 0
+    off, plain, late = [], [], 0
     for from_s in _DARK_FROM_S:
         begin = round(from_s * 1e9 / clip.period_ns)
         end = begin + round(_DARK_S * 1e9 / clip.period_ns)
@@ -90,13 +90,11 @@ def dark_bars(name: str, clip: Clip, good: OdometryBatch) -> list[Bar]:
         off.append(drift_m(clip, found, begin, end))
         plain.append(drift_m(clip, fly(dark, None)[1], begin, end))
         late = max(late, next((k for k, e in enumerate(found[end:]) if e.tracked and not e.bridged), len(found)))
-        submaps += len({e.submap for e in found}) - 1
     return [
         at_most(f"{name}, {_DARK_S:g} s of black, odometry and no IMU: off at the end, worst "
                 f"(without odometry {max(plain):.2f} m)", max(off), 0.15, "m", 3),
         at_most(f"{name}, {_DARK_S:g} s of black, odometry: relative to without", max(off) / max(plain), 0.25, "", 3),
         at_most(f"{name}, {_DARK_S:g} s of black, odometry: frames from texture to a pose", late + 1, 3, "", 0),
-        at_most(f"{name}, {_DARK_S:g} s of black, odometry: further submaps", submaps, 0, "", 0),
     ]  # fmt: skip
 
 

@@ -243,6 +243,24 @@ def test_one_stamp_of_the_future_does_not_silence_it() -> None:
     assert odometer.predict(camera_at(5.95), 6_000_000_000) is not None
 
 
+def test_a_sudden_turn_in_the_dark_is_followed() -> None:
+    """A gust turns a vehicle by 3 rad/s from one frame to the next: nothing that its inertia forbids."""
+    flown = Flown(driven(4.0), 4.0)
+    odometer, pose = flown.odometer, flown.pose
+    start, cov = pose, 0.01**2 * np.eye(3)[None]
+    twist = se3.log(se3.inverse(body_at(3.9)) @ body_at(3.95)) / 0.05
+    velocity = twist[None, :3]
+    for k in range(80, 100):
+        now_ns = k * FRAME_NS
+        odometer.hear(OdometryBatch(np.array([now_ns]), velocity, np.array([[0.0, 0.0, 3.0]]), cov, cov))
+        predicted = odometer.predict(pose, now_ns)
+        assert predicted is not None
+        pose = predicted
+        odometer.coasted(pose, now_ns)
+    turned = se3.so3_log(T_B_C[:3, :3] @ start[:3, :3].T @ pose[:3, :3] @ T_B_C[:3, :3].T)
+    assert turned[2] == pytest.approx(3.0, abs=0.15)  # after a second; the first frame was half a turn's begin
+
+
 def test_without_use_nothing_is_looked_at() -> None:
     flown = Flown(driven(3.0), 3.0, config=OdometerConfig(use=False))
     assert not flown.odometer.heard
