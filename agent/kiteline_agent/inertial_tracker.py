@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.turn_watch import TurnWatch
 from kiteline_core import imu_alignment, se3
 from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.fixed_lag import (
@@ -51,10 +52,12 @@ class InertialConfig:
     trusted_blind_s: float = 1.0  # so long the IMU alone counts as tracking
     askew_rad: float = 0.035  # a map that leans by more than two degrees is set upright
     max_coast_s: float = 20.0  # longer without images, a small IMU knows no more than that velocities change
+    scale_inflation: float = 2.0  # of the deviation of a scale: a young map errs alike from frame to frame
     unit_sigma: float = 0.03  # relative, of what IMU and odometer each do not know of their own scale
     offset_memory_s: float = 60.0  # a time offset drifts slowly
     offset_start_sigma_s: float = 0.02  # cameras without a trigger line
-    offset_turn_sigma_rad: float = 6e-4  # error of a visual turn between two frames
+    offset_window_s: float = 0.15  # over which turns are compared
+    offset_turn_sigma_rad: float = 6e-4  # error of a visual turn meanwhile
     offset_trusted_s: float = 3e-3  # deviation below which the estimate is applied
     offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
     offset_rate: float = 0.05  # s/s, how fast the applied offset follows
@@ -92,7 +95,9 @@ class InertialTracker:
         self._offset = TimeOffsetEstimator(
             config.offset_memory_s, config.offset_start_sigma_s, config.offset_turn_sigma_rad, config.offset_s
         )
+        self._watch = TurnWatch(calibration, config.offset_window_s)
         self._applied_s = self._told_s = config.offset_s
+        self._held: tuple[int, int] | None = None  # the last interval, where samples of its end had not come yet
         self._bias = np.zeros(6)
         self._waiting: list[_Pose] = []
         self._last: _Pose | None = None  # the last pose, however it was come by
@@ -182,7 +187,8 @@ class InertialTracker:
         """
         samples = self._interval(t_ns)
         if samples is not None:
-            self._watch_offset(t_ns, T_m_b_visual, samples)
+            self._watch.see(t_ns, T_m_b_visual[:3, :3])
+            self._follow_offset(samples.duration_s)
         state = None
         if self._smoother.running:
             state = self._advance(samples, points, driven)
@@ -202,6 +208,7 @@ class InertialTracker:
         """
         samples = self._interval(t_ns)
         self._last_visual = None
+        self._watch.forget()
         self._waiting = []
         if self._last is not None:
             self._blind_s += (t_ns - self._last.t_ns) * 1e-9
@@ -222,6 +229,7 @@ class InertialTracker:
             self._last = _Pose(self._last.t_ns, T_new_old @ self._last.T_m_b, self._last.samples)
         if self._last_visual is not None:
             self._last_visual = (self._last_visual[0], T_new_old @ self._last_visual[1])
+        self._watch.turn_map(T_new_old[:3, :3])
 
     def begin_map(self, t_ns: int, T_m_b: F64) -> None:
         """A new map begins at this frame, where the body is at T_m_b (4,4) by definition. What is known of velocity,
@@ -230,6 +238,8 @@ class InertialTracker:
         """
         if self._smoother.running:
             self._smoother.begin_map(T_m_b)
+        self._watch.forget()
+        self._held = None
         self._waiting = []
         self._note(t_ns, T_m_b)
         self._last_visual = (t_ns, T_m_b.copy())
@@ -242,6 +252,8 @@ class InertialTracker:
         self._smoother.stop()
         self._waiting = []
         self._last = self._last_visual = None
+        self._watch.forget()
+        self._held = None
         self._blind_s = 0.0
 
     def metric_scale(self) -> tuple[float, float] | None:
@@ -253,7 +265,7 @@ class InertialTracker:
             return None
         bias = np.concatenate([imu_alignment.gyro_bias(poses, motions), self._bias[3:]])
         found = imu_alignment.align(poses, self._p_b_c, motions, bias, self._config.gravity_m_s2, with_scale=True)
-        return None if found is None else (found.scale, found.scale_sigma)
+        return None if found is None else (found.scale, self._config.scale_inflation * found.scale_sigma)
 
     def rescale(self, scale: float) -> None:
         """The map was multiplied by `scale` and is metric from now on: the smoother may start."""
@@ -287,23 +299,25 @@ class InertialTracker:
         if samples is None:
             self._smoother.stop()
             return None
+        self._complete()
         state = self._smoother.add(samples, points, driven)
         if state is not None:
             self._bias = state.bias
+        end_ns = self._ends_ns + round(samples.duration_s * 1e9)
+        newest = self._buffer.newest_t_ns
+        self._held = (self._ends_ns, end_ns) if newest is not None and newest < end_ns else None
         return state
 
-    def _watch_offset(self, t_ns: int, T_m_b: F64, samples: Samples) -> None:
-        if self._last_visual is None:
-            return
+    def _complete(self) -> None:
+        """Where stamps of the IMU run ahead of the camera's, the end of an interval comes after its frame."""
+        if self._held is not None:
+            samples = self._buffer.between(*self._held)
+            if samples is not None:
+                self._smoother.replace_last(samples)
+
+    def _follow_offset(self, dt_s: float) -> None:
         config = self._config
-        before_ns, before = self._last_visual
-        dt_s = (t_ns - before_ns) * 1e-9
-        if abs(dt_s - samples.duration_s) < 2e-3:
-            # the bias is left in, since the smoother's would itself follow a wrong offset
-            turn = preintegrate(samples, np.zeros(6), self._calibration).turn
-            change = samples.gyro[-1] - turn.T @ samples.gyro[0]
-            error = se3.so3_log(turn.T @ before[:3, :3].T @ T_m_b[:3, :3])
-            self._offset.add(error + change * self._applied_s, change, dt_s)
+        self._watch.look(self._buffer, self._applied_s, self._offset)
         if not config.apply_offset:
             return
         offset_s, sigma_s = self.time_offset_s

@@ -224,6 +224,14 @@ class FixedLagSmoother:
             return None
         return self.state
 
+    def replace_last(self, samples: Samples) -> None:
+        """Better samples of the interval that leads to the newest state, before the next one is added."""
+        k = self._n - 2
+        if k >= 0 and self._samples:
+            self._samples[-1] = samples
+            bias = self._imu_bias[k].copy()
+            self._put_interval(k, preintegrate(samples, bias, self._calibration, self._config.imu_inflation))
+
     def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
         """A new map begins in which the newest body pose is T_m_b (4,4) by definition. Velocity, biases and the
         direction of gravity are taken along, with what the old map's pose lacked in certainty.

@@ -20,6 +20,7 @@ from kiteline_hw.sim.trajectory import Path
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
+CHEAP = ImuCalibration(gyro_noise=1e-3, gyro_walk=8e-5, accel_noise=6e-3, accel_walk=4e-3)
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 375.5, 239.5, 0.11, True, T_B_C)
 FRAME_NS = 50_000_000
@@ -38,7 +39,10 @@ class Step:
     truth: F64
 
 
-def flight(frames: int, seed: int = 0, rest_s: float = 0.0, late_ns: int = 0, T_m_w: F64 | None = None) -> list[Step]:
+def flight(
+    frames: int, seed: int = 0, rest_s: float = 0.0, late_ns: int = 0, T_m_w: F64 | None = None,
+    calibration: ImuCalibration = CALIBRATION,
+) -> list[Step]:  # fmt: skip
     """A lively flight along the room's course. late_ns: images are so much later than stamped. T_m_w: map."""
     T_m_w = np.eye(4) if T_m_w is None else T_m_w
     rng = np.random.default_rng([seed, 2])
@@ -46,7 +50,7 @@ def flight(frames: int, seed: int = 0, rest_s: float = 0.0, late_ns: int = 0, T_
     path = Path(path.coefficients, path.knot_s * HASTE, path.length_s * HASTE, 0.7, rest_s)
     stamps = np.arange(frames, dtype=np.int64) * FRAME_NS + 100_000_000
     imu_t = np.arange(0, int(stamps[-1]) + 1, 5_000_000, dtype=np.int64)
-    samples = sim_imu.measure(path, imu_t, 0, CALIBRATION, seed)
+    samples = sim_imu.measure(path, imu_t, 0, calibration, seed)
     truth = path.motion((stamps + late_ns) * 1e-9).T_w_b
     cloud = truth[:, :3, 3].mean(axis=0) + rng.uniform(-6.0, 6.0, (3000, 3))
     steps, done = [], 0
@@ -74,9 +78,10 @@ def see(T_w_b: F64, cloud: F64, rng: np.random.Generator, T_m_w: F64) -> VisualP
 
 
 def run(
-    steps: list[Step], blind: range = range(0), config: InertialConfig | None = None
-) -> tuple[InertialTracker, list[InertialState | None]]:
-    tracker = InertialTracker(CAMERA, CALIBRATION, config or InertialConfig())
+    steps: list[Step], blind: range = range(0), config: InertialConfig | None = None,
+    calibration: ImuCalibration = CALIBRATION,
+) -> tuple[InertialTracker, list[InertialState | None]]:  # fmt: skip
+    tracker = InertialTracker(CAMERA, calibration, config or InertialConfig())
     states: list[InertialState | None] = []
     for k, step in enumerate(steps):
         tracker.predict(step.imu, step.t_ns)
@@ -165,10 +170,12 @@ def test_a_hole_in_the_samples_is_survived() -> None:
     assert running[39] and not running[44] and running[-1]
 
 
-@pytest.mark.parametrize("late_ns", [12_000_000, -8_000_000])
-def test_time_offset_is_found_and_applied(late_ns: int) -> None:
-    steps = flight(160, 6, late_ns=late_ns)
-    tracker, states = run(steps)
+@pytest.mark.parametrize("late_ns", [25_000_000, 12_000_000, -8_000_000])
+@pytest.mark.parametrize("calibration", [CALIBRATION, CHEAP])
+def test_time_offset_is_found_and_applied(late_ns: int, calibration: ImuCalibration) -> None:
+    """Also where the samples of a frame come after it, and where rates change by little more than their noise."""
+    steps = flight(160, 6, late_ns=late_ns, calibration=calibration)
+    tracker, states = run(steps, calibration=calibration)
     offset_s, sigma_s = tracker.time_offset_s
     assert offset_s == pytest.approx(late_ns * 1e-9, abs=1.5e-3)
     assert sigma_s < 1e-3
