@@ -5,7 +5,7 @@ Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -24,9 +24,10 @@ from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.publisher import Published, Publisher, adopt
 from kiteline_basestation.refinement import apply_bundle
 from kiteline_basestation.whole_maps import WholeMaps
+from kiteline_basestation.world import World
 from kiteline_basestation.world_view import world_view
 from kiteline_codec.schema import Calibration, Key, Kind, Live, Record
-from kiteline_core import se3, sim3
+from kiteline_core import sim3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.map_tables import BIRTH, CULLED
@@ -78,13 +79,11 @@ class Mapper:
         self.config = config or BaseConfig()
         self.map = SparseMap()
         self.grid = Grid(self.config.grid)
-        self.placements: dict[SubmapId, F64] = {}  # S_w_m of placed submaps: a similarity where w has another unit
-        self._carried: dict[SubmapId, F64] = {}  # S_w_m of those that have a place by themselves
-        self._withdrawn: list[tuple[AgentId, Key]] = []
         self.names: dict[SubmapId, str] = {}  # what people call maps, by their eldest submap
         self.counts = MapperCounts()
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map)
+        self.world = World(self.config.intake, self.map, self._intake, self._publisher)
         self._last_job = 0
         self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
@@ -101,13 +100,13 @@ class Mapper:
         """Take in what came, and say what is to be published and worked on."""
         for agent, records in given.arrivals:
             self._intake.take(agent, records, now_ns)  # sections -> map, whatever their order
-        self._set_upright()  # where an agent has learnt which way is up
-        self._set_metric()  # where one eye has learnt how long its first map is
+        if self.world.set_upright() or self.world.set_metric():  # where an agent has learnt what is up, or a metre
+            self._grid_due = max(self._grid_due, len(self.map.rows))  # the grid is made anew
         for done in given.done:
             self._finish(done, now_ns)  # refined poses and points, outliers, grid
         answers = tuple(management.answer(self, command, now_ns) for command in given.commands)
         for keyframe in self._intake.ready(now_ns):
-            self._place(keyframe)  # the first submap is the world
+            self.world.begin(keyframe)  # the first submap is the world
             self.counts.found += refind.refind(self.map, keyframe, self.config.refind, self._publisher)
             self.counts.triangulated += newpoints.triangulate(
                 self.map, keyframe, self.config.new_points, self.config.measurement, self._publisher
@@ -125,8 +124,7 @@ class Mapper:
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.atlas is not None:
             jobs += self.atlas.jobs()
-        withdrawn = tuple((agent, key) for agent, key in self._withdrawn if key.id not in self.placements)
-        self._withdrawn.clear()
+        withdrawn = self.world.withdrawn()
         return MapperOutput(self._publisher.collect(), tuple(jobs), answers, withdrawn)
 
     def adopt(self, record: Record) -> None:
@@ -160,7 +158,7 @@ class Mapper:
                 "stale": [[int(s), sorted({int(k) for k in waiting})] for s, waiting in sorted(stale.items())],
                 "unused": [int(k) for k in self._intake.unused],
                 "bundled": [[int(s), size] for s, size in sorted(self._whole.bundled.items())],
-                "carried": [[int(s), matrix(T)] for s, T in self._carried.items()],
+                "carried": [[int(s), matrix(T)] for s, T in self.world.carried.items()],
                 "deleted": sorted(int(s) for s in self.deleted),
             }
         )
@@ -202,7 +200,7 @@ class Mapper:
                     self._stale[SubmapId(submap)] = here
             unused = {KeyframeId(k) for k in value["unused"]}
             self._whole.bundled = {SubmapId(s): size for s, size in value.get("bundled", [])}
-            self._carried = {SubmapId(s): similarity_of(S) for s, S in value["carried"]}
+            self.world.carried = {SubmapId(s): similarity_of(S) for s, S in value["carried"]}
             self._intake.deleted = {SubmapId(s) for s in value["deleted"]}
         self._intake.keep_unused(unused)
         self._grid_due = len(self.map)  # the grid is made anew
@@ -233,6 +231,11 @@ class Mapper:
         if self.atlas is not None:
             self.atlas.forget(submaps)
         self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
+
+    @property
+    def placements(self) -> dict[SubmapId, F64]:
+        """S_w_m of placed submaps, the first one of all first: a similarity where w has another unit of length."""
+        return self.world.placements
 
     @property
     def deleted(self) -> set[SubmapId]:
@@ -285,68 +288,6 @@ class Mapper:
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
-    def _set_upright(self) -> None:
-        """Turn the world when the agent of its first submap says which way is up; all that is placed moves along."""
-        first = next(iter(self.placements), None)
-        level = None if first is None else self._intake.levels.get(first)
-        if first is None or level is None:
-            return
-        if np.allclose(level.T_l_m[:3, :3], sim3.rigid(self.placements[first])[:3, :3], 0.0, 1e-9):
-            return
-        unit = sim3.scale_of(self.placements[first])
-        self._move_world(sim3.of(unit, level.T_l_m) @ sim3.inverse(self.placements[first]))
-
-    def _set_metric(self) -> None:
-        """Stretch the world when the agent of its first submap says how long a unit of it is, which nobody knew."""
-        first = next(iter(self.placements), None)
-        metres = None if first is None else self._intake.units.get(first)
-        if first is None or metres is None or not self.map.own_unit(self.map.island_of(first)):
-            return
-        if sim3.scale_of(self.placements[first]) == 1.0 and metres != 1.0:
-            self._move_world(sim3.of(metres, np.eye(4)))
-
-    def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
-        """Turn or stretch the world with all that is placed in it, but for some; metres stay metres."""
-        self._carried = {s: self._moved(s, S_new_old, S) for s, S in self._carried.items()}
-        for submap, S_w_m in self.placements.items():
-            if submap not in but:
-                self.placements[submap] = self._moved(submap, S_new_old, S_w_m)
-                self._publisher.place(submap, self.placements[submap])
-        self._grid_due = max(self._grid_due, len(self.map.rows))  # the grid is made anew
-
-    def _moved(self, submap: SubmapId, S_new_old: F64, S_w_m: F64) -> F64:
-        """Where a submap lies in a world that moved: where its first keyframe does, as long as it is in metres."""
-        if sim3.scale_of(S_new_old) == 1.0 or self.map.own_unit(submap):
-            return sim3.normalise(S_new_old @ S_w_m)
-        begin = self.map.pose(self.map.submaps[submap][0]) if submap in self.map.submaps else None
-        begin = np.eye(4) if begin is None else begin
-        return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, begin)) @ se3.inverse(begin))
-
-    def _place(self, keyframe: KeyframeId) -> None:
-        """The first submap of all is the world. A later one of the same flight begins where the last was left."""
-        submap = submap_of_keyframe(keyframe)
-        if submap in self.placements:
-            return
-        if not self.placements:
-            level = self._intake.levels.get(submap)
-            S_w_m = np.eye(4) if level is None else level.T_l_m
-        else:
-            before = SubmapId(submap - 1)
-            live, S_w_before = self._intake.last_of.get(before), self.placements.get(before)
-            first = self.map.submaps[submap][0]
-            begin = self.map.pose(first)
-            left = self.map.pose(live.keyframe) if live else None
-            if live is None or S_w_before is None or left is None or begin is None:
-                return
-            tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
-            if self.map.keyframes.t_ns[self.map.rows[first]] - tracked_ns > self.config.intake.carry_s * 1e9:
-                return  # a place that it reached unseen: it is found when it is recognised
-            there = sim3.place(S_w_before, left @ live.T_k_c)
-            unit = sim3.scale_of(S_w_before) if self.map.own_unit(submap) else 1.0
-            S_w_m = sim3.normalise(sim3.of(unit, there) @ se3.inverse(begin))
-        self.placements[submap] = self._carried[submap] = S_w_m
-        self._publisher.place(submap, S_w_m)
-
     def _finish(self, done: JobDone, now_ns: int) -> None:
         if self.atlas is not None and self.atlas.finish(done):
             if isinstance(done.result, BundleResult):
@@ -378,16 +319,9 @@ class Mapper:
             return
         for keyframe in self.atlas.revisit():
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
-        self._unplace(self.atlas.parted)
+        self.world.part(self.atlas.parted)
         self.atlas.parted.clear()
-        for submap, more in self.atlas.grown.items():  # what the map made of them stays as long in the world as it was
-            begin = self.map.pose(self.map.submaps[submap][0])
-            assert begin is not None
-            if submap in self.placements:
-                self.placements[submap] = sim3.grown(self.placements[submap], more, begin)
-                self._publisher.place(submap, self.placements[submap])
-            if submap in self._carried:
-                self._carried[submap] = sim3.grown(self._carried[submap], more, begin)
+        self.world.grow(self.atlas.grown)
         self.atlas.grown.clear()
         for island in sorted(self.atlas.moved):
             for job, (submap, _) in list(self._windows.items()):
@@ -395,7 +329,7 @@ class Mapper:
                     del self._windows[job]
                     waiting = self._stale.setdefault(submap, [])
                     waiting.append(self.map.submaps[submap][-1])
-            self._place_island(island)
+            self.world.lay_out(island)
             self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
         self.atlas.moved.clear()
 
@@ -421,43 +355,6 @@ class Mapper:
             if not np.array_equal(self._told.get(agent, 0.0), offset):
                 self._told[agent] = offset
                 self._publisher.send(agent, Calibration(agent, offset))
-
-    def _unplace(self, parted: set[SubmapId]) -> None:
-        """Submaps that were taken out of a map lie where they lay by themselves, or nowhere; their agents are told."""
-        first = next(iter(self.placements), None)
-        for submap in sorted(parted & self.placements.keys() - {first}):
-            if submap in self._carried:
-                self.placements[submap] = self._carried[submap]
-                self._publisher.place(submap, self._carried[submap])
-            else:
-                del self.placements[submap]
-                self._publisher.forget_place(submap)
-                self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.PLACEMENT), int(submap), 0)))
-
-    def _place_island(self, island: SubmapId) -> None:
-        """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place. A map in
-        metres keeps them: where the world had another unit, it takes on this one.
-        """
-        submaps = self.map.island(island)
-        eldest = self.map.island_of(island)
-        first = next(iter(self.placements), None)
-        anchor = next((s for s in [first, eldest, *submaps] if s in self.placements and s in submaps), None)
-        if first is None or anchor is None:
-            return
-        S_w_i = sim3.normalise(self.placements[anchor] @ sim3.inverse(self.map.frame(anchor)))
-        unit = sim3.scale_of(S_w_i)
-        if unit != 1.0 and not self.map.own_unit(eldest):
-            at = self.placements[anchor][:3, 3]
-            stretch = sim3.of(1.0 / unit, se3.from_rt(np.eye(3), at - at / unit))
-            if anchor == first or self.map.own_unit(self.map.island_of(first)):
-                self._move_world(stretch, submaps)
-            S_w_i = sim3.normalise(stretch @ S_w_i)
-        for submap in submaps:
-            S_w_m = sim3.normalise(S_w_i @ self.map.frame(submap))
-            held = self.placements.get(submap)
-            if held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
-                self.placements[submap] = S_w_m
-                self._publisher.place(submap, S_w_m)
 
     def _next_job(self) -> int:
         self._last_job += 1
