@@ -1,0 +1,124 @@
+"""Whole flights of an agent through a simulated room, with an odometer and without."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.alone import AloneChannel
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_core import odometry, se3
+from kiteline_core.cameras import CameraRig
+from kiteline_core.frame import Frame, OdometryBatch
+from kiteline_core.ids import AgentId
+from kiteline_hw.sim.source import open_sim
+
+F64 = np.ndarray
+DARK = range(70, 110)  # 2 s
+
+
+@dataclass
+class Flight:
+    rig: CameraRig
+    frames: list[Frame]
+    truth: F64
+    driven: OdometryBatch
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """6.5 s in full motion along the room's own course, at half the usual size."""
+    source = open_sim("room", seconds=6.5, seed=5, scale=0.5, texture_bits=9, imu=False, rest=0.0, odometry=50.0)
+    truth, driven = source.ground_truth, source.odometry()
+    assert truth is not None
+    assert driven is not None
+    return Flight(source.rig, [item for item in source if isinstance(item, Frame)], truth.T_w_b, driven)
+
+
+def fly(
+    flight: Flight, driven: OdometryBatch | None, dark: range = range(0), *, one_eye: bool = False
+) -> tuple[Agent, list[Estimate], list[str]]:
+    rig = replace(flight.rig, right=None, T_c_r=None) if one_eye else flight.rig
+    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    out, events, done = [], [], 0
+    for k, shown in enumerate(flight.frames):
+        frame = replace(shown, right=None) if one_eye else shown
+        if k in dark:
+            frame = replace(frame, left=np.full_like(shown.left, 8), right=np.full_like(shown.left, 8))
+        part = None
+        if driven is not None:
+            end = int(np.searchsorted(driven.t_ns, frame.t_ns, side="right"))
+            part, done = odometry.chosen(driven, slice(done, end)), end
+        output = agent.step(StepInput(frame, odometry=part), frame.t_ns)
+        assert output.estimate is not None
+        out.append(output.estimate)
+        events += output.events
+    return agent, out, events
+
+
+def drift(flight: Flight, found: list[Estimate], begin: int, end: int) -> F64:
+    """(6,) by which the odometry frame's pose is off at the end of frames begin..end, [translation, rotation]."""
+    flown = se3.inverse(found[begin - 1].T_o_b) @ found[end - 1].T_o_b
+    true = se3.inverse(flight.truth[begin - 1]) @ flight.truth[end - 1]
+    return np.concatenate([flown[:3, 3] - true[:3, 3], se3.so3_log(true[:3, :3].T @ flown[:3, :3])])
+
+
+def test_two_seconds_of_black_are_bridged(flight: Flight) -> None:
+    _, found, events = fly(flight, flight.driven, DARK)
+    _, without, _ = fly(flight, None, DARK)
+    off, plain = (np.linalg.norm(drift(flight, f, DARK.start, DARK.stop)[:3]) for f in (found, without))
+    assert off < 0.08
+    assert off < 0.25 * plain
+    assert any(event.startswith("odometer: agrees") for event in events)
+    # for a second it counts as tracking, as with an IMU, and its certainty is told all the way
+    assert [e.tracked and e.bridged for e in found[DARK.start : DARK.start + 19]] == [True] * 19
+    assert not any(e.tracked for e in found[DARK.start + 21 : DARK.stop])
+    assert found[DARK.start + 15].quality > 50
+    sigma = [float(np.sqrt(np.trace(found[k].cov_o[:3, :3]))) for k in (DARK.start, DARK.start + 20, DARK.stop - 1)]
+    assert sigma[0] < sigma[1] < sigma[2] < 0.3
+    assert off < 3.0 * sigma[2]
+    # the old map is found again at once, where it was expected
+    assert found[DARK.stop].tracked
+    assert not found[DARK.stop].bridged
+    assert len({e.submap for e in found}) == 1
+
+
+@pytest.mark.parametrize("kind", ["slip", "dead", "axes"])
+def test_a_bad_odometer_costs_nothing_in_sight(flight: Flight, kind: str) -> None:
+    good = flight.driven
+    velocity, rate = good.velocity.copy(), good.rate.copy()
+    if kind == "slip":
+        velocity[(good.t_ns // 1_000_000_000) % 2 == 1] *= 2.0
+    elif kind == "dead":
+        velocity[:], rate[:] = 0.0, 0.0
+    else:
+        velocity, rate = velocity[:, [2, 0, 1]], rate[:, [2, 0, 1]]
+    _, found, _ = fly(flight, replace(good, velocity=velocity, rate=rate))
+    _, without, _ = fly(flight, None)
+    off, plain = (_ate(flight, f) for f in (found, without))
+    assert all(e.tracked for e in found)
+    assert off < 1.1 * plain + 1e-4
+
+
+def test_one_eye_gets_its_metre(flight: Flight) -> None:
+    agent, found, events = fly(flight, flight.driven, one_eye=True)
+    assert agent.metric
+    assert any(event.startswith("mono: metric") for event in events)
+    metric = [k for k, e in enumerate(found) if e.submap == agent.submap and e.T_m_b is not None]
+    a, b = metric[0], metric[-1]
+    flown = se3.inverse(found[a].T_m_b) @ found[b].T_m_b  # type: ignore[arg-type, operator]
+    true = se3.inverse(flight.truth[a]) @ flight.truth[b]
+    assert np.linalg.norm(true[:3, 3]) > 0.3
+    assert np.linalg.norm(flown[:3, 3]) == pytest.approx(np.linalg.norm(true[:3, 3]), rel=0.05)
+    plain, _, _ = fly(flight, None, one_eye=True)
+    assert not plain.metric
+
+
+def _ate(flight: Flight, found: list[Estimate]) -> float:
+    flown = np.array([(se3.inverse(found[0].T_o_b) @ e.T_o_b)[:3, 3] for e in found])
+    true = np.array([(se3.inverse(flight.truth[0]) @ T)[:3, 3] for T in flight.truth])
+    return float(np.sqrt(np.mean(np.sum((flown - true) ** 2, axis=1))))
