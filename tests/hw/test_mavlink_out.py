@@ -11,8 +11,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from kiteline_core.frame import OdometryBatch
 from kiteline_hw.clock import MonotonicClock
 from kiteline_hw.mavlink_frames import mounting
+from kiteline_hw.mavlink_messages import Odometry
+from kiteline_hw.mavlink_odometry import FromController, Told
 from kiteline_hw.mavlink_out import MavlinkPoseSink
 from kiteline_hw.mavlink_wire import MavlinkUrl, parse_mavlink_url
 from kiteline_hw.ports import LinkError, PoseSample
@@ -56,6 +59,31 @@ def test_udp_out_to_a_controller_with_another_clock() -> None:
         assert seen is not None and seen.autopilot == 12
         assert not model.dropped and sink.counters.timesync_answers >= 1
         assert model.heartbeats[1, 197] >= 1
+
+
+def test_odometry_comes_from_a_controller_with_another_clock() -> None:
+    model = FlightController("px4")
+    offset_ns = -3_000_000_000
+    wanted = FromController(Told.CONTROLLER, FLU)
+    with (
+        UdpFlightController(model, clock_offset_ns=offset_ns) as controller,
+        MavlinkPoseSink(f"udp:127.0.0.1:{controller.port}", FLU, CLOCK, wanted=wanted) as sink,
+    ):
+        told: list[OdometryBatch] = []
+
+        def nothing_yet() -> bool:
+            t_us = (CLOCK.now_ns() + offset_ns) // 1000
+            pose = Odometry(t_us, (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (0.0,) * 3, (0.1,) * 21,
+                            (0.01,) * 21, 0, 90)  # fmt: skip
+            with controller.lock:
+                controller.send(model.codec.odometry(pose))
+            batch = sink.take_odometry(CLOCK.now_ns())
+            told.extend([] if batch is None else [batch])
+            return len(told) < 5
+
+        push_while(sink, nothing_yet)
+        np.testing.assert_allclose(told[-1].velocity[-1], [1.0, -2.0, -3.0], atol=1e-6)
+        assert abs(CLOCK.now_ns() - int(told[-1].t_ns[-1])) < 200_000_000
 
 
 def test_udp_in_answers_who_spoke_last() -> None:
