@@ -18,8 +18,10 @@ from kiteline_basestation.management import _list
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.outputs import keyframe_poses
 from kiteline_basestation.overlap import depth_scale
+from kiteline_basestation.supply import Supply
 from kiteline_basestation.world_view import world_view
-from kiteline_codec.schema import Camera, Head, Live, Placement, Record, Unit
+from kiteline_codec.channel import plain_pair
+from kiteline_codec.schema import Camera, Copied, Copy, Head, Live, Placement, Record, Unit
 from kiteline_core import se3, sim3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
@@ -179,6 +181,31 @@ def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: Ma
     error, scale = error_m(alone, true_places(b))
     assert error < 0.01
     assert abs(scale * 0.37 - 1.0) < 0.1
+
+
+def test_what_one_eye_is_lent_is_said_in_its_unit(make_flight: MakeFlight, words: Any) -> None:
+    pair, eye = make_flight(keyframes=40, turns=0.8), the_other_eye(make_flight)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [pair, eye])
+    base, reader = plain_pair()
+    supply = Supply(replace(BaseConfig().supply, min_cosine=-1.0, reach=9.0), BaseConfig().loops, mapper.map)
+    supply.serve(eye.agent, Live(eye.agent, 10**9, eye.keyframes[-1], np.eye(4), 90), base, 10**9)
+    records = reader.receive((), 0)
+    copies = {r.keyframe: r for r in records if isinstance(r, Copy)}
+    assert any(k in pair.keyframes for k in copies)
+    S_w_m = mapper.map.frame(submap_of_keyframe(eye.keyframes[0]))
+    compared = 0
+    for copied in (r for r in records if isinstance(r, Copied)):
+        T_m_k, camera = copies[copied.keyframe].T_m_k, eye.camera
+        z = 1.0 / copied.inv_depth.astype(np.float64)
+        x, y = ((copied.uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
+        seen = se3.transform(S_w_m, se3.transform(T_m_k, np.stack([x * z, y * z, z], 1)))
+        slots = mapper.map.slots_of(copied.keyframe)[copied.index]
+        there, known = mapper.map.positions(slots)
+        assert known.all()
+        assert np.abs(seen - there).max() < 1e-3
+        compared += len(slots)
+    assert compared > 50
 
 
 @pytest.mark.parametrize("rooms", ["papered", "half_papered"])
