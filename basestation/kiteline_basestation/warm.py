@@ -39,7 +39,11 @@ def warm(config: BaseConfig | None = None, words: Vocabulary | None = None) -> N
     if words is not None:
         submap = submap_id(0, 0, 0)
         easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_share=0.0)
-        find_overlap(station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0), easy)
+        sparse_map, last, first = station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
+        find_overlap(sparse_map, last, first, easy)
+        sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))
+        sparse_map.measures_depth.clear()
+        find_overlap(sparse_map, last, first, easy)  # as one eye's, with a scale
 
 
 def warm_graphs() -> None:
