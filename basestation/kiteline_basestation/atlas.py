@@ -8,31 +8,20 @@ undone.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation import disparity, refind
+from kiteline_basestation import atlas_memory, disparity, refind
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.correction import graph_of, keyframes_of, move_keyframes, rescale
-from kiteline_basestation.covisibility import Window, covisible_keyframes, window
+from kiteline_basestation.correction import graph_of, keyframes_of, move_keyframes, rescale, whole_window
+from kiteline_basestation.covisibility import Window, covisible_keyframes
 from kiteline_basestation.essential_graph import GraphResult
 from kiteline_basestation.jobs import BundleInputs, Job, JobDone
 from kiteline_basestation.loops import Finding, LoopFinder
-from kiteline_basestation.memory import (
-    Entry,
-    Json,
-    Memory,
-    matrix,
-    parsed,
-    plain,
-    similarity_of,
-    slots_of,
-    votes_entry,
-    votes_of,
-)
+from kiteline_basestation.memory import Memory
+from kiteline_basestation.merge import Merge
 from kiteline_basestation.odometry_links import with_links, without_links
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
@@ -47,16 +36,6 @@ from kiteline_core.place_index import Vocabulary
 from kiteline_core.sparse_map import SparseMap
 
 F64 = NDArray[np.float64]
-
-
-@dataclass(slots=True)
-class Merge:
-    """A map that was laid into another. moved: its submaps and where they lay before, and how long (S_w_m)."""
-
-    eldest: SubmapId
-    into: SubmapId
-    moved: dict[SubmapId, F64]
-    fused: list[tuple[int, int]] = field(default_factory=list)  # slots of points that became one at the merge
 
 
 class Atlas:
@@ -165,7 +144,7 @@ class Atlas:
                 out.append(job)
         self._graph_due.clear()
         for island in sorted(self._full_due - set(self._graphs.values())):
-            part = self._whole(island)
+            part = whole_window(self._map, island, self._edges, self._config)
             if part is not None:
                 agents: tuple[AgentId, ...] = ()
                 if self.fits(island) and not self._keeps_disparities(island):
@@ -204,56 +183,11 @@ class Atlas:
 
     def memory(self) -> Memory:
         """What a successor needs to go on from here; corrections under way are due again."""
-        sparse_map = self._map
-        out = {f"edge/{i:06d}": votes_entry(sparse_map, [v], points=False) for i, v in enumerate(self._edges)}
-        out |= {f"fresh/{s}": votes_entry(sparse_map, votes, points=True) for s, votes in sorted(self._fresh.items())}
-        for i, merge in enumerate(self.merges):
-            mark = (merge.eldest, merge.into, tuple(T.tobytes() for T in merge.moved.values()), len(merge.fused))
-            out[f"merge/{i:04d}"] = Entry(mark, partial(self._merge_text, merge))
-        out["atlas"] = plain(
-            {
-                "loops": self.loops,
-                "undone": self.undone,
-                "returned": [[int(s), at] for s, at in self._returned.items()],
-                "doubted": [[int(s), size] for s, size in sorted(self._doubted.items())],
-                "graphs": sorted({int(s) for s in self._graph_due | set(self._graphs.values())}),
-                "fulls": sorted({int(s) for s in self._full_due | {full[0] for full in self._fulls.values()}}),
-                "revisit": [int(k) for k in self._revisit],
-            }
-        )
-        return out | self.finder.memory()
-
-    def _merge_text(self, merge: Merge) -> Json:
-        fused = np.array(merge.fused, np.int32).reshape(-1, 2)
-        return {
-            "eldest": int(merge.eldest),
-            "into": int(merge.into),
-            "moved": [[int(s), matrix(T)] for s, T in merge.moved.items()],
-            "fused": [self._map.point_ids(fused[:, side]).tolist() for side in (0, 1)],
-        }
+        return atlas_memory.memory(self)
 
     def recall(self, texts: Mapping[str, str]) -> None:
         """Go on from what a forerunner remembered; every keyframe is a known place."""
-        sparse_map = self._map
-        for keyframe in sorted(sparse_map.rows):
-            if sparse_map.pose(keyframe) is not None and not sparse_map.keyframes.culled[sparse_map.rows[keyframe]]:
-                self.finder.add(keyframe)
-        self.finder.recall(texts)
-        for _, votes in parsed(texts, "edge"):
-            self._edges.extend(votes_of(sparse_map, votes))
-        for (submap,), votes in parsed(texts, "fresh"):
-            self._fresh[SubmapId(int(submap))] = votes_of(sparse_map, votes)
-        for _, m in parsed(texts, "merge"):
-            moved = {SubmapId(s): similarity_of(S) for s, S in m["moved"]}
-            fused = [(int(a), int(b)) for a, b in zip(*slots_of(sparse_map, *m["fused"]))]
-            self.merges.append(Merge(SubmapId(m["eldest"]), SubmapId(m["into"]), moved, fused))
-        for _, value in parsed(texts, "atlas"):
-            self.loops, self.undone = value["loops"], value["undone"]
-            self._returned = {SubmapId(s): at for s, at in value["returned"]}
-            self._doubted = {SubmapId(s): size for s, size in value.get("doubted", [])}
-            self._graph_due = {SubmapId(s) for s in value["graphs"] if s in sparse_map.submaps}
-            self._full_due = {SubmapId(s) for s in value["fulls"] if s in sparse_map.submaps}
-            self._revisit = [KeyframeId(k) for k in value["revisit"] if k in sparse_map]
+        atlas_memory.recall(self, texts)
 
     # -- findings ----------------------------------------------------------------------------------------------------
 
@@ -357,24 +291,6 @@ class Atlas:
                 if keyframe not in seen:
                     seen.add(keyframe)
                     refind.refind(self._map, keyframe, self._config.refind, self._publisher)
-
-    def _whole(self, island: SubmapId) -> Window | None:
-        """The problem of a whole map, or of the part around its newest loop when it is too large."""
-        config = self._config.graph
-        keyframes = [k for k in keyframes_of(self._map, island) if not self._map.keyframes.culled[self._map.rows[k]]]
-        first = self._map.submaps[self._map.island_of(island)][0]
-        if len(keyframes) > config.max_full:
-            newest = next((v for v in reversed(self._edges) if v.new in keyframes), None)
-            spots = [newest.new, newest.old] if newest is not None else keyframes[-1:]
-            near = self._map.keyframes.T_w_k[[self._map.rows[k] for k in keyframes], :3, 3]
-            centres = np.stack([self._map.keyframes.T_w_k[self._map.rows[k], :3, 3] for k in spots])
-            distance = np.linalg.norm(near[:, None] - centres, axis=2).min(axis=1)
-            keep = np.sort(np.argsort(distance, kind="stable")[: config.max_full])
-            keyframes = [keyframes[i] for i in keep.tolist()]
-        if len(keyframes) < 2:
-            return None
-        wide = replace(self._config.window, fixed=config.max_full // 2)
-        return window(self._map, keyframes, wide, self._config.measurement, {first})
 
     def _full_config(self) -> BundleConfig:
         config = self._config.graph

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import GraphConfig, PublishConfig
-from kiteline_basestation.covisibility import covisible_keyframes
+from kiteline_basestation.config import BaseConfig, GraphConfig, PublishConfig
+from kiteline_basestation.covisibility import Window, covisible_keyframes, window
 from kiteline_basestation.essential_graph import GraphInputs, Scaled
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.publisher import Publisher
@@ -156,3 +157,24 @@ def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher:
     if known.any():
         sparse_map.set_depths(slots[known], (inverse[known] / factor).astype(np.float32), offset[known])
         publisher.touch(Kind.DEPTHS, keyframe)
+
+
+def whole_window(
+    sparse_map: SparseMap, island: SubmapId, loops: Sequence[Overlap], base: BaseConfig
+) -> Window | None:  # fmt: skip
+    """The problem of a whole map, or of the part around its newest loop when it is too large."""
+    config = base.graph
+    keyframes = [k for k in keyframes_of(sparse_map, island) if not sparse_map.keyframes.culled[sparse_map.rows[k]]]
+    first = sparse_map.submaps[sparse_map.island_of(island)][0]
+    if len(keyframes) > config.max_full:
+        newest = next((v for v in reversed(loops) if v.new in keyframes), None)
+        spots = [newest.new, newest.old] if newest is not None else keyframes[-1:]
+        near = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
+        centres = np.stack([sparse_map.keyframes.T_w_k[sparse_map.rows[k], :3, 3] for k in spots])
+        distance = np.linalg.norm(near[:, None] - centres, axis=2).min(axis=1)
+        keep = np.sort(np.argsort(distance, kind="stable")[: config.max_full])
+        keyframes = [keyframes[i] for i in keep.tolist()]
+    if len(keyframes) < 2:
+        return None
+    wide = replace(base.window, fixed=config.max_full // 2)
+    return window(sparse_map, keyframes, wide, base.measurement, {first})

@@ -6,8 +6,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from kiteline_basestation.atlas import Merge
 from kiteline_basestation.management import called
+from kiteline_basestation.merge import Merge
 from kiteline_basestation.overlap import Overlap
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
