@@ -13,6 +13,8 @@ from kiteline_core.frame import UNMEASURED, OdometryBatch
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_FASTEST = 1e3  # m/s and rad/s; more is a fault of a device
+_VAGUEST = 1e12  # (m/s)^2 and (rad/s)^2; more only loses digits
 _ANY_RATE = 100.0  # (rad/s)^2; what is measured at all is measured far better than this
 _LIKELY_RATE = 0.25  # (rad/s)^2; a turn about an axis that nothing measures, of a vehicle that drives or flies calmly
 
@@ -60,12 +62,15 @@ def chosen(batch: OdometryBatch, keep: Bools | slice) -> OdometryBatch:
 
 
 def usable(batch: OdometryBatch) -> Bools:
-    """(n,) which samples hold finite numbers and variances that are none below zero."""
-    finite = np.isfinite(batch.velocity).all(axis=1) & np.isfinite(batch.rate).all(axis=1)
+    """(n,) which samples hold numbers that a vehicle can have, and covariances that are some."""
+    moving = np.concatenate([batch.velocity, batch.rate], axis=1)
+    good = np.asarray((np.abs(moving) < _FASTEST).all(axis=1))
     for cov in (batch.velocity_cov, batch.rate_cov):
         diagonal = np.diagonal(cov, axis1=1, axis2=2)
-        finite &= np.isfinite(cov).all(axis=(1, 2)) & (diagonal >= 0.0).all(axis=1)
-    return np.asarray(finite)
+        good &= ((diagonal >= 0.0) & (diagonal < _VAGUEST)).all(axis=1)
+        root = np.sqrt(np.where(good[:, None], diagonal, 0.0))
+        good &= (np.abs(cov) <= 1.001 * root[:, :, None] * root[:, None, :]).all(axis=(1, 2))
+    return np.asarray(good)
 
 
 def variances(sigma: Sequence[float]) -> F64:

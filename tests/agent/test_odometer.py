@@ -261,6 +261,23 @@ def test_a_sudden_turn_in_the_dark_is_followed() -> None:
     assert turned[2] == pytest.approx(3.0, abs=0.15)  # after a second; the first frame was half a turn's begin
 
 
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=9, max_size=9), st.integers(0, 1000))
+@settings(max_examples=60)
+def test_no_numbers_break_it(numbers: list[float], seed: int) -> None:
+    """Samples that hold anything, among good ones, in sight and in the dark."""
+    batch, rng = driven(3.0), np.random.default_rng(seed)
+    for k in rng.integers(30, len(batch.t_ns), 12):
+        batch.velocity[k] = numbers[:3]
+        batch.rate[k] = numbers[3:6]
+        batch.velocity_cov[k] = np.diag(numbers[6:])
+        if rng.random() < 0.3:
+            batch.rate_cov[k] = numbers[6] * np.ones((3, 3))
+    flown = Flown(batch, 3.0, blind_from_s=2.0)
+    assert np.isfinite(flown.pose).all()
+    assert np.isfinite(flown.cov).all()
+    assert np.linalg.eigvalsh(flown.cov).min() > -1e-9
+
+
 def test_without_use_nothing_is_looked_at() -> None:
     flown = Flown(driven(3.0), 3.0, config=OdometerConfig(use=False))
     assert not flown.odometer.heard

@@ -83,6 +83,11 @@ def test_batches_are_joined_and_chosen_from() -> None:
 def test_what_holds_no_numbers_is_told_apart() -> None:
     good, nan = one([1.0, 0.0, 0.0], [0.0] * 3), one([np.nan, 0.0, 0.0], [0.0] * 3)
     negative = OdometryBatch(good.t_ns, good.velocity, good.rate, -good.velocity_cov, good.rate_cov)
-    batch = odometry.joined([good, nan, negative])
+    fast, vague = one([1e30, 0.0, 0.0], [0.0] * 3), one([1.0, 0.0, 0.0], [0.0] * 3)
+    vague.rate_cov[0, 1, 1] = 1e300
+    askew = one([1.0, 0.0, 0.0], [0.0] * 3)
+    askew.velocity_cov[0, 0, 1] = 5.0
+    infinite = one([1.0, 0.0, 0.0], [0.0, np.inf, 0.0])
+    batch = odometry.joined([good, nan, negative, fast, vague, askew, infinite, good])
     assert batch is not None
-    assert odometry.usable(batch).tolist() == [True, False, False]
+    assert odometry.usable(batch).tolist() == [True, *[False] * 6, True]
