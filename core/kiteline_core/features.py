@@ -42,6 +42,10 @@ class DetectorConfig:
     cell_px: int = 32  # one new corner a cell keeps features spread; 32 px gives about 350 cells at 752x480
     fast_threshold: int = 12  # grey levels; low, since the cell keeps only its best corner
     min_score: float = 12.0  # (grey levels / px)^2; below it, sensor noise is as strong as the corner
+    faint_below: int = 100  # corners, taken ones among them: with fewer, the cells left are searched for faint ones
+    faint_threshold: int = 6  # grey levels of those
+    faint_score: float = 2.0  # of those at least, and
+    faint_noise: float = 1.5  # times the square of the noise: corners of pure noise reach 0.9
     margin_px: int = 20  # level-0 px: the lens's blind rim after rectification
     max_corners: int = 200  # a keyframe's births; what a link of 12 kB a keyframe carries
 
@@ -72,20 +76,37 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
     best_score = np.zeros((rows, columns))
     best_xy = np.zeros((rows, columns, 2), np.int32)
     best_level = np.zeros((rows, columns), np.uint8)
-    for level in range(config.first, min(config.levels, len(pyramid))):
-        image = pyramid[level]
-        margin = max(kernels.BORDER, config.margin_px >> level)
-        corners = np.empty((max(image.size // 4, 1), 2), np.int32)
-        n = fast_corners(image, config.fast_threshold, margin, 1 << level, float(config.cell_px), occupied, corners)
-        xy, score = corners[:n], np.empty(n)
-        kernels.corner_scores(image, xy, score)
-        kernels.best_per_cell(
-            xy, score, level, float(config.cell_px), config.min_score, occupied, best_score, best_xy, best_level
-        )
+
+    def search(threshold: int, min_score: float) -> None:
+        for level in range(config.first, min(config.levels, len(pyramid))):
+            image = pyramid[level]
+            margin = max(kernels.BORDER, config.margin_px >> level)
+            corners = np.empty((max(image.size // 4, 1), 2), np.int32)
+            n = fast_corners(image, threshold, margin, 1 << level, float(config.cell_px), occupied, corners)
+            xy, score = corners[:n], np.empty(n)
+            kernels.corner_scores(image, xy, score)
+            kernels.best_per_cell(
+                xy, score, level, float(config.cell_px), min_score, occupied, best_score, best_xy, best_level
+            )
+
+    search(config.fast_threshold, config.min_score)
+    if np.count_nonzero(occupied | (best_score > 0.0)) < config.faint_below:
+        occupied |= best_score > 0.0
+        noise = noise_of(pyramid[min(config.first, len(pyramid) - 1)])
+        search(config.faint_threshold, max(config.faint_score, config.faint_noise * noise * noise))
     r, c = np.nonzero(best_score > 0.0)
     order = np.argsort(-best_score[r, c], kind="stable")[: config.max_corners]
     r, c = r[order], c[order]
     return Corners(best_xy[r, c].astype(np.float64), best_level[r, c], best_score[r, c])
+
+
+def noise_of(image: U8) -> float:
+    """Deviation of an image's noise in grey levels, by what second differences along both axes leave of its content
+    (J. Immerkaer, "Fast noise variance estimation", 1996), median of every eighth row.
+    """
+    at = np.arange(1, image.shape[0] - 1, 8)
+    bent = image[at - 1].astype(np.int32) - 2 * image[at].astype(np.int32) + image[at + 1]
+    return float(np.median(np.abs(bent[:, :-2] - 2 * bent[:, 1:-1] + bent[:, 2:]))) * 1.4826 / 6.0
 
 
 def describe(pyramid: Pyramid, uv: NDArray[np.float64], octave: U8) -> tuple[U8, U8]:

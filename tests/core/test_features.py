@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from kiteline_core import feature_kernels as kernels
@@ -103,3 +104,24 @@ def test_pattern_stays_as_it_was_frozen() -> None:
     assert (
         int((features.PATTERN * weights).sum()) == 70162
     )  # two builds that differ here cannot match each other's corners
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.2, 2.0, 3.0])
+def test_noise_has_no_corners_and_is_measured(sigma: float) -> None:
+    rng = np.random.default_rng(4)
+    noise = np.clip(np.round(120.0 + sigma * rng.standard_normal((480, 752))), 0, 255).astype(np.uint8)
+    assert len(features.detect(features.build_pyramid(noise, 4), np.zeros((0, 2)), DetectorConfig()).uv) == 0
+    assert features.noise_of(noise) == pytest.approx(sigma, abs=0.2)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.2])
+def test_faint_corners_are_found_where_there_are_few_others(sigma: float) -> None:
+    rng = np.random.default_rng(5)
+    patches = np.kron(rng.uniform(98.0, 114.0, (30, 47)), np.ones((16, 16)))
+    image = np.clip(np.round(patches + sigma * rng.standard_normal(patches.shape)), 0, 255).astype(np.uint8)
+    pyramid, nothing = features.build_pyramid(image, 4), np.zeros((0, 2))
+    assert len(features.detect(pyramid, nothing, DetectorConfig(faint_below=0)).uv) < 30
+    found = features.detect(pyramid, nothing, DetectorConfig())
+    assert len(found.uv) > 80
+    corner = np.abs((found.uv + 0.5 + 8.0) % 16.0 - 8.0).max(axis=1)
+    assert np.mean(corner < 4.0) > 0.8, "corners of the patches, not of the noise, of which a quarter would be so near"
