@@ -125,8 +125,8 @@ class LoopConfig:
     drift_path: float = 0.02  # this share of the way flown since
     drift_rad: float = 0.1  # this turn, and
     drift_rad_m: float = 0.002  # this turn for each metre
-    own_drift_path: float = 0.2  # the same share where the unit of length drifts as well: one eye without a metre
-    own_drift_scale: float = 0.7  # logarithm by which that unit may drift along a loop: a factor of two
+    own_drift_path: float = 0.05  # the same share where the unit of length drifts as well, by one eye, and beside it
+    own_drift_scale: float = 0.4  # logarithm by which that unit may drift along a loop; it says how far the way is off
     small_m: float = 0.02  # correction that needs no pose graph: fusing points is enough
     small_rad: float = 0.005
     small_scale: float = 0.005  # of its logarithm

@@ -293,9 +293,11 @@ class LoopFinder:
         return explained
 
     def _drift_m(self, vote: Overlap, way: float) -> float:
-        """By how much the end of a way may be off."""
-        own = any(self._map.own_unit(submap_of_keyframe(k)) for k in (vote.new, vote.old))
-        return self._config.drift_m + (self._config.own_drift_path if own else self._config.drift_path) * way
+        """By how much the end of a way may be off: where the unit of length drifts, by as much as it did, too."""
+        config, share = self._config, self._config.drift_path
+        if any(self._map.own_unit(submap_of_keyframe(k)) for k in (vote.new, vote.old)):
+            share = config.own_drift_path + abs(float(np.log(sim3.scale_of(motion_of(self._map, vote)))))
+        return config.drift_m + share * way
 
     def _way_m(self, a: KeyframeId, b: KeyframeId) -> float:
         """Length of the way flown between two keyframes of one map."""

@@ -11,7 +11,7 @@ from kiteline_basestation.config import CullConfig, PublishConfig
 from kiteline_basestation.covisibility import Window
 from kiteline_basestation.publisher import Publisher
 from kiteline_codec.schema import Kind
-from kiteline_core import se3
+from kiteline_core import se3, sim3
 from kiteline_core.bundle import BundleResult
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
@@ -123,9 +123,7 @@ def keep_units(
     eldest = sparse_map.island_of(island)
     if eldest in growth:
         whole = _growth(sparse_map, sparse_map.submaps[eldest][:_AROUND], window, result)
-        about = sparse_map.world_pose(sparse_map.submaps[eldest][0])
-        assert about is not None
-        centre = about[:3, 3]
+        centre = sim3.place(sparse_map.frame(eldest), sparse_map.beginning(eldest))[:3, 3]
         poses = np.linalg.inv(result.T_c_m)
         poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)

@@ -100,8 +100,7 @@ class World:
     def grow(self, units: Mapping[SubmapId, float]) -> None:
         """Units of submaps have grown in their maps: these stay as long in the world as they were."""
         for submap, more in units.items():
-            begin = self._map.pose(self._map.submaps[submap][0])
-            assert begin is not None
+            begin = self._map.beginning(submap)
             if submap in self.placements:
                 self._set(submap, sim3.grown(self.placements[submap], more, begin))
             if submap in self.carried:
@@ -159,6 +158,5 @@ class World:
         """Where a submap lies in a world that moved: where its first keyframe does, as long as it is in metres."""
         if sim3.scale_of(S_new_old) == 1.0 or self._map.own_unit(submap):
             return sim3.normalise(S_new_old @ S_w_m)
-        begin = self._map.pose(self._map.submaps[submap][0]) if submap in self._map.submaps else None
-        begin = np.eye(4) if begin is None else begin
+        begin = self._map.beginning(submap)
         return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, begin)) @ se3.inverse(begin))

@@ -170,10 +170,13 @@ class SparseMap(MapView):
             self._follow(self.rows[keyframe])
 
     def stretch_submap(self, submap: SubmapId, factor: float) -> None:
-        """Let lengths of a submap be so many times as long in w; its first keyframe stays where it is."""
-        begin = self.pose(self.submaps[submap][0])
-        assert begin is not None
-        self.move_submap(submap, sim3.grown(self.frame(submap), factor, begin))
+        """Let lengths of a submap be so many times as long in w; its beginning stays where it is."""
+        self.move_submap(submap, sim3.grown(self.frame(submap), factor, self.beginning(submap)))
+
+    def beginning(self, submap: SubmapId) -> F64:
+        """T_m_k (4,4) of the first keyframe of a submap; the identity while that has no pose."""
+        begin = self.pose(self.submaps[submap][0]) if submap in self.submaps else None
+        return np.eye(4) if begin is None else begin
 
     def set_depths(self, slots: I32, inv_depth: F32, offset: F32) -> None:
         """The base's positions of the points born at `slots` (n,): inv_depth (n,) 1/m, offset (n,2) px."""

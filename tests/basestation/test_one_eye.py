@@ -17,8 +17,9 @@ from kiteline_basestation.jobs import BundleInputs, Job, JobDone, run_job
 from kiteline_basestation.management import _list
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.outputs import keyframe_poses
-from kiteline_basestation.overlap import depth_scale
+from kiteline_basestation.overlap import Overlap, depth_scale
 from kiteline_basestation.supply import Supply
+from kiteline_basestation.votes import similarity
 from kiteline_basestation.world_view import world_view
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import Camera, Copied, Copy, Head, Live, Placement, Record, Unit
@@ -232,6 +233,29 @@ def test_a_corridor_that_repeats_fools_one_eye_neither(make_flight: MakeFlight, 
     lone = Mapper(BaseConfig(), words)
     feed(lone, [in_own_unit(make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4, stereo=False), 0.6)])
     assert lone.summary()["loops"] == 0
+
+
+def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight, ring: Any, words: Any) -> None:
+    flight = make_flight(keyframes=40, turns=0.5, scene=ring, drift_m=0.002, seed=4, memory=3, stereo=False)
+    mapper = Mapper(BaseConfig(), words)
+    feed(mapper, [flight])
+    assert mapper.atlas is not None
+    old, new = flight.keyframes[0], flight.keyframes[-1]
+
+    def explained(shift_m: float, scale: float) -> bool:
+        at = similarity(mapper.map, new)[:3, 3]
+        X = sim3.of(scale, se3.from_rt(np.eye(3), at - scale * at + [shift_m, 0.0, 0.0]))  # about where the camera is
+        S = sim3.inverse(similarity(mapper.map, old)) @ X @ similarity(mapper.map, new)
+        none = np.zeros(0, np.int32)
+        vote = Overlap(new, old, sim3.rigid(S), 90, none, none, 3.0, sim3.scale_of(S))
+        assert mapper.atlas is not None
+        return mapper.atlas.finder._drift_explains(vote)
+
+    # 50 m on, a place that looks the same stands 6 m aside: no drift of the unit, and so no drift of the way either.
+    assert not explained(6.0, 1.0)
+    assert explained(6.0, 1.15)
+    assert explained(2.0, 1.0)
+    assert not explained(0.0, 1.8)
 
 
 def test_depths_that_do_not_say_one_length_say_none() -> None:
