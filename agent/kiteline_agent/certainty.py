@@ -160,11 +160,10 @@ class Certainty:
             return
         self._blind_s = before + dt_s
         speed = (c.blind_velocity_m_s, c.blind_rate_rad_s) if moves else (c.blind_speed_m_s, c.blind_speed_rad_s)
-        moved, turned = (
-            (v * s + 0.5 * a * s * s for s in (before, self._blind_s))
+        (m0, m1), (t0, t1) = (
+            tuple(v * s + 0.5 * a * s * s for s in (before, self._blind_s))
             for v, a in zip(speed, (c.blind_accel_m_s2, c.blind_turn_rad_s2), strict=True)
         )
-        (m0, m1), (t0, t1) = moved, turned
         grown = np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3)
         self._blind = self._blind + np.diag(grown)
 

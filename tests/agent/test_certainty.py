@@ -189,6 +189,19 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
     assert after[0, 0] > before[0, 0]
 
 
+def test_where_the_speed_was_not_known_blindness_is_worse() -> None:
+    config = replace(CertaintyConfig(), blind_speed_m_s=5.0, blind_speed_rad_s=1.0)
+    sigma = []
+    for moves in (True, False):
+        certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config,
+                              has_body=False, has_depth=True)  # fmt: skip
+        certainty.begin(np.eye(4))
+        certainty.blind(0.3, None, moves=moves)
+        sigma.append(np.sqrt(np.diag(certainty.of_poses(PoseState(), np.eye(4))[0])))
+    np.testing.assert_allclose(sigma[0], np.repeat([0.03 * 0.3 + 0.09, 0.02 * 0.3 + 0.09], 3), rtol=1e-6)
+    np.testing.assert_allclose(sigma[1], np.repeat([5.0 * 0.3 + 0.09, 1.0 * 0.3 + 0.09], 3), rtol=1e-6)
+
+
 def test_how_likely_an_error_is_small() -> None:
     rng = np.random.default_rng(1)
     for sigma in ([0.1, 0.1, 0.1], [0.2, 0.02, 0.05], [0.01, 0.01, 0.01], [1.0, 1.0, 0.1]):
