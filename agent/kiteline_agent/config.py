@@ -227,8 +227,8 @@ class GovernorConfig:
     cpu_percent: float = 0.0  # of one core, over any window; 0: no budget
     window_s: float = 1.0  # s in which the budget has to hold
     margin: float = 0.97  # share of the budget that is planned with: the rest is for what was not foreseen
-    tight: float = 0.95  # share of the budget above which effort falls
-    fill: float = 0.92  # share up to which frames are let through between two rows
+    tight: float = 1.0  # share of the budget above which effort falls
+    fill: float = 1.05  # share up to which frames are let through between two rows: keyframes are not always due
     comfort: float = 0.86  # share below which the next better effort would have to stay, so that effort rises
     grace_s: float = 2.0  # s at the start that are not booked: a map has to be begun
     down_s: float = 0.25  # s between two falls: the expectations need time to show the first one
@@ -236,7 +236,7 @@ class GovernorConfig:
     max_gap_s: float = 0.35  # s between tracked frames; after more, a track is hard to find again
     carried_gap_s: float = 0.8  # the same with an IMU, whose prediction counts as tracking for 1 s
     blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
-    doubt: float = 0.1  # how much dearer than expected a frame may be
+    doubt: float = 0.1  # how much dearer than expected a frame may be, at least
     learning: float = 0.15  # gain of the expectations of frames
     keyframe_learning: float = 0.4  # gain of how often keyframes are asked for
     first_keyframes: float = 2.0  # in a second, before it was seen

@@ -68,6 +68,7 @@ _LONGER = 1.03  # growth of the expected period a frame, should the camera be sl
 _FIRST_LONGER = 2.5  # the same between the first two frames; more, and the core was busy with the first
 _GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0}  # usual frames that it costs, before it was seen
 _OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
+_SPREAD = 2.0  # mean deviations within which nine of ten frames lie
 _LEAST = 0.1  # of the budget is for frames, whatever keyframes cost
 
 
@@ -124,6 +125,7 @@ class Governor:
         self._window_ns = 0
         self._turn = 1.0  # grows by the share of frames that are tracked; at 1 it is a frame's turn
         self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
+        self._scatter = 0.0  # how much, of their cost, frames differ from what was expected, on average
         self._idle_ns = 0.0  # what a frame costs that is not tracked
         self._extra_ns = dict.fromkeys(Extra, 0.0)  # what each adds to a frame
         self._keyframes_s = config.first_keyframes  # that are asked for in a second
@@ -173,7 +175,7 @@ class Governor:
         self._steer(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
         track = (self._its_turn(lost) or self._early(t_ns)) and self._affordable(t_ns, lost)
         if not track and not lost and self._blind_for(t_ns, self._gap_s):  # frames before tracking
-            track = self._window_ns + (1.0 + 0.5 * self._config.doubt) * self._frame_ns <= self._budget_ns
+            track = self._window_ns + (1.0 + 0.5 * self._doubt) * self._frame_ns <= self._budget_ns
             if not track and self._blind_for(t_ns, self._config.blind_s):
                 track = True
                 events.append("governor: over budget, or the track would be lost")
@@ -198,7 +200,8 @@ class Governor:
                 self._asked_t_ns = self._last_t_ns
             if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
                 return False
-            if not self._room_for(extra, 1.0 + (0.5 if urgent else 1.0) * self._config.doubt):
+            dearer = 1.0 + (0.5 if urgent or self._waited is extra else 1.0) * self._doubt  # room was made for it
+            if not self._room_for(extra, dearer):
                 self._waiting = extra
                 return False
         self.note(extra)
@@ -219,6 +222,7 @@ class Governor:
         if not self._last_tracked:
             self._idle_ns += (cpu_ns - self._idle_ns) * (gain if self._idle_ns else 1.0)
             return
+        self._scatter += (self._surprise(cpu_ns) - self._scatter) * gain
         if self._last_extra is not None:
             known_ns = self._extra_ns[self._last_extra]
             more_ns = max(cpu_ns - self._frame_ns, 0.0)
@@ -252,6 +256,19 @@ class Governor:
             self._keyframes_s = min(self._keyframes_s, 1e9 / max(t_ns - self._keyframe_t_ns, 1))
         self._turn += self._share() * passed_ns / self._period_ns
 
+    def _surprise(self, cpu_ns: int) -> float:
+        """By how much the last frame was off, of what it was expected to cost, as far as that was known."""
+        known_ns = 0.0 if self._last_extra is None else self._extra_ns[self._last_extra]
+        if not self._measured or (self._last_extra is not None and not known_ns):
+            return self._scatter
+        expected_ns = self._frame_ns + known_ns
+        return min(abs(cpu_ns - expected_ns) / expected_ns, _OUTLIER - 1.0)
+
+    @property
+    def _doubt(self) -> float:
+        """How much dearer than expected a frame may be."""
+        return max(self._config.doubt, _SPREAD * self._scatter)
+
     def _count_keyframe(self, t_ns: int) -> None:
         """A keyframe was made: how many are asked for, whether there was room for them at once or not."""
         asked_t_ns = t_ns if self._asked_t_ns is None else self._asked_t_ns
@@ -263,10 +280,10 @@ class Governor:
     def _affordable(self, t_ns: int, lost: bool) -> bool:
         """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
         if lost:
-            return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._config.doubt)
+            return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._doubt)
         if self._waiting is Extra.KEYFRAME and not self._blind_for(t_ns, self._gap_s):
-            return self._room_for(Extra.KEYFRAME, 1.0 + 0.5 * self._config.doubt)  # it goes before more frames
-        cost_ns = self._frame_ns * (1.0 + self._config.doubt)
+            return self._room_for(Extra.KEYFRAME, 1.0 + 0.5 * self._doubt)  # it goes before more frames
+        cost_ns = self._frame_ns * (1.0 + self._doubt)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 
     def _blind_for(self, t_ns: int, gap_s: float) -> bool:

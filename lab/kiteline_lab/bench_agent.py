@@ -29,7 +29,7 @@ _SOAK_MINUTES = 30.0
 _SOAK_FRAMES = 200  # of the recording, flown to and fro
 _SIM_SECONDS = 30.0
 # name: scene, trajectory, s into it, seed
-_SIMULATED = {"MH_03": ("hall", "MH_03_medium.txt", 15.0, 3), "V1_02": ("room", "V1_02_medium.txt", 20.0, 4)}
+SIMULATED = {"MH_03": ("hall", "MH_03_medium.txt", 15.0, 3), "V1_02": ("room", "V1_02_medium.txt", 20.0, 4)}
 _DEPTH_SECONDS = 18.0
 
 
@@ -82,8 +82,8 @@ def _kitti(bench: Bench) -> list[Bar]:
 def _simulated(bench: Bench) -> list[Bar]:
     """Flights in the simulator along real ones' paths, with IMU and base."""
     bars = []
-    for name in _SIMULATED:
-        agent = _fly(bench, _rendered(bench, name), f"agent_{name}")
+    for name in SIMULATED:
+        agent = _fly(bench, rendered(bench, name), f"agent_{name}")
         live = agent["accuracy"]["live"]
         bars += [
             at_most(f"{name} in the simulator, IMU and base: ATE live", live["ate_m"], 0.03, "m", 4),
@@ -93,9 +93,9 @@ def _simulated(bench: Bench) -> list[Bar]:
     return bars
 
 
-def _rendered(bench: Bench, name: str) -> str:
+def rendered(bench: Bench, name: str) -> str:
     """The recording of a simulated flight; rendered once, if the folder is kept."""
-    scene, trajectory, start_s, seed = _SIMULATED[name]
+    scene, trajectory, start_s, seed = SIMULATED[name]
     options = ["--trajectory", bench.source(f"trajectories/{trajectory}"), "--start", f"{start_s}", "--seed", f"{seed}"]
     return _render(bench, name, [scene, *options, "--seconds", f"{_SIM_SECONDS}"])
 
@@ -120,9 +120,9 @@ def _mono(bench: Bench) -> list[Bar]:
         at_most("kitti07_mono: frames until it has begun", first + 1, 15, "", 0),
         at_most("kitti07_mono: frames lost afterwards", lost, 0, "", 0),
     ]
-    for name in _SIMULATED:
+    for name in SIMULATED:
         bench.say(f"flying {name} with one eye")
-        clip = load(_rendered(bench, name), mono=True)
+        clip = load(rendered(bench, name), mono=True)
         plain = _similar(estimates(replace(clip, imu=None)), clip)
         agent, found = _with_imu(clip)
         metric = _similar([e for e in found if e.submap == agent.submap], clip) if agent.metric else None
@@ -177,7 +177,7 @@ def _odometry(bench: Bench) -> list[Bar]:
 
 
 def _governor(bench: Bench) -> list[Bar]:
-    return bench_governor.bars(bench, [_rendered(bench, name) for name in _SIMULATED])
+    return bench_governor.bars(bench, [rendered(bench, name) for name in SIMULATED])
 
 
 def _losses(bench: Bench) -> list[Bar]:

@@ -23,6 +23,7 @@ BENCHMARKS = {
     "first-flight": "kiteline_lab.bench_first_flight",
     "front-end": "kiteline_lab.bench_front_end",
     "agent": "kiteline_lab.bench_agent",
+    "governor": "kiteline_lab.bench_knobs",
     "honest": "kiteline_lab.bench_honest",
     "link": "kiteline_lab.bench_link",
     "fuzz": "kiteline_lab.bench_fuzz",

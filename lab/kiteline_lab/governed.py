@@ -86,12 +86,7 @@ def _judged(
     clip: Clip, percent: float, governor: bool, real: bool, estimates: list[Estimate | None], spent: I64
 ) -> Governed:
     good = [e for e in estimates if e is not None and e.tracked and e.T_m_b is not None]
-    ate_m = rpe_mm = float("nan")
-    if clip.truth is not None and len(good) > 3:
-        stamps = np.array([e.t_ns for e in good], np.int64)
-        found = metrics.evaluate(Trajectory(stamps, np.array([e.T_m_b for e in good])), clip.truth)
-        ate_m = found.ate_m.rmse
-        rpe_mm = 1000.0 * found.rpe_frame.translation_m.rmse if found.rpe_frame is not None else rpe_mm
+    ate_m, rpe_mm = pose_errors(clip, good)
     dropped = sum(e is None for e in estimates)
     span_ns = clip.items[-1][0].t_ns - clip.items[0][0].t_ns + clip.period_ns
     return Governed(
@@ -99,6 +94,16 @@ def _judged(
         len({e.submap for e in good}), 100.0 * float(spent[:, 1].sum()) / span_ns, 100.0 * dearest_window(spent),
         ate_m, rpe_mm, float(np.mean([e.quality for e in good])) if good else 0.0,
     )  # fmt: skip
+
+
+def pose_errors(clip: Clip, tracked: list[Estimate]) -> tuple[float, float]:
+    """ATE in m and relative error in mm a frame of tracked frames; nan with too few of them, or no truth."""
+    if clip.truth is None or len(tracked) <= 3:
+        return float("nan"), float("nan")
+    stamps = np.array([e.t_ns for e in tracked], np.int64)
+    found = metrics.evaluate(Trajectory(stamps, np.array([e.T_m_b for e in tracked])), clip.truth)
+    relative = found.rpe_frame
+    return found.ate_m.rmse, float("nan") if relative is None else 1000.0 * relative.translation_m.rmse
 
 
 def dearest_window(spent: I64, settled_ns: int = _SETTLED_NS) -> float:

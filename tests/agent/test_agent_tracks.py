@@ -117,6 +117,34 @@ def test_faults_on_frames_are_survived(data_dir: Path, fault: str) -> None:
     assert jump_m(estimates) < 0.35
 
 
+def test_where_the_imu_knows_the_place_the_map_goes_on(data_dir: Path) -> None:
+    source = open_source(str(data_dir / "room_flight.mcap"))
+    items, seen = [], 0
+    for item in first_frames(source, 90):
+        if isinstance(item, Frame):
+            seen += 1
+            if 60 <= seen < 68:  # 0.4 s of black in a flight, and what was known of the place is gone with it
+                item = replace(item, left=np.zeros_like(item.left), right=np.zeros_like(item.left), encoded=())
+        items.append(item)
+    agent = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    found: list[Estimate] = []
+    imu: ImuBatch | None = None
+    for item in items:
+        if isinstance(item, ImuBatch):
+            imu = item
+            continue
+        if len(found) == 66:
+            agent.map.forget(agent.submap)
+        estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
+        assert estimate is not None
+        found.append(estimate)
+        imu = None
+    assert all(e.tracked for e in found) and {e.submap for e in found} == {found[0].submap}
+    assert found[67].bridged and not found[70].bridged
+    assert step_errors_m(source, found)[-20:].max() < 0.02
+    assert found[70].cov_m[0, 0] > found[58].cov_m[0, 0]
+
+
 def test_nothing_to_see_is_no_error() -> None:
     from kiteline_core.cameras import CameraModel, CameraRig
 

@@ -206,3 +206,33 @@ def test_effort_scales_what_the_user_has_chosen() -> None:
     assert governed(chosen, FULL).align.points == 120
     assert governed(chosen, CARRIED[-1]).align.points == round(120 * CARRIED[-1].points)
     assert governed(chosen, FULL).align.fine_from == 0
+
+
+@pytest.mark.parametrize("carried", [True, False])
+@pytest.mark.parametrize("share", [0.5, 0.25])
+def test_a_keyframe_that_is_wanted_does_not_starve_behind_frames(carried: bool, share: float) -> None:
+    governor, cost_ns, asked, waited = Governor(GovernorConfig(cpu_percent=share * LOAD)), 0, 0, []
+    for k in range(600):
+        decision = governor.frame(k * PERIOD_NS, cost_ns, carried=carried)
+        cost_ns = 20_000
+        if decision.track:
+            cost_ns = round(FRAME_NS * decision.effort.frame_cost)
+            if k >= asked:
+                if governor.may(Extra.KEYFRAME):
+                    cost_ns += round(KEYFRAME_NS * decision.effort.keyframe_cost)
+                    waited.append(k - asked)
+                    asked = k + 22  # not more often than the budget bears
+    assert max(waited[2:]) <= 16 and len(waited) > 18
+
+
+def test_where_costs_scatter_more_is_left_free() -> None:
+    def dearest(scatter: float) -> float:
+        rng, governor, cost_ns, spent = np.random.default_rng(5), Governor(GovernorConfig(cpu_percent=2.0)), 0, []
+        for k in range(1200):
+            decision = governor.frame(k * PERIOD_NS, cost_ns, carried=True)
+            cost_ns = round(3_500_000 * (1.0 + scatter * rng.uniform(-1.0, 1.0))) if decision.track else 20_000
+            spent.append(cost_ns)
+        return max(sum(spent[k - 19 : k + 1]) for k in range(60, 1200)) / 20e6
+
+    assert 0.85 < dearest(0.0) <= 1.0
+    assert dearest(0.3) <= 1.0
