@@ -169,10 +169,10 @@ def _off(found: metrics.Evaluation | None) -> float:
 
 def _odometry(bench: Bench) -> list[Bar]:
     flights = {}
-    for name, (scene, trajectory, start_s, seed) in _SIMULATED.items():
+    for name, (scene, trajectory, start_s, seed) in SIMULATED.items():
         path = bench.source(f"trajectories/{trajectory}")
         options = {"trajectory": path, "start": start_s, "seed": seed, "seconds": _SIM_SECONDS}
-        flights[name] = bench_agent_odometry.Simulated(_rendered(bench, name), scene, options)
+        flights[name] = bench_agent_odometry.Simulated(rendered(bench, name), scene, options)
     return bench_agent_odometry.bars(bench, flights)
 
 
