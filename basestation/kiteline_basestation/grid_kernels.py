@@ -7,7 +7,7 @@ Cells are numbered from the lower left corner of the box; a tile has 32x32 of th
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 I32 = NDArray[np.int32]
@@ -22,7 +22,7 @@ SHIFT, MASK = 5, TILE - 1  # a division by TILE and its rest: the inner loop's m
 COUNT_MAX = 65535  # counts are 16 bits wide and stay there
 
 
-@njit(cache=True, nogil=True)
+@njit
 def mark_points(
     column: I64, row: I64, z: F64, weight: I64, slots: I32, used: int, hits: U16, low: F32, high: F32
 ) -> int:
@@ -45,7 +45,7 @@ def mark_points(
     return used
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cast_rays(
     start: I64, end: I64, z: F64, ceiling: F64, short: I64, first: int, slots: I32, used: int, margin_m: float,
     free: U16, through: U16, low: F32, high: F32,
@@ -97,7 +97,7 @@ def cast_rays(
     return start.shape[0], used
 
 
-@njit(cache=True, nogil=True)
+@njit
 def spread_ground(
     histogram: F32, seed: int, seed_bin: int, reach: int, share: float, least: float, ground: I32, queue: I32
 ) -> None:

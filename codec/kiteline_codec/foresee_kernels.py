@@ -7,7 +7,7 @@ get the same integers whatever their machines.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
@@ -23,7 +23,7 @@ _DEPTH_SCALE = 0.0078125
 _LEAST_DEPTH = 0.05  # of the point's depth: what comes nearer to the camera than that is not foreseen
 
 
-@njit(cache=True, nogil=True)
+@njit
 def compose(a: F64, b: F64, out: F64) -> None:
     """out (4,4) = a @ b for rigid motions."""
     for i in range(3):
@@ -36,7 +36,7 @@ def compose(a: F64, b: F64, out: F64) -> None:
     out[3, 3] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def invert(a: F64, out: F64) -> None:
     """out (4,4) = inverse of a rigid motion."""
     for i in range(3):
@@ -50,13 +50,13 @@ def invert(a: F64, out: F64) -> None:
     out[3, 3] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _inverse_depth(code: int) -> float:
     e, m = code // _MANTISSA, code % _MANTISSA
     return (float(_MANTISSA + m) * float(1 << e) / _MANTISSA - 1.0) * _DEPTH_SCALE
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pick(births: I32, keypoint: I64, mask: int, out: I64) -> None:
     """Codes (4, n) of the births at keypoints (n,), as they are where they came with a part that the mask names.
 
@@ -72,7 +72,7 @@ def pick(births: I32, keypoint: I64, mask: int, out: I64) -> None:
                 out[k, i] = births[k, at]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def foresee(born: I64, place: I64, T_k_a: F64, camera: F64, out: I64) -> None:
     """Codes of u, v and inverse depth (3, n) of points as keyframe k would see them; -1 where nothing can be said.
 

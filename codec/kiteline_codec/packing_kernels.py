@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 I64 = NDArray[np.int64]
@@ -13,7 +13,7 @@ MAX_WIDTH = 40  # bits of one packed number: wider than any column needs
 _MAX_VARINT = 1 << 42  # keeps sums of 2048 deltas far from the limits of int64
 
 
-@njit(cache=True, nogil=True)
+@njit
 def first_outside(values: I64, low: I64, high: I64) -> int:
     """The first of the columns (c, n) that holds a number below low or above high (c,); -1 where none does."""
     for i in range(values.shape[0]):
@@ -23,7 +23,7 @@ def first_outside(values: I64, low: I64, high: I64) -> int:
     return -1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _put_varint(out: U8, at: int, value: int) -> int:
     while value >= 128:
         out[at] = np.uint8((value & 127) | 128)
@@ -33,7 +33,7 @@ def _put_varint(out: U8, at: int, value: int) -> int:
     return at + 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _varint_bytes(value: int) -> int:
     n = 1
     while value >= 128:
@@ -42,12 +42,12 @@ def _varint_bytes(value: int) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _zigzag(value: int) -> int:
     return 2 * value if value >= 0 else -2 * value - 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _width(value: int) -> int:
     n = 0
     while value > 0:
@@ -56,7 +56,7 @@ def _width(value: int) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pack_columns(values: I64, out: U8) -> int:
     """Pack values (c, n) int64, n >= 1, |value| < 2^38, into `out` (zeroed, at least c * (5 * n + 16) + 8 bytes).
 
@@ -119,7 +119,7 @@ def pack_columns(values: I64, out: U8) -> int:
     return (bit + 7) >> 3
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _get_varint(data: U8, at: int) -> tuple[int, int]:
     """(value, position after it); position -1 when the bytes end or the number is too large or not the shortest."""
     value = 0
@@ -136,7 +136,7 @@ def _get_varint(data: U8, at: int) -> tuple[int, int]:
     return 0, -1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def unpack_columns(data: U8, at: int, values: I64) -> int:
     """Fill values (c, n), n >= 1, from data[at:]. Returns the position after the columns, or -1 for invalid bytes."""
     c, n = values.shape

@@ -7,7 +7,7 @@ LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixe
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 I64 = NDArray[np.int64]
@@ -23,7 +23,7 @@ LIMIT = 1 << 30  # magnitude of values
 _HALVE = 16  # numbers after which older ones count half
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _put(out: U8, bit: int, value: int, width: int) -> int:
     left = width
     while left > 0:
@@ -36,7 +36,7 @@ def _put(out: U8, bit: int, value: int, width: int) -> int:
     return bit
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _get(data: U8, bit: int, width: int) -> int:
     value = 0
     got = 0
@@ -49,7 +49,7 @@ def _get(data: U8, bit: int, width: int) -> int:
     return value
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _parameter(total: int, count: int) -> int:
     k = 0
     while (count << k) < total and k < MAX_START:
@@ -57,7 +57,7 @@ def _parameter(total: int, count: int) -> int:
     return k
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _symbol(values: I64, j: int, mode: int, shift: int, low: int) -> int:
     """The number that stands for values[j]; of STEPS from j = 1 on."""
     v = values[j] >> shift
@@ -68,7 +68,7 @@ def _symbol(values: I64, j: int, mode: int, shift: int, low: int) -> int:
     return int(2 * v if v >= 0 else -2 * v - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _rice_bits(values: I64, mode: int, shift: int, low: int, start: int) -> int:
     total = 1 << start
     count = 1
@@ -86,7 +86,7 @@ def _rice_bits(values: I64, mode: int, shift: int, low: int, start: int) -> int:
     return bits
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _varint_bits(value: int) -> int:
     z = 2 * value if value >= 0 else -2 * value - 1
     n = 8
@@ -96,7 +96,7 @@ def _varint_bits(value: int) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _shape(values: I64, out: I64) -> None:
     """Mode, shift, first number and width or start of the shortest form of a column (n,), n >= 1, into out (4,)."""
     n = values.size
@@ -128,7 +128,7 @@ def _shape(values: I64, out: I64) -> None:
             last = bits
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pack_tight(values: I64, out: U8) -> int:
     """Pack values (c, n) int64, n >= 1, |value| < LIMIT, into `out` (zeroed, at least c * (7 * n + 16) + 8 bytes).
 
@@ -177,7 +177,7 @@ def pack_tight(values: I64, out: U8) -> int:
     return (bit + 7) >> 3
 
 
-@njit(cache=True, nogil=True)
+@njit
 def unpack_tight(data: U8, at: int, values: I64) -> int:
     """Read columns into values (c, n), n >= 1. Returns the position after them, or -1 when they are malformed."""
     c, n = values.shape

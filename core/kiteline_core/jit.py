@@ -27,5 +27,6 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def njit(function: F) -> F:
     """Compile a kernel: arrays in, caller's arrays out; no parallel, no fastmath, no objects."""
-    compiled: F = _numba.njit(cache=True, nogil=True)(function)
+    helper = function.__name__.startswith("_")
+    compiled: F = _numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=helper)(function)
     return compiled

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
@@ -11,7 +11,7 @@ I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def roads_free(free: Bool, nodes: F64, pairs: I64, out: Bool) -> None:
     """Whether each straight road runs over free cells only.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
@@ -14,7 +14,7 @@ _STILL_PX = 0.7  # a shorter streak blurs less than resampling it would
 _MOST_TAPS = 17
 
 
-@njit(cache=True, nogil=True)
+@njit
 def motion_blur(
     radiance: F32, distance: F32, rays: F32, linear: F64, angular: F64, exposure_s: float, out: F32
 ) -> None:
@@ -58,7 +58,7 @@ def motion_blur(
             out[y, x] = total / taps
 
 
-@njit(cache=True, nogil=True)
+@njit
 def expose(radiance: F32, fall_off: F32, gain: float, read: float, shot: float, key: np.uint64, out: U8) -> None:
     """Grey values of a radiance image: vignette, gain, then noise of variance read^2 + shot * value, rounded.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from kiteline_core.jit import njit
 from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def paint(shapes: F32, kinds: NDArray[np.int32], out: F32) -> None:
     """Paint shapes in order, later ones over earlier ones; `out` (n, n), n a power of two, wraps around.
 
