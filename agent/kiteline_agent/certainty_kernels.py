@@ -51,8 +51,11 @@ def sensitivity(
     here, there = np.empty((3, SHAPES)), np.empty((3, SHAPES))
     jac, pj, e = np.zeros((3, 6)), np.zeros((3, 3)), np.empty((3, SHAPES))
     v, dk, dm, jv, ev = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(SHAPES)
-    h[:] = 0.0
-    g[:] = 0.0
+    for a in range(6):
+        for b in range(6):
+            h[a, b] = 0.0
+        for b in range(SHAPES):
+            g[a, b] = 0.0
     for i in range(rows.shape[0]):
         if not inlier[i]:
             continue
@@ -156,17 +159,19 @@ def _cross_into(t: F64, r: F64, sign: float, a: F64) -> None:
 @njit
 def adjoint_into(T: F64, a: F64) -> None:
     """a (6,6): Exp(a x) T = T Exp(x) for x [translation, rotation]."""
-    a[:] = 0.0
     for i in range(3):
         for j in range(3):
             a[i, j] = a[3 + i, 3 + j] = T[i, j]
+            a[3 + i, j] = 0.0
     _cross_into(T[:3, 3], T, 1.0, a)
 
 
 @njit
 def body_into(T: F64, j: F64) -> None:
     """j (6,6): of [translation in a, rotation about the body's axes] by a perturbation on the left of T = T_a_b."""
-    j[:] = 0.0
+    for i in range(6):
+        for k in range(6):
+            j[i, k] = 0.0
     t = T[:3, 3]
     for i in range(3):
         j[i, i] = 1.0

@@ -109,7 +109,9 @@ def spread_ground(
     queue: (rows * columns,) scratch.
     """
     rows, columns, bins = histogram.shape
-    ground[:, :] = -1
+    for r in range(rows):
+        for c in range(columns):
+            ground[r, c] = -1
     ground[seed // columns, seed % columns] = seed_bin
     queue[0] = seed
     head, tail = 0, 1

@@ -67,8 +67,11 @@ def linearise(  # type: ignore[no-untyped-def]
 
     hcc (f,6,6) upper triangle, bc (f,6), hpp (n,6) = xx xy xz yy yz zz, bp (n,3), hcp (m,6,3): filled from nothing.
     """
-    hcc[:] = 0.0
-    bc[:] = 0.0
+    for f in range(bc.shape[0]):
+        for a in range(6):
+            bc[f, a] = 0.0
+            for b in range(6):
+                hcc[f, a, b] = 0.0
     total = 0.0
     jc = np.zeros((3, 6))
     jp = np.zeros((3, 3))
@@ -88,7 +91,9 @@ def linearise(  # type: ignore[no-untyped-def]
             else:
                 total += s
             if not seen:
-                hcp[o] = 0.0
+                for a in range(6):
+                    for b in range(3):
+                        hcp[o, a, b] = 0.0
                 continue
             inv = 1.0 / d
             g00, g02 = lens[c, 0] * inv, -lens[c, 0] * x * inv * inv
@@ -140,7 +145,9 @@ def reduce(starts, camera, active, free, damping, hcc, bc, hpp, bp, hcp, inv, s,
     Diagonals are damped by the factor 1 + damping (Marquardt). inv (n,6): the inverted point blocks. Returns the number
     of pairs of observations that were combined.
     """
-    s[:] = 0.0
+    for a in range(s.shape[0]):
+        for b in range(s.shape[1]):
+            s[a, b] = 0.0
     for f in range(hcc.shape[0]):
         for a in range(6):
             rhs[6 * f + a] = bc[f, a]
@@ -157,7 +164,8 @@ def reduce(starts, camera, active, free, damping, hcc, bc, hpp, bp, hcp, inv, s,
         c0, c1, c2 = m3 * m5 - m4 * m4, m2 * m4 - m1 * m5, m1 * m4 - m2 * m3
         det = m0 * c0 + m1 * c1 + m2 * c2
         if det <= 1e-30 * m0 * m3 * m5 or det <= 0.0:
-            inv[i] = 0.0  # a point that nothing holds: it stays where it is
+            for a in range(6):
+                inv[i, a] = 0.0  # a point that nothing holds: it stays where it is
             continue
         q = 1.0 / det
         v0, v1, v2 = c0 * q, c1 * q, c2 * q
@@ -240,7 +248,8 @@ def step(  # type: ignore[no-untyped-def]
     for c in range(cameras.shape[0]):
         f = free[c]
         if f < 0:
-            new_cameras[c] = cameras[c]
+            for a in range(12):
+                new_cameras[c, a] = cameras[c, a]
             continue
         d = dx[6 * f : 6 * f + 6]
         for a in range(6):
@@ -287,6 +296,14 @@ def _rotation(x, y, z, r):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _copy(a, out):  # type: ignore[no-untyped-def]
+    """out = a for matrices of one shape."""
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            out[i, k] = a[i, k]
+
+
+@njit
 def minimise(  # type: ignore[no-untyped-def]
     cameras, lens, points, starts, camera, measured, weight, active, bound, free, trials, stop, hcc, bc, hpp, bp, hcp,
     inv, s, rhs, new_cameras, new_points, counts,
@@ -316,8 +333,8 @@ def minimise(  # type: ignore[no-untyped-def]
         new = robust_cost(new_cameras, lens, new_points, starts, camera, measured, weight, active, bound)
         if new < cost:
             gain = (cost - new) / cost
-            cameras[:] = new_cameras
-            points[:] = new_points
+            _copy(new_cameras, cameras)
+            _copy(new_points, points)
             cost = new
             fresh = True
             damping = max(damping * 0.2, 1e-9)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.imu_kernels import mul33, mul33_tn, so3_exp, so3_log
+from kiteline_core.imu_kernels import copy33, mul33, mul33_tn, so3_exp, so3_log
 from kiteline_core.inertial_kernels import imu_terms, velocity_terms, visual_terms
 from kiteline_core.jit import njit
 
@@ -151,7 +151,10 @@ def smooth(
     cost = 0.0
     for it in range(iterations):
         cost = 0.0
-        blocks[:] = 0.0
+        for f in range(n):
+            for i in range(_W):
+                for k in range(_W + 1):
+                    blocks[f, i, k] = 0.0
         # gravity's part of the system rides in rows and columns 30, 31 of every block and is passed on
         _prior_side(rot[0], state[0], tilt, prior_h, prior_b, prior_r, prior_s, prior_tilt, out17)
         for i in range(_B):
@@ -165,8 +168,9 @@ def smooth(
                     rot[f], state[f, :3], r_cb, t_cb, camera, counts[f], xyz[f], ray[f], observed[f], sigma_px[f],
                     use[f], chi2, scale[f], vis_h[f], vis_b[f],
                 )  # fmt: skip
-                vis_r[f] = rot[f]
-                vis_p[f] = state[f, :3]
+                copy33(rot[f], vis_r[f])
+                for i in range(3):
+                    vis_p[f, i] = state[f, i]
             _from_linearised(rot[f], state[f, :3], vis_h[f], vis_b[f], vis_r[f], vis_p[f], out6)
             for i in range(6):
                 blocks[f, i, _W] += out6[i]
@@ -227,7 +231,7 @@ def smooth(
         for f in range(n):
             so3_exp(x[f, :3], turn)
             mul33(rot[f], turn, after)
-            rot[f] = after
+            copy33(after, rot[f])
             for i in range(12):
                 state[f, i] += x[f, 3 + i]
             for i in range(6):
@@ -300,9 +304,11 @@ def marginalise(
     # gravity walks: eliminate its old value from the prior joined with (new - old)^2 / tilt_walk
     if tilt_walk > 0.0:
         _let_tilt_walk(1.0 / tilt_walk, prior_h, prior_b)
-    prior_r[:] = rot[1]
-    prior_s[:] = state[1]
-    prior_tilt[:] = tilt
+    copy33(rot[1], prior_r)
+    for i in range(12):
+        prior_s[i] = state[1, i]
+    for i in range(2):
+        prior_tilt[i] = tilt[i]
     return True
 
 

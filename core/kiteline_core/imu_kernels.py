@@ -15,6 +15,14 @@ F64 = NDArray[np.float64]
 
 
 @njit
+def copy33(a: F64, out: F64) -> None:
+    """out = a for (3,3) matrices."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, j]
+
+
+@njit
 def mul33(a: F64, b: F64, out: F64) -> None:
     """out = a @ b for (3,3) matrices; out may be neither a nor b."""
     for i in range(3):

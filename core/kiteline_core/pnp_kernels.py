@@ -224,9 +224,12 @@ def p3p_ransac(
             cost = reprojection_cost(found[s], point, uv, limit_px, camera, least)
             if cost < least:
                 least = cost
-                T_c_m[:] = found[s]
+                for i in range(4):
+                    for j in range(4):
+                        T_c_m[i, j] = found[s, i, j]
                 count = _mark_inliers(T_c_m, point, uv, limit_px, camera, inlier)
                 needed = draws_needed(count / n, confidence, most_draws)
     if count == 0:
-        inlier[:] = False
+        for i in range(n):
+            inlier[i] = False
     return count

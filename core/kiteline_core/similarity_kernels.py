@@ -129,6 +129,15 @@ def _invert(S: F64, out: F64) -> None:
 
 
 @njit
+def _take_over(S: F64, mine: Bools, S_a_b: F64, inlier: Bools) -> None:
+    for i in range(4):
+        for j in range(4):
+            S_a_b[i, j] = S[i, j]
+    for i in range(mine.shape[0]):
+        inlier[i] = mine[i]
+
+
+@njit
 def align_ransac(
     a: F64, uv_a: F64, limit_a_px: F64, camera_a: F64, b: F64, uv_b: F64, limit_b_px: F64, camera_b: F64,
     with_scale: bool, most_draws: int, confidence: float, state: U64, S_a_b: F64, inlier: Bools,
@@ -160,18 +169,17 @@ def align_ransac(
         # Every new best is fitted to its support, as long as that grows it.
         while support > count:
             count = support
-            S_a_b[:] = S
-            inlier[:] = mine
+            _take_over(S, mine, S_a_b, inlier)
             if not align_points(a, b, inlier, with_scale, S):
                 break
             _invert(S, back)
             support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, mine)
         if support == count:
-            S_a_b[:] = S
-            inlier[:] = mine
+            _take_over(S, mine, S_a_b, inlier)
         needed = draws_needed(count / n, confidence, most_draws)
     if count == 0:
-        inlier[:] = False
+        for i in range(n):
+            inlier[i] = False
     return count
 
 
