@@ -11,13 +11,13 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-CALIBRATION = 10  # ways in which a calibration errs, see _bias: those of the disparity, then those of both eyes
+CALIBRATION = 10  # ways in which a calibration errs, see bias_error: those of the disparity, then those of both eyes
 DISPARITY_SHAPES = 5
 SHAPES = CALIBRATION + 1  # what a whole flight shares: the last is how an IMU pulls poses off the images
 
 
 @njit
-def _bias(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
+def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
     """out (3,11): by how much u, v and disparity are off for one pixel of each error, told at the image's edge.
 
     Disparity (the eyes differ): constant, along x and y, with the square of the distance from the centre, distortion.
@@ -79,8 +79,8 @@ def sensitivity(
         slot = row // births
         depth = 1.0 / rho[row]
         u0, v0 = born_at[row, 0], born_at[row, 1]
-        _bias(u0, v0, bf * rho[row], camera, half_px, there)
-        _bias(observed[i, 0], observed[i, 1], observed[i, 2], camera, half_px, here)
+        bias_error(u0, v0, bf * rho[row], camera, half_px, there)
+        bias_error(observed[i, 0], observed[i, 1], observed[i, 2], camera, half_px, here)
         bx, by = (u0 - camera[2]) / fx, (v0 - camera[3]) / fy
         for s in range(SHAPES):
             farther = -depth * depth * there[2, s] / bf

@@ -119,7 +119,7 @@ def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-u
 
 
 @njit
-def _spread_out(reference, patches):  # type: ignore[no-untyped-def]
+def spread_out(reference, patches):  # type: ignore[no-untyped-def]
     """The template (row 1 of patches) and its gradients along x (2) and y (3), twice in the same unit."""
     grey = reference.reshape(-1)
     for k in range(LANES - 2):
@@ -131,7 +131,7 @@ def _spread_out(reference, patches):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def dot(a, b):  # type: ignore[no-untyped-def]
     """Sum of products of two rows (LANES,) int16; 81 products of 12 and 13 bits fit into 31."""
     total = np.int32(0)
     for k in range(LANES):
@@ -141,7 +141,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _look(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
+def look(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
     """The patch around (x, y) of an image, in 1/GREY grey levels, in 1/128 px.
 
     raw: (PATCH + 1, STRIDE) uint8. across: as many int16, for the rows interpolated along x. seen: (LANES,) int16, out.
@@ -169,22 +169,22 @@ def _look(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
 def _settle(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
     """Move (x, y) until the patch there looks like the template. Returns (x, y, ncc, whether it stayed inside).
 
-    patches: (5, LANES) int16: the patch as seen (filled here), the template, its gradients, see _spread_out, and ones.
+    patches: (5, LANES) int16: the patch as seen (filled here), the template, its gradients, see spread_out, and ones.
     The gradients that count are those made orthogonal to the template and to a constant: their sums follow from the
     sums over the plain ones, which are exact.
     """
     h, w = image.shape
     seen, t, gx, gy, ones = patches[0], patches[1], patches[2], patches[3], patches[4]
     count = float(PATCH * PATCH)
-    mean = _dot(t, ones) / count
-    mean_x = _dot(gx, ones) / count
-    mean_y = _dot(gy, ones) / count
-    tt = _dot(t, t) - count * mean * mean + 1e-9
-    share_x = (_dot(t, gx) - count * mean * mean_x) / tt
-    share_y = (_dot(t, gy) - count * mean * mean_y) / tt
-    h00 = _dot(gx, gx) - count * mean_x * mean_x - share_x * share_x * tt
-    h01 = _dot(gx, gy) - count * mean_x * mean_y - share_x * share_y * tt
-    h11 = _dot(gy, gy) - count * mean_y * mean_y - share_y * share_y * tt
+    mean = dot(t, ones) / count
+    mean_x = dot(gx, ones) / count
+    mean_y = dot(gy, ones) / count
+    tt = dot(t, t) - count * mean * mean + 1e-9
+    share_x = (dot(t, gx) - count * mean * mean_x) / tt
+    share_y = (dot(t, gy) - count * mean * mean_y) / tt
+    h00 = dot(gx, gx) - count * mean_x * mean_x - share_x * share_x * tt
+    h01 = dot(gx, gy) - count * mean_x * mean_y - share_x * share_y * tt
+    h11 = dot(gy, gy) - count * mean_y * mean_y - share_y * share_y * tt
     det = h00 * h11 - h01 * h01
     # The gradients are twice the slope: hence 2 GREY to the square, and a factor 2 in each step.
     if det < 1e-3 * (h00 + h11) ** 2 * 0.25 or h00 + h11 < 4.0 * GREY * GREY:
@@ -196,20 +196,20 @@ def _settle(image, patches, raw, across, x, y, iterations, max_step):  # type: i
     for k in range(iterations + 1):
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             return x, y, 0.0, False
-        _look(image, x, y, raw, across, seen)
-        total = float(_dot(seen, ones))
-        st = _dot(seen, t) - mean * total
+        look(image, x, y, raw, across, seen)
+        total = float(dot(seen, ones))
+        st = dot(seen, t) - mean * total
         gain = st / tt
         if gain < 0.1:
             return x, y, 0.0, False
         if converged or k == iterations:
             for j in range(LANES):
                 seen[j] *= ones[j]
-            spread = _dot(seen, seen) - total * total / count
+            spread = dot(seen, seen) - total * total / count
             ncc = st / np.sqrt(tt * max(spread, 1e-9))
             break
-        sx = _dot(seen, gx) - mean_x * total - share_x * st
-        sy = _dot(seen, gy) - mean_y * total - share_y * st
+        sx = dot(seen, gx) - mean_x * total - share_x * st
+        sy = dot(seen, gy) - mean_y * total - share_y * st
         dx = -2.0 * (h11 * sx - h01 * sy) / (det * gain)
         dy = -2.0 * (h00 * sy - h01 * sx) / (det * gain)
         norm = np.sqrt(dx * dx + dy * dy)
@@ -268,7 +268,7 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
             )
             if not inside:
                 continue
-            _spread_out(reference, patches)
+            spread_out(reference, patches)
             s = float(1 << level)
             px, py, score, ok = _settle(pyramid[level], patches, raw, across, x / s, y / s, iterations, max_step_px)
             if ok and (score >= min_ncc or j > last):

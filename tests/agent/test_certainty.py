@@ -32,7 +32,7 @@ def seen_with(error: F64, X: F64, T_c_m: F64) -> F64:
     out = uvd.copy()
     for i, (u, v, d) in enumerate(uvd):
         bias = np.empty((3, SHAPES))
-        certainty_kernels._bias(u, v, d, np.array([450.0, 450.0, 370.0, 240.0, CAMERA.bf]), 376.0, bias)
+        certainty_kernels.bias_error(u, v, d, np.array([450.0, 450.0, 370.0, 240.0, CAMERA.bf]), 376.0, bias)
         out[i] += bias @ error
     return out
 

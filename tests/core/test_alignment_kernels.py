@@ -136,7 +136,7 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     inside = np.zeros((kernels.PATCH, kernels.STRIDE), np.bool_)
     inside[:, : kernels.PATCH] = True
     patches[4] = inside.ravel()
-    kernels._spread_out(reference, patches)
+    kernels.spread_out(reference, patches)
     grey = reference[:, : kernels.PATCH + 2].astype(np.int64)
     for row, wanted in (
         (1, grey[1:-1, 1:-1]),
@@ -145,11 +145,11 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     ):
         np.testing.assert_array_equal(patches[row].reshape(inside.shape)[:, : kernels.PATCH], wanted)
         assert not patches[row].reshape(inside.shape)[~inside].any()
-    assert kernels._dot(patches[2], patches[1]) == (grey[1:-1, 1:-1] * (grey[1:-1, 2:] - grey[1:-1, :-2])).sum()
+    assert kernels.dot(patches[2], patches[1]) == (grey[1:-1, 1:-1] * (grey[1:-1, 2:] - grey[1:-1, :-2])).sum()
 
     raw, across = np.zeros(kernels.LANES + kernels.STRIDE, np.uint8), np.zeros(kernels.LANES + kernels.STRIDE, np.int16)
     for x, y in ((100.0, 90.0), (47.31, 60.78), (4.0, 4.99), (314.9, 234.9)):
-        kernels._look(image, x, y, raw, across, patches[0])
+        kernels.look(image, x, y, raw, across, patches[0])
         dx, dy = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0))
         seen = patches[0].reshape(inside.shape)[:, : kernels.PATCH] / kernels.GREY
         np.testing.assert_allclose(seen, bilinear(image, x + dx, y + dy), atol=0.04 + 40.0 / 256)
