@@ -17,6 +17,11 @@ from kiteline_lab.metrics import Evaluation
 SCENE = "room"  # four walls, furniture, a window: what EuRoC's Vicon room is like
 SECONDS = 8.0  # long enough to see the room, short enough to wait for
 SEED = 7
+_WARM_ALL = "from kiteline_lab.doctor import warm; warm()"
+_WARM_BASE = (
+    "from kiteline_basestation.warm import warm; from kiteline_hw.words import shipped_words; "
+    "warm(words=shipped_words())"
+)
 
 
 def demo(folder: Path, seconds: float = SECONDS) -> str:
@@ -68,15 +73,18 @@ def main(argv: list[str]) -> int:
 def _compiling() -> Iterator[None]:
     """Compile the kernels of the flight beside what is done meanwhile, and wait for it at the end.
 
-    Should that fail, the flight compiles for itself.
+    Two processes: one takes all in turn, and finds those of the base done by the other. Should that fail, the flight
+    compiles for itself.
     """
-    compiler = subprocess.Popen([sys.executable, "-c", "from kiteline_lab.doctor import warm; warm()"])
+    compilers = [subprocess.Popen([sys.executable, "-c", words]) for words in (_WARM_ALL, _WARM_BASE)]
     try:
         yield
-        compiler.wait()
+        for compiler in compilers:
+            compiler.wait()
     finally:
-        compiler.kill()
-        compiler.wait()
+        for compiler in compilers:
+            compiler.kill()
+            compiler.wait()
 
 
 def _step(text: str) -> None:
