@@ -7,8 +7,9 @@ Cells are numbered from the lower left corner of the box; a tile has 32x32 of th
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.jit import njit
 from numpy.typing import NDArray
+
+from kiteline_core.jit import njit
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]

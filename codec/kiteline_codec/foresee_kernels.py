@@ -7,8 +7,9 @@ get the same integers whatever their machines.
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.jit import njit
 from numpy.typing import NDArray
+
+from kiteline_core.jit import njit
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]

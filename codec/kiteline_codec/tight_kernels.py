@@ -7,8 +7,9 @@ LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixe
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.jit import njit
 from numpy.typing import NDArray
+
+from kiteline_core.jit import njit
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from kiteline_core.jit import njit
 from numpy.typing import NDArray
+
+from kiteline_core.jit import njit
 
 F32 = NDArray[np.float32]
 
