@@ -200,8 +200,7 @@ class Governor:
                 self._asked_t_ns = self._last_t_ns
             if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
                 return False
-            dearer = 1.0 + (0.5 if urgent or self._waited is extra else 1.0) * self._doubt  # room was made for it
-            if not self._room_for(extra, dearer):
+            if not self._room_for(extra, 1.0 + (0.5 if urgent else 1.0) * self._doubt):
                 self._waiting = extra
                 return False
         self.note(extra)
@@ -262,7 +261,7 @@ class Governor:
         if not self._measured or (self._last_extra is not None and not known_ns):
             return self._scatter
         expected_ns = self._frame_ns + known_ns
-        return min(abs(cpu_ns - expected_ns) / expected_ns, _OUTLIER - 1.0)
+        return min(abs(cpu_ns - expected_ns) / max(expected_ns, 1.0), _OUTLIER - 1.0)
 
     @property
     def _doubt(self) -> float:
@@ -282,7 +281,7 @@ class Governor:
         if lost:
             return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._doubt)
         if self._waiting is Extra.KEYFRAME and not self._blind_for(t_ns, self._gap_s):
-            return self._room_for(Extra.KEYFRAME, 1.0 + 0.5 * self._doubt)  # it goes before more frames
+            return self._room_for(Extra.KEYFRAME, 1.0 + self._doubt)  # it goes before more frames
         cost_ns = self._frame_ns * (1.0 + self._doubt)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 

@@ -225,6 +225,12 @@ def test_a_keyframe_that_is_wanted_does_not_starve_behind_frames(carried: bool, 
     assert max(waited[2:]) <= 16 and len(waited) > 18
 
 
+def test_a_clock_that_says_nothing_is_borne() -> None:
+    governor = Governor(GovernorConfig(cpu_percent=2.0))
+    tracked = [governor.frame(k * PERIOD_NS, 0).track and governor.may(Extra.KEYFRAME) for k in range(100)]
+    assert sum(tracked) > 40
+
+
 def test_where_costs_scatter_more_is_left_free() -> None:
     def dearest(scatter: float) -> float:
         rng, governor, cost_ns, spent = np.random.default_rng(5), Governor(GovernorConfig(cpu_percent=2.0)), 0, []
