@@ -48,7 +48,8 @@ class LinkConfig:
     """The agent's own pose of a keyframe in its parent."""
 
     enough: int = 80  # observations of a keyframe above which its points hold it: every keyframe of a wide link
-    enough_px: float = 0.2  # of each of 6 far made-up points there: together they say the turn to 0.3 mrad
+    enough_px: float = 0.1  # of each of 6 far made-up points there: together they say the turn to 0.15 mrad
+    run: int = 20  # links one after the other, over which an agent's turns may all be off the same way
     sigma_px: float = 0.15  # of each of 12 made-up points where there is nothing else; it grows with what there is
 
 

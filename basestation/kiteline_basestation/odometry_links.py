@@ -3,8 +3,9 @@
 The agent saw all frames in between, and felt them where it has an IMU; a thin link carries a tenth of the points that
 its tracker saw. So the pose relative to the parent knows what the points of two keyframes do not tell. It enters a
 bundle as a few made-up points that both keyframes see just where that pose puts them. Where a keyframe has enough
-points of its own, the made-up ones are far away and say only how it turned, which the agent knows best (it measured
-0.3 mrad a keyframe, bundles alone 0.3 to 0.5); disparities that are off spoil the agent's lengths.
+points of its own, the made-up ones are far away and say only how it turned, which the agent knows best (to 0.1 to 0.2
+mrad an axis, from keyframe to keyframe). Disparities that are off spoil the agent's lengths, and its turns a little,
+all of them the same way: where that shows, the links are looser.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ F64 = NDArray[np.float64]
 
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
 _LOOSE = 1.7  # deviations of each of 6 far points, seen twice, that make one of the turn
+_LEAST_RUN = 5  # links; fewer tell nothing of what they have in common
 _FAR = (8.0,)  # the same where only the turn is to be held
 _DEPTHS = (0.7, 1.8)  # times the median depth: near points hold the position, far ones the direction
 
@@ -35,7 +37,7 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
     table = sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    loose = max(config.enough_px, _LOOSE * _turns_differ_px(sparse_map, window, number))
+    loose = max(config.enough_px, _LOOSE * _turns_differ_px(sparse_map, window, number, config.run))
     points, camera, measured, sigma = [], [], [], []
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
@@ -76,8 +78,10 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
     )
 
 
-def _turns_differ_px(sparse_map: SparseMap, window: Window, number: dict[int, int]) -> float:
-    """By how much the window's turns from keyframe to keyframe differ from what agents said: the median, an axis."""
+def _turns_differ_px(sparse_map: SparseMap, window: Window, number: dict[int, int], run: int) -> float:
+    """By how much the window's turns from keyframe to keyframe differ from what agents said, an axis: the median, or,
+    where more, what runs of them differ by together. Disparities that are off turn all keyframes a little the same way.
+    """
     table, T = sparse_map.keyframes, window.problem.T_c_m
     parents = [number.get(int(p), -1) for p in table.parent[window.rows].tolist()]
     pairs = [(k, p) for k, p in enumerate(parents) if p >= 0]
@@ -85,9 +89,15 @@ def _turns_differ_px(sparse_map: SparseMap, window: Window, number: dict[int, in
         return 0.0
     k, p = np.array(pairs).T
     turn = T[p, :3, :3] @ np.swapaxes(T[k, :3, :3], 1, 2)
-    said = table.T_p_k[window.rows[k], :3, :3]
-    angle = np.linalg.norm(turn - said, axis=(1, 2)) / np.sqrt(2.0)
-    return float(np.median(angle * window.problem.lens[k, 0]) / np.sqrt(3.0))
+    off = np.swapaxes(table.T_p_k[window.rows[k], :3, :3], 1, 2) @ turn
+    angle = 0.5 * np.stack([off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]], 1)
+    each = float(np.median(np.linalg.norm(angle, axis=1))) / np.sqrt(3.0)
+    n = min(run, len(angle))
+    summed = np.cumsum(np.concatenate([np.zeros((1, 3)), angle]), axis=0)
+    together = float(np.sqrt(np.mean((summed[n:] - summed[:-n]) ** 2) / n))
+    if n < _LEAST_RUN:
+        together = 0.0
+    return max(each, together) * float(np.median(window.problem.lens[k, 0]))
 
 
 def _made_up(

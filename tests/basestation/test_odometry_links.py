@@ -98,6 +98,21 @@ def test_keyframes_with_many_points_are_told_how_they_turned_and_no_lengths() ->
     assert abs(length(loose.T_c_m) - true_m) < 0.5 * abs(length(firm.T_c_m) - true_m)
 
 
+def test_turns_that_are_all_off_the_same_way_count_less() -> None:
+    sigma = {}
+    for name, signs in (("alike", (1, 1, 1, 1, 1, 1)), ("by chance", (1, 1, -1, -1, 1, -1))):
+        sparse_map, truth = flight(noise_px=0.1)
+        for sign, row in zip(signs, sparse_map.rows.values(), strict=True):
+            off = se3.from_rt(se3.so3_exp(np.array([0.0, sign * 5e-4, 0.0])), np.zeros(3))
+            sparse_map.keyframes.T_p_k[row] = sparse_map.keyframes.T_p_k[row] @ off
+        config = BaseConfig()
+        part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
+        assert part is not None
+        part = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
+        sigma[name] = with_links(sparse_map, part, LinkConfig(enough=5)).sigma[-1, 0]
+    assert sigma["alike"] > 1.3 * sigma["by chance"]
+
+
 def test_links_stand_aside_of_the_border() -> None:
     sparse_map, _ = flight(noise_px=0.3)
     config = BaseConfig()
