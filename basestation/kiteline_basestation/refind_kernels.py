@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.jit import njit
-from kiteline_core.matching_kernels import hamming
+from kiteline_core.matching_kernels import hamming, take
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -52,11 +52,7 @@ def match_projected(
                 second = d
         if chosen >= 0 and first <= max_hamming and first <= ratio * second:
             distance[i] = first
-            if first < owner_distance[chosen]:
-                if owner[chosen] >= 0:
-                    best[owner[chosen]] = -1
-                owner[chosen], owner_distance[chosen] = i, first
-                best[i] = chosen
+            take(i, chosen, first, owner, owner_distance, best)
 
 
 @njit
@@ -91,8 +87,4 @@ def match_epipolar(
                 second = d
         if chosen >= 0 and first <= max_hamming and first <= ratio * second:
             distance[i] = first
-            if first < owner_distance[chosen]:
-                if owner[chosen] >= 0:
-                    best[owner[chosen]] = -1
-                owner[chosen], owner_distance[chosen] = i, first
-                best[i] = chosen
+            take(i, chosen, first, owner, owner_distance, best)

@@ -88,7 +88,7 @@ class Writer:
             if max(int(values.max()), -int(values.min())) >= LIMIT:
                 raise ValueError(f"numbers below {LIMIT} are expected, found {values.min()}..{values.max()}")
             out = np.zeros(c * (7 * n + 16) + 8, np.uint8)
-            self._out += out[: pack_tight(values, out)].tobytes()
+            self._out += out[: pack_tight(np.ascontiguousarray(values), out)].tobytes()
 
     def bytes(self) -> bytes:
         """What has been written."""

@@ -34,6 +34,17 @@ def hamming(a: U64, i: int, b: U64, j: int) -> int:
 
 
 @njit
+def take(i: int, j: int, distance: int, owner: I32, owner_distance: I32, best: I32) -> bool:
+    """Let i have j, unless j's owner is as near; an owner that is not loses it. Whether i has it."""
+    if distance >= owner_distance[j]:
+        return False
+    if owner[j] >= 0:
+        best[owner[j]] = -1
+    owner[j], owner_distance[j], best[i] = i, distance, j
+    return True
+
+
+@njit
 def match_all(a: U64, b: U64, max_hamming: int, ratio: float, best: I32, distance: I32) -> int:
     """For each of a (n,4) the nearest of b (m,4), where it is near, distinct, and prefers nobody else.
 
@@ -52,12 +63,10 @@ def match_all(a: U64, b: U64, max_hamming: int, ratio: float, best: I32, distanc
                 first, second, chosen = d, first, j
             elif d < second:
                 second = d
-        if chosen < 0 or first > max_hamming or first > ratio * second or first >= owner_distance[chosen]:
+        if chosen < 0 or first > max_hamming or first > ratio * second:
             continue
-        if owner[chosen] >= 0:
-            best[owner[chosen]] = -1
-        owner[chosen], owner_distance[chosen] = i, first
-        best[i], distance[i] = chosen, first
+        if take(i, chosen, first, owner, owner_distance, best):
+            distance[i] = first
     return _count(best)
 
 
@@ -120,12 +129,10 @@ def match_cells(
                     first, second, chosen = d, first, int(j)
                 elif d < second:
                     second = d
-        if chosen < 0 or first > max_hamming or first > ratio * second or first >= owner_distance[chosen]:
+        if chosen < 0 or first > max_hamming or first > ratio * second:
             continue
-        if owner[chosen] >= 0:
-            best[owner[chosen]] = -1
-        owner[chosen], owner_distance[chosen] = i, first
-        best[i], distance[i] = chosen, first
+        if take(i, chosen, first, owner, owner_distance, best):
+            distance[i] = first
     return _count(best)
 
 
