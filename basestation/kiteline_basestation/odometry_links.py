@@ -91,7 +91,7 @@ def _turns_differ_px(sparse_map: SparseMap, window: Window, number: dict[int, in
     turn = T[p, :3, :3] @ np.swapaxes(T[k, :3, :3], 1, 2)
     off = np.swapaxes(table.T_p_k[window.rows[k], :3, :3], 1, 2) @ turn
     angle = 0.5 * np.stack([off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]], 1)
-    each = float(np.median(np.linalg.norm(angle, axis=1))) / np.sqrt(3.0)
+    each = float(np.median(np.linalg.norm(angle, axis=1)) / np.sqrt(3.0))
     n = min(run, len(angle))
     summed = np.cumsum(np.concatenate([np.zeros((1, 3)), angle]), axis=0)
     together = float(np.sqrt(np.mean((summed[n:] - summed[:-n]) ** 2) / n))
