@@ -13,6 +13,8 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from kiteline_cli.examples import EXAMPLES
+
 EXIT_ERROR = 2  # as argparse uses for a wrong command line
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
@@ -68,7 +70,7 @@ examples:
                                                a base on one machine, an agent on another
 
 SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path, recognised by its layout.
-LINK   is zenoh:ENDPOINT serial:DEV:BAUD none.
+LINK   is zenoh:ENDPOINT serial:DEV:BAUD mavlink:URL none.
 `kiteline COMMAND --help` says more about each."""
 
 
@@ -116,6 +118,9 @@ def main(argv: Sequence[str]) -> int:
             raise
         print(f"kiteline: error: {text}", file=sys.stderr)
         return EXIT_ERROR
+    finally:
+        if rest[1:2] in (["-h"], ["--help"]):
+            print("\nexamples:", *EXAMPLES[rest[0]], sep="\n  ")
 
 
 def explanation(error: Exception) -> str | None:

@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from kiteline_cli import main as cli
+from kiteline_cli.examples import EXAMPLES
+
+WITH_VERBS = ("grid", "log", "maps", "keys")  # a verb's own help explains its flags
 
 
 @pytest.mark.parametrize("name", [c.name for c in cli.COMMANDS])
@@ -14,6 +19,12 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     assert status == 0
     text = capsys.readouterr().out
     assert text.startswith(f"usage: kiteline {name}")
+    explained, _, examples = text.partition("\nexamples:\n")
+    assert len(examples.splitlines()) == len(EXAMPLES[name]) > 0
+    for line in examples.splitlines():
+        assert line.startswith(f"  kiteline {name}")
+        flags = {word for word in line.split() if word.startswith("--")}
+        assert name in WITH_VERBS or flags <= set(re.findall(r"--[a-z-]+", explained))
 
 
 @pytest.mark.parametrize("name", ["fly", "eval", "convert", "agent", "replay"])
