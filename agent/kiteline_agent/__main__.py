@@ -45,6 +45,7 @@ from kiteline_hw.lockstep_barrier import Barrier
 from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.mcap_log import LogWriter
 from kiteline_hw.ports import ByteLink, ControllerLink, FrameSource, LinkError, PoseSample, SourceError
+from kiteline_hw.reduced import with_other_imu
 from kiteline_hw.sealed_link import SealedLink
 from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources import open_source
@@ -263,6 +264,7 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
     with ExitStack() as stack:
         stack.callback(source.close)
+        source = _with_imu(spec, source)
         onboard = Onboard(spec, source, channel_for(spec, _spill(spec)), whole_process=True)
         stack.callback(onboard.close)
         link = open_link(spec.link, "agent", spec.agent, framer=StreamFramer, required=False)
@@ -281,6 +283,8 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
             _tell([f"flying {source.name}, {_link_words(spec)}"])
         begin_ns = clock.now_ns()
         onboard.begin_at(begin_ns)
+        if sink is not None:
+            sink.take_imu(begin_ns)  # what was felt before the flight
         shift_ns = onboard.spec.start_ns - begin_ns
         while not stop and onboard.next_ns is not None:
             wait_s = (begin_ns + onboard.next_ns - clock.now_ns()) / 1e9
@@ -295,6 +299,8 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
                 frame, imu, driven = onboard.camera.take()
                 told = None if sink is None else sink.take_odometry(captured_ns)
                 driven = driven if told is None else replace(told, t_ns=told.t_ns + shift_ns)
+                felt = None if sink is None else sink.take_imu(captured_ns)  # late ones come with the next frame
+                imu = imu if felt is None else replace(felt, t_ns=felt.t_ns + shift_ns)
             for packet in onboard.step(frame, imu, link.receive(), now_ns, driven):
                 link.send(packet)
             e = onboard.output.estimate if onboard.output is not None else None
@@ -361,20 +367,34 @@ def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stac
         if spec.odometry:
             raise LinkError("--odometry takes velocities from a flight controller: expected --mavlink URL beside it")
         return None
-    from kiteline_hw.mavlink_frames import mounting  # the dialect takes 5 MiB: only where it is spoken
-    from kiteline_hw.mavlink_odometry import FromController, FromControllerConfig, told_of
-    from kiteline_hw.mavlink_out import MavlinkPoseSink
+    from kiteline_hw.mavlink_connect import connect  # the dialect takes 5 MiB: only where it is spoken
 
-    axes = spec.axes or ("flu" if source.rig.has_body else "rdf")
-    wanted = None
-    try:
-        T_b_f = mounting(axes)
-        if spec.odometry:
-            told, track_m = told_of(spec.odometry)
-            wanted = FromController(told, T_b_f, FromControllerConfig(track_m=track_m))
-    except ValueError as error:
-        raise LinkError(f"--axes or --odometry: {error}") from error
-    return stack.enter_context(MavlinkPoseSink(spec.mavlink, T_b_f, clock, required=False, wanted=wanted))
+    own = agent_config(spec.config).controller_imu
+    return stack.enter_context(
+        connect(
+            spec.mavlink, source.rig, spec.axes, clock, odometry=spec.odometry,
+            imu_rate_hz=own.noise.rate_hz if spec.imu_of else 0.0,
+            body_is_controller=bool(spec.imu_of and own.T_f_c), report=source.report,
+        )
+    )  # fmt: skip
+
+
+def _with_imu(spec: AgentSpec, source: FrameSource) -> FrameSource:
+    """The source, with the flight controller's IMU in place of its own where that is asked for. Raises LinkError."""
+    if not spec.imu_of:
+        return source
+    if spec.imu_of != "controller" or not spec.mavlink:
+        raise LinkError("--imu controller takes a flight controller's samples: expected --mavlink URL beside it")
+    if not spec.imu:
+        raise LinkError("--imu controller and --no-imu: expected one of them")
+    own = agent_config(spec.config).controller_imu
+    if not own.T_f_c and not (source.rig.has_body and spec.axes):
+        raise LinkError(
+            f"--imu controller: nobody says where the camera of {source.name} sits in the vehicle: expected T_f_c, the "
+            "camera in the flight controller's frame, in [agent.controller_imu] of --config (or --axes, for a source "
+            "that knows its body)"
+        )
+    return with_other_imu(source, own.noise, own.camera())
 
 
 def main(argv: Sequence[str] | None = None) -> int:

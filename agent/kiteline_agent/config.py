@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from kiteline_agent.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial_tracker import InertialConfig
 from kiteline_agent.odometer import OdometerConfig
 from kiteline_core.features import DetectorConfig
@@ -258,6 +259,7 @@ class AgentConfig:
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
     inertial: InertialConfig = field(default_factory=InertialConfig)
+    controller_imu: ControllerImuConfig = field(default_factory=ControllerImuConfig)
     odometer: OdometerConfig = field(default_factory=OdometerConfig)
     certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)

@@ -43,6 +43,7 @@ class AgentSpec:
     mavlink: str = ""  # URL of a flight controller
     axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
     odometry: str = ""  # what to take from the flight controller: controller, wheels, wheels:TRACK_M; "": nothing
+    imu_of: str = ""  # whose inertial samples are used: controller; "": the source's, where it has any
     kill_at_s: float = -1.0  # end like a crash at this flight time
     await_base_at_s: float = -1.0  # look for a base again at this flight time
     await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
@@ -54,7 +55,7 @@ def spec_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentSpec:
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
         key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
-        odometry=a.odometry,
+        odometry=a.odometry, imu_of=a.imu,
     )  # fmt: skip
 
 
@@ -129,6 +130,11 @@ def parser() -> argparse.ArgumentParser:
         "--odometry", metavar="WHAT", default="",
         help="take velocities from the flight controller too: wheels, wheels:TRACK_M (wheels tell turns as well), or "
         "controller (its filter's, where that does not live on our own poses); of a recording they are taken anyhow",
+    )  # fmt: skip
+    p.add_argument(
+        "--imu", choices=("controller",), default="",
+        help="fly on the flight controller's IMU in place of the source's; where the camera sits is said by T_f_c in "
+        "[agent.controller_imu] of --config, or by a source that knows its body, with --axes",
     )  # fmt: skip
     p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")

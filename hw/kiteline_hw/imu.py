@@ -56,6 +56,10 @@ class ImuStream:
         self._rows: list[tuple[float, ...]] = []
         self._last_ns = -(2**63)
 
+    def __len__(self) -> int:
+        """How many samples wait."""
+        return len(self._t_ns)
+
     def add(self, t_ns: int, row: tuple[float, ...]) -> None:
         """One sample: gyro x y z rad/s, accel x y z m/s^2."""
         self._t_ns.append(t_ns)

@@ -11,6 +11,9 @@ from pymavlink.dialects.v20 import common
 COMPONENT_VIO = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _MARKERS = (0xFD, 0xFE)  # first byte of a frame of MAVLink 2 and 1
 _SHORTEST = 8  # bytes of the shortest frame: what pymavlink starts with
+HIGHRES_IMU, RAW_IMU, SCALED_IMU = 105, 27, 26  # message numbers
+_ACCEL_AND_GYRO = 0x3F  # of HIGHRES_IMU's fields_updated
+_MG = 9.80665e-3  # m/s^2 of a thousandth of standard gravity
 _KEEP_BYTES = 4096  # bytes already parsed that pymavlink's buffer may hold before it is trimmed
 
 
@@ -41,12 +44,18 @@ class TimeSync:
 
 
 @dataclass(frozen=True, slots=True)
-class HighresImu:
-    """An inertial sample of the flight controller, in its body frame (FRD), on its clock. m/s^2 and rad/s."""
+class VehicleImu:
+    """An inertial sample of the flight controller, in its body frame (FRD), on its clock. m/s^2 (specific force: -9.8
+    down at rest) and rad/s. message: which one it came with (its stamps have an origin of their own). unit: which of
+    several. RAW_IMU is taken to be in mg and mrad/s, as ArduPilot sends it.
+    """
 
     t_us: int
     accel: tuple[float, float, float]
     gyro: tuple[float, float, float]
+    message: int = HIGHRES_IMU
+    unit: int = 0
+    component: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +129,7 @@ class RadioStatus:
 
 
 Incoming = (
-    Heartbeat | TimeSync | HighresImu | Odometry | Tunnel | RadioStatus | LocalPosition | Attitude | WheelDistance
+    Heartbeat | TimeSync | VehicleImu | Odometry | Tunnel | RadioStatus | LocalPosition | Attitude | WheelDistance
 )  # fmt: skip
 
 
@@ -173,10 +182,12 @@ class MavlinkCodec:
         """TIMESYNC."""
         return self._pack(common.MAVLink_timesync_message(tc1_ns, ts1_ns))
 
-    def highres_imu(self, sample: HighresImu) -> bytes:
+    def highres_imu(self, sample: VehicleImu) -> bytes:
         """HIGHRES_IMU with accelerometer and gyroscope (as a flight controller sends it)."""
-        zeros = (0.0,) * 7
-        return self._pack(common.MAVLink_highres_imu_message(sample.t_us, *sample.accel, *sample.gyro, *zeros, 0x3F))
+        m, zeros = sample, (0.0,) * 7
+        return self._pack(
+            common.MAVLink_highres_imu_message(m.t_us, *m.accel, *m.gyro, *zeros, _ACCEL_AND_GYRO, m.unit)
+        )
 
     def message_interval(self, system: int, component: int, message_id: int, interval_us: int) -> bytes:
         """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: ask a flight controller for a stream."""
@@ -285,8 +296,8 @@ class MavlinkCodec:
             return Heartbeat(system, component, m.type, m.autopilot, bool(m.base_mode & 128))
         if kind == "TIMESYNC":
             return TimeSync(system, component, m.tc1, m.ts1)
-        if kind == "HIGHRES_IMU":
-            return HighresImu(m.time_usec, (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro))
+        if kind in ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU"):
+            return _inertial(m, kind, component)
         if kind == "ODOMETRY":
             return Odometry(
                 m.time_usec,
@@ -318,3 +329,14 @@ class MavlinkCodec:
             return RadioStatus(m.txbuf, m.rssi, m.remrssi)
         self.unknown += 1
         return None
+
+
+def _inertial(m: Any, kind: str, component: int) -> VehicleImu | None:
+    accel, gyro = (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro)
+    if kind == "HIGHRES_IMU":
+        whole = m.fields_updated & _ACCEL_AND_GYRO == _ACCEL_AND_GYRO
+        return VehicleImu(m.time_usec, accel, gyro, HIGHRES_IMU, m.id, component) if whole else None
+    accel, gyro = tuple(_MG * a for a in accel), tuple(1e-3 * g for g in gyro)
+    if kind == "RAW_IMU":
+        return VehicleImu(m.time_usec, accel, gyro, RAW_IMU, m.id, component)
+    return VehicleImu(m.time_boot_ms * 1000, accel, gyro, SCALED_IMU, 0, component)

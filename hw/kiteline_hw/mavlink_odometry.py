@@ -53,8 +53,8 @@ class FromControllerConfig:
 class StampClock:
     """A controller's stamps on our clock: they arrive late, never early, so the least delay is the nearest to none."""
 
-    def __init__(self, config: FromControllerConfig) -> None:
-        self._config = config
+    def __init__(self, config: FromControllerConfig | None = None) -> None:
+        self._config = config or FromControllerConfig()
         self._ahead_ns: int | None = None  # our clock less theirs, with the least delay seen
         self._last: tuple[int, int] = (0, 0)  # stamp, arrival
 
@@ -80,7 +80,6 @@ class FromController:
         self._T_b_f = T_b_f
         self._clocks = {False: StampClock(self.config), True: StampClock(self.config)}  # us and ms stamps differ
         self._stream = OdometerStream()
-        self._waiting = 0
         self._attitude: tuple[int, F64, F64] | None = None  # ms; R_n_f; rate
         self._rolled: WheelDistance | None = None
         self._has_odometry = False  # LOCAL_POSITION_NED would say the same again
@@ -110,15 +109,12 @@ class FromController:
             batch = self._local(message, now_ns)
         if batch is not None:
             self._heard_ns = now_ns
-            if self._waiting < self.config.most_samples:
-                self._waiting += 1
+            if len(self._stream) < self.config.most_samples:
                 self._stream.add(odometry.in_body(batch, self._T_b_f))
 
     def take_until(self, t_ns: int) -> OdometryBatch | None:
         """The samples up to an instant of our clock, in the body frame."""
-        batch = self._stream.take_until(t_ns)
-        self._waiting -= 0 if batch is None else len(batch.t_ns)
-        return batch
+        return self._stream.take_until(t_ns)
 
     # by message
 

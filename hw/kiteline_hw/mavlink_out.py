@@ -6,8 +6,9 @@ import threading
 from types import TracebackType
 from typing import Self
 
-from kiteline_core.frame import OdometryBatch
+from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.se3 import F64
+from kiteline_hw.mavlink_imu import ControllerImu
 from kiteline_hw.mavlink_messages import Heartbeat, MavlinkCodec, Signing
 from kiteline_hw.mavlink_odometry import FromController
 from kiteline_hw.mavlink_wire import MavlinkWire
@@ -22,7 +23,7 @@ class MavlinkPoseSink:
     """A PoseSink that speaks MAVLink. Its thread sends heartbeats and answers TIMESYNC at once, from the same clock.
 
     url: see MAVLINK_FORMS. T_b_f: (4,4) mounting, see mavlink_frames. clock: the one that stamps poses. wanted:
-    takes what the controller says of its own velocity. Raises LinkError.
+    takes what the controller says of its own velocity, imu: what its inertial unit feels. Raises LinkError.
     """
 
     def __init__(
@@ -36,10 +37,11 @@ class MavlinkPoseSink:
         signing: Signing | None = None,
         required: bool = True,
         wanted: FromController | None = None,
+        imu: ControllerImu | None = None,
     ) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._stream = OdometryStream(T_b_f, config, MavlinkCodec(system, signing=signing), wanted)
+        self._stream = OdometryStream(T_b_f, config, MavlinkCodec(system, signing=signing), wanted, imu)
         self.refused = 0  # messages that nobody took
         self._wire = MavlinkWire(url, "mavlink", self._on_data, self._turn, _TICK_S, _OUTBOX, required=required)
         self._wire.start()
@@ -75,6 +77,11 @@ class MavlinkPoseSink:
         """What the controller said of its velocity up to an instant of our clock; None where nobody asked."""
         with self._lock:
             return self._stream.take_odometry(t_ns)
+
+    def take_imu(self, t_ns: int) -> ImuBatch | None:
+        """What the controller's inertial unit felt up to an instant of our clock; None where nobody asked."""
+        with self._lock:
+            return self._stream.take_imu(t_ns)
 
     def close(self) -> None:
         """Stop, within a second. May be called twice."""

@@ -37,6 +37,10 @@ class OdometerStream:
         self._waiting: list[OdometryBatch] = []
         self._last_ns = -(2**63)
 
+    def __len__(self) -> int:
+        """How many samples wait."""
+        return sum(len(batch.t_ns) for batch in self._waiting)
+
     def add(self, batch: OdometryBatch) -> None:
         """Samples in the body frame."""
         self._waiting.append(batch)

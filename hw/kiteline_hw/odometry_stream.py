@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_core.frame import OdometryBatch
+from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.se3 import F64
 from kiteline_hw.mavlink_frames import body_rates, controller_covariance, local_covariance, local_pose, upper_triangle
-from kiteline_hw.mavlink_messages import Heartbeat, HighresImu, MavlinkCodec, Odometry, TimeSync
+from kiteline_hw.mavlink_imu import ControllerImu
+from kiteline_hw.mavlink_messages import Heartbeat, MavlinkCodec, Odometry, TimeSync, VehicleImu
 from kiteline_hw.mavlink_odometry import FromController
 from kiteline_hw.ports import PoseSample
 
@@ -37,7 +38,6 @@ class OdometryConfig:
     angle_sigma_rad: float = 0.02  # rad; likewise
     velocity_sigma_m_s: float = 0.1  # m/s; of two poses a frame apart
     rate_sigma_rad_s: float = 0.1  # rad/s; likewise
-    imu_samples: int = 4096  # samples kept for who asks; 20 s at 200 Hz
 
 
 @dataclass(slots=True)
@@ -58,9 +58,11 @@ class OdometryStream:
 
     def __init__(
         self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None,
-        wanted: FromController | None = None,
+        wanted: FromController | None = None, imu: ControllerImu | None = None,
     ) -> None:  # fmt: skip
-        """wanted: takes what the controller says of its own velocity; None: nobody asks."""
+        """wanted: takes what the controller says of its own velocity, imu: what its inertial unit feels; None: nobody
+        asks.
+        """
         self.config = config or OdometryConfig()
         self.codec = codec or MavlinkCodec()
         self.counters = OdometryCounters()
@@ -70,8 +72,8 @@ class OdometryStream:
         self._next_odometry_ns: int | None = None
         self._past: deque[PoseSample] = deque()
         self._autopilot: tuple[Heartbeat, int] | None = None
-        self._imu: list[HighresImu] = []
         self._wanted = wanted
+        self._imu = imu
 
     def step(self, pose: PoseSample | None, now_ns: int) -> list[bytes]:
         """Messages to send now: a heartbeat if it is time, the pose (the newest, or None) if it is its turn."""
@@ -165,9 +167,10 @@ class OdometryStream:
                 if message.is_autopilot:
                     self._autopilot = message, now_ns
                     out += [] if self._wanted is None else self._wanted.questions(self.codec, now_ns)
-            elif isinstance(message, HighresImu):
-                self._imu.append(message)
-                del self._imu[: -self.config.imu_samples]
+                    out += [] if self._imu is None else self._imu.questions(self.codec, message, now_ns)
+            elif isinstance(message, VehicleImu):
+                if self._imu is not None:
+                    self._imu.receive(message, None if self._autopilot is None else self._autopilot[0], now_ns)
             elif self._wanted is not None:
                 self._wanted.receive(message, now_ns)
         return out
@@ -182,7 +185,6 @@ class OdometryStream:
         """What the controller said of its velocity up to an instant, in the body frame; None where nobody asked."""
         return None if self._wanted is None else self._wanted.take_until(t_ns)
 
-    def take_imu(self) -> list[HighresImu]:
-        """The controller's inertial samples since the last call."""
-        samples, self._imu = self._imu, []
-        return samples
+    def take_imu(self, t_ns: int) -> ImuBatch | None:
+        """The controller's inertial samples up to an instant, in the body frame; None where nobody asked."""
+        return None if self._imu is None else self._imu.take_until(t_ns)

@@ -124,10 +124,14 @@ class PoseSink(Protocol):
 
 
 class ControllerLink(PoseSink, Protocol):
-    """A flight controller that is told of poses and may tell of its own velocity."""
+    """A flight controller that is told of poses and may tell of its own velocity and of what it feels."""
 
     def take_odometry(self, t_ns: int) -> OdometryBatch | None:
         """What it said of its velocity since the last call, up to an instant of our clock; None for nothing."""
+        ...
+
+    def take_imu(self, t_ns: int) -> ImuBatch | None:
+        """What its inertial unit felt since the last call, likewise."""
         ...
 
 

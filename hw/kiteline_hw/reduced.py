@@ -1,12 +1,14 @@
-"""A source with something left out: the right eye and depth (mono), or the inertial samples."""
+"""A source with something left out (the right eye and depth, or the inertial samples), or with another IMU."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
 
+from kiteline_core import odometry, se3
 from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
+from kiteline_core.se3 import F64
 from kiteline_hw.ports import FrameSource, SourceReport
 
 
@@ -56,3 +58,39 @@ class _Reduced:
 
     def close(self) -> None:
         self._source.close()
+
+
+def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> FrameSource:
+    """A view of a source whose inertial samples come from elsewhere: its own are left out. T_b_c: (4,4) left camera in
+    the body frame of that IMU, which becomes the body of all; None: that of the source stays.
+    """
+    return _OtherImu(source, imu, T_b_c)
+
+
+class _OtherImu(_Reduced):
+    def __init__(self, source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> None:
+        super().__init__(source, mono=False, imu=False)
+        self._calibration, self._T_b_c = imu, T_b_c
+
+    @property
+    def rig(self) -> CameraRig:
+        rig = self._source.rig
+        return rig if self._T_b_c is None else replace(rig, T_b_c=self._T_b_c, has_body=True)
+
+    @property
+    def imu(self) -> ImuCalibration | None:
+        return self._calibration
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        truth = self._source.ground_truth
+        if truth is None or self._T_b_c is None:
+            return truth
+        return Trajectory(truth.t_ns, truth.T_w_b @ self._source.rig.T_b_c @ se3.inverse(self._T_b_c))
+
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
+        for item in super().__iter__():
+            if self._T_b_c is not None and isinstance(item, OdometryBatch):
+                yield odometry.in_body(item, self._T_b_c @ se3.inverse(self._source.rig.T_b_c))
+            else:
+                yield item

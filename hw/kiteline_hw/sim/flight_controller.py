@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
 
-from kiteline_hw.mavlink_messages import Heartbeat, HighresImu, MavlinkCodec, Odometry, TimeSync
+from kiteline_hw.mavlink_messages import Heartbeat, MavlinkCodec, Odometry, TimeSync, VehicleImu
 
 Vector = tuple[float, float, float]
 
@@ -68,7 +68,7 @@ class FlightController:
 
     def imu(self, t_us: int, accel: Vector, gyro: Vector) -> bytes:
         """A HIGHRES_IMU message."""
-        return self.codec.highres_imu(HighresImu(t_us, accel, gyro))
+        return self.codec.highres_imu(VehicleImu(t_us, accel, gyro))
 
     def receive(self, data: bytes, now_ns: int) -> list[bytes]:
         """Take a datagram; what it answers."""
