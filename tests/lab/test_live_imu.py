@@ -13,10 +13,13 @@ import pytest
 from kiteline_agent.__main__ import fly_live
 from kiteline_agent.flight_log import estimate_from_json
 from kiteline_agent.spec import AgentSpec, parser, spec_of
+from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.config import ConfigError
 from kiteline_hw import process
+from kiteline_hw.clock import MonotonicClock
+from kiteline_hw.mavlink_connect import connect
 from kiteline_hw.mcap_log import LogReader
-from kiteline_hw.ports import LinkError
+from kiteline_hw.ports import LinkError, SourceReport
 from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_lab.replay import replay_agent
 
@@ -68,6 +71,23 @@ def test_the_imu_of_a_flight_controller_reaches_the_agent(recording: Path, tmp_p
         R_l_b = last.R_l_o @ last.T_o_b[:3, :3]
         assert R_l_b[:, UP] == pytest.approx([0.0, 0.0, -1.0], abs=0.05)
         assert replay_agent(log).difference is None
+
+
+def test_a_source_that_knows_its_body_needs_letters_only() -> None:
+    rig = CameraRig(CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5), None, np.eye(4), None)
+    model, clock, batch = FlightController("px4"), MonotonicClock(), None
+    with UdpFlightController(model) as controller:
+        url = f"udp:127.0.0.1:{controller.port}"
+        with connect(url, rig, "urf", clock, imu_rate_hz=200.0, report=SourceReport()) as sink:
+            end_s = time.monotonic() + 5.0
+            while batch is None and time.monotonic() < end_s:
+                with controller.lock:
+                    controller.send(model.imu(time.monotonic_ns() // 1000, (1.0, 2.0, -9.5), (0.25, 0.5, 0.125)))
+                time.sleep(0.02)
+                batch = sink.take_imu(clock.now_ns())
+    assert batch is not None
+    assert batch.accel[0] == pytest.approx([9.5, 2.0, 1.0])  # up, right, forward
+    assert batch.gyro[0] == pytest.approx([-0.125, 0.5, 0.25])
 
 
 def test_what_is_missing_is_said(recording: Path, tmp_path: Path) -> None:
