@@ -116,6 +116,7 @@ class LoopConfig:
     min_cells: int = 8  # of the 24 parts
     votes: int = 3  # keyframes that say the same
     memory: int = 24  # keyframes of a submap among which votes are counted
+    ask_before: int = 4  # keyframes before one that was proved, asked of the same place: their views still overlap
     against: int = 3  # votes for, for each vote against
     agree_m: float = 0.10  # between two votes, and
     agree_depth: float = 0.04  # of the median depth, and

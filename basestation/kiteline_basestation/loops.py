@@ -99,7 +99,7 @@ class LoopFinder:
             if overlap is None:
                 continue
             self.proofs += 1
-            finding = finding or self._count(overlap)
+            finding = finding or self._count(overlap) or self._ask_before(overlap)
         return finding
 
     def memory(self) -> Memory:
@@ -224,6 +224,25 @@ class LoopFinder:
         if same_map:
             self._votes[key] = []  # those that joined maps stay, to be weighed against later ones
         return self._finding(best, chosen)
+
+    def _ask_before(self, vote: Overlap) -> Finding | None:
+        """Ask keyframes just before a proved one of the same place: where maps hardly overlap, few find it alone."""
+        new, old = submap_of_keyframe(vote.new), submap_of_keyframe(vote.old)
+        if self._map.island_of(new) == self._map.island_of(old):
+            return None
+        same = self._map.submaps[new]
+        at = same.index(vote.new)
+        for keyframe in reversed(same[max(0, at - self._config.ask_before) : at]):
+            if any(v.new == keyframe for v in self._votes[(min(new, old), max(new, old))]):
+                continue
+            overlap = find_overlap(self._map, keyframe, vote.old, self._config)
+            if overlap is None:
+                continue
+            self.proofs += 1
+            finding = self._count(overlap)
+            if finding is not None:
+                return finding
+        return None
 
     def _stands_out(self, votes: list[Overlap]) -> bool:
         """Whether points lie off the plane that fits most of them: what is flat may hang in two places."""

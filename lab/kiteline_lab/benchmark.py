@@ -157,6 +157,8 @@ def main(argv: list[str]) -> int:
             p.error(f"no benchmark {name!r}; there are: {', '.join(BENCHMARKS)}")
         chosen += found
     data = data_folder()
+    if a.keep is not None:
+        a.keep.mkdir(parents=True, exist_ok=True)
     good = True
     for name, title, run in chosen:
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:

@@ -92,6 +92,20 @@ def test_agents_in_a_corridor_that_repeats_stay_apart(make_flight: MakeFlight, c
     assert mapper.summary()["merges"] == 0
 
 
+@pytest.mark.parametrize(("ask_before", "merges"), [(0, 0), (4, 1)])
+def test_where_one_keyframe_finds_another_map_those_before_it_are_asked(
+    make_flight: MakeFlight, words: Any, ask_before: int, merges: int
+) -> None:
+    first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
+    second = make_flight(keyframes=24, turns=0.45, T_w_m=ELSEWHERE)
+    loops = replace(BaseConfig().loops, ask_before=ask_before, min_likeness=0.34)  # words alone tell of one keyframe
+    mapper = Mapper(replace(BaseConfig(), loops=loops), words)
+    feed(mapper, [first, second], [0, 24])
+    assert mapper.summary()["merges"] == merges
+    if merges:
+        assert np.sqrt(np.mean(joint_error_m(mapper, [first, second]) ** 2)) < 0.03
+
+
 def test_three_agents_in_a_chain_and_one_that_keeps_to_itself(make_flight: MakeFlight, words: Any) -> None:
     flights = [
         make_flight(keyframes=24, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))
