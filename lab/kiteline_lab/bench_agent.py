@@ -19,11 +19,9 @@ from kiteline_core.frame import Trajectory
 from kiteline_core.ids import AgentId
 from kiteline_lab import bench_agent_odometry, bench_governor, metrics, simulate, trials
 from kiteline_lab.bench_agent_faults import estimates, fault_bars, loss_bars
-from kiteline_lab.benchmark import Bar, Bench, at_most
+from kiteline_lab.benchmark import Bar, Bench, Run, at_most
 from kiteline_lab.clip import Clip, load
 from kiteline_lab.fly import Options, fly
-
-TITLE = "The onboard agent"
 
 _SOAK_MINUTES = 30.0
 _SOAK_FRAMES = 200  # of the recording, flown to and fro
@@ -31,16 +29,6 @@ _SIM_SECONDS = 30.0
 # name: scene, trajectory, s into it, seed
 SIMULATED = {"MH_03": ("hall", "MH_03_medium.txt", 15.0, 3), "V1_02": ("room", "V1_02_medium.txt", 20.0, 4)}
 _DEPTH_SECONDS = 18.0
-
-
-def run(bench: Bench) -> list[Bar]:
-    """All bars, in the order of the promise."""
-    bench.say("compiling kernels, so that the flights measure flying")
-    subprocess.run([sys.executable, "-m", "kiteline_cli", "doctor", "--warm"], check=False, capture_output=True)
-    bars: list[Bar] = []
-    for part in (_room, _kitti, _simulated, _mono, _odometry, _governor, _losses, _faults, _first_pose, _soak):
-        bars += part(bench)
-    return bars
 
 
 # accuracy and cost
@@ -209,3 +197,29 @@ def _soak(bench: Bench) -> list[Bar]:
             at_most(f"soak, {what}: frames without a pose", found["lost"], 0, "", 0),
         ]
     return bars
+
+
+# parts of the benchmark
+
+
+def _warm(bench: Bench) -> None:
+    bench.say("compiling kernels, so that the flights measure flying")
+    subprocess.run([sys.executable, "-m", "kiteline_cli", "doctor", "--warm"], check=False, capture_output=True)
+
+
+def _all(*bars: Run) -> Run:
+    def run(bench: Bench) -> list[Bar]:
+        _warm(bench)
+        return [bar for part in bars for bar in part(bench)]
+
+    return run
+
+
+PARTS = {
+    "flights": ("The onboard agent: accuracy and cost", _all(_room, _kitti, _simulated, _first_pose)),
+    "mono": ("The onboard agent: one eye", _all(_mono)),
+    "odometry": ("The onboard agent: odometry as a prior", _all(_odometry)),
+    "governor": ("The onboard agent: under a limit", _all(_governor)),
+    "faults": ("The onboard agent: losses and faults", _all(_losses, _faults)),
+    "soak": ("The onboard agent: half an hour", _all(_soak)),
+}
