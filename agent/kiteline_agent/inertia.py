@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from numpy import float64
 from numpy.typing import NDArray
 
+from kiteline_agent.imu_watch import ImuWatch
 from kiteline_agent.inertial_tracker import InertialConfig, InertialTracker
 from kiteline_agent.odometer import Odometer, OdometerConfig
 from kiteline_agent.pose_state import PoseState
@@ -44,6 +45,8 @@ class Inertia:
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
+        self._watch = ImuWatch(config.silent_s)
+        self._news: list[str] = []
 
     @property
     def running(self) -> bool:
@@ -66,6 +69,8 @@ class Inertia:
 
     def predict(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
         """T_m_c of a frame: by an IMU that knows, else by an odometer that does, else by constant velocity."""
+        if self.tracker is not None:
+            self._news += self._watch.frame(t_ns, imu)
         known = None if self.tracker is None else self.tracker.predict(imu, t_ns)
         if known is not None:
             return se3.orthonormalise(known.T_m_b @ self._T_b_c)
@@ -86,7 +91,8 @@ class Inertia:
 
     def news(self) -> list[str]:
         """What is worth an event since the last call."""
-        return self.odometer.news() + ([] if self.tracker is None else self.tracker.offset_news())
+        news, self._news = self._news, []
+        return news + self.odometer.news() + ([] if self.tracker is None else self.tracker.offset_news())
 
     def coast(self, predicted: F64, t_ns: int) -> Coasted:
         """A frame without images, predicted at T_m_c (4,4)."""

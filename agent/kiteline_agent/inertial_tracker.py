@@ -36,6 +36,7 @@ class InertialConfig:
 
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer's bias takes up
+    silent_s: float = 3.0  # without any sample, after which people are told
     max_gap_s: float = 0.05  # a longer hole in the samples makes an interval unknown
     rest_window_s: float = 0.3  # so long must the vehicle stand to start from rest
     rest_gyro_rad_s: float = 0.02  # deviation of the gyro below which it stands

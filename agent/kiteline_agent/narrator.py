@@ -13,6 +13,7 @@ _TOLD = (
     "disparities",
     "governor: level",
     "odometer",
+    "imu",
 )  # beginnings of the events worth a line
 
 
