@@ -64,6 +64,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--no-imu", action="store_true")
     p.add_argument("--link", action="store_true", help="the link is up")
     p.add_argument("--frames", type=int, default=0)
+    p.add_argument("--begin", type=int, default=0, help="frames that are left out before them")
     p.add_argument("--minutes", type=float, default=30.0)
     a = p.parse_args(argv)
     cv2.setNumThreads(1)
@@ -72,7 +73,8 @@ def main(argv: list[str] | None = None) -> int:
     if a.trial == "first-pose":
         print(json.dumps({"seconds": _first_pose_s(a.source)}))
         return 0
-    clip = load(a.source, imu=not a.no_imu, frames=a.frames)
+    clip = load(a.source, imu=not a.no_imu, frames=a.begin + a.frames if a.frames else 0)
+    clip = clip.part(a.begin, len(clip.items))
     warm(clip.rig)
     release_memory()
     with contextlib.ExitStack() as stack:
