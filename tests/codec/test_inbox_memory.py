@@ -6,28 +6,11 @@ import random
 
 from kiteline_codec.schema import Key, Kind
 from kiteline_codec.sync import Endpoint, SyncConfig
+from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 100_000
 KINDS = (Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED)
-
-
-class Memory:
-    """A Spill. It takes no more than `room` bytes, and from `forgetful` on gives none back."""
-
-    def __init__(self, room: int = 1 << 40) -> None:
-        self.data: list[bytes] = []
-        self.room = room
-        self.forgetful = False
-
-    def put(self, data: bytes) -> int | None:
-        if sum(map(len, self.data)) + len(data) > self.room:
-            return None
-        self.data.append(data)
-        return len(self.data) - 1
-
-    def get(self, where: int, n_bytes: int) -> bytes | None:
-        return None if self.forgetful else self.data[where]
 
 
 class Line:
@@ -98,8 +81,8 @@ def test_what_a_disk_has_lost_is_sent_again() -> None:
     line = Line(spill)
     for keyframe in range(200):
         line.say(keyframe)
-    spill.forgetful = True
+    spill.forgets = 1  # every one
     line.say(3)
-    spill.forgetful = False
+    spill.forgets = 0
     line.settle()
     assert line.b.peer_values() == line.a.own_values()

@@ -9,31 +9,11 @@ import pytest
 from kiteline_codec.packet import parse
 from kiteline_codec.schema import Key, Kind
 from kiteline_codec.sync import Endpoint, SyncConfig
+from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 200_000
 LIVE = Key(Kind.LIVE, 0)
-
-
-class Memory:
-    """A Spill. Of what was put it loses every `forgets`-th; it takes no more than `room` bytes."""
-
-    def __init__(self, forgets: int = 0, room: int = 1 << 40) -> None:
-        self.data: list[bytes] = []
-        self.forgets = forgets
-        self.room = room
-
-    def put(self, data: bytes) -> int | None:
-        if sum(map(len, self.data)) + len(data) > self.room:
-            return None
-        self.data.append(data)
-        return len(self.data) - 1
-
-    def get(self, where: int, n_bytes: int) -> bytes | None:
-        if self.forgets and where % self.forgets == 0:
-            return None
-        assert len(self.data[where]) == n_bytes
-        return self.data[where]
 
 
 class Line:
