@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.kiteline-installed
-ROOMS := core codec hw agent basestation lab cli
+ROOMS := core codec hw agent basestation lab bench cli
 
 # Compiled kernels are kept with the environment, so that tests and demo compile once.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba-cache

@@ -44,9 +44,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     import numpy as np
 
-    from kiteline_core.cameras import CameraModel, CameraRig
     from kiteline_core.frame import Frame, Trajectory
-    from kiteline_hw.mcap_log import LogWriter
+    from kiteline_core.geometry.cameras import CameraModel, CameraRig
+    from kiteline_hw.logs.mcap_log import LogWriter
 
     frames, step_m, depth_m, baseline_m, focal = 30, 0.02, 2.0, 0.1, 200.0
     random = np.random.default_rng(1)

@@ -19,38 +19,38 @@ from typing import Any
 import cv2
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.camera import Camera
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.cost import VirtualCpu
-from kiteline_agent.cost_model import cost_ns
-from kiteline_agent.cpu_account import CpuAccount
-from kiteline_agent.flight_record import FlightRecord, metadata
-from kiteline_agent.narrator import Narrator, summary
-from kiteline_agent.spec import AgentSpec, agent_config, channel_for, from_json, parser, settled, spec_of
+from kiteline_agent.governor.cost_model import cost_ns
+from kiteline_agent.governor.cpu_account import CpuAccount
+from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.runtime.flight_record import FlightRecord, metadata
+from kiteline_agent.runtime.frame_reader import Camera
+from kiteline_agent.runtime.options import AgentSpec, agent_config, channel_for, from_json, parser, settled, spec_of
+from kiteline_agent.runtime.tally import Tally
+from kiteline_agent.runtime.terminal import Narrator, summary
+from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
-from kiteline_agent.tally import Tally
-from kiteline_agent.warm import warm
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.framing import StreamFramer
-from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
+from kiteline_codec.transport.framing import StreamFramer
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
-from kiteline_hw import kernel_cache, process
-from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.cpu import CpuQuota, release_memory, rss_mib
-from kiteline_hw.key_store import read_keys
-from kiteline_hw.links import open_link
-from kiteline_hw.lockstep_barrier import Barrier
-from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
-from kiteline_hw.mcap_log import LogWriter
+from kiteline_hw.links.open import open_link
+from kiteline_hw.links.sealed_link import SealedLink
+from kiteline_hw.lockstep.barrier import Barrier
+from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.logs.mcap_log import LogWriter
+from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import ByteLink, ControllerLink, FrameSource, LinkError, PoseSample, SourceError
-from kiteline_hw.reduced import with_other_imu
-from kiteline_hw.sealed_link import SealedLink
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
-from kiteline_hw.sources import open_source
-from kiteline_hw.spill_file import SpillFile
-from kiteline_hw.words import shipped_words
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sources.open import open_source
+from kiteline_hw.sources.reduced import with_other_imu
+from kiteline_hw.system import kernel_cache, process
+from kiteline_hw.system.clock import MonotonicClock
+from kiteline_hw.system.cpu import CpuQuota, release_memory, rss_mib
+from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.vocabulary import shipped_words
 
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
@@ -75,7 +75,7 @@ class Onboard:
         self.rss_mib = 0.0
         config = agent_config(spec.config, spec.cpu_percent)
         if whole_process:
-            kernel_cache.fill("kiteline_agent.warm")
+            kernel_cache.fill("kiteline_agent.runtime.warm")
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(source.rig, config)
@@ -367,7 +367,7 @@ def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stac
         if spec.odometry:
             raise LinkError("--odometry takes velocities from a flight controller: expected --mavlink URL beside it")
         return None
-    from kiteline_hw.mavlink_connect import connect  # the dialect takes 5 MiB: only where it is spoken
+    from kiteline_hw.mavlink.connect import connect
 
     own = agent_config(spec.config).controller_imu
     return stack.enter_context(

@@ -5,24 +5,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.camera import joined
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.depth_from_motion import DepthFromMotion
-from kiteline_agent.glimpse import Glimpse
-from kiteline_agent.governor import FULL, Extra, governed
-from kiteline_agent.map_growth import MapGrowth
-from kiteline_agent.recovery import Recovered
-from kiteline_agent.right_eye import RightEye, rectified
+from kiteline_agent.governor.governor import FULL, Extra, governed
+from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
+from kiteline_agent.relocalisation.relocaliser import Recovered
+from kiteline_agent.runtime.frame_reader import joined
 from kiteline_agent.stages import Stages
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
-from kiteline_agent.tracker import Track, Tracker, View
+from kiteline_agent.submaps.map_growth import MapGrowth
+from kiteline_agent.tracking.image_pair import RightEye, rectified
+from kiteline_agent.tracking.image_shift import Glimpse
+from kiteline_agent.tracking.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Camera, Live, Record, Tile
-from kiteline_core import se3
-from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import NO_KEYFRAME, SubmapId
-from kiteline_core.place_index import Vocabulary
+from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from kiteline_agent.controller_imu import ControllerImuConfig
-from kiteline_agent.inertial_tracker import InertialConfig
-from kiteline_agent.odometer import OdometerConfig
-from kiteline_core.features import DetectorConfig
-from kiteline_core.matching import MatchConfig
-from kiteline_core.pnp import RansacConfig
-from kiteline_core.two_view import TwoViewConfig
+from kiteline_agent.imaging.features import DetectorConfig
+from kiteline_agent.inertial.controller_imu import ControllerImuConfig
+from kiteline_agent.inertial.inertial_tracker import InertialConfig
+from kiteline_agent.initialisation.two_view import TwoViewConfig
+from kiteline_agent.motion.odometer import OdometerConfig
+from kiteline_core.imaging.matching import MatchConfig
+from kiteline_core.pose.pnp import RansacConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,30 +5,30 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.certainty import Certainty
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.cost_model import Work
-from kiteline_agent.from_base import FromBase
-from kiteline_agent.frozen import FrozenEye
-from kiteline_agent.governor import Governor
-from kiteline_agent.inertia import Inertia
-from kiteline_agent.keyframe_maker import KeyframeMaker
-from kiteline_agent.levelling import Levelling
-from kiteline_agent.local_map import LocalMap
-from kiteline_agent.mono_start import MonoStart
-from kiteline_agent.pose_state import PoseState
-from kiteline_agent.recovery import Recovery
-from kiteline_agent.reference import Reference
+from kiteline_agent.covariance.pose_covariance import Certainty
+from kiteline_agent.exchange.corrections import FromBase
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.governor.governor import Governor
+from kiteline_agent.inertial.gravity_alignment import Levelling
+from kiteline_agent.initialisation.two_view_start import MonoStart
+from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.keyframes.reference import Reference
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.motion.motion_model import Inertia
+from kiteline_agent.relocalisation.map_cache import Window
+from kiteline_agent.relocalisation.relocaliser import Recovery
 from kiteline_agent.step import Identity
-from kiteline_agent.submaps import Submaps
-from kiteline_agent.tracker import Tracker
-from kiteline_agent.window import Window
+from kiteline_agent.submaps.submaps import Submaps
+from kiteline_agent.tracking.pose_state import PoseState
+from kiteline_agent.tracking.stuck_camera import FrozenEye
+from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
-from kiteline_core import se3
-from kiteline_core.cameras import CameraRig, Rectifier
 from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import SubmapId
-from kiteline_core.place_index import Vocabulary
+from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 

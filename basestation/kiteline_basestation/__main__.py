@@ -20,42 +20,42 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from kiteline_basestation.combine import combine
-from kiteline_basestation.flight_log import RESTORED, metadata_of, station_of, write_step
-from kiteline_basestation.flown import Flown, as_flown, settled, timings
-from kiteline_basestation.jobs import JobDone
-from kiteline_basestation.keeper import Keeper, read_imports
-from kiteline_basestation.kept import Kept, pack
 from kiteline_basestation.management import Command
-from kiteline_basestation.narrator import Narrator
-from kiteline_basestation.outputs import counts, map_files
-from kiteline_basestation.restore import Restored, restore
-from kiteline_basestation.spec import BaseSpec, base_config, coded_channels, from_json, of_arguments, parser
+from kiteline_basestation.runtime.flight_log import RESTORED, metadata_of, station_of, write_step
+from kiteline_basestation.runtime.jobs import JobDone
+from kiteline_basestation.runtime.options import BaseSpec, base_config, coded_channels, from_json, of_arguments, parser
+from kiteline_basestation.runtime.outputs import counts, map_files
+from kiteline_basestation.runtime.summary import Flown, as_flown, settled, timings
+from kiteline_basestation.runtime.terminal import Narrator
+from kiteline_basestation.runtime.warm import warm, warm_graphs
+from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_basestation.station import Import, Station, StationOutput
-from kiteline_basestation.store import StoreError
-from kiteline_basestation.warm import warm, warm_graphs
-from kiteline_basestation.worker import SAMPLES, LockstepJobs, Worker
+from kiteline_basestation.store.combine import combine
+from kiteline_basestation.store.keeper import Keeper, read_imports
+from kiteline_basestation.store.kept import Kept, pack
+from kiteline_basestation.store.restore import Restored, restore
+from kiteline_basestation.store.store import StoreError
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.framing import StreamFramer
 from kiteline_codec.schema import WireError
-from kiteline_codec.seal import Direction, Opener, Sealer, suite_for
+from kiteline_codec.transport.framing import StreamFramer
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core.ids import AgentId
-from kiteline_core.place_index import Vocabulary
-from kiteline_hw import process
-from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.cpu import return_large_arrays, rss_mib
-from kiteline_hw.key_store import read_keys
-from kiteline_hw.links import open_link
-from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
-from kiteline_hw.mcap_log import LogWriter
+from kiteline_core.places.place_index import Vocabulary
+from kiteline_hw.links.open import open_link
+from kiteline_hw.links.sealed_link import SealedHub
+from kiteline_hw.links.zenoh_link import ZenohHub
+from kiteline_hw.links.zenoh_queries import QueryServer
+from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
+from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, LinkHub, SourceError
-from kiteline_hw.sealed_link import SealedHub
-from kiteline_hw.sim.link_model import LinkModelConfig, LinkModels
-from kiteline_hw.words import shipped_words
-from kiteline_hw.zenoh_link import ZenohHub
-from kiteline_hw.zenoh_lockstep import LockstepServer
-from kiteline_hw.zenoh_queries import QueryServer
+from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
+from kiteline_hw.system import process
+from kiteline_hw.system.clock import MonotonicClock
+from kiteline_hw.system.cpu import return_large_arrays, rss_mib
+from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.vocabulary import shipped_words
 
 if TYPE_CHECKING:
     from kiteline_basestation.web.status_page import StatusPage
@@ -302,7 +302,7 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         questions = _questions(spec, plain, stack)
         page: StatusPage | None = None
         if spec.web:
-            from kiteline_basestation.web.status_page import open_page  # the plain install lacks what it needs
+            from kiteline_basestation.web.status_page import open_page
 
             page = open_page(spec.web, clock.now_ns())
             stack.callback(page.close)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from kiteline_basestation.grid import GridConfig
-from kiteline_core.bundle import BundleConfig
-from kiteline_core.matching import MatchConfig
-from kiteline_core.pnp import RansacConfig
+from kiteline_basestation.grid.grid import GridConfig
+from kiteline_core.imaging.matching import MatchConfig
+from kiteline_core.optimisation.bundle import BundleConfig
+from kiteline_core.pose.pnp import RansacConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kiteline_basestation.memory import matrix, similarity_of
-from kiteline_core import sim3
+from kiteline_basestation.store.state import matrix, similarity_of
+from kiteline_core.geometry import sim3
 from kiteline_core.ids import (
     BOOT_BITS,
     KEYPOINT_BITS,
@@ -28,8 +28,8 @@ from kiteline_core.ids import (
 )
 
 if TYPE_CHECKING:
-    from kiteline_basestation.atlas import Atlas
     from kiteline_basestation.mapper import Mapper
+    from kiteline_basestation.merging.map_merger import Atlas
 
 _NAME_CHARS = 64
 _FLIES_NS = 10_000_000_000  # ns after its last word that an agent counts as flying: its map is not deleted

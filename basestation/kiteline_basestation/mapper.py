@@ -11,28 +11,30 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation import culling, management, newpoints, refind
-from kiteline_basestation.atlas import Atlas
+from kiteline_basestation import management
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.covisibility import Window, local_window
-from kiteline_basestation.grid import Grid, GridMap
-from kiteline_basestation.intake import Intake
-from kiteline_basestation.jobs import BundleInputs, GridInputs, Job, JobDone
+from kiteline_basestation.grid.grid import Grid, GridMap
+from kiteline_basestation.intake.intake import Intake
+from kiteline_basestation.intake.placements import World
 from kiteline_basestation.management import Answer, Command
-from kiteline_basestation.memory import Json, Memory, matrix, parsed, plain, similarity_of
-from kiteline_basestation.odometry_links import with_links, without_links
-from kiteline_basestation.publisher import Published, Publisher, adopt
-from kiteline_basestation.refinement import apply_bundle
-from kiteline_basestation.whole_maps import WholeMaps
-from kiteline_basestation.world import World
-from kiteline_basestation.world_view import world_view
+from kiteline_basestation.map.covisibility import Window, local_window
+from kiteline_basestation.map.map_tables import BIRTH, CULLED
+from kiteline_basestation.map.publisher import Published, Publisher, adopt
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.map.world_view import world_view
+from kiteline_basestation.merging.map_merger import Atlas
+from kiteline_basestation.refinement import culling, refind
+from kiteline_basestation.refinement import new_landmarks as newpoints
+from kiteline_basestation.refinement.apply_bundle import apply_bundle
+from kiteline_basestation.refinement.odometry_links import with_links, without_links
+from kiteline_basestation.refinement.whole_maps import WholeMaps
+from kiteline_basestation.runtime.jobs import BundleInputs, GridInputs, Job, JobDone
+from kiteline_basestation.store.state import Json, Memory, matrix, parsed, plain, similarity_of
 from kiteline_codec.schema import Calibration, Key, Kind, Live, Record
-from kiteline_core import sim3
-from kiteline_core.bundle import BundleResult
+from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
-from kiteline_core.map_tables import BIRTH, CULLED
-from kiteline_core.place_index import Vocabulary
-from kiteline_core.sparse_map import SparseMap
+from kiteline_core.optimisation.bundle import BundleResult
+from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 

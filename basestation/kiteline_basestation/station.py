@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.supply import Supply
-from kiteline_codec import messages
+from kiteline_basestation.runtime.jobs import Job, JobDone
+from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, RecordChannel
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Key, Record, WireError
 from kiteline_core.ids import AgentId
-from kiteline_core.place_index import Vocabulary
+from kiteline_core.places.place_index import Vocabulary
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,13 +46,13 @@ COMMANDS = (
 
 # Raised on purpose, with a text for the user. Looked up among loaded modules: what was raised has been imported.
 KNOWN_ERRORS = (
-    ("kiteline_core.cameras", "CalibrationError"),
+    ("kiteline_core.geometry.cameras", "CalibrationError"),
     ("kiteline_core.config", "ConfigError"),
     ("kiteline_codec.schema", "WireError"),
-    ("kiteline_basestation.store", "StoreError"),
+    ("kiteline_basestation.store.store", "StoreError"),
     ("kiteline_hw.ports", "SourceError"),
     ("kiteline_hw.ports", "LinkError"),
-    ("kiteline_lab.trajectories", "TrajectoryError"),
+    ("kiteline_lab.evaluation.trajectories", "TrajectoryError"),
 )
 
 # Which extra brings a package that the plain install leaves out.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from kiteline_codec import messages
-from kiteline_codec.archive import Spill
-from kiteline_codec.pacing import Pacer
-from kiteline_codec.profiles import EXACT, PROFILES, RADIO, Profile
+from kiteline_codec.coding import messages
+from kiteline_codec.pacing.pacer import Pacer
+from kiteline_codec.pacing.profiles import EXACT, PROFILES, RADIO, Profile
+from kiteline_codec.residuals.residual_coding import Tightener
 from kiteline_codec.schema import Head, Key, Live, Record, WireError
-from kiteline_codec.sync import Endpoint, SyncConfig, SyncStats
-from kiteline_codec.tight import Tightener
+from kiteline_codec.sync.archive import Spill
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig, SyncStats
 
 
 class RecordChannel(Protocol):

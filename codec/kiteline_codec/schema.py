@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 
 F32 = NDArray[np.float32]
@@ -228,7 +228,7 @@ class Copied:
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """What the base found of an agent's cameras. disparity_px: (5,) what its disparities are too large by, as factors
-    of 1, x, y, x^2, x y in normalised image coordinates (`kiteline_core.disparity_offset`).
+    of 1, x, y, x^2, x y in normalised image coordinates (`kiteline_core.geometry.disparity_offset`).
     """
 
     agent: AgentId

@@ -6,7 +6,7 @@ import numpy as np
 
 from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import Births, Camera, Depths, Head, Sightings
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
 _TICK_NS = 50_000_000

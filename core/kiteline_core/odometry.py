@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core import se3
 from kiteline_core.frame import UNMEASURED, OdometryBatch
+from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]

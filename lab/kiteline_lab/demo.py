@@ -11,23 +11,24 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from kiteline_lab.evaluate import evaluate_files
-from kiteline_lab.metrics import Evaluation
+from kiteline_lab.evaluation.evaluate import evaluate_files
+from kiteline_lab.evaluation.metrics import Evaluation
 
 SCENE = "room"  # four walls, furniture, a window: what EuRoC's Vicon room is like
 SECONDS = 8.0  # long enough to see the room, short enough to wait for
 SEED = 7
 # A sixth of the time to compile would go to looking for garbage; without, it takes 700 MiB in place of 500.
-_WARM_ALL = "import gc; gc.disable(); from kiteline_lab.doctor import warm; warm()"
+_WARM_ALL = "import gc; gc.disable(); from kiteline_lab.tools.doctor import warm; warm()"
 _WARM_BASE = (
-    "import gc; gc.disable(); from kiteline_basestation.warm import warm; from kiteline_hw.words import shipped_words; "
+    "import gc; gc.disable(); from kiteline_basestation.runtime.warm import warm; "
+    "from kiteline_hw.system.vocabulary import shipped_words; "
     "warm(words=shipped_words())"
 )
 
 
 def demo(folder: Path, seconds: float = SECONDS) -> str:
     """Make the recording, fly it, evaluate it; the table that sums it up. Leaves everything in `folder`."""
-    from kiteline_lab import fly, simulate
+    from kiteline_lab.flights import fly, simulate
 
     folder.mkdir(parents=True, exist_ok=True)
     recording, out = folder / "flight.mcap", folder / "flight"

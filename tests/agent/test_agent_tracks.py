@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import AloneChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_core import se3
 from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from kiteline_hw.ports import FrameSource
-from kiteline_hw.sources import open_source
+from kiteline_hw.sources.open import open_source
 
 
 def fly(source: FrameSource, frames: Iterable[Frame | ImuBatch], config: AgentConfig | None = None) -> list[Estimate]:
@@ -146,7 +146,7 @@ def test_where_the_imu_knows_the_place_the_map_goes_on(data_dir: Path) -> None:
 
 
 def test_nothing_to_see_is_no_error() -> None:
-    from kiteline_core.cameras import CameraModel, CameraRig
+    from kiteline_core.geometry.cameras import CameraModel, CameraRig
 
     camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
     rig = CameraRig(camera, camera, np.eye(4), se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))

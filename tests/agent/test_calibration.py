@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
-from kiteline_agent.local_map import LocalMap
+from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import Depths, Head
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 376.0, 240.0, 0.1, True, np.eye(4))

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent import certainty_kernels
-from kiteline_agent.certainty import Certainty, adjoint, probability_good
 from kiteline_agent.config import AgentConfig, CertaintyConfig
-from kiteline_agent.local_map import LocalMap
-from kiteline_agent.pose_state import PoseState
-from kiteline_agent.tracker import Track
+from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
+from kiteline_agent.covariance.pose_covariance import Certainty, adjoint, probability_good
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.tracking.pose_state import PoseState
+from kiteline_agent.tracking.tracker import Track
 from kiteline_codec.schema import Head
-from kiteline_core import pose_kernels, se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+from kiteline_core.pose import pose_kernels
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))

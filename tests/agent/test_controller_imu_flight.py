@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.controller_imu import ControllerImuConfig
+from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_core import se3
 from kiteline_core.frame import Frame
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
-from kiteline_hw.mavlink_imu import ControllerImu
-from kiteline_hw.mavlink_messages import VehicleImu
+from kiteline_hw.mavlink.imu import ControllerImu
+from kiteline_hw.mavlink.messages import VehicleImu
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sim.source import SimSource, open_sim
 

@@ -6,15 +6,15 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.cost import VirtualCpu
-from kiteline_agent.cost_model import PRICES_NS, Work, cost_ns
-from kiteline_agent.governor import CARRIED, governed
+from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.governor.cost_model import PRICES_NS, Work, cost_ns
+from kiteline_agent.governor.governor import CARRIED, governed
+from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.step import Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
-from kiteline_hw.sources import open_source
+from kiteline_hw.sources.open import open_source
 
 
 def costs_of(path: Path, config: AgentConfig, frames: int = 12) -> tuple[list[int], list[Work], list[bool]]:

@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_agent.camera import Camera, joined
-from kiteline_agent.cost import VirtualCpu
-from kiteline_agent.cpu_account import CpuAccount
-from kiteline_agent.flight_log import estimate_from_json, estimate_to_json
-from kiteline_agent.spec import AgentSpec, agent_config, from_json
+from kiteline_agent.governor.cpu_account import CpuAccount
+from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.runtime.flight_log import estimate_from_json, estimate_to_json
+from kiteline_agent.runtime.frame_reader import Camera, joined
+from kiteline_agent.runtime.options import AgentSpec, agent_config, from_json
+from kiteline_agent.runtime.tally import Tally, live_line, odometry_line
 from kiteline_agent.step import Estimate
-from kiteline_agent.tally import Tally, live_line, odometry_line
-from kiteline_core import se3
 from kiteline_core.config import ConfigError
 from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 
 IMAGE = np.zeros((4, 4), np.uint8)

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.from_base import FromBase
-from kiteline_agent.local_map import LocalMap
-from kiteline_agent.window import Window
+from kiteline_agent.exchange.corrections import FromBase
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.relocalisation.map_cache import Window
 from kiteline_codec.schema import Key, Kind, Placement
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, submap_id
 
 FIRST, YOUNG = submap_id(AgentId(0), 1, 0), submap_id(AgentId(0), 1, 1)

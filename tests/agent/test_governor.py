@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kiteline_agent.config import AgentConfig, GovernorConfig
-from kiteline_agent.governor import ALONE, CARRIED, FULL, Effort, Extra, Governor, governed
+from kiteline_agent.governor.governor import ALONE, CARRIED, FULL, Effort, Extra, Governor, governed
 
 PERIOD_NS = 50_000_000
 FRAME_NS, KEYFRAME_NS = 3_500_000, 5_000_000

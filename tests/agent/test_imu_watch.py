@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_agent.imu_watch import ImuWatch
+from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_core.frame import ImuBatch
 
 _FRAME_NS = 50_000_000

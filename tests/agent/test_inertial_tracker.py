@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.inertial_tracker import InertialConfig, InertialTracker
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.fixed_lag import InertialState, VisualPoints
+from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
+from kiteline_agent.inertial.inertial_tracker import InertialConfig, InertialTracker
 from kiteline_core.frame import ImuBatch, ImuCalibration
-from kiteline_hw.sim import imu as sim_imu
-from kiteline_hw.sim.paths import built_in
-from kiteline_hw.sim.trajectory import Path
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_hw.sim.sensors import imu as sim_imu
+from kiteline_hw.sim.world.paths import built_in
+from kiteline_hw.sim.world.trajectory import Path
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial_tracker import InertialTracker
-from kiteline_agent.levelling import Levelling, level_rotation
+from kiteline_agent.inertial.gravity_alignment import Levelling, level_rotation
+from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.step import Estimate
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
 from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId
 
 CAMERA = RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, True, np.eye(4))
@@ -28,7 +28,7 @@ class Knows(InertialTracker):
 
 
 def _config():  # type: ignore[no-untyped-def]
-    from kiteline_agent.inertial_tracker import InertialConfig
+    from kiteline_agent.inertial.inertial_tracker import InertialConfig
 
     return InertialConfig()
 
@@ -105,7 +105,7 @@ def test_gravity_is_known_after_five_frames_in_motion() -> None:
 
 
 def _nothing():  # type: ignore[no-untyped-def]
-    from kiteline_core.fixed_lag import VisualPoints
+    from kiteline_agent.inertial.fixed_lag import VisualPoints
 
     none = np.zeros((0, 3))
     return VisualPoints(none, none, none, np.zeros(0), np.zeros(0, np.bool_))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from kiteline_agent.config import AgentConfig, SmoothingConfig
-from kiteline_agent.from_base import FromBase
-from kiteline_agent.local_map import LocalMap
-from kiteline_agent.window import Window
+from kiteline_agent.exchange.corrections import FromBase
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.relocalisation.map_cache import Window
 from kiteline_codec.schema import Key, Kind, Placement
-from kiteline_core import se3, sim3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import submap_id
 
 T_B_C = se3.exp(np.array([0.1, -0.05, 0.02, 0.3, 0.1, -1.2]))

@@ -13,20 +13,20 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig, LocalMapConfig
-from kiteline_agent.depth_from_motion import sigma_of_meeting
-from kiteline_agent.mono_start import MonoStart
+from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
+from kiteline_agent.initialisation.two_view_start import MonoStart
+from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_agent.tracker import View
+from kiteline_agent.tracking.tracker import View
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import Births
-from kiteline_core import se3
-from kiteline_core.cameras import CameraModel, CameraRig, Rectifier
-from kiteline_core.features import DetectorConfig, build_pyramid
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.ids import NO_KEYFRAME, AgentId, submap_of_keyframe
-from kiteline_hw.sources import open_source
+from kiteline_hw.sources.open import open_source
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_agent.narrator import Narrator, summary
+from kiteline_agent.runtime.tally import Tally
+from kiteline_agent.runtime.terminal import Narrator, summary
 from kiteline_agent.step import Estimate, StepOutput
-from kiteline_agent.tally import Tally
 from kiteline_core.ids import KeyframeId, SubmapId
 
 

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_agent.odometer import Odometer, OdometerConfig
-from kiteline_core import odometry, se3
+from kiteline_agent.motion.odometer import Odometer, OdometerConfig
+from kiteline_core import odometry
 from kiteline_core.frame import UNMEASURED, OdometryBatch
+from kiteline_core.geometry import se3
 
 F64 = np.ndarray
 FRAME_NS, SAMPLE_NS = 50_000_000, 20_000_000

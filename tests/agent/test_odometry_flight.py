@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import AloneChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_core import odometry, se3
-from kiteline_core.cameras import CameraRig
+from kiteline_core import odometry
 from kiteline_core.frame import Frame, OdometryBatch
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import AgentId
 from kiteline_hw.sim.source import open_sim
 

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.alone import AloneChannel
 from kiteline_agent.config import AgentConfig, LocalMapConfig
+from kiteline_agent.exchange.no_base import AloneChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.schema import Head, Record
-from kiteline_core import se3
-from kiteline_core.cameras import CameraRig
 from kiteline_core.frame import Frame
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import MAX_SUBMAPS, NO_KEYFRAME, AgentId, KeyframeId, submap_of_keyframe
-from kiteline_core.place_index import Vocabulary
+from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.sim.source import open_sim
-from kiteline_hw.sources import open_source
-from kiteline_hw.words import shipped_words
+from kiteline_hw.sources.open import open_source
+from kiteline_hw.system.vocabulary import shipped_words
 
 PERIOD_NS = 50_000_000
 

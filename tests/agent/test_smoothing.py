@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_agent.config import SmoothingConfig
-from kiteline_agent.smoothing import Smoothing
-from kiteline_core import se3, sim3
+from kiteline_agent.exchange.smoothing import Smoothing
+from kiteline_core.geometry import se3, sim3
 
 TICK_NS = 50_000_000
 

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.window import Seen, Window
+from kiteline_agent.relocalisation.map_cache import Seen, Window
 from kiteline_codec.schema import Copied, Copy, Key, Kind
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
-from kiteline_hw.words import shipped_words
+from kiteline_hw.system.vocabulary import shipped_words
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
-from kiteline_core.place_index import Vocabulary, nodes
+from kiteline_core.places.place_index import Vocabulary, nodes
 
 F64 = NDArray[np.float64]
 

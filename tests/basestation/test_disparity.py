@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import Job, JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
 from kiteline_codec.schema import Births, Camera, Record, Sightings
-from kiteline_core.disparity_offset import none, terms
+from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 
 F64 = NDArray[np.float64]

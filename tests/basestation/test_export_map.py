@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_basestation import export
-from kiteline_core import se3
+from kiteline_basestation.runtime import export
+from kiteline_core.geometry import se3
 
 
 def poses(n: int) -> np.ndarray:

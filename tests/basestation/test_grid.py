@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_basestation.floor import FloorConfig, ground_heights
-from kiteline_basestation.grid import (
+from kiteline_basestation.grid.grid import (
     GROUND,
     OBSTACLE,
     UNKNOWN,
@@ -23,7 +22,8 @@ from kiteline_basestation.grid import (
     to_pgm,
     to_yaml,
 )
-from kiteline_basestation.tiles import tiles
+from kiteline_basestation.grid.ground_height import FloorConfig, ground_heights
+from kiteline_basestation.grid.tiles import tiles
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

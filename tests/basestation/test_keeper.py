@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from kiteline_basestation import keeper as keeper_module
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.keeper import KEEP_NS, Keeper
-from kiteline_basestation.kept import Kept
 from kiteline_basestation.station import Import, Station
-from kiteline_basestation.store import Batch, Store, StoreError, read
-from kiteline_codec import messages
+from kiteline_basestation.store import keeper as keeper_module
+from kiteline_basestation.store.keeper import KEEP_NS, Keeper
+from kiteline_basestation.store.kept import Kept
+from kiteline_basestation.store.store import Batch, Store, StoreError, read
 from kiteline_codec.channel import CodedChannel
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Kind
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.sync.endpoint import SyncConfig
 
 MakeFlight = Callable[..., Any]
 

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, RefindConfig
-from kiteline_basestation.jobs import Job, JobDone, run_job
-from kiteline_basestation.loops import Shares
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.merging.loop_detector import Shares
+from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
 from kiteline_codec.schema import Camera, Pose, Record
 from kiteline_core.ids import AgentId
 

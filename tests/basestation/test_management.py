@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.integrity import contradictions
-from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.management import VERBS, Answer, Command, called
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.runtime.jobs import JobDone, run_job
+from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import Camera, Culled, Live, Record
-from kiteline_core import se3
+from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
 
 MakeFlight = Callable[..., Any]

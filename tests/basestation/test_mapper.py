@@ -12,15 +12,15 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
-from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.map.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
+from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.memory import Scribe
-from kiteline_basestation.world_view import world_view
-from kiteline_codec import messages
+from kiteline_basestation.runtime.jobs import JobDone, run_job
+from kiteline_basestation.store.state import Scribe
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Births, Camera, Culled, Depths, Found, Head, Live, Placement, Pose, Record, Removed
-from kiteline_core import se3
+from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
-from kiteline_core.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]

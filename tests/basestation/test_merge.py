@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import JobDone, run_job
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import Camera, Key, Kind, Placement, Record
-from kiteline_core import se3
+from kiteline_core.geometry import se3
 from kiteline_core.ids import submap_of_keyframe
 
 F64 = NDArray[np.float64]

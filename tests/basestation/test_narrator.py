@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import JobDone, run_job
-from kiteline_basestation.narrator import Narrator
+from kiteline_basestation.runtime.jobs import JobDone, run_job
+from kiteline_basestation.runtime.terminal import Narrator
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import Camera
-from kiteline_codec.sync import SyncConfig
-from kiteline_core import se3
+from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_core.geometry import se3
 
 MakeFlight = Callable[..., Any]
 STEP_NS = 200_000_000

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig, LinkConfig
-from kiteline_basestation.covisibility import window
-from kiteline_basestation.disparity import with_border
-from kiteline_basestation.odometry_links import with_links, without_links
-from kiteline_core import se3
-from kiteline_core.bundle import bundle
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_basestation.map.covisibility import window
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.disparity_calibration import with_border
+from kiteline_basestation.refinement.odometry_links import with_links, without_links
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
-from kiteline_core.sparse_map import SparseMap
+from kiteline_core.optimisation.bundle import bundle
 
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
 SUBMAP = submap_id(0, 0, 0)

@@ -12,21 +12,21 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.integrity import contradictions
-from kiteline_basestation.jobs import BundleInputs, Job, JobDone, run_job
 from kiteline_basestation.management import _list
+from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.outputs import keyframe_poses
-from kiteline_basestation.overlap import Overlap, depth_scale
-from kiteline_basestation.supply import Supply
-from kiteline_basestation.votes import similarity
-from kiteline_basestation.world_view import world_view
+from kiteline_basestation.merging.loop_edges import similarity
+from kiteline_basestation.merging.loop_verification import Overlap, depth_scale
+from kiteline_basestation.runtime.jobs import BundleInputs, Job, JobDone, run_job
+from kiteline_basestation.runtime.outputs import keyframe_poses
+from kiteline_basestation.store.integrity import contradictions
+from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import Camera, Copied, Copy, Head, Live, Placement, Record, Unit
-from kiteline_core import se3, sim3
-from kiteline_core.bundle import BundleResult
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
-from kiteline_core.pnp import align_points
+from kiteline_core.optimisation.bundle import BundleResult
+from kiteline_core.pose.pnp import align_points
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kiteline_basestation.overlap import View, _one_unit
-from kiteline_core import se3
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.loop_verification import View, _one_unit
+from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
-from kiteline_core.sparse_map import SparseMap
 
 
 @pytest.mark.parametrize(

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_basestation.combine import combine
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.integrity import contradictions, sound
-from kiteline_basestation.jobs import JobDone, run_job
-from kiteline_basestation.keeper import Keeper, snapshot
-from kiteline_basestation.kept import Codes, Kept
-from kiteline_basestation.restore import restore
+from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Import, Station
-from kiteline_basestation.store import read
-from kiteline_codec import messages
+from kiteline_basestation.store.combine import combine
+from kiteline_basestation.store.integrity import contradictions, sound
+from kiteline_basestation.store.keeper import Keeper, snapshot
+from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Camera, Found, Head, Key, Kind, Placement, Pose, WireError
-from kiteline_codec.sync import SyncConfig
-from kiteline_core import se3
+from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, keyframe_id, submap_of_keyframe
 
 STEP_NS = 100_000_000

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
-from kiteline_basestation.essential_graph import GraphInputs, Scaled, optimise, residuals
-from kiteline_core import se3, sim3
+from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise, residuals
+from kiteline_core.geometry import se3, sim3
 
 F64 = NDArray[np.float64]
 

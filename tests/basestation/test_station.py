@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import run_job
+from kiteline_basestation.runtime.jobs import run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
 from kiteline_codec.schema import Camera, Depths, Pose, Record
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.ids import AgentId
 
 STEP_NS = 100_000_000

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_basestation.kept import Codes, Kept, pack, unpack
-from kiteline_basestation.store import FILE, Batch, Store, StoreError, batch_of, read
+from kiteline_basestation.store.kept import Codes, Kept, pack, unpack
+from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read
 from kiteline_codec.schema import Key, Kind, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
 

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.config import BaseConfig, SupplyConfig
-from kiteline_basestation.intake import Intake
-from kiteline_basestation.kept import Codes, Kept
-from kiteline_basestation.restore import restore
+from kiteline_basestation.intake.intake import Intake
+from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.station import Station
-from kiteline_basestation.supply import Supply
-from kiteline_codec import messages
+from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.restore import restore
+from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, plain_pair
-from kiteline_codec.profiles import RADIO
+from kiteline_codec.coding import messages
+from kiteline_codec.pacing.profiles import RADIO
 from kiteline_codec.schema import Camera, Copied, Copy, Key, Live, Placement, Record
-from kiteline_codec.sync import SyncConfig
-from kiteline_core import se3
+from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, keyframe_id, submap_id, submap_of_keyframe
-from kiteline_core.sparse_map import SparseMap
 
 MakeFlight = Callable[..., Any]
 SECOND_NS = 1_000_000_000

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import JobDone, run_job
+from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_basestation.web import nothing, overview, status
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.sync import SyncConfig
+from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.ids import AgentId
 
 S = 1_000_000_000

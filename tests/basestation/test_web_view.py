@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_basestation.grid import UNKNOWN, GridMap
+from kiteline_basestation.grid.grid import UNKNOWN, GridMap
 from kiteline_basestation.web import view
 from kiteline_basestation.web.view import AgentView, Snapshot
 from kiteline_core.ids import AgentId

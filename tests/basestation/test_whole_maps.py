@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kiteline_basestation.config import GraphConfig
-from kiteline_basestation.whole_maps import WholeMaps
+from kiteline_basestation.refinement.whole_maps import WholeMaps
 from kiteline_core.ids import SubmapId, submap_id
 
 ONE, TWO = submap_id(0, 0, 0), submap_id(1, 0, 0)

@@ -6,10 +6,10 @@ import time
 
 import numpy as np
 
-from kiteline_basestation.flight_log import fingerprint
-from kiteline_basestation.grid import GridConfig
-from kiteline_basestation.jobs import GridInputs, Job, JobDone, run_job
-from kiteline_basestation.worker import Worker
+from kiteline_basestation.grid.grid import GridConfig
+from kiteline_basestation.runtime.flight_log import fingerprint
+from kiteline_basestation.runtime.jobs import GridInputs, Job, JobDone, run_job
+from kiteline_basestation.runtime.worker import Worker
 
 
 def grid_job(number: int) -> Job:

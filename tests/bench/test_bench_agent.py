@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_hw.cpu import CpuQuota
-from kiteline_lab import bench_agent, trials
-from kiteline_lab.bench_agent_faults import estimates
-from kiteline_lab.bench_governor import governor_table
-from kiteline_lab.benchmark import BENCHMARKS
-from kiteline_lab.clip import Clip, load
-from kiteline_lab.faults import FAULTS, blind, faulty, fitting, rearranged
-from kiteline_lab.governed import Governed, dearest_window, fly_clip
-from kiteline_lab.plot_governor import plot_governor
+from kiteline_bench.agent import flights as bench_agent
+from kiteline_bench.agent.faults import estimates
+from kiteline_bench.agent.governor import governor_table
+from kiteline_bench.benchmark import BENCHMARKS
+from kiteline_bench.harness import trials
+from kiteline_bench.harness.clip import Clip, load
+from kiteline_bench.harness.faults import FAULTS, blind, faulty, fitting, rearranged
+from kiteline_bench.harness.governed import Governed, dearest_window, fly_clip
+from kiteline_bench.harness.plot_governor import plot_governor
+from kiteline_hw.system.cpu import CpuQuota
 
 
 @pytest.fixture(scope="module")

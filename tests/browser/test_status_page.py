@@ -18,7 +18,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation import web
-from kiteline_basestation.grid import GridMap
+from kiteline_basestation.grid.grid import GridMap
 from kiteline_core.ids import AgentId
 
 

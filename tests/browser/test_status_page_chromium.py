@@ -19,8 +19,8 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation import web
-from kiteline_basestation.grid import GridConfig, build
-from kiteline_core import se3
+from kiteline_basestation.grid.grid import GridConfig, build
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

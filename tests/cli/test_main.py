@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_cli import main as cli
-from kiteline_core.cameras import CalibrationError
+from kiteline_core.geometry.cameras import CalibrationError
 
 
 def _stand_in(monkeypatch: pytest.MonkeyPatch, run: object) -> None:

@@ -21,14 +21,14 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from kiteline_codec.budget import SlidingBudget
-from kiteline_codec.flights import Flight
-from kiteline_codec.inbox import Inbox, Update
-from kiteline_codec.outbox import Outbox
-from kiteline_codec.packet import Item
-from kiteline_codec.round_trip import RoundTrip
+from kiteline_codec.pacing.budget import SlidingBudget
 from kiteline_codec.schema import Key
-from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.flights import Flight
+from kiteline_codec.sync.inbox import Inbox, Update
+from kiteline_codec.sync.outbox import Outbox
+from kiteline_codec.sync.packet import Item
+from kiteline_codec.sync.round_trip import RoundTrip
 
 MS = 1_000_000
 CONFIG = SyncConfig(packet_bytes=160, overhead_bytes=10, budget_bytes=1500, window_packets=16, ack_packets=4)

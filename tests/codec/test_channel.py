@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_codec import messages
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Copied, Copy, Key, Kind, Placement, Pose, Record, Removed, Tile
-from kiteline_codec.sync import SyncConfig
-from kiteline_core import se3
+from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 
 POSE = Pose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.packet import parse
 from kiteline_codec.schema import Key, Kind, WireError
-from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.packet import parse
 
 MS = 1_000_000
 PLAIN = SyncConfig(overhead_bytes=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.framing import Deframer, StreamFramer, frame, framed_bytes
+from kiteline_codec.transport.framing import Deframer, StreamFramer, frame, framed_bytes
 
 PACKETS = st.lists(st.one_of(st.binary(max_size=40), st.binary(min_size=250, max_size=600)), max_size=6)
 

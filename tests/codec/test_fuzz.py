@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_codec import messages
+from kiteline_bench.link import fuzz
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Key
-from kiteline_lab import fuzz
 
 HERE = Path(__file__).parent
 

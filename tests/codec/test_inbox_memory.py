@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from kiteline_codec.schema import Key, Kind
-from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000

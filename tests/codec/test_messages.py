@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec import messages, sections
+from kiteline_codec.coding import messages, sections
 from kiteline_codec.schema import (
     Births,
     Calibration,
@@ -38,8 +38,8 @@ from kiteline_codec.schema import (
     Unit,
     WireError,
 )
-from kiteline_core import se3, sim3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
 GOLDEN = Path(__file__).parent / "golden" / "records.json"

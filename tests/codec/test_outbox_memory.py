@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from kiteline_codec.packet import parse
 from kiteline_codec.schema import Key, Kind
-from kiteline_codec.sync import Endpoint, SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.packet import parse
 from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec import packing_kernels, ranges
-from kiteline_codec.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
+from kiteline_codec.coding import packing_kernels, ranges
+from kiteline_codec.coding.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
 from kiteline_codec.schema import WireError
 
 

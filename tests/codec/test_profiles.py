@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec import messages
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.pacing import Pacer
-from kiteline_codec.profiles import EXACT, RADIO, WIFI, Profile
+from kiteline_codec.coding import messages
+from kiteline_codec.pacing.pacer import Pacer
+from kiteline_codec.pacing.profiles import EXACT, RADIO, WIFI, Profile
+from kiteline_codec.pacing.throughput import Throughput
 from kiteline_codec.schema import Births, Head, Live, Sightings
-from kiteline_codec.throughput import Throughput
-from kiteline_core import descriptors
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from kiteline_core.imaging import descriptors
 
 KEYFRAME = keyframe_id(submap_id(1, 2, 3), 40)
 SECOND = 1_000_000_000

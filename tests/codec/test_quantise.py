@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kiteline_codec import quantise
-from kiteline_core import se3
+from kiteline_codec.coding import quantise
+from kiteline_core.geometry import se3
 
 SLACK = 1.0 + 1e-6  # float32 storage
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.record_log import read_record, write_record
+from kiteline_codec.coding.record_log import read_record, write_record
 from kiteline_codec.schema import Key, WireError
 from kiteline_core.ids import AgentId
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec import remembered
+from kiteline_codec.residuals.residual_coding import Tightener
 from kiteline_codec.schema import Key, Kind, WireError
-from kiteline_codec.sync import Endpoint, SyncConfig
-from kiteline_codec.tight import Tightener
+from kiteline_codec.sync import remembered
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_core.ids import keyframe_id, submap_id
 
 STEP_NS = 25_000_000

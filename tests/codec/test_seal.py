@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec import seal
-from kiteline_codec.seal import Direction, Opener, Sealer, Suite, fingerprint, seal_bytes
+from kiteline_codec.transport import seal
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite, fingerprint, seal_bytes
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
 GOLDEN = (

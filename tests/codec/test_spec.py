@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from kiteline_codec import messages
-from kiteline_codec.framing import frame
-from kiteline_codec.packet import PROTOCOL_VERSION
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Births, Key, Kind, Record, Sightings
-from kiteline_codec.sync import Endpoint, SyncConfig
-from kiteline_core import se3
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.packet import PROTOCOL_VERSION
+from kiteline_codec.transport.framing import frame
+from kiteline_core.geometry import se3
 
 GOLDEN = Path(__file__).parent / "golden"
 

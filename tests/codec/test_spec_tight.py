@@ -14,9 +14,9 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from kiteline_codec import messages
+from kiteline_codec.coding import messages
+from kiteline_codec.residuals.residual_coding import Tightener
 from kiteline_codec.schema import Camera, Head, Key, Kind, Sightings
-from kiteline_codec.tight import Tightener
 
 
 def load(name: str) -> ModuleType:

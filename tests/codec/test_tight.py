@@ -12,13 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_codec import foresee_kernels, messages, quantise, references
-from kiteline_codec.packing import Reader, Writer
+from kiteline_codec.coding import messages, quantise
+from kiteline_codec.coding.packing import Reader, Writer
+from kiteline_codec.residuals import prediction_kernels as foresee_kernels
+from kiteline_codec.residuals import predictors as references
+from kiteline_codec.residuals.residual_coding import Tightener
 from kiteline_codec.schema import Births, Camera, Depths, Head, Key, Kind, Record, Sightings, WireError
-from kiteline_codec.sync import Endpoint, SyncConfig
-from kiteline_codec.tight import Tightener
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
 
 CAMERA = RectifiedCamera(752, 480, 430.0, 431.0, 370.0, 241.0, 0.11, True, np.eye(4))

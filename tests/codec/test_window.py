@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kiteline_codec.window import Window
+from kiteline_codec.pacing.congestion_window import Window
 
 MS = 1_000_000
 

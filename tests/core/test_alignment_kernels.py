@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_core import alignment_kernels as kernels
-from kiteline_core.features import build_pyramid
+from kiteline_agent.imaging import alignment_kernels as kernels
+from kiteline_agent.imaging.features import build_pyramid
 
 
 def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> NDArray[np.float64]:

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from kiteline_core import bundle_kernels as kernels
-from kiteline_core import se3
-from kiteline_core.bundle import BundleConfig, BundleProblem, bundle, pack, unpack
-from kiteline_core.robust import huber_cost, huber_weight
+from kiteline_core.geometry import se3
+from kiteline_core.optimisation import bundle_kernels as kernels
+from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle, pack, unpack
+from kiteline_core.optimisation.robust import huber_cost, huber_weight
 
 F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from kiteline_core import se3
-from kiteline_core.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
+from kiteline_core.geometry import se3
+from kiteline_core.optimisation.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
 
 F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])

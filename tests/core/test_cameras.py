@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kiteline_core import se3
-from kiteline_core.cameras import CalibrationError, CameraModel, CameraRig, Lens, RectifiedCamera, Rectifier
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CalibrationError, CameraModel, CameraRig, Lens, RectifiedCamera, Rectifier
 
 W, H = 752, 480
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)

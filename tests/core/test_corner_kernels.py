@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_core import corner_kernels
+from kiteline_agent.imaging import corner_kernels
 
 
 def noise(seed: int, rows: int, columns: int) -> NDArray[np.uint8]:

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core import alignment_kernels
-from kiteline_core.epipolar_kernels import search_segments
-from kiteline_core.features import Pyramid, build_pyramid
+from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging.epipolar_kernels import search_segments
+from kiteline_agent.imaging.features import Pyramid, build_pyramid
 
 F64 = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_core import feature_kernels as kernels
-from kiteline_core import features
-from kiteline_core.features import DetectorConfig, build_pyramid, describe, detect
+from kiteline_agent.imaging import feature_kernels as kernels
+from kiteline_agent.imaging import features
+from kiteline_agent.imaging.features import DetectorConfig, build_pyramid, describe, detect
 
 
 def blobs(seed: int, turn_deg: float = 0.0) -> NDArray[np.uint8]:

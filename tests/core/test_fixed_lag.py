@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_core import fixed_lag_kernels as kernels
-from kiteline_core import inertial_kernels, se3
-from kiteline_core.cameras import RectifiedCamera
-from kiteline_core.fixed_lag import (
+from kiteline_agent.inertial import fixed_lag_kernels as kernels
+from kiteline_agent.inertial import inertial_kernels
+from kiteline_agent.inertial.fixed_lag import (
     BodyVelocity,
     FixedLagConfig,
     FixedLagSmoother,
@@ -22,8 +21,10 @@ from kiteline_core.fixed_lag import (
     VisualPoints,
     tilt_of,
 )
+from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_core.frame import ImuCalibration
-from kiteline_core.imu_preintegration import Samples, preintegrate
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 SEEDS = st.integers(0, 2**31)

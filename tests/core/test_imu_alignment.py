@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_core import imu_alignment, se3
+from kiteline_agent.inertial import initial_alignment as imu_alignment
+from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.time_offset import TimeOffsetEstimator
 from kiteline_core.frame import ImuCalibration
-from kiteline_core.imu_preintegration import Preintegrated, Samples, preintegrate
-from kiteline_core.time_offset import TimeOffsetEstimator
+from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_core import imu_kernels, se3
+from kiteline_agent.inertial import imu_kernels
+from kiteline_agent.inertial.preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
 from kiteline_core.frame import ImuBatch, ImuCalibration
-from kiteline_core.imu_preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
+from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core import matching
-from kiteline_core.matching import MatchConfig
+from kiteline_core.imaging import matching
+from kiteline_core.imaging.matching import MatchConfig
 
 
 def bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_core import odometry, se3
+from kiteline_core import odometry
 from kiteline_core.frame import UNMEASURED, OdometryBatch
+from kiteline_core.geometry import se3
 
 F64 = np.ndarray
 

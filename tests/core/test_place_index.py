@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_core import place_index
-from kiteline_core.place_index import PlaceIndex, Vocabulary
+from kiteline_core.places import place_index
+from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 
 
 def tree(seed: int, branching: int = 4, levels: int = 3) -> Vocabulary:

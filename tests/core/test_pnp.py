@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_core import pnp, pnp_kernels, ransac_kernels, se3
+from kiteline_core.geometry import se3
+from kiteline_core.pose import pnp, pnp_kernels, ransac_kernels
 
 CAMERA = np.array([450.0, 455.0, 370.0, 245.0, 50.0])
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from kiteline_core import pose_kernels, se3
+from kiteline_core.geometry import se3
+from kiteline_core.pose import pose_kernels
 
 F64 = NDArray[np.float64]
 CAMERA = np.array([450.0, 450.0, 370.0, 240.0, 50.0])

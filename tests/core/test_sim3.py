@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_core import se3, sim3
-from kiteline_core.pnp import align_points
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.pose.pnp import align_points
 
 F64 = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_basestation.map.map_tables import CULLED, REMOVED, SIGHTING
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
-from kiteline_core.map_tables import CULLED, REMOVED, SIGHTING
-from kiteline_core.sparse_map import SparseMap
 
 CAMERA = RectifiedCamera(640, 480, 400.0, 410.0, 320.0, 240.0, 0.1, True, np.eye(4))
 SUBMAP = submap_id(3, 1, 0)

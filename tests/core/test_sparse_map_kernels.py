@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core import sparse_map_kernels as kernels
+from kiteline_basestation.map import sparse_map_kernels as kernels
 
 
 def test_links_and_fusions_agree_with_plain_sets() -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core import se3
-from kiteline_core.triangulation import nearest_point, parallax, project, rays
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
 
 CAMERA = np.array([400.0, 410.0, 320.0, 240.0])
 

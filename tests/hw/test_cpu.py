@@ -10,14 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_hw.clock import ManualClock, MonotonicClock
-from kiteline_hw.cpu import (
-    CpuQuota,
-    QuotaError,
-    children_cpu_ns,
-    clean_mappings,
-    process_cpu_ns,
-)
+from kiteline_hw.system.clock import ManualClock, MonotonicClock
+from kiteline_hw.system.cpu import CpuQuota, QuotaError, children_cpu_ns, clean_mappings, process_cpu_ns
 
 SPIN = "import time; e = time.process_time() + {}\nwhile time.process_time() < e: pass"
 
@@ -44,7 +38,7 @@ def test_cpu_time_counts_other_threads_and_no_sleep() -> None:
 
 MEMORY = """
 import numpy as np
-from kiteline_hw.cpu import peak_rss_mib, rss_mib
+from kiteline_hw.system.cpu import peak_rss_mib, rss_mib
 before = rss_mib()
 block = np.ones(64 << 17)  # 64 MiB
 held, peak = rss_mib(), peak_rss_mib()
@@ -126,7 +120,7 @@ def test_a_small_limit_holds_over_a_second() -> None:
 
 def test_memory_that_only_the_start_needed_is_given_back() -> None:
     code = (
-        "import cv2, numpy as np\nfrom kiteline_hw.cpu import release_memory, rss_mib\n"
+        "import cv2, numpy as np\nfrom kiteline_hw.system.cpu import release_memory, rss_mib\n"
         "image = np.arange(40000, dtype=np.uint8).reshape(200, 200)\nwanted = cv2.GaussianBlur(image, (5, 5), 1.0)\n"
         "before = rss_mib()\nrelease_memory()\nprint(before - rss_mib())\n"
         "assert (cv2.GaussianBlur(image, (5, 5), 1.0) == wanted).all()\nimport zlib, decimal\n"
@@ -141,7 +135,7 @@ def test_memory_that_only_the_start_needed_is_given_back() -> None:
 def test_freed_arrays_go_back_to_the_system() -> None:
     """Arrays that outgrow each other, with small things that live on between them."""
     code = (
-        "import numpy as np\nfrom kiteline_hw.cpu import return_large_arrays, rss_mib\n"
+        "import numpy as np\nfrom kiteline_hw.system.cpu import return_large_arrays, rss_mib\n"
         "return_large_arrays()\nkept = []\nbefore = rss_mib()\n"
         "for k in range(60):\n"
         "    a, small = np.ones((k + 1) << 16), np.ones(3000)\n    b = np.ones((k + 1) << 15)\n"

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_core import se3
-from kiteline_core.cameras import Lens
 from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import FrameSource, SourceError
-from kiteline_hw.sources import open_source
+from kiteline_hw.sources.open import open_source
 
 BASELINE_M = 379.8145 / 707.0912
 

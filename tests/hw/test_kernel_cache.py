@@ -17,7 +17,7 @@ def twice(x):
 WARM = "import tiny_kernels\ntiny_kernels.twice(1)\n"
 FLIGHT = """
 import sys, tiny_kernels
-from kiteline_hw import kernel_cache
+from kiteline_hw.system import kernel_cache
 print(kernel_cache.filled(), kernel_cache.fill(sys.argv[1]))
 tiny_kernels.twice(1)
 print(sum(tiny_kernels.twice.stats.cache_misses.values()))

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient, LockstepServer
 from kiteline_hw.ports import LinkError
-from kiteline_hw.zenoh_lockstep import LockstepClient, LockstepServer
 
 ROOT = Path(__file__).parents[2]
 
 AGENT = """
 import sys
 import threading
-from kiteline_hw.zenoh_lockstep import LockstepClient
+from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient
 endpoint, agent, ticks = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 with LockstepClient(endpoint, agent) as client:
     for tick in range(ticks):
@@ -84,7 +84,7 @@ def test_a_killed_agent_is_named() -> None:
 BASE = """
 import sys
 import time
-from kiteline_hw.zenoh_lockstep import LockstepServer
+from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
 with LockstepServer(sys.argv[1]) as server:
     for _ in range(3):
         server.answer(1, server.collect({1}, 10.0)[1])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig, LinkModels
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig, LinkModels
 
 chances = st.floats(0.0, 1.0)
 configs = st.builds(

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from kiteline_hw.links import open_link
+from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import LinkError
-from kiteline_hw.sim.serial_pair import SerialPair
+from kiteline_hw.sim.links.serial_pair import SerialPair
 
 
 class Lines:

@@ -7,9 +7,9 @@ import os
 import socket
 import time
 
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
-from kiteline_hw.sim.relay import UdpRelay
-from kiteline_hw.sim.serial_pair import SerialPair
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sim.links.relay import UdpRelay
+from kiteline_hw.sim.links.serial_pair import SerialPair
 
 MS = 1_000_000
 

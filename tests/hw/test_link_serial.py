@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from cobs import cobs
 
-from kiteline_hw.packet_lane import OUTBOX_PACKETS
+from kiteline_hw.links.packet_lane import OUTBOX_PACKETS
+from kiteline_hw.links.serial_link import SerialLink
 from kiteline_hw.ports import LinkError
-from kiteline_hw.serial_link import SerialLink
-from kiteline_hw.serial_port import parse_serial
-from kiteline_hw.sim.serial_pair import SerialPair
+from kiteline_hw.sim.links.serial_pair import SerialPair
+from kiteline_hw.system.serial_port import parse_serial
 
 
 class CobsFramer:

@@ -16,13 +16,13 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from kiteline_hw.zenoh_link import ZenohHub
+from kiteline_hw.links.zenoh_link import ZenohHub
 
 NAME = x509.oid.NameOID.COMMON_NAME
 
 AGENT = """
 import sys, time
-from kiteline_hw.zenoh_link import ZenohLink
+from kiteline_hw.links.zenoh_link import ZenohLink
 with ZenohLink(sys.argv[1], int(sys.argv[2])) as link:
     end = time.monotonic() + float(sys.argv[3])
     got = 0

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_hw.mavlink_messages import MavlinkCodec
-from kiteline_hw.mavlink_tunnel import TunnelConfig, TunnelEnd
-from kiteline_hw.mavlink_tunnel_link import MavlinkTunnelLink
-from kiteline_hw.sim.telemetry_radio import RadioConfig, RoutingController, TelemetryConfig
+from kiteline_hw.mavlink.messages import MavlinkCodec
+from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
+from kiteline_hw.mavlink.tunnel_link import MavlinkTunnelLink
+from kiteline_hw.sim.links.telemetry_radio import RadioConfig, RoutingController, TelemetryConfig
 
 MS = 1_000_000
 BASE = TunnelConfig(system=255, peer_system=1)

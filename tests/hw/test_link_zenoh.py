@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from kiteline_hw.packet_lane import INBOX_PACKETS, OUTBOX_PACKETS, PacketLane
+from kiteline_hw.links.packet_lane import INBOX_PACKETS, OUTBOX_PACKETS, PacketLane
+from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
+from kiteline_hw.links.zenoh_session import open_session
 from kiteline_hw.ports import LinkError
-from kiteline_hw.zenoh_link import ZenohHub, ZenohLink
-from kiteline_hw.zenoh_session import open_session
 
 ROOT = Path(__file__).parents[2]
 
@@ -149,7 +149,7 @@ def test_queues_stay_bounded() -> None:
 
 BASE = """
 import sys, time
-from kiteline_hw.zenoh_link import ZenohHub
+from kiteline_hw.links.zenoh_link import ZenohHub
 hub = ZenohHub(sys.argv[1])
 print("up", flush=True)
 time.sleep(30)
@@ -184,9 +184,9 @@ def test_a_frozen_base_never_blocks_the_sender_nor_close() -> None:
 
 AGENT = """
 import signal, sys, time
-from kiteline_hw.process import StopSignal
-from kiteline_hw.zenoh_link import ZenohHub, ZenohLink
-from kiteline_hw.zenoh_session import open_session
+from kiteline_hw.system.process import StopSignal
+from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
+from kiteline_hw.links.zenoh_session import open_session
 way = sys.argv[2]
 if way == "handler":
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_hw.lockstep_messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.ports import LinkError
 
 times = st.integers(-1, 2**62)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
 
-from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
-from kiteline_hw.mavlink_frames import mounting
-from kiteline_hw.mavlink_imu import ControllerImu, ControllerImuConfig
-from kiteline_hw.mavlink_messages import MavlinkCodec, VehicleImu
-from kiteline_hw.odometry_stream import OdometryStream
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.mavlink.frames import mounting
+from kiteline_hw.mavlink.imu import ControllerImu, ControllerImuConfig
+from kiteline_hw.mavlink.messages import MavlinkCodec, VehicleImu
+from kiteline_hw.mavlink.odometry_stream import OdometryStream
 from kiteline_hw.ports import SourceReport
-from kiteline_hw.reduced import with_other_imu
-from kiteline_hw.sim.flight_controller import FlightController
+from kiteline_hw.sim.links.flight_controller import FlightController
+from kiteline_hw.sources.reduced import with_other_imu
 
 S, MS = 1_000_000_000, 1_000_000
 

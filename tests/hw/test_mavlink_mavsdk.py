@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.mavlink_frames import mounting
-from kiteline_hw.mavlink_out import MavlinkPoseSink
+from kiteline_hw.mavlink.frames import mounting
+from kiteline_hw.mavlink.out import MavlinkPoseSink
 from kiteline_hw.ports import PoseSample
-from kiteline_hw.sim.flight_controller import FlightController
+from kiteline_hw.sim.links.flight_controller import FlightController
+from kiteline_hw.system.clock import MonotonicClock
 
 CLIENT = """
 import asyncio, sys

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_hw.mavlink_frames import mounting
-from kiteline_hw.mavlink_messages import MavlinkCodec, Odometry, Signing, TimeSync
-from kiteline_hw.odometry_stream import OdometryStream
+from kiteline_hw.mavlink.frames import mounting
+from kiteline_hw.mavlink.messages import MavlinkCodec, Odometry, Signing, TimeSync
+from kiteline_hw.mavlink.odometry_stream import OdometryStream
 from kiteline_hw.ports import PoseSample
-from kiteline_hw.sim.flight_controller import FlightController
+from kiteline_hw.sim.links.flight_controller import FlightController
 
 S = 1_000_000_000
 KINDS = ("ardupilot", "px4")

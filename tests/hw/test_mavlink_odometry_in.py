@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_core import se3
 from kiteline_core.frame import UNMEASURED, OdometryBatch
-from kiteline_hw.mavlink_frames import body_rates, local_pose, mounting
-from kiteline_hw.mavlink_messages import Attitude, LocalPosition, MavlinkCodec, Odometry, WheelDistance
-from kiteline_hw.mavlink_odometry import FromController, FromControllerConfig, StampClock, Told, told_of
-from kiteline_hw.odometry_stream import OdometryStream
-from kiteline_hw.sim.flight_controller import FlightController
+from kiteline_core.geometry import se3
+from kiteline_hw.mavlink.frames import body_rates, local_pose, mounting
+from kiteline_hw.mavlink.messages import Attitude, LocalPosition, MavlinkCodec, Odometry, WheelDistance
+from kiteline_hw.mavlink.odometry import FromController, FromControllerConfig, StampClock, Told, told_of
+from kiteline_hw.mavlink.odometry_stream import OdometryStream
+from kiteline_hw.sim.links.flight_controller import FlightController
 
 S = 1_000_000_000
 NAN = float("nan")

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from kiteline_core.frame import OdometryBatch
-from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.mavlink_frames import mounting
-from kiteline_hw.mavlink_messages import Odometry
-from kiteline_hw.mavlink_odometry import FromController, Told
-from kiteline_hw.mavlink_out import MavlinkPoseSink
-from kiteline_hw.mavlink_wire import MavlinkUrl, parse_mavlink_url
+from kiteline_hw.mavlink.frames import mounting
+from kiteline_hw.mavlink.messages import Odometry
+from kiteline_hw.mavlink.odometry import FromController, Told
+from kiteline_hw.mavlink.out import MavlinkPoseSink
+from kiteline_hw.mavlink.wire import MavlinkUrl, parse_mavlink_url
 from kiteline_hw.ports import LinkError, PoseSample
-from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
-from kiteline_hw.sim.serial_pair import SerialPair
+from kiteline_hw.sim.links.flight_controller import FlightController, UdpFlightController
+from kiteline_hw.sim.links.serial_pair import SerialPair
+from kiteline_hw.system.clock import MonotonicClock
 
 CLOCK = MonotonicClock()
 FLU = mounting("flu")

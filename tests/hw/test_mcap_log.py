@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from kiteline_core import se3
-from kiteline_core.cameras import CameraModel, CameraRig, Lens
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, Trajectory
-from kiteline_hw.images import decode_depth, decode_grey, encode_depth, encode_image
-from kiteline_hw.mcap_log import GROUND_TRUTH, IMU, LEFT, LogReader, LogWriter, read_frame
-from kiteline_hw.mcap_schemas import CompressedImage, bytes_field
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
+from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, LEFT, LogReader, LogWriter, read_frame
+from kiteline_hw.logs.mcap_schemas import CompressedImage, bytes_field
+from kiteline_hw.logs.rig_json import rig_from_json, rig_to_json
 from kiteline_hw.ports import SourceError
-from kiteline_hw.rig_json import rig_from_json, rig_to_json
-from kiteline_hw.sources import open_source
+from kiteline_hw.sensors.images import decode_depth, decode_grey, encode_depth, encode_image
+from kiteline_hw.sources.open import open_source
 
 T0 = 5_000_000_000
 RNG = np.random.default_rng(3)

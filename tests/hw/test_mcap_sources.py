@@ -19,12 +19,12 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from kiteline_core import se3
-from kiteline_core.cameras import Lens
 from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
-from kiteline_hw.odometer import VELOCITY_SIGMA_M_S
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import FrameSource, SourceError
-from kiteline_hw.sources import open_source
+from kiteline_hw.sensors.odometry_buffer import VELOCITY_SIGMA_M_S
+from kiteline_hw.sources.open import open_source
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 50_000_000

@@ -9,11 +9,11 @@ import pytest
 
 from kiteline_core import odometry
 from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
-from kiteline_hw.mcap_log import ODOMETER, LogReader, LogWriter
-from kiteline_hw.odometer import OdometerStream, before_frames, stated_variances
+from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.sensors.odometry_buffer import OdometerStream, before_frames, stated_variances
 from kiteline_hw.sim.source import SimSource, open_sim
-from kiteline_hw.sources import open_source
+from kiteline_hw.sources.open import open_source
 
 RNG = np.random.default_rng(3)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_hw import process
+from kiteline_hw.system import process
 
 
 def test_numbers_only_grow(tmp_path: Path) -> None:
@@ -54,7 +54,7 @@ def test_systemd_hears_or_nobody_does(tmp_path: Path, monkeypatch: pytest.Monkey
 def run(code: str, **options: object) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.Popen(
-        [sys.executable, "-c", "from kiteline_hw import process\n" + code],
+        [sys.executable, "-c", "from kiteline_hw.system import process\n" + code],
         env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     )  # fmt: skip
 
@@ -92,7 +92,7 @@ def test_a_stop_signal_comes_through_whenever_it_comes() -> None:
     """Also into the middle of a `wait`, thousands of times: a lock that the interrupted wait holds would end it all."""
     code = (
         "import os, signal\n"
-        "from kiteline_hw.process import StopSignal\n"
+        "from kiteline_hw.system.process import StopSignal\n"
         "stop = StopSignal()\n"
         "signal.signal(signal.SIGALRM, stop._on_signal)\n"
         "signal.setitimer(signal.ITIMER_REAL, 2e-4, 2e-4)\n"

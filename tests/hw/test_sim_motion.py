@@ -7,14 +7,14 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from kiteline_core import se3
 from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sim.imu import measure
-from kiteline_hw.sim.lens import make_rig
-from kiteline_hw.sim.paths import built_in
-from kiteline_hw.sim.scenes import SCENES
-from kiteline_hw.sim.trajectory import GRAVITY, Path, fit, read_trajectory
+from kiteline_hw.sim.sensors.imu import measure
+from kiteline_hw.sim.sensors.lens import make_rig
+from kiteline_hw.sim.world.paths import built_in
+from kiteline_hw.sim.world.scenes import SCENES
+from kiteline_hw.sim.world.trajectory import GRAVITY, Path, fit, read_trajectory
 
 T_B_C = make_rig().T_b_c
 

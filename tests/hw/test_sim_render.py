@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_core import se3
-from kiteline_core.cameras import Lens
-from kiteline_hw.sim import lens
-from kiteline_hw.sim.raycast_kernels import box_hit, ground_hit, texture_value
-from kiteline_hw.sim.render import Eye
-from kiteline_hw.sim.sensor_kernels import expose, motion_blur
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Lens
+from kiteline_hw.sim.sensors import lens
+from kiteline_hw.sim.sensors.render import Eye
+from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
 from kiteline_hw.sim.source import SimSource, open_sim
-from kiteline_hw.sim.textures import TexturePool, make_pool
-from kiteline_hw.sim.world import NO_GROUND, World, bilinear
+from kiteline_hw.sim.world.raycast_kernels import box_hit, ground_hit, texture_value
+from kiteline_hw.sim.world.textures import TexturePool, make_pool
+from kiteline_hw.sim.world.world import NO_GROUND, World, bilinear
 
 SMALL: dict[str, Any] = {"miscalibration": 0.0, "scale": 0.25, "texture_bits": 8}
 

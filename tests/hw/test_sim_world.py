@@ -11,14 +11,23 @@ import numpy as np
 import pytest
 
 from kiteline_hw.sim.config import read_config
-from kiteline_hw.sim.lens import make_rig
-from kiteline_hw.sim.scenes import SCENES
+from kiteline_hw.sim.sensors.lens import make_rig
 from kiteline_hw.sim.source import build_world, open_sim
-from kiteline_hw.sim.street import ground_field
-from kiteline_hw.sim.texture_kernels import paint
-from kiteline_hw.sim.textures import MAKERS, make_pool, shapes
-from kiteline_hw.sim.trajectory import read_trajectory
-from kiteline_hw.sim.world import FREE, OCCUPIED, UNKNOWN, World, bilinear, box_distances, occupancy, write_occupancy
+from kiteline_hw.sim.world.scenes import SCENES
+from kiteline_hw.sim.world.street import ground_field
+from kiteline_hw.sim.world.texture_kernels import paint
+from kiteline_hw.sim.world.textures import MAKERS, make_pool, shapes
+from kiteline_hw.sim.world.trajectory import read_trajectory
+from kiteline_hw.sim.world.world import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    World,
+    bilinear,
+    box_distances,
+    occupancy,
+    write_occupancy,
+)
 
 T_B_C = make_rig().T_b_c
 

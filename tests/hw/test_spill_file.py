@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from kiteline_hw.spill_file import SpillFile
+from kiteline_hw.logs.spill_file import SpillFile
 
 
 def test_what_was_put_is_there_and_leaves_no_file(tmp_path: Path) -> None:

@@ -6,11 +6,11 @@ import numpy as np
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Station
+from kiteline_bench.harness.base_memory import Sample, bytes_of, parts_of, table
 from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import Camera, Head, Live
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
-from kiteline_lab.base_memory import Sample, bytes_of, parts_of, table
 
 
 def test_what_hangs_on_an_object_is_weighed_once_and_code_never() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from kiteline_core import se3
+from kiteline_bench.harness.honest_flights import FAULTS, Shown, _error, no_texture
 from kiteline_core.frame import Frame, ImuBatch
-from kiteline_lab.honest_flights import FAULTS, Shown, _error, no_texture
+from kiteline_core.geometry import se3
 
 
 def shown(k: int) -> Shown:
@@ -51,7 +51,7 @@ def test_faults_keep_stamps_in_order_and_lose_no_samples() -> None:
 
 
 def test_a_flight_is_the_same_each_time(data_dir: Path, tmp_path: Path) -> None:
-    from kiteline_lab.honest_flights import flight
+    from kiteline_bench.harness.honest_flights import flight
 
     a, b = (flight(1, data_dir / "trajectories", tmp_path, 0.1, 0.5) for _ in "ab")
     assert len(a.items) == 10 and a.items[9].frame.left.tobytes() == b.items[9].frame.left.tobytes()

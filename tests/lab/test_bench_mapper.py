@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core.bundle import BundleConfig, bundle
-from kiteline_lab.bench_mapper import further_kb, map_bytes_a_keyframe, queue_p95_s, ring_of_poses, row_of_cameras
+from kiteline_bench.base.mapper import further_kb, map_bytes_a_keyframe, queue_p95_s, ring_of_poses, row_of_cameras
+from kiteline_core.optimisation.bundle import BundleConfig, bundle
 
 
 def test_the_row_of_cameras_is_a_bundle_that_converges() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_lab import bench_ratios
-from kiteline_lab.benchmark import Bench
+from kiteline_bench.benchmark import Bench
+from kiteline_bench.harness import ratios as bench_ratios
 
 
 def a_bench(folder: Path) -> Bench:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from kiteline_lab.bench_stages import STAGES, Clocks, table
+from kiteline_bench.agent.stages import STAGES, Clocks, table
 
 
 def spin(ms: float) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_bench import benchmark
+from kiteline_bench.benchmark import Bench, at_most, data_folder, is_true, main, replace_section, section
 from kiteline_hw.ports import SourceError
-from kiteline_lab import benchmark
-from kiteline_lab.benchmark import Bench, at_most, data_folder, is_true, main, replace_section, section
 
 
 def test_bars_are_met_up_to_their_limit() -> None:

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
-from kiteline_hw.mcap_log import IMU, LogReader, LogWriter
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.logs.mcap_log import IMU, LogReader, LogWriter
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources import open_source
-from kiteline_lab import convert, logs
+from kiteline_hw.sources.open import open_source
+from kiteline_lab.tools import convert, logs
 
 T0 = 10_000_000_000
 STEP_NS = 50_000_000

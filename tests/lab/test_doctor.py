@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_lab import doctor
-from kiteline_lab.doctor import Finding, Level
+from kiteline_lab.tools import doctor
+from kiteline_lab.tools.doctor import Finding, Level
 
 
 def test_every_plain_dependency_is_looked_at() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_core import se3
 from kiteline_core.frame import Trajectory
-from kiteline_lab import evaluate
-from kiteline_lab.trajectories import TrajectoryError, read
+from kiteline_core.geometry import se3
+from kiteline_lab.evaluation import evaluate
+from kiteline_lab.evaluation.trajectories import TrajectoryError, read
 
 TUM = "1403715273.262142976 0.1 0.2 0.3 0 0 0 1\n1403715273.312143104 0.2 0.2 0.3 0 0 0.6 0.8\n"
 
@@ -127,7 +127,7 @@ def test_command_prints_a_table_or_json_and_draws(tmp_path: Path, capsys: pytest
 
 
 def test_plot_without_truth_and_of_an_empty_line(tmp_path: Path) -> None:
-    from kiteline_lab.plot import Line, plot_trajectories
+    from kiteline_lab.plots.plot import Line, plot_trajectories
 
     poses = np.stack(arc(30))
     whole = Trajectory(np.arange(30, dtype=np.int64) * 10**8, poses)

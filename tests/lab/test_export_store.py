@@ -9,18 +9,18 @@ import gtsam
 import numpy as np
 import pytest
 
-from kiteline_basestation.kept import Codes, Kept
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.store import FILE, Store, batch_of
-from kiteline_codec import messages
+from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.store import FILE, Store, batch_of
+from kiteline_codec.coding import messages
 from kiteline_codec.schema import Births, Camera, Head, Placement, Record
-from kiteline_core import se3
-from kiteline_core.cameras import RectifiedCamera
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
-from kiteline_lab import trajectories
-from kiteline_lab.export import ExportError, files, main
-from kiteline_lab.grid_eval import read_grid
-from kiteline_lab.plot_map import read_map_ply
+from kiteline_lab.evaluation import trajectories
+from kiteline_lab.evaluation.grid_eval import read_grid
+from kiteline_lab.plots.plot_map import read_map_ply
+from kiteline_lab.tools.export import ExportError, files, main
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_hw.mcap_log_read import LogReader
-from kiteline_lab.flight_report import check_contract, without_timing
-from kiteline_lab.fly import Options, fly, main
+from kiteline_hw.logs.mcap_log_read import LogReader
+from kiteline_lab.flights.flight_report import check_contract, without_timing
+from kiteline_lab.flights.fly import Options, fly, main
 
 
 @pytest.mark.parametrize("mode", ["tracker", "local", "monolith"])

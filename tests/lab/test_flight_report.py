@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_core import se3, sim3
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
-from kiteline_lab import flight_report
-from kiteline_lab.flight_report import check_contract, compose, statistic, table, without_timing, write_tum
-from kiteline_lab.fly import Options, fly
+from kiteline_lab.flights import flight_report
+from kiteline_lab.flights.flight_report import check_contract, compose, statistic, table, without_timing, write_tum
+from kiteline_lab.flights.fly import Options, fly
 
 F64 = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_core.cameras import CameraModel, CameraRig
 from kiteline_core.frame import Frame
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.ports import LinkError, SourceError, SourceReport
-from kiteline_lab.fly import Options, clear, flight_starts, fly, link_bytes, options
+from kiteline_lab.flights.fly import Options, clear, flight_starts, fly, link_bytes, options
 
 
 class Stamps:

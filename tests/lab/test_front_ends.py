@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kiteline_bench.agent import front_end as bench
+from kiteline_bench.agent.front_end import KINDS, Flown
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.ports import FrameSource
-from kiteline_hw.sources import open_source
-from kiteline_lab import bench_front_end as bench
-from kiteline_lab.bench_front_end import KINDS, Flown
+from kiteline_hw.sources.open import open_source
 
 
 class Beginning:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_lab.grid_eval import (
+from kiteline_lab.evaluation.grid_eval import (
     GridEvalConfig,
     GridFile,
     GridFileError,
@@ -22,7 +22,7 @@ from kiteline_lab.grid_eval import (
     read_grid,
     score,
 )
-from kiteline_lab.grid_eval_kernels import roads_free
+from kiteline_lab.evaluation.grid_eval_kernels import roads_free
 
 FEW = GridEvalConfig(draws=5, nodes=40)
 

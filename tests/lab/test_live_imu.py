@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from kiteline_agent.__main__ import fly_live
-from kiteline_agent.flight_log import estimate_from_json
-from kiteline_agent.spec import AgentSpec, parser, spec_of
-from kiteline_core.cameras import CameraModel, CameraRig
+from kiteline_agent.runtime.flight_log import estimate_from_json
+from kiteline_agent.runtime.options import AgentSpec, parser, spec_of
 from kiteline_core.config import ConfigError
-from kiteline_hw import process
-from kiteline_hw.clock import MonotonicClock
-from kiteline_hw.mavlink_connect import connect
-from kiteline_hw.mcap_log import LogReader
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.logs.mcap_log import LogReader
+from kiteline_hw.mavlink.connect import connect
 from kiteline_hw.ports import LinkError, SourceReport
-from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
-from kiteline_lab.replay import replay_agent
+from kiteline_hw.sim.links.flight_controller import FlightController, UdpFlightController
+from kiteline_hw.system import process
+from kiteline_hw.system.clock import MonotonicClock
+from kiteline_lab.replay.replay import replay_agent
 
 OFFSET_NS = 7_000_000_000  # the controller's clock ahead of ours
 DOWN, UP = (0.0, 0.0, -9.81), 2  # what a level controller feels; the axis of height

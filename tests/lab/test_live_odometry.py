@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from kiteline_agent.__main__ import fly_live
-from kiteline_agent.spec import AgentSpec
-from kiteline_hw import process
-from kiteline_hw.mavlink_messages import WheelDistance
-from kiteline_hw.mcap_log import LogReader
+from kiteline_agent.runtime.options import AgentSpec
+from kiteline_hw.logs.mcap_log import LogReader
+from kiteline_hw.mavlink.messages import WheelDistance
 from kiteline_hw.ports import LinkError
-from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
-from kiteline_lab.replay import replay_agent
+from kiteline_hw.sim.links.flight_controller import FlightController, UdpFlightController
+from kiteline_hw.system import process
+from kiteline_lab.replay.replay import replay_agent
 
 SPEED_M_S, OFFSET_NS = 0.4, 7_000_000_000  # of the wall's recording: 2 cm a frame to the camera's right
 

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_core import se3
 from kiteline_core.frame import Trajectory
-from kiteline_lab import metrics
-from kiteline_lab.metrics import Alignment, associate, evaluate, match, truth_at, umeyama
+from kiteline_core.geometry import se3
+from kiteline_lab.evaluation import metrics
+from kiteline_lab.evaluation.metrics import Alignment, associate, evaluate, match, truth_at, umeyama
 
 F64 = NDArray[np.float64]
 PERIOD_NS = 50_000_000

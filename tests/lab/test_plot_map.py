@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_basestation.export import map_ply, tum
-from kiteline_basestation.grid import GridConfig, build, to_pgm, to_yaml
-from kiteline_lab.plot_map import MapFileError, main, read_map_ply
+from kiteline_basestation.grid.grid import GridConfig, build, to_pgm, to_yaml
+from kiteline_basestation.runtime.export import map_ply, tum
+from kiteline_lab.plots.plot_map import MapFileError, main, read_map_ply
 
 
 @pytest.fixture

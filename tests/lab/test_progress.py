@@ -4,8 +4,8 @@ import io
 
 import pytest
 
-from kiteline_lab import progress
-from kiteline_lab.progress import Progress
+from kiteline_lab.flights import progress
+from kiteline_lab.flights.progress import Progress
 
 
 class Terminal(io.StringIO):

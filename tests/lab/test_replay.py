@@ -10,13 +10,13 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from kiteline_core.frame import Frame, OdometryBatch
-from kiteline_hw.mcap_file import McapFile
-from kiteline_hw.mcap_log import ODOMETER, LogReader, LogWriter
-from kiteline_hw.mcap_mend import mend
+from kiteline_hw.logs.mcap_file import McapFile
+from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
+from kiteline_hw.logs.mcap_mend import mend
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources import open_source
-from kiteline_lab.fly import Options, fly
-from kiteline_lab.replay import main, replay_agent
+from kiteline_hw.sources.open import open_source
+from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.replay.replay import main, replay_agent
 
 
 @pytest.fixture(scope="module")

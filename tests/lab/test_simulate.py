@@ -10,8 +10,8 @@ import pytest
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.source import open_sim
-from kiteline_hw.sources import open_source
-from kiteline_lab.simulate import main
+from kiteline_hw.sources.open import open_source
+from kiteline_lab.flights.simulate import main
 
 SCENE = "room?scale=0.2&texture_bits=7&seconds=0.4"
 

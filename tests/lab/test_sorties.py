@@ -9,9 +9,9 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_basestation.config import BaseConfig
+from kiteline_bench.base.map_cache import Judged
+from kiteline_bench.harness.sorties import TICK_NS, Flight, Part, Sortie, fly
 from kiteline_core.ids import AgentId
-from kiteline_lab.bench_window import Judged
-from kiteline_lab.sorties import TICK_NS, Flight, Part, Sortie, fly
 
 
 def flown(data_dir: Path, **base: int) -> tuple[Flight, list[Sortie]]:

@@ -7,11 +7,11 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from kiteline_core.matching import words
+from kiteline_core.imaging.matching import words
 from kiteline_hw.ports import SourceError
-from kiteline_hw.words import shipped_words
-from kiteline_lab import train_words_kernels as kernels
-from kiteline_lab.train_words import train
+from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_lab.tools import train_words_kernels as kernels
+from kiteline_lab.tools.train_words import train
 
 
 def clusters(rng: np.random.Generator, count: int, each: int, flips: int) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ def test_too_few_descriptors_are_refused() -> None:
 
 
 def test_the_shipped_tree_is_small_and_tells_words_apart() -> None:
-    assert len(files("kiteline_core").joinpath("words.bin").read_bytes()) <= 400_000
+    assert len(files("kiteline_core.places").joinpath("words.bin").read_bytes()) <= 400_000
     tree = shipped_words()
     assert (tree.branching, tree.levels) == (10, 4)
     rng = np.random.default_rng(3)

@@ -18,18 +18,18 @@ from urllib.request import urlopen
 
 import pytest
 
-from kiteline_basestation.integrity import sound
-from kiteline_basestation.store import FILE, StoreError, read
-from kiteline_codec import record_log
+from kiteline_basestation.store.integrity import sound
+from kiteline_basestation.store.store import FILE, StoreError, read
+from kiteline_codec.coding import record_log
 from kiteline_codec.schema import Kind
 from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import AgentId
-from kiteline_hw.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, read_frame
-from kiteline_hw.rig_json import rig_from_json
-from kiteline_lab.flight import free_endpoint
-from kiteline_lab.flight_report import check_contract
-from kiteline_lab.fly import Options, fly
-from kiteline_lab.replay import main as replay
+from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, read_frame
+from kiteline_hw.logs.rig_json import rig_from_json
+from kiteline_lab.flights.flight import free_endpoint
+from kiteline_lab.flights.flight_report import check_contract
+from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.replay.replay import main as replay
 
 STOP_S = 2.0  # s in which a program told to stop has to be gone
 
@@ -169,7 +169,7 @@ def drain(s: socket.socket) -> None:
 
 
 def test_poses_go_to_a_flight_controller(recording: Path, start: Start) -> None:
-    from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
+    from kiteline_hw.sim.links.flight_controller import FlightController, UdpFlightController
 
     model = FlightController("ardupilot")
     with UdpFlightController(model) as controller:

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from kiteline_hw.ports import LinkError, SourceError
-from kiteline_lab.flight import free_endpoint
-from kiteline_lab.flight_report import check_contract, without_timing
-from kiteline_lab.fly import Options, fly
-from kiteline_lab.replay import main as replay
+from kiteline_lab.flights.flight import free_endpoint
+from kiteline_lab.flights.flight_report import check_contract, without_timing
+from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.replay.replay import main as replay
 
 
 def children_of(folder: Path) -> list[int]:
@@ -79,7 +79,7 @@ def test_an_agent_that_dies_leaves_its_map_to_the_base(recording: Path, tmp_path
 
 def test_a_base_that_cannot_listen_is_told_at_once(recording: Path, tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    from kiteline_hw.zenoh_lockstep import LockstepServer
+    from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
 
     with LockstepServer(endpoint), pytest.raises(LinkError, match="listen"):
         fly(Options((str(recording),), tmp_path, link=f"zenoh:{endpoint}"), quiet=True)

@@ -8,10 +8,10 @@ from collections import deque
 import pytest
 
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.framing import frame
 from kiteline_codec.schema import Key, Kind
-from kiteline_codec.seal import Direction, Opener, Sealer, seal_bytes, suite_for
-from kiteline_hw.mavlink_tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
+from kiteline_codec.transport.framing import frame
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, seal_bytes, suite_for
+from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
 
 SECOND = 1_000_000_000
 KEY = bytes(range(32))

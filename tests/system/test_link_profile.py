@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kiteline_bench.link.cpu import flight
 from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.schema import Births, Head, Live, Sightings
 from kiteline_core.ids import AgentId, KeyframeId
-from kiteline_hw.sim.link_model import LinkModel, LinkModelConfig
-from kiteline_lab.bench_link_cpu import flight
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 
 TICK_NS = 50_000_000
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import random
 import time
 
-from kiteline_codec.framing import Deframer, frame
 from kiteline_codec.schema import Key, Kind
-from kiteline_codec.sync import Endpoint, SyncConfig
-from kiteline_hw.links import Framing, open_link
+from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.transport.framing import Deframer, frame
+from kiteline_hw.links.open import Framing, open_link
 from kiteline_hw.ports import ByteLink
-from kiteline_hw.sim.serial_pair import SerialPair
+from kiteline_hw.sim.links.serial_pair import SerialPair
 
 
 def framing() -> Framing:

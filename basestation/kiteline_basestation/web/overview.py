@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.grid import GridConfig, empty
+from kiteline_basestation.grid.grid import GridConfig, empty
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.station import Station
 from kiteline_basestation.web.view import AgentView, Snapshot

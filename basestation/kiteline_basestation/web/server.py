@@ -22,7 +22,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from kiteline_basestation.grid import GridMap
+from kiteline_basestation.grid.grid import GridMap
 from kiteline_basestation.web.view import Snapshot, map_messages, status
 
 STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read

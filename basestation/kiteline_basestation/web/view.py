@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.grid import UNKNOWN, GridConfig, GridMap, differences, empty
+from kiteline_basestation.grid.grid import UNKNOWN, GridConfig, GridMap, differences, empty
 from kiteline_codec.schema import Tile
 from kiteline_core.ids import AgentId
 

@@ -5,6 +5,6 @@ from __future__ import annotations
 
 def run(argv: list[str]) -> int | None:
     """Parse the arguments after `kiteline bench` and do it; the exit status."""
-    from kiteline_lab.benchmark import main
+    from kiteline_bench.benchmark import main
 
     return main(argv)

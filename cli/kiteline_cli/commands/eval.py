@@ -5,6 +5,6 @@ from __future__ import annotations
 
 def run(argv: list[str]) -> int | None:
     """Parse the arguments after `kiteline eval` and do it; the exit status."""
-    from kiteline_lab.evaluate import main
+    from kiteline_lab.evaluation.evaluate import main
 
     return main(argv)

@@ -12,6 +12,6 @@ def run(argv: list[str]) -> int | None:
         stream = sys.stdout if asked else sys.stderr
         print("usage: kiteline grid eval EST.yaml TRUE.yaml [options]; --help after eval says more", file=stream)
         return 0 if asked else 2
-    from kiteline_lab.grid_eval import main
+    from kiteline_lab.evaluation.grid_eval import main
 
     return main(argv[1:])

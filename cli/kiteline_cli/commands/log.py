@@ -5,6 +5,6 @@ from __future__ import annotations
 
 def run(argv: list[str]) -> int | None:
     """Parse the arguments after `kiteline log` and do it; the exit status."""
-    from kiteline_lab.logs import main
+    from kiteline_lab.tools.logs import main
 
     return main(argv)

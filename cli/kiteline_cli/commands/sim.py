@@ -5,6 +5,6 @@ from __future__ import annotations
 
 def run(argv: list[str]) -> int | None:
     """Parse the arguments after `kiteline sim` and do it; the exit status."""
-    from kiteline_lab.simulate import main
+    from kiteline_lab.flights.simulate import main
 
     return main(argv)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from kiteline_core.cameras import Lens
+from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sim.scenes import SCENES
-from kiteline_hw.sim.trajectory import REST_S
+from kiteline_hw.sim.world.scenes import SCENES
+from kiteline_hw.sim.world.trajectory import REST_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core import odometry
-from kiteline_core.cameras import CameraRig, Lens
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
+from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sim import imu as inertial
-from kiteline_hw.sim import odometer
 from kiteline_hw.sim.config import SimConfig, read_config
-from kiteline_hw.sim.lens import imperfect, make_rig
-from kiteline_hw.sim.paths import built_in, course_length_s
-from kiteline_hw.sim.render import Eye
-from kiteline_hw.sim.scenes import build_indoor
-from kiteline_hw.sim.street import build_street
-from kiteline_hw.sim.trajectory import Motion, Path, flight_s, read_trajectory, to_trajectory
-from kiteline_hw.sim.world import World
+from kiteline_hw.sim.sensors import imu as inertial
+from kiteline_hw.sim.sensors import odometer
+from kiteline_hw.sim.sensors.lens import imperfect, make_rig
+from kiteline_hw.sim.sensors.render import Eye
+from kiteline_hw.sim.world.paths import built_in, course_length_s
+from kiteline_hw.sim.world.scenes import build_indoor
+from kiteline_hw.sim.world.street import build_street
+from kiteline_hw.sim.world.trajectory import Motion, Path, flight_s, read_trajectory, to_trajectory
+from kiteline_hw.sim.world.world import World
 
 F64 = NDArray[np.float64]
 

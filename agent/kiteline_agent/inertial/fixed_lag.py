@@ -1,0 +1,374 @@
+"""A tightly coupled smoother over the last few frames: poses, velocities, biases and gravity from images and IMU.
+
+Points are fixed, with their own uncertainty of depth. What leaves the window stays as a dense prior on the oldest state
+that remains, linearised once (S. Leutenegger et al., "Keyframe-based visual-inertial odometry using nonlinear
+optimization", 2015; the chain is that of T. Qin et al., "VINS-Mono", 2018, without points among the unknowns).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial import fixed_lag_kernels as kernels
+from kiteline_agent.inertial import inertial_kernels
+from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class FixedLagConfig:
+    """The window, and what is believed of the measurements."""
+
+    states: int = 3  # frames in the window; points being fixed, 2 to 6 measure the same and more cost time
+    fresh: int = 1  # newest frames whose points are linearised anew; older ones are condensed to 6x6
+    iterations: int = 3  # Gauss-Newton steps; the prediction is near
+    points: int = 320  # most points of a frame
+    chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
+    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it counts less
+    velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity counts nothing, wheels slip
+    visual_inflation: float = 16.0  # of variance: successive frames share errors of templates and points
+    imu_inflation: float = 3.0  # of noise densities: vibration, scale and axes are not calibrated, and the map bends
+    turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
+    velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
+    position_floor_m: float = 2e-5  # the same of position
+    tilt_walk_rad: float = 2e-4  # per sqrt(s): the map itself bends while it grows
+    relinearise_gyro_rad_s: float = 0.01  # bias change from which on an interval is integrated anew
+    relinearise_accel_m_s2: float = 0.2  # the same of the accelerometer
+
+
+@dataclass(frozen=True, slots=True)
+class StartDeviations:
+    """One standard deviation of what is known at the start."""
+
+    turn_rad: float = 0.02
+    position_m: float = 0.02
+    velocity_m_s: float = 0.1
+    gyro_bias_rad_s: float = 0.01
+    accel_bias_m_s2: float = 0.1
+    tilt_rad: float = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class VisualPoints:
+    """What one frame saw of the map. xyz: (n,3) m in m. ray: (n,3) m, one deviation of depth. observed: (n,3) u, v,
+    disparity px (< 0: none). sigma_px: (n,). inlier: (n,) which of them to believe.
+    """
+
+    xyz: F64
+    ray: F64
+    observed: F64
+    sigma_px: F64
+    inlier: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class BodyVelocity:
+    """What an odometer measured. value: (3,) m/s of the body's origin in the body's axes. cov: (3,3) of it, huge where
+    nothing was measured. counted: (3,3) as what it counts beside those of other frames, whose errors are alike. age_s:
+    how long before the frame.
+    """
+
+    value: F64
+    cov: F64
+    counted: F64
+    age_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class InertialState:
+    """T_m_b: (4,4). velocity: (3,) m/s in m. bias: (6,) gyro rad/s, accel m/s^2. tilt: (2,) rad, turn of true up
+    against z of m about its x and y. cov: (17,17) of [rotation (right), position, velocity, gyro bias, accel bias,
+    tilt].
+    """
+
+    T_m_b: F64
+    velocity: F64
+    bias: F64
+    tilt: F64
+    cov: F64
+
+    @property
+    def pose_cov(self) -> F64:
+        """(6,6) covariance [translation in m, rotation about the body's axes]."""
+        order = np.array([3, 4, 5, 0, 1, 2])
+        return np.asarray(self.cov[np.ix_(order, order)])
+
+
+class FixedLagSmoother:
+    """Window, prior and buffers. `start` first; then `add` once a frame."""
+
+    def __init__(
+        self, camera: RectifiedCamera, calibration: ImuCalibration, config: FixedLagConfig, gravity_m_s2: float = 9.81
+    ) -> None:
+        n, p = config.states + 1, config.points
+        self._config = config
+        self._calibration = calibration
+        self._gravity = gravity_m_s2
+        T_c_b = se3.inverse(camera.T_b_c)
+        self._r_cb, self._t_cb = np.ascontiguousarray(T_c_b[:3, :3]), T_c_b[:3, 3].copy()
+        self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
+        self._n = 0
+        self._rot, self._state, self._tilt = np.zeros((n, 3, 3)), np.zeros((n, 12)), np.zeros(2)
+        self._samples: list[Samples] = []
+        self._imu_dt, self._imu_turn, self._imu_vp = np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 6))
+        self._imu_jac, self._imu_bias = np.zeros((n, 9, 6)), np.zeros((n, 6))
+        self._imu_info, self._imu_walk = np.zeros((n, 9, 9)), np.zeros((n, 2))
+        self._prior_h, self._prior_b = np.zeros((17, 17)), np.zeros(17)
+        self._prior_r, self._prior_s, self._prior_tilt = np.eye(3), np.zeros(12), np.zeros(2)
+        self._counts, self._scale = np.zeros(n, np.int64), np.ones(n)
+        self._xyz, self._ray, self._observed = np.zeros((n, p, 3)), np.zeros((n, p, 3)), np.zeros((n, p, 3))
+        self._sigma, self._use = np.ones((n, p)), np.zeros((n, p), np.bool_)
+        self._vis_h, self._vis_b = np.zeros((n, 6, 6)), np.zeros((n, 6))
+        self._vis_r, self._vis_p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+        self._vel, self._vel_info = np.zeros((n, 3)), np.zeros((n, 3, 3))
+        self._cov = np.zeros((17, 17))
+
+    @property
+    def running(self) -> bool:
+        """Whether there is a state."""
+        return self._n > 0
+
+    @property
+    def gravity(self) -> F64:
+        """Gravity (3,) in m, m/s^2."""
+        down, jac = np.empty(3), np.empty((3, 2))
+        inertial_kernels.down_of_tilt(self._tilt, down, jac)
+        return self._gravity * down
+
+    @property
+    def state(self) -> InertialState:
+        """The newest state."""
+        k = self._n - 1
+        s = self._state[k]
+        return InertialState(
+            se3.from_rt(self._rot[k], s[:3]), s[3:6].copy(), s[6:].copy(), self._tilt.copy(), self._cov.copy()
+        )
+
+    def start(self, T_m_b: F64, velocity: F64, bias: F64, gravity: F64, deviations: StartDeviations) -> None:
+        """Begin (anew) with one state. gravity: (3,) in m, of which the direction counts."""
+        self._n = 1
+        self._samples = []
+        self._rot[0] = T_m_b[:3, :3]
+        self._state[0] = np.concatenate([T_m_b[:3, 3], velocity, bias])
+        self._tilt[:] = tilt_of(gravity)
+        d = deviations
+        sigma = np.repeat(
+            [d.turn_rad, d.position_m, d.velocity_m_s, d.gyro_bias_rad_s, d.accel_bias_m_s2, d.tilt_rad],
+            [3, 3, 3, 3, 3, 2],
+        )
+        self._cov = np.diag(sigma**2)
+        self._prior_h[:] = np.diag(sigma**-2.0)
+        self._prior_b[:] = 0.0
+        self._prior_r[:], self._prior_s[:], self._prior_tilt[:] = self._rot[0], self._state[0], self._tilt
+        self._counts[0] = 0
+        self._vis_h[0], self._vis_b[0] = 0.0, 0.0
+        self._vis_r[0], self._vis_p[0] = self._rot[0], self._state[0, :3]
+        self._vel_info[0] = 0.0
+
+    def stop(self) -> None:
+        """Forget everything."""
+        self._n = 0
+
+    def predict(self, samples: Samples) -> tuple[F64, F64]:
+        """Pose (4,4) and velocity (3,) after the samples, which begin at the newest state."""
+        state = self.state
+        motion = preintegrate(samples, state.bias, self._calibration, self._config.imu_inflation)
+        return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)
+
+    def add(
+        self, samples: Samples, points: VisualPoints | None, driven: BodyVelocity | None = None
+    ) -> InertialState | None:
+        """One more frame: the samples since the last one, what it saw (None: nothing, the IMU alone carries it), and
+        what an odometer said.
+
+        None when the system could not be solved; then nothing is believed any more, and `start` is needed.
+        """
+        if self._n > self._config.states - 1 and not self._drop_oldest():
+            self.stop()
+            return None
+        k = self._n
+        bias = self._state[k - 1, 6:].copy()
+        motion = preintegrate(samples, bias, self._calibration, self._config.imu_inflation)
+        T_m_b, velocity = motion.propagate(
+            se3.from_rt(self._rot[k - 1], self._state[k - 1, :3]), self._state[k - 1, 3:6], bias, self.gravity
+        )
+        if not (np.isfinite(T_m_b).all() and np.isfinite(motion.cov).all()):
+            self.stop()
+            return None
+        self._put_interval(k - 1, motion)
+        self._samples.append(samples)
+        self._rot[k] = se3.orthonormalise(T_m_b)[:3, :3]
+        self._state[k] = np.concatenate([T_m_b[:3, 3], velocity, bias])
+        self._put_points(k, points)
+        self._put_velocity(k, driven, motion)
+        self._n = k + 1
+        self._relinearise_biases()
+        c = self._config
+        cost = kernels.smooth(
+            self._n, c.iterations, min(c.fresh, self._n), self._rot, self._state, self._tilt, self._gravity,
+            self._imu_dt, self._imu_turn, self._imu_vp, self._imu_jac, self._imu_bias, self._imu_info, self._imu_walk,
+            self._prior_h, self._prior_b, self._prior_r, self._prior_s, self._prior_tilt, self._r_cb, self._t_cb,
+            self._intrinsics, self._counts, self._xyz, self._ray, self._observed, self._sigma, self._use, c.chi2,
+            self._scale, self._vis_h, self._vis_b, self._vis_r, self._vis_p, self._vel,
+            self._vel_info, self._cov,
+        )  # fmt: skip
+        if not (cost >= 0.0 and np.isfinite(self._state[: self._n]).all()):
+            self.stop()
+            return None
+        return self.state
+
+    def replace_last(self, samples: Samples) -> None:
+        """Better samples of the interval that leads to the newest state, before the next one is added."""
+        k = self._n - 2
+        if k >= 0 and self._samples:
+            self._samples[-1] = samples
+            bias = self._imu_bias[k].copy()
+            self._put_interval(k, preintegrate(samples, bias, self._calibration, self._config.imu_inflation))
+
+    def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
+        """A new map begins in which the newest body pose is T_m_b (4,4) by definition. Velocity, biases and the
+        direction of gravity are taken along, with what the old map's pose lacked in certainty.
+        """
+        old = self.state
+        r, gravity = old.T_m_b[:3, :3], self.gravity
+        down, jac = np.empty(3), np.empty((3, 2))
+        inertial_kernels.down_of_tilt(self._tilt, down, jac)
+        # the error of the old attitude becomes one of what is known in the map's axes
+        carry = np.eye(17)[6:]
+        carry[:3, :3] = se3.skew(old.velocity) @ r
+        carry[9:, :3] = np.linalg.pinv(self._gravity * jac) @ se3.skew(gravity) @ r
+        cov = np.zeros((17, 17))
+        cov[:3, :3], cov[3:6, 3:6] = turn_sigma_rad**2 * np.eye(3), position_sigma_m**2 * np.eye(3)
+        cov[6:, 6:] = carry @ old.cov @ carry.T
+        T_new_old = T_m_b @ se3.inverse(old.T_m_b)
+        self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations())
+        self._cov = 0.5 * (cov + cov.T)
+        self._prior_h[:] = np.linalg.inv(self._cov)
+        self.shift_map(T_new_old)
+
+    def shift_map(self, T_new_old: F64) -> None:
+        """The map moved: express everything in the new place, `p_new = T_new_old p_old`."""
+        if self._n == 0:
+            return
+        r, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        n = self._n
+        tilt_turn = _tilt_jacobian(r, self._tilt)
+        old_prior_tilt = self._prior_tilt - self._tilt
+        self._tilt[:] = tilt_of(r @ self.gravity)
+        self._prior_tilt[:] = self._tilt + tilt_turn @ old_prior_tilt
+        self._rot[:n] = r @ self._rot[:n]
+        self._prior_r[:], self._vis_r[:n] = r @ self._prior_r, r @ self._vis_r[:n]
+        for block in (self._state[:n], self._prior_s[None, :]):
+            block[:, :3] = block[:, :3] @ r.T + t
+            block[:, 3:6] = block[:, 3:6] @ r.T
+        self._vis_p[:n] = self._vis_p[:n] @ r.T + t
+        # positions, velocities and the tilt of the prior turn with the map, the rest hangs on the body
+        q = np.eye(17)
+        q[3:6, 3:6], q[6:9, 6:9], q[15:, 15:] = r, r, tilt_turn
+        back = np.eye(17)
+        back[3:6, 3:6], back[6:9, 6:9], back[15:, 15:] = r.T, r.T, np.linalg.inv(tilt_turn)
+        self._prior_h[:] = back.T @ self._prior_h @ back
+        self._prior_b[:] = back.T @ self._prior_b
+        self._cov = q @ self._cov @ q.T
+        q6 = q[:6, :6]
+        self._vis_h[:n] = q6 @ self._vis_h[:n] @ q6.T
+        self._vis_b[:n] = self._vis_b[:n] @ q6.T
+        self._xyz[:n] = self._xyz[:n] @ r.T + t
+        self._ray[:n] = self._ray[:n] @ r.T
+
+    def _put_interval(self, k: int, motion: Preintegrated) -> None:
+        c = self._config
+        self._imu_dt[k], self._imu_turn[k], self._imu_vp[k] = motion.dt_s, motion.turn, motion.vp
+        self._imu_jac[k], self._imu_bias[k] = motion.jac, motion.bias
+        floor = np.repeat([c.turn_floor_rad, c.velocity_floor_m_s, c.position_floor_m], 3) ** 2
+        self._imu_info[k] = np.linalg.inv(motion.cov + np.diag(floor))
+        walk = np.array([self._calibration.gyro_walk, self._calibration.accel_walk])
+        self._imu_walk[k] = 1.0 / (walk * walk * motion.dt_s)
+
+    def _put_points(self, k: int, points: VisualPoints | None) -> None:
+        self._vis_h[k], self._vis_b[k] = 0.0, 0.0
+        self._vis_r[k], self._vis_p[k] = self._rot[k], self._state[k, :3]
+        self._scale[k] = 1.0 / self._config.visual_inflation
+        self._counts[k] = 0
+        if points is None:
+            return
+        n = min(len(points.xyz), self._config.points)
+        self._counts[k] = n
+        self._xyz[k, :n], self._ray[k, :n] = points.xyz[:n], points.ray[:n]
+        self._observed[k, :n], self._sigma[k, :n] = points.observed[:n], points.sigma_px[:n]
+        self._use[k, :n] = points.inlier[:n]
+
+    def _put_velocity(self, k: int, driven: BodyVelocity | None, motion: Preintegrated) -> None:
+        """An odometer's velocity, brought to the frame by what the IMU felt since, unless it surprises."""
+        self._vel_info[k] = 0.0
+        if driven is None:
+            return
+        c, r, velocity = self._config, self._rot[k], self._state[k, 3:6]
+        change = (velocity - self._state[k - 1, 3:6]) * (driven.age_s / motion.dt_s)
+        turned = se3.so3_exp(se3.so3_log(motion.turn) * (driven.age_s / motion.dt_s))
+        value = turned.T @ driven.value + r.T @ change
+        cov = turned.T @ driven.cov @ turned
+        off = value - r.T @ velocity
+        square = float(off @ np.linalg.solve(cov + r.T @ self._cov[6:9, 6:9] @ r, off))
+        if not square < c.velocity_gate:
+            return
+        self._vel[k] = value
+        weight = min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
+        self._vel_info[k] = weight * np.linalg.inv(turned.T @ driven.counted @ turned)
+
+    def _relinearise_biases(self) -> None:
+        """Integrate again where the bias has left the neighbourhood in which its first-order correction holds."""
+        c = self._config
+        for k in range(self._n - 1):
+            change = np.abs(self._state[k, 6:] - self._imu_bias[k])
+            if change[:3].max() > c.relinearise_gyro_rad_s or change[3:].max() > c.relinearise_accel_m_s2:
+                self._put_interval(
+                    k, preintegrate(self._samples[k], self._state[k, 6:], self._calibration, c.imu_inflation)
+                )
+
+    def _drop_oldest(self) -> bool:
+        """Fold the oldest state into the prior and move the rest down."""
+        walk = self._config.tilt_walk_rad**2 * float(self._imu_dt[0])
+        ok = kernels.marginalise(
+            self._rot[:2], self._state[:2], self._tilt, self._gravity, self._imu_dt[0], self._imu_turn[0],
+            self._imu_vp[0], self._imu_jac[0], self._imu_bias[0], self._imu_info[0], self._imu_walk[0],
+            self._vis_h[0], self._vis_b[0], self._vis_r[0], self._vis_p[0], self._vel[0], self._vel_info[0], walk,
+            self._prior_h, self._prior_b, self._prior_r, self._prior_s, self._prior_tilt,
+        )  # fmt: skip
+        n = self._n
+        arrays: list[NDArray[np.generic]] = [
+            self._rot, self._state, self._imu_dt, self._imu_turn, self._imu_vp, self._imu_jac, self._imu_bias,
+            self._imu_info, self._imu_walk, self._counts, self._scale, self._vis_h, self._vis_b, self._vis_r,
+            self._vis_p, self._vel, self._vel_info,
+        ]  # fmt: skip
+        if self._config.fresh > 1:  # else nobody looks at the points of older frames again
+            arrays += [self._xyz, self._ray, self._observed, self._sigma, self._use]
+        for array in arrays:
+            array[: n - 1] = array[1:n].copy()
+        self._samples.pop(0)
+        self._n = n - 1
+        return bool(ok)
+
+
+def tilt_of(gravity: F64) -> F64:
+    """The two angles (2,) in rad about x and y by which `-gravity` is turned against z."""
+    up = -gravity / np.linalg.norm(gravity)
+    s, angle = float(np.hypot(up[0], up[1])), float(np.arctan2(np.hypot(up[0], up[1]), up[2]))
+    k = angle / s if s > 1e-12 else 1.0
+    return np.array([-k * up[1], k * up[0]])
+
+
+def _tilt_jacobian(r: F64, tilt: F64) -> F64:
+    """Change (2,2) of the tilt of a turned map by the tilt before."""
+    down, jac, down_new, jac_new = np.empty(3), np.empty((3, 2)), np.empty(3), np.empty((3, 2))
+    inertial_kernels.down_of_tilt(tilt, down, jac)
+    inertial_kernels.down_of_tilt(tilt_of(r @ down), down_new, jac_new)
+    return np.asarray(np.linalg.lstsq(jac_new, r @ jac, rcond=None)[0])

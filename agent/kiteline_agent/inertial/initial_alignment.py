@@ -1,0 +1,139 @@
+"""Start in motion: gyro bias, velocity, gravity and, without stereo, the scale of a map from poses and IMU.
+
+The IMU hardly errs over a second, so a window has few unknowns: place and velocity at its begin, gravity,
+accelerometer bias and scale, all linear (A. Martinelli, "Closed-form solution of visual-inertial structure from
+motion", 2014). The gyro bias and the refinement that imposes the length of gravity are those of T. Qin et al.,
+"VINS-Mono", 2018, section V-B.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.preintegration import Preintegrated
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """velocities: (n,3) m/s in m of every pose. gravity: (3,) m/s^2 in m. accel_bias: (3,) m/s^2. scale: metres per
+    unit of the map, scale_sigma: one deviation of it, 0 when it was not asked for. residual_m: rms of what the
+    positions disagree. gravity_error: relative difference of the length of gravity, before it was imposed, from the
+    true one.
+    """
+
+    velocities: F64
+    gravity: F64
+    accel_bias: F64
+    scale: float
+    scale_sigma: float
+    residual_m: float
+    gravity_error: float
+
+
+def gyro_bias(T_m_b: F64, motions: list[Preintegrated]) -> F64:
+    """Bias (3,) rad/s that makes the gyro agree with turns of the poses T_m_b (n,4,4) between which motions (n-1)
+    lead.
+    """
+    bias = motions[0].bias[:3].copy()
+    for _ in range(2):
+        h, g = np.zeros((3, 3)), np.zeros(3)
+        for k, motion in enumerate(motions):
+            turn, _ = motion.corrected(np.concatenate([bias, motion.bias[3:]]))
+            error = se3.so3_log(turn.T @ T_m_b[k, :3, :3].T @ T_m_b[k + 1, :3, :3])
+            j = motion.jac[:3, :3]
+            h += j.T @ j
+            g += j.T @ error
+        bias = bias + np.linalg.solve(h, g)
+    return bias
+
+
+def align(
+    T_m_b: F64,
+    p_b_c: F64,
+    motions: list[Preintegrated],
+    bias: F64,
+    gravity_m_s2: float,
+    *,
+    with_scale: bool,
+    position_sigma_m: float = 0.003,
+    accel_bias_sigma: float = 0.1,
+) -> Alignment | None:
+    """Velocities, gravity, accelerometer bias and scale from n >= 5 poses by least squares; None when it is degenerate.
+
+    T_m_b: (n,4,4) poses of which the *camera* lies at s p_c, p_c = p_b + R p_b_c, with p_b_c (3,) in metres, so the
+    body lies at s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess. position_sigma_m: of a
+    visual position. accel_bias_sigma: m/s^2, of the guess.
+    """
+    n = len(T_m_b)
+    if n < 5:
+        return None
+    rotated = T_m_b[:, :3, :3] @ p_b_c
+    camera = (T_m_b[:, :3, 3] + rotated).reshape(-1)
+    times, v, p = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))  # what the accelerometer alone makes of them
+    jv, jp = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    for k, motion in enumerate(motions):
+        _, vp = motion.corrected(bias)
+        r, dt = T_m_b[k, :3, :3], motion.dt_s
+        times[k + 1] = times[k] + dt
+        p[k + 1], v[k + 1] = p[k] + v[k] * dt + r @ vp[3:], v[k] + r @ vp[:3]
+        jp[k + 1], jv[k + 1] = jp[k] + jv[k] * dt + r @ motion.jac[6:, 3:], jv[k] + r @ motion.jac[3:6, 3:]
+    felt = (rotated + p).reshape(-1)
+    # With q = 1 / s the noisy positions stand alone on their side, so that noise does not pull at the scale:
+    # p_c = p0 q + v0 q t + gravity q t^2 / 2 + jp bias q + felt q
+    free = np.concatenate(
+        [
+            np.tile(np.eye(3), (n, 1)),
+            np.kron(times[:, None], np.eye(3)),
+            jp.reshape(-1, 3),
+            np.kron(0.5 * times[:, None] ** 2, np.eye(3)),
+        ],
+        axis=1,
+    )
+    guess = np.zeros((3, free.shape[1]))
+    guess[:, 6:9] = np.eye(3)
+    ratio = position_sigma_m / accel_bias_sigma
+    unit, length = -v[-1] / float(np.linalg.norm(v[-1])), gravity_m_s2
+    if not with_scale:
+        x = np.linalg.lstsq(np.concatenate([free, ratio * guess]), np.append(camera - felt, np.zeros(3)), rcond=1e-10)[
+            0
+        ]
+        length = float(np.linalg.norm(x[9:]))
+        if not 0.3 * gravity_m_s2 < length < 3.0 * gravity_m_s2:
+            return None
+        unit = x[9:] / length
+    # impose the length: gravity q = length * (q unit + basis @ w), w in the tangent plane
+    q = 1.0
+    for _ in range(8):
+        basis = np.linalg.svd(unit[None, :])[2][1:].T
+        pull = felt + gravity_m_s2 * free[:, 9:] @ unit
+        a = np.concatenate([free[:, :9], gravity_m_s2 * free[:, 9:] @ basis], axis=1)
+        b = camera - (0.0 if with_scale else pull)
+        if with_scale:
+            a = np.concatenate([a, pull[:, None]], axis=1)
+        prior = np.zeros((3, a.shape[1]))
+        prior[:, 6:9] = ratio * np.eye(3)
+        a, b = np.concatenate([a, prior]), np.append(b, np.zeros(3))
+        x, _, rank, _ = np.linalg.lstsq(a, b, rcond=1e-10)
+        if rank < a.shape[1]:
+            return None
+        q = float(x[11]) if with_scale else 1.0
+        if q <= 0.0:
+            return None
+        turned = q * unit + basis @ x[9:11]
+        unit = turned / float(np.linalg.norm(turned))
+    rest = a @ x - b
+    gravity, change = gravity_m_s2 * unit, x[6:9] / q
+    velocities = x[3:6] / q + times[:, None] * gravity + v + jv @ change
+    sigma = 0.0
+    if with_scale:
+        variance = max(float(rest @ rest) / (3 * n - 9), (1e-5 * q) ** 2)
+        sigma = float(np.sqrt(variance * np.linalg.inv(a.T @ a)[11, 11])) / q**2
+    residual = float(np.sqrt(np.mean(rest[: 3 * n] ** 2))) / q
+    error = abs(length / gravity_m_s2 - 1.0)
+    return Alignment(velocities, gravity, bias[3:] + change, 1.0 / q, sigma, residual, error)

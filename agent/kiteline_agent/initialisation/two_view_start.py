@@ -1,0 +1,157 @@
+"""The beginning of a map with one eye: corners of a first frame are followed until two views give motion and depth.
+
+One eye knows no scale: the median depth of the first points is set to a convention, and the map keeps that scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.imaging import alignment_kernels, features
+from kiteline_agent.initialisation.two_view import two_view
+from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
+from kiteline_agent.keyframes.keyframes import NewPoints
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.tracking.tracker import View
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import KeyframeId
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """The first keyframe of a map, seen from the second.
+
+    view, t_ns: of the first frame. frames: from there to the second. T_a_b: (4,4) the second camera in the first.
+    points: what is born in the first frame. median_depth_m: theirs. flat: the scene was taken for a plane.
+    """
+
+    view: View
+    t_ns: int
+    frames: int
+    T_a_b: F64
+    points: NewPoints
+    median_depth_m: float
+    flat: bool
+
+    def sharpen(self, local_map: LocalMap, keyframe: KeyframeId, sigma_px: float) -> None:
+        """Say in the local map how well the two views measured what was born in the first one."""
+        slot = local_map.slot_of(keyframe)
+        n = int(local_map.counts[slot])
+        octave = local_map.octave[slot * local_map.births : slot * local_map.births + n]
+        local_map.sigma_rho[slot, :n] = sigma_of_meeting(
+            local_map.bearing[slot, :n], local_map.rho[slot, :n], se3.inverse(self.T_a_b),
+            local_map.camera.fx, sigma_px * np.exp2(octave.astype(np.float64)),
+        )  # fmt: skip
+
+
+class MonoStart:
+    """Follows corners of a first frame through those that come after it."""
+
+    def __init__(self, camera: RectifiedCamera, config: AgentConfig) -> None:
+        self._camera = camera
+        self._config = config
+        self._detector = replace(
+            config.detector, cell_px=config.mono_start.cell_px, max_corners=config.mono_start.corners
+        )
+        self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        self._median_depth_m = config.mono_start.median_depth_m
+        self._first: View | None = None
+        self._first_t_ns = 0
+        self._frames = 0
+        self._last: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._uv0 = np.zeros((0, 2))
+        self._octave = np.zeros(0, np.uint8)
+        self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
+        self._uv = np.zeros((0, 2))
+        self._index = np.zeros(0, np.int64)  # template of each corner that is still followed
+
+    def tracked(self, depth_m: F64) -> None:
+        """A map is being tracked, at these depths (n,): a later start takes on their scale, and begins anew."""
+        self._first = None
+        if len(depth_m):
+            self._median_depth_m = float(np.median(depth_m))
+
+    def rescale(self, factor: float) -> None:
+        """Change the unit of length: all lengths grow by `factor`."""
+        self._median_depth_m *= factor
+
+    def step(self, view: View, t_ns: int) -> Opening | None:
+        """Take in a frame. Returns the opening of a map when this frame and the first one give at least 100 points."""
+        config = self._config.mono_start
+        if self._first is None:
+            self._begin(view, t_ns)
+            return None
+        self._follow(view)
+        self._frames += 1
+        moved = np.linalg.norm(self._uv - self._uv0, axis=1)
+        opening = None
+        if len(moved) >= config.two_view.min_points and np.median(moved) > config.min_flow * self._camera.fx:
+            opening = self._try(view)
+        few = len(self._uv) < max(config.two_view.min_points, config.min_share * len(self._templates))
+        if opening is not None:
+            self._first = None
+        elif few or self._frames >= config.max_frames:
+            self._begin(view, t_ns)
+        return opening
+
+    def _begin(self, view: View, t_ns: int) -> None:
+        corners = features.detect(view.left, np.zeros((0, 2)), self._detector)
+        self._first, self._first_t_ns, self._frames = replace(view, right=None), t_ns, 0
+        self._last = view.left[0]
+        self._uv0, self._uv, self._octave = corners.uv, corners.uv.copy(), corners.octave
+        self._templates = np.empty((len(corners.uv), *self._templates.shape[1:]), np.uint8)
+        self._index = np.arange(len(corners.uv))
+        alignment_kernels.cut_templates(view.left, corners.uv, corners.octave, self._templates)
+
+    def _follow(self, view: View) -> None:
+        """Pyramidal flow from the last frame, forth and back."""
+        image, window = view.left[0], self._config.mono_start.window_px
+        if len(self._uv):
+            before = self._uv.astype(np.float32)
+            size = {"winSize": (window, window), "maxLevel": 3}
+            after, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, image, before, None, **size)  # type: ignore[call-overload]
+            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(image, self._last, after, None, **size)  # type: ignore[call-overload]
+            same = np.linalg.norm(back - before, axis=1) < 1.0
+            inside = (after >= 4.0).all(axis=1) & (after < np.array([image.shape[1], image.shape[0]]) - 4.0).all(axis=1)
+            keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & same & inside
+            self._uv, self._uv0 = after[keep].astype(np.float64), self._uv0[keep]
+            self._octave, self._index = self._octave[keep], self._index[keep]
+        self._last = image
+
+    def _try(self, view: View) -> Opening | None:
+        """Sharpen the pixels on the first frame's templates, and ask the two views."""
+        align, config = self._config.align, self._config.mono_start
+        uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
+        warp = np.tile(self._mean_warp(), (len(uv), 1, 1))
+        alignment_kernels.align(
+            view.left, self._templates, self._index, self._octave, warp, uv, 0, 0,
+            align.iterations, align.fine_step_px, align.min_ncc, found, ncc,
+        )  # fmt: skip
+        uv[~found] = self._uv[~found]
+        seen = two_view(self._uv0, uv, self._intrinsics, config.two_view, self._frames)
+        if seen is None or self._first is None:
+            return None
+        factor = self._median_depth_m / float(np.median(seen.points[seen.good, 2]))
+        T_a_b = se3.inverse(seen.T_b_a)
+        T_a_b[:3, 3] *= factor
+        rows = np.flatnonzero(seen.good)[: self._config.local_map.births]
+        place, octave = self._uv0[rows], self._octave[rows]
+        angle, descriptor = features.describe(self._first.left, place, octave)
+        disparity = self._camera.bf / (seen.points[rows, 2] * factor)
+        points = NewPoints(place, disparity, octave, angle, descriptor)
+        return Opening(
+            self._first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m, seen.flat
+        )  # fmt: skip
+
+    def _mean_warp(self) -> F64:
+        """The linear part (2,2) of the affine map that brings the first frame's corners nearest to the last ones."""
+        a = np.column_stack([self._uv0, np.ones(len(self._uv0))])
+        return np.ascontiguousarray(np.linalg.lstsq(a, self._uv, rcond=None)[0][:2].T)

@@ -1,0 +1,67 @@
+"""What a flight leaves: its log and its trajectories. Pure: what is written to is handed in."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TextIO
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.runtime.flight_log import StepLog, write_step
+from kiteline_agent.runtime.options import AgentSpec
+from kiteline_agent.runtime.tally import live_line, odometry_line
+from kiteline_agent.step import Estimate, StepInput, StepOutput
+from kiteline_codec.channel import CodedChannel, RecordChannel
+from kiteline_codec.coding import record_log
+from kiteline_core import config as configuration
+from kiteline_core.ids import AgentId
+
+_LINK_NS = 1_000_000_000  # ns between two words of the link in the log
+
+
+class FlightRecord:
+    """Writes down each step, what was shared in it, and where the vehicle was."""
+
+    def __init__(self, log: StepLog, live: TextIO, odometry: TextIO, agent: int, channel: RecordChannel) -> None:
+        """live, odometry: files of TUM lines."""
+        self._log = log
+        self._live = live
+        self._odometry = odometry
+        self._agent = AgentId(agent)
+        self._channel = channel
+        self._link_due_ns = 0
+        if isinstance(channel, CodedChannel | AloneChannel):
+            channel.noting = True
+
+    def step(self, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int) -> None:
+        """Note a step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+        write_step(self._log, step_input, output, now_ns, log_ns)
+        self._shared(log_ns)
+        if isinstance(self._channel, CodedChannel) and now_ns >= self._link_due_ns:
+            self._link_due_ns = now_ns + _LINK_NS
+            self._log.json("/link", log_ns, self._channel.report())
+
+    def _shared(self, log_ns: int) -> None:
+        """What was shared, for a base that reads the log after landing: no link may have carried it."""
+        if isinstance(self._channel, CodedChannel | AloneChannel):
+            for key, code in self._channel.take_noted().items():
+                self._log.blob(record_log.TOPIC, log_ns, record_log.write_record(self._agent, key, code))
+
+    def pose(self, estimate: Estimate) -> None:
+        """Note where the vehicle was."""
+        self._live.write(live_line(estimate))
+        self._odometry.write(odometry_line(estimate))
+
+
+def metadata(spec: AgentSpec, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
+    """What a log says of its flight at its head. source: its name."""
+    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
+    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
+    return {
+        "role": "agent",
+        "channel": type(channel).__name__,
+        "source": source,
+        "spec": json.dumps(plain),
+        "config": configuration.describe(config),
+    }

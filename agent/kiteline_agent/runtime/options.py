@@ -1,0 +1,148 @@
+"""What one agent's flight is told, on the command line or by `fly`; and its configuration and channel."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tomllib
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
+from kiteline_codec.sync.archive import Spill
+from kiteline_codec.transport.seal import seal_bytes, suite_for
+from kiteline_core import config as configuration
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSpec:
+    """All that one agent's flight is told. Plain values, so that it travels as JSON."""
+
+    source: str
+    folder: str  # for the log and the trajectories
+    log_name: str = "log.mcap"  # "": no log and no trajectories
+    agent: int = 0
+    boot: int = 0
+    link: str = "none"  # LINK, or lockstep:ENDPOINT
+    mono: bool = False
+    imu: bool = True
+    config: str = ""  # a TOML file
+    start_ns: int = 0  # the stamp that is flight time 0
+    seconds: float = 0.0  # s of flight time to fly; 0: all
+    up_bytes_s: int = 0  # B/s that the link takes; 0: any number
+    key: str = ""  # a file with this agent's key; "": packets are not sealed
+    profile: str = ""  # what to share of a keyframe: wifi or radio; "": as the link allows
+    delay_s: float = 0.0  # s that a packet is under way
+    loss: float = 0.0  # probability that a packet is lost
+    disorder: float = 0.0  # probability that it is doubled, and that it is late
+    seed: int = 0
+    cpu_percent: float = 0.0  # of one core; 0: all of it
+    mavlink: str = ""  # URL of a flight controller
+    axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
+    odometry: str = ""  # what to take from the flight controller: controller, wheels, wheels:TRACK_M; "": nothing
+    imu_of: str = ""  # whose inertial samples are used: controller; "": the source's, where it has any
+    kill_at_s: float = -1.0  # end like a crash at this flight time
+    await_base_at_s: float = -1.0  # look for a base again at this flight time
+    await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
+
+
+def spec_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentSpec:
+    """What the command line says. folder: for the log. boot: number of this start."""
+    return AgentSpec(
+        source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
+        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
+        key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
+        odometry=a.odometry, imu_of=a.imu,
+    )  # fmt: skip
+
+
+def from_json(text: str) -> AgentSpec:
+    """A spec from its JSON; unknown keys are an error."""
+    values: dict[str, Any] = json.loads(text)
+    known = {f.name for f in fields(AgentSpec)}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
+    return AgentSpec(**values)
+
+
+def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
+    """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError.
+
+    cpu_percent: of one core, overrides the governor's budget; 0: what the file says.
+    """
+    config = _config_of(path) if path else AgentConfig()
+    if cpu_percent <= 0.0:
+        return config
+    return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
+
+
+def _config_of(path: str) -> AgentConfig:
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise configuration.ConfigError(f"{path}: {error}") from error
+    unknown = set(table) - {"agent", "base"}
+    if unknown:
+        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
+    section = table.get("agent", {})
+    if not isinstance(section, dict):
+        raise configuration.ConfigError(f"{path}: [agent] is a section")
+    return configuration.apply(AgentConfig(), section, "agent")
+
+
+def channel_for(spec: AgentSpec, spill: Spill | None = None) -> RecordChannel:
+    """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1.
+
+    spill: keeps what would take too much memory while the link is down.
+    """
+    if spec.link == "none":
+        return AloneChannel()
+    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
+    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
+
+
+def settled(channel: RecordChannel) -> tuple[bool, bool]:
+    """Whether a channel is quiet, and whether both sides were seen to hold the same."""
+    if isinstance(channel, CodedChannel):
+        return channel.endpoint.quiet, channel.endpoint.digest_equal
+    return True, True
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline agent`."""
+    p = argparse.ArgumentParser(
+        prog="kiteline agent",
+        description="The onboard half: tracks a camera, sends poses to a flight controller and thin diffs to a base.",
+        epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path. "
+        "LINK is zenoh:tcp/HOST:PORT serial:DEVICE:BAUD none. URL is udp:HOST:PORT udpin:HOST:PORT serial:DEVICE:BAUD.",
+    )
+    p.add_argument("source", metavar="SOURCE", nargs="?")
+    p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
+    p.add_argument(
+        "--agent", metavar="N", type=int, default=0, help="number of this agent, 0 to 63, its own in a group"
+    )
+    p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
+    p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
+    p.add_argument(
+        "--odometry", metavar="WHAT", default="",
+        help="take velocities from the flight controller too: wheels, wheels:TRACK_M (wheels tell turns as well), or "
+        "controller (its filter's, where that does not live on our own poses); of a recording they are taken anyhow",
+    )  # fmt: skip
+    p.add_argument(
+        "--imu", choices=("controller",), default="",
+        help="fly on the flight controller's IMU in place of the source's; where the camera sits is said by T_f_c in "
+        "[agent.controller_imu] of --config, or by a source that knows its body, with --axes",
+    )  # fmt: skip
+    p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
+    p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
+    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--mono", action="store_true", help="the left camera alone")
+    p.add_argument("--no-imu", action="store_true", help="without inertial samples")
+    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
+    return p

@@ -1,0 +1,80 @@
+"""What a flight amounts to, counted frame by frame; no clock and no file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from kiteline_agent.step import Estimate
+from kiteline_core.geometry import tum
+from kiteline_core.ids import KeyframeId, SubmapId
+
+F64 = NDArray[float64]
+
+
+@dataclass(slots=True)
+class Tally:
+    """frames = tracked + lost + dropped. bridged: those of the tracked that the IMU carried."""
+
+    tracked: int = 0
+    bridged: int = 0
+    lost: int = 0
+    dropped: int = 0
+    bytes_up: int = 0
+    bytes_down: int = 0
+    keyframes: set[KeyframeId] = field(default_factory=set)
+    submaps: set[SubmapId] = field(default_factory=set)
+
+    @property
+    def frames(self) -> int:
+        """How many frames the source gave."""
+        return self.tracked + self.lost + self.dropped
+
+    def count(self, estimate: Estimate | None) -> None:
+        """Count one frame that was given to the agent; None when it was passed over to save CPU time."""
+        if estimate is None:
+            self.dropped += 1
+        elif live_pose(estimate) is None:
+            self.lost += 1
+        else:
+            self.tracked += 1
+            self.bridged += estimate.bridged
+        if estimate is not None and estimate.keyframe >= 0:
+            self.keyframes.add(estimate.keyframe)
+            self.submaps.add(estimate.submap)
+
+    def as_report(self) -> dict[str, int | float]:
+        """The counts as report.json holds them."""
+        keyframes = len(self.keyframes)
+        return {
+            "frames": self.frames,
+            "tracked": self.tracked,
+            "bridged": self.bridged,
+            "lost": self.lost,
+            "dropped": self.dropped,
+            "submaps": len(self.submaps),
+            "keyframes": keyframes,
+            "bytes_up": self.bytes_up,
+            "bytes_down": self.bytes_down,
+            "bytes_per_keyframe": round(self.bytes_up / keyframes, 1) if keyframes else 0.0,
+        }
+
+
+def live_pose(estimate: Estimate) -> F64 | None:
+    """The body in w where the base has placed the submap, else in m; None for a frame that was not tracked."""
+    if not estimate.tracked:
+        return None
+    return estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
+
+
+def live_line(estimate: Estimate) -> str:
+    """The frame's line in live.tum; empty where it has no pose."""
+    pose = live_pose(estimate)
+    return "" if pose is None else tum.line(estimate.t_ns, pose)
+
+
+def odometry_line(estimate: Estimate) -> str:
+    """The frame's line in odometry.tum."""
+    return tum.line(estimate.t_ns, estimate.T_o_b)

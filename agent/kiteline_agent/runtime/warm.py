@@ -1,0 +1,89 @@
+"""Compile all kernels of the onboard half before the first frame, by flying a few frames of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.imaging.epipolar_kernels import search_segments
+from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.initialisation.two_view import TwoViewConfig, two_view
+from kiteline_agent.step import Identity, StepInput
+from kiteline_codec import warm as codec_warm
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.geometry.se3 import from_rt
+from kiteline_core.ids import AgentId
+from kiteline_core.imaging.matching import MatchConfig, match, match_near
+from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
+from kiteline_core.pose.pnp import solve_pnp
+
+
+def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> None:
+    """Run every kernel once, on the types that flights use. A filled cache makes this take a fraction of a second."""
+    state, pixels = 1, np.empty(240 * 320, np.uint8)
+    for i in range(pixels.size):  # deterministic noise: corners everywhere
+        state = state * 1103515245 + 12345 & 0x7FFFFFFF
+        pixels[i] = state >> 16 & 255
+    image = np.kron(pixels.reshape(240, 320)[:60, :80], np.ones((4, 4), np.uint8))
+    camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
+    small = CameraRig(camera, camera, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
+    right = np.ascontiguousarray(np.roll(image, -8, axis=1))
+    centres = pixels[: 32 * nodes(4, 2)].view(np.uint64).reshape(-1, 4)
+    words = Vocabulary(4, 2, centres, np.ones(16, np.float32))
+    agent = Agent(small, ImuCalibration(), config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+    for k in range(14):
+        # At last the picture jumps by a quarter of its width: lost, and found again by its descriptors.
+        shift = 0 if k < 13 else -80
+        eyes = [np.ascontiguousarray(np.roll(eye, shift, axis=1)) for eye in (image, right)]
+        agent.step(StepInput(Frame(k * 50_000_000, eyes[0], eyes[1]), _resting(k)), k * 50_000_000)
+    _warm_recovery(words, pixels)
+    _warm_one_eye(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
+
+
+def _warm_recovery(words: Vocabulary, noise: NDArray[np.uint8]) -> None:
+    """A place looked up, descriptors matched, and a pose from points, on 40 corners of noise."""
+    descriptor, angle = noise[:1280].reshape(40, 32).copy(), np.zeros(40, np.uint8)
+    places = PlaceIndex(words)
+    for key in (0, 1):
+        places.add(key, descriptor)
+    places.query(descriptor)
+    places.remove(0)
+    match(descriptor, angle, descriptor, angle, MatchConfig())
+    points = noise[1280:1400].reshape(40, 3) / 128.0 + np.array([-1.0, -1.0, 2.0])
+    observed = np.column_stack([100.0 * points[:, :2] / points[:, 2:] + 150.0, np.full(40, -1.0)])
+    camera = np.array([100.0, 100.0, 150.0, 150.0, 10.0])
+    flat = np.zeros(40, np.uint8)
+    solve_pnp(points, np.zeros((40, 3)), observed, flat, camera, 0)
+    uv = np.ascontiguousarray(observed[:, :2])
+    match_near(
+        uv, np.full(40, 4.0), np.zeros(40), descriptor, uv, flat, descriptor, (320, 240), 1.2, MatchConfig()
+    )  # fmt: skip
+
+
+def _resting(k: int) -> ImuBatch:
+    """Inertial samples of a standing vehicle between frames k - 1 and k."""
+    t_ns = np.arange(k * 50_000_000 - 45_000_000, k * 50_000_000 + 1, 5_000_000, dtype=np.int64)
+    return ImuBatch(t_ns, np.zeros((10, 3)), np.tile([0.0, 0.0, 9.81], (10, 1)))
+
+
+def _warm_one_eye(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
+    """The start from two views, on a cloud of points (3,n) drawn from 0 to 1, and the search along a segment."""
+    x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
+    a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
+    two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
+    place = np.array([[160.0, 120.0]])
+    search_segments(
+        build_pyramid(image, 4), np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8), np.zeros(1, np.int64),
+        np.zeros(1, np.uint8), np.eye(2)[None], place, place + 5.0, 0.7, 40, 0.7, 0.9,
+        place.copy(), np.zeros(1, np.int8),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    codec_warm.warm()
+    warm()

@@ -1,0 +1,86 @@
+"""Where the camera is, in the submap and in the odometry frame, and how it moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+_UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
+
+
+class PoseState:
+    """The pose and the motion model; whatever moves the map leaves the odometry frame still.
+
+    T_m_c: (4,4) camera in the active submap. T_o_m: (4,4) submap in the odometry frame. velocity: (3,) m/s in m.
+    """
+
+    def __init__(self) -> None:
+        self.T_m_c: F64 = np.eye(4)
+        self.T_o_m: F64 = np.eye(4)
+        self.velocity: F64 = np.zeros(3)
+        self.moves = False
+        self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame
+        self._step_s = 0.0  # that the last motion took; 0: not known
+
+    @property
+    def T_c_m(self) -> F64:
+        """(4,4) submap in the camera."""
+        return se3.inverse(self.T_m_c)
+
+    def predict(self, dt_s: float) -> F64:
+        """T_m_c (4,4) after dt_s at constant velocity."""
+        step = self._step_T
+        if self._step_s > 0.0 and abs(dt_s / self._step_s - 1.0) > _UNEVEN:  # frames are missing in between
+            step = se3.exp(dt_s / self._step_s * se3.log(step))
+        return se3.orthonormalise(self.T_m_c @ step)
+
+    def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
+        """The camera moved to T_m_c (4,4) within dt_s. repeated: by an old image, that says nothing of motion."""
+        before, self.T_m_c = self.T_m_c, T_m_c
+        if repeated:
+            return
+        self._step_T = se3.orthonormalise(se3.inverse(before) @ T_m_c)
+        self._step_s = dt_s
+        if dt_s > 0.0:
+            self.velocity = (T_m_c[:3, 3] - before[:3, 3]) / dt_s
+            self.moves = True
+
+    def stand(self) -> None:
+        """Nothing is known of the motion: the next frame is looked for where this one was."""
+        self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
+
+    def go_on(self, step_T: F64, velocity: F64) -> None:
+        """The motion is known otherwise. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
+        self._step_T, self.velocity, self.moves = step_T, velocity, True
+
+    def move_map(self, T_m_c: F64) -> None:
+        """The map moved under the camera: its pose in m is T_m_c (4,4) now, that in o stays."""
+        T_o_c = self.T_o_m @ self.T_m_c
+        change = T_m_c[:3, :3] @ self.T_m_c[:3, :3].T
+        self.velocity = change @ self.velocity
+        self.T_m_c = se3.orthonormalise(T_m_c)
+        self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
+
+    def enter_submap(self) -> None:
+        """A new submap begins here; its axes are those of the odometry frame."""
+        self.T_m_c = self.T_o_m @ self.T_m_c
+        self.T_o_m = np.eye(4)
+
+    def rescale(self, metres: float) -> F64:
+        """A submap in metres begins where the camera is, one unit of the old one being so many. T_new_old (4,4), with
+        the old one's lengths in metres.
+        """
+        T_m_c = longer(self.T_m_c, metres)
+        self.enter_submap()
+        T_n_m = se3.orthonormalise(self.T_m_c @ se3.inverse(T_m_c))
+        self._step_T, self.velocity = longer(self._step_T, metres), metres * T_n_m[:3, :3] @ self.velocity
+        return T_n_m
+
+
+def longer(T: F64, factor: float) -> F64:
+    """T (4,4) with its translation multiplied by `factor`."""
+    return se3.from_rt(T[:3, :3], T[:3, 3] * factor)

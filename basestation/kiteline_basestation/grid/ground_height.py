@@ -1,0 +1,153 @@
+"""The height of the ground under a sparse map, z up: neighbourhood by neighbourhood, so that it may rise and tilt.
+
+First the lowest peak of the heights below the cameras, spread from the best known neighbourhood to the others; then a
+plane for each neighbourhood, fitted to the points near it in ever narrower bands (a hard-limited M-estimator).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.grid import grid_kernels as kernels
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class FloorConfig:
+    """How the ground is found."""
+
+    camera_above_m: float = 0.1  # m; ground points lie at least this far below every camera that sees them
+    patch_m: float = 2.0  # m; side of the neighbourhoods; three by three of them share their points
+    height_bin_m: float = 0.05  # m; a floor's points, with stereo noise, fill two or three bins
+    slope: float = 0.25  # m/m; how steep the ground may be: a ramp, or a map whose z is 10 degrees off the vertical
+    peak_share: float = 0.25  # of the highest peak: a lower peak with this share is the ground, below it is noise
+    peak_points: float = 4.0  # points; fewer make no peak
+    bands_m: tuple[float, ...] = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
+    plane_points: float = 12.0  # points that a neighbourhood's plane needs; with fewer it stays as it is
+    level_m: float = 0.3  # m; a patch of points with less spread than this says nothing of the slope
+
+
+def ground_heights(config: FloorConfig, points: F64, camera_z: F64) -> F64:
+    """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that sees each.
+
+    NaN at all points when the heights below the cameras have no peak.
+    """
+    below = points[:, 2] < camera_z - config.camera_above_m
+    patches = _Patches(config.patch_m, points)
+    level = _levels(config, patches, points[:, 2], below)
+    if level is None:
+        return np.full(len(points), np.nan)
+    planes = np.stack([level, np.zeros_like(level), np.zeros_like(level)])
+    for band_m in config.bands_m:
+        near = below & (np.abs(points[:, 2] - patches.heights(planes)) < band_m)
+        planes = _fit(config, patches, points[:, 2], near, planes)
+    return patches.heights(planes)
+
+
+class _Patches:
+    """Points sorted into square neighbourhoods of the x-y plane."""
+
+    def __init__(self, side_m: float, points: F64) -> None:
+        corner = points[:, :2].min(axis=0)
+        self.side_m = side_m
+        self.xy = points[:, :2] - corner
+        self.at = np.asarray((self.xy // side_m).astype(np.int64))  # (n,2) column, row
+        self.columns, self.rows = (int(v) + 1 for v in self.at.max(axis=0))
+        self.flat: I64 = self.at[:, 1] * self.columns + self.at[:, 0]
+
+    def total(self, keep: Bool, values: F64) -> F64:
+        """Sums (rows, columns) of values (n,) over three by three neighbourhoods."""
+        sums = np.bincount(self.flat[keep], values[keep], self.rows * self.columns).astype(np.float64)
+        return _box3(_box3(sums.reshape(self.rows, self.columns), 0), 1)
+
+    def centres(self) -> tuple[F64, F64]:
+        """x and y (rows, columns) of the middles."""
+        r, c = np.indices((self.rows, self.columns)).astype(np.float64)
+        return (c + 0.5) * self.side_m, (r + 0.5) * self.side_m
+
+    def heights(self, planes: F64) -> F64:
+        """z (n,) at the points, blended from the four nearest planes. planes: (3, rows, columns) z, dz/dx, dz/dy."""
+        last = np.array([self.columns - 1, self.rows - 1])
+        place = np.clip(self.xy / self.side_m - 0.5, 0.0, last)
+        low = np.minimum(place.astype(np.int64), np.maximum(last - 1, 0))
+        share = place - low
+        out = np.zeros(len(self.xy))
+        for right in (0, 1):
+            for up in (0, 1):
+                c, r = np.minimum(low + [right, up], last).T
+                weight = np.abs(1 - right - share[:, 0]) * np.abs(1 - up - share[:, 1])
+                z, a, b = planes[:, r, c]
+                dx, dy = self.xy[:, 0] - (c + 0.5) * self.side_m, self.xy[:, 1] - (r + 0.5) * self.side_m
+                out += weight * (z + a * dx + b * dy)
+        return out
+
+
+def _levels(config: FloorConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
+    """z (rows, columns) of the lowest peak in every neighbourhood; None where there is no peak at all."""
+    if not below.any():
+        return None
+    bins = 256  # 12.8 m of heights
+    base = float(np.median(z[below])) - bins / 2 * config.height_bin_m
+    b = np.floor((z - base) / config.height_bin_m).astype(np.int64)
+    keep = below & (b >= 0) & (b < bins)
+    shape = (patches.rows, patches.columns, bins)
+    sums = np.bincount(patches.flat[keep] * bins + b[keep], minlength=int(np.prod(shape))).reshape(shape)
+    count: F64 = sums.astype(np.float64)
+    for axis in range(3):
+        count = _box3(count, axis)
+    counts = count.astype(np.float32)
+    floor_bin = _lowest_peak(counts.sum(axis=(0, 1)), config)
+    if floor_bin < 0:
+        return None
+    reach = max(1, round(config.slope * config.patch_m / config.height_bin_m))
+    near = counts[:, :, max(0, floor_bin - reach) : floor_bin + reach + 1].sum(axis=2)
+    seed = int(np.argmax(near))
+    seed_bin = _lowest_peak(counts[seed // patches.columns, seed % patches.columns], config)
+    ground = np.zeros((patches.rows, patches.columns), np.int32)
+    kernels.spread_ground(
+        counts, seed, seed_bin if seed_bin >= 0 else floor_bin, reach, config.peak_share, config.peak_points,
+        ground, np.zeros(ground.size, np.int32),
+    )  # fmt: skip
+    return np.asarray(base + (ground.astype(np.float64) + 0.5) * config.height_bin_m)
+
+
+def _fit(config: FloorConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
+    """Least-squares plane (3, rows, columns) of the points `near` in every neighbourhood; slopes kept small."""
+    x, y = patches.xy.T
+    n = patches.total(near, np.ones_like(x))
+    enough = n >= config.plane_points
+    m = np.maximum(n, 1.0)
+    mx, my, mz = (patches.total(near, v) / m for v in (x, y, z))
+    xx, yy = (patches.total(near, u * u) / m - w * w + config.level_m**2 for u, w in ((x, mx), (y, my)))
+    xy, xz, yz = (
+        patches.total(near, u * v) / m - w * t for u, v, w, t in ((x, y, mx, my), (x, z, mx, mz), (y, z, my, mz))
+    )
+    det = xx * yy - xy * xy
+    a = np.clip((xz * yy - yz * xy) / det, -config.slope, config.slope)
+    b = np.clip((yz * xx - xz * xy) / det, -config.slope, config.slope)
+    cx, cy = patches.centres()
+    return np.where(enough, np.stack([mz + a * (cx - mx) + b * (cy - my), a, b]), planes)
+
+
+def _box3(values: F64, axis: int) -> F64:
+    """Sum of each element and its two neighbours along an axis."""
+    out = values.copy()
+    ahead, back = [slice(None)] * values.ndim, [slice(None)] * values.ndim
+    ahead[axis], back[axis] = slice(1, None), slice(None, -1)
+    out[tuple(ahead)] += values[tuple(back)]
+    out[tuple(back)] += values[tuple(ahead)]
+    return out
+
+
+def _lowest_peak(count: NDArray[np.float32], config: FloorConfig) -> int:
+    """The lowest bin that is a peak, with enough points and a fair share of the highest count; -1 none."""
+    after = np.append(count[1:], 0.0)
+    need = max(config.peak_share * float(count.max()), config.peak_points)
+    peaks = np.flatnonzero((count >= need) & (count >= after))
+    return int(peaks[0]) if len(peaks) else -1

@@ -1,0 +1,142 @@
+"""Which keyframes see the same points, and the part of the map that a local bundle adjusts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import MeasurementConfig, WindowConfig
+from kiteline_basestation.map.map_tables import BIRTH, NO_POSE
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.disparity_calibration import offsets
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.optimisation.bundle import BundleProblem
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of the map as rows and slots, and the problem made of it: same order, same lengths."""
+
+    rows: I32  # (k,) keyframe rows
+    points: I32  # (n,) slots of roots
+    slots: I32  # (m,) slots of the observations
+    problem: BundleProblem
+
+
+def covisible_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, min_shared: int) -> list[KeyframeId]:
+    """Keyframes of the same map that share at least min_shared points, most first, newer first among equals."""
+    shared = sparse_map.covisible(sparse_map.points_of(keyframe))
+    rows = np.flatnonzero(shared >= max(min_shared, 1))
+    ids = sparse_map.keyframes.id[rows]
+    order = np.lexsort((-ids, -shared[rows]))
+    return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe]
+
+
+def local_window(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: WindowConfig, measurement: MeasurementConfig
+) -> Window | None:
+    """The keyframe, its most covisible ones, all they see, and the keyframes that hold these points in place."""
+    free = [keyframe, *covisible_keyframes(sparse_map, keyframe, config.min_shared)[: config.free - 1]]
+    parent = keyframe
+    while len(free) < config.free // 2:  # few points are known: go on along the way that the agent came
+        parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[parent]]))
+        if parent not in sparse_map or sparse_map.pose(parent) is None:
+            break
+        if parent not in free:
+            free.append(parent)
+    return window(sparse_map, free, config, measurement)
+
+
+def window(
+    sparse_map: SparseMap, free: list[KeyframeId], config: WindowConfig, measurement: MeasurementConfig,
+    held: set[KeyframeId] | None = None,
+) -> Window | None:  # fmt: skip
+    """The bundle problem that moves the keyframes `free`, all of one map, but none of `held`, which is the first one
+    of each submap unless it is said.
+    """
+    table, keyframes = sparse_map.keypoints, sparse_map.keyframes
+    submaps = sparse_map.island(submap_of_keyframe(free[0]))
+    held = {sparse_map.submaps[s][0] for s in submaps} if held is None else held
+    points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in free]))
+    _, known = sparse_map.positions(points)
+    points = points[known]
+    starts, slots = sparse_map.observations(points)
+    which = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(starts))
+
+    # Keep the free keyframes, and of the others those that see most.
+    free_rows = np.array([sparse_map.rows[k] for k in free], np.int32)
+    counts = np.bincount(table.row[slots], minlength=len(sparse_map))
+    rows_inside = np.array([sparse_map.rows[k] for s in submaps for k in sparse_map.submaps[s]], np.int32)
+    mask = np.zeros(len(sparse_map), bool)
+    mask[rows_inside] = True
+    mask &= keyframes.pose_source[: len(sparse_map)] != NO_POSE
+    counts[~mask] = 0
+    counts[free_rows] = 0
+    others = np.flatnonzero(counts > 0)
+    order = np.lexsort((-keyframes.id[others], -counts[others]))
+    others = others[order[: config.fixed]].astype(np.int32)
+    rows = np.concatenate([free_rows, others])
+    rows = rows[np.argsort(keyframes.id[rows])]
+    number = np.full(len(sparse_map), -1, np.int32)
+    number[rows] = np.arange(len(rows))
+    keep = number[table.row[slots]] >= 0
+
+    # Points need two views to say anything about poses.
+    seen = np.bincount(which[keep], minlength=len(points))
+    keep &= seen[which] >= 2
+    points = points[seen >= 2]
+    if len(points) < config.min_points:
+        return None
+    slots = slots[keep]
+    starts = np.concatenate([[0], np.cumsum(seen[seen >= 2])]).astype(np.int32)
+
+    moves = np.isin(rows, free_rows) & ~np.isin(keyframes.id[rows], np.array(sorted(held), np.int64))
+    if moves.all():
+        moves[0] = False
+    if not moves.any():
+        return None
+    positions, _ = sparse_map.positions(points)
+    measured, sigma = measurements(sparse_map, slots, measurement)
+    problem = BundleProblem(
+        _inverted(keyframes.T_w_k[rows]), keyframes.camera[rows], moves, positions, starts,
+        number[table.row[slots]], measured, sigma,
+    )  # fmt: skip
+    return Window(rows, points, slots, problem)
+
+
+def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -> tuple[F64, F64]:
+    """What observations measured, (m,3) u, v, disparity (-1 none) in px, and how well, (m,2) sigma in px."""
+    table = sparse_map.keypoints
+    rows = table.row[slots]
+    deep = np.zeros(len(sparse_map), bool)
+    sigma = np.full(len(sparse_map), config.sigma_disparity_px)
+    for row in np.unique(rows).tolist():
+        agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
+        camera = sparse_map.cameras.get(agent)
+        if agent in sparse_map.disparity_known:
+            sigma[row] = config.sigma_settled_px
+        deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
+    ranged = (table.inv_depth[slots] > 0) & deep[rows]
+    measured = np.empty((len(slots), 3))
+    measured[:, :2] = table.uv[slots]
+    disparity = sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots] - offsets(sparse_map, slots)
+    measured[:, 2] = np.where(ranged, np.maximum(disparity, 0.0), -1.0)
+    octave = table.octave[slots].astype(np.float64)
+    aligned = config.sigma_growth**octave
+    fused = (table.kind[slots] == BIRTH) & (table.root[slots] != slots)
+    pixel = np.where(fused, config.fused_px * config.fused_growth**octave, config.sigma_px * aligned)
+    return measured, np.stack([pixel, sigma[rows] * aligned], 1)
+
+
+def _inverted(poses: F64) -> F64:
+    out = np.zeros_like(poses)
+    out[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], poses[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out

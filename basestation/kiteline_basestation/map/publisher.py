@@ -1,0 +1,116 @@
+"""Gathers what changed in the map and words it as records for the agents that own the keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.map.map_tables import BIRTH, CULLED, REFINED, REFINED_POSE, REMOVED
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_codec.schema import Culled, Depths, Found, Kind, Placement, Pose, Record, Removed
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
+
+
+class Publisher:
+    """The dirty values of the base. A record always tells the whole value, so that a later one replaces an earlier."""
+
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self._map = sparse_map
+        self._dirty: set[tuple[int, KeyframeId]] = set()
+        self._records: list[tuple[AgentId, Record]] = []
+
+    def touch(self, kind: Kind, keyframe: KeyframeId) -> None:
+        """A value of a keyframe has changed."""
+        self._dirty.add((int(kind), keyframe))
+
+    def touch_slots(self, kind: Kind, slots: I32) -> None:
+        """Values of the keyframes that own these slots have changed."""
+        for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
+            self.touch(kind, KeyframeId(keyframe))
+
+    def place(self, submap: SubmapId, S_w_m: F64) -> None:
+        """A submap has a new place in the world, or another unit of length in it."""
+        self._records.append((agent_of_submap(submap), Placement(submap, S_w_m)))
+
+    def forget_place(self, submap: SubmapId) -> None:
+        """A submap has no place any more: what is not said yet is not to be said."""
+        self._records = [
+            (a, r) for a, r in self._records if not (isinstance(r, Placement) and r.submap == submap)
+        ]  # fmt: skip
+
+    def send(self, agent: AgentId, record: Record) -> None:
+        """Any other record, as it is."""
+        self._records.append((agent, record))
+
+    def collect(self) -> Published:
+        """All that changed since the last call, by agent, in order of kind and keyframe."""
+        out: dict[AgentId, list[Record]] = {}
+        for agent, record in self._records:
+            out.setdefault(agent, []).append(record)
+        for kind, keyframe in sorted(self._dirty):
+            made = self._record(Kind(kind), keyframe)
+            if made is not None:
+                out.setdefault(agent_of_keyframe(keyframe), []).append(made)
+        self._records.clear()
+        self._dirty.clear()
+        return tuple((agent, tuple(records)) for agent, records in sorted(out.items()))
+
+    def _record(self, kind: Kind, keyframe: KeyframeId) -> Record | None:
+        sparse_map, table = self._map, self._map.keypoints
+        slots = sparse_map.slots_of(keyframe)
+        row = sparse_map.rows[keyframe]
+        born = table.kind[slots] == BIRTH
+        if kind is Kind.POSE:
+            if sparse_map.keyframes.pose_source[row] != REFINED_POSE:
+                return None
+            return Pose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
+        if kind is Kind.DEPTHS:
+            here = slots[born & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)]
+            return Depths(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
+        if kind is Kind.FOUND:
+            here = slots[born & (table.root[slots] != slots)]
+            return Found(keyframe, self._index(here), sparse_map.point_ids(table.root[here]))
+        if kind is Kind.REMOVED:
+            return Removed(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
+        if kind is Kind.CULLED:
+            here = slots[born & (table.flags[slots] & CULLED != 0)]
+            return Culled(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
+        raise ValueError(f"the base writes no {kind.name} of a keyframe")
+
+    def _index(self, slots: I32) -> NDArray[np.uint16]:
+        return self._map.keypoint_of(slots).astype(np.uint16)
+
+
+def adopt(sparse_map: SparseMap, record: Record) -> None:
+    """Make a record that the base wrote true in the map: as quantised just now, or as an earlier base left it.
+
+    Records of keyframes that are not here, and what is true already, change nothing.
+    """
+    if not isinstance(record, Pose | Depths | Found | Removed | Culled) or record.keyframe not in sparse_map:
+        return
+    if isinstance(record, Pose):
+        sparse_map.set_pose(record.keyframe, record.T_m_k)
+        return
+    row = sparse_map.rows[record.keyframe]
+    known = record.index < sparse_map.keyframes.count[row]
+    slots = (int(sparse_map.keyframes.start[row]) + record.index[known].astype(np.int32)).astype(np.int32)
+    flags = sparse_map.keypoints.flags
+    if isinstance(record, Depths):
+        sparse_map.set_depths(slots, record.inv_depth[known], record.offset[known])
+    elif isinstance(record, Found):
+        roots = sparse_map.find_points(record.point[known])
+        for slot, root in zip(slots.tolist(), roots.tolist()):
+            if root >= 0 and sparse_map.keypoints.root[slot] == slot != root:
+                sparse_map.fuse(slot, int(sparse_map.keypoints.root[root]))
+    else:
+        bit = REMOVED if isinstance(record, Removed) else CULLED
+        fresh = slots[flags[slots] & bit == 0]
+        if len(fresh):
+            sparse_map.set_flags(fresh, bit)
+        if isinstance(record, Culled) and record.keyframe_too:
+            sparse_map.cull_keyframe(record.keyframe)

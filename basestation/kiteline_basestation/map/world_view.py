@@ -1,0 +1,75 @@
+"""The placed part of the map in w, as the grid and the exports take it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.geometry import sim3
+from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, SubmapId
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class GridView:
+    """The placed part of the map as `grid.build` takes it, and what its rows mean.
+
+    keyframes: (n,) ids of the rows of positions. point_ids: (m,). observations: (k,2) rows of positions and of points.
+    metric: (n,) keyframes of maps in metres.
+    """
+
+    keyframes: I64
+    positions: F64
+    point_ids: I64
+    points: F64
+    observations: I64
+    metric: NDArray[np.bool_]
+
+    @property
+    def rays(self) -> I64:
+        """Observations from which cells can be made: a map in a unit of its own says nothing of metres."""
+        return self.observations[self.metric[self.observations[:, 0]]]
+
+
+def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> GridView:
+    """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
+    rows, positions, metric = [], [], []
+    for submap in sorted(placements):
+        S_w_m, metres = placements[submap], not sparse_map.own_unit(sparse_map.island_of(submap))
+        for keyframe in sparse_map.submaps.get(submap, []):
+            pose = sparse_map.pose(keyframe)
+            if pose is not None:
+                rows.append(sparse_map.rows[keyframe])
+                positions.append((S_w_m @ pose)[:3, 3])
+                metric.append(metres)
+    number = np.full(len(sparse_map), -1, np.int64)
+    number[rows] = np.arange(len(rows))
+    points = sparse_map.roots()
+    xyz, known = sparse_map.positions(points)
+    known &= number[sparse_map.keypoints.row[points]] >= 0
+    points, xyz = points[known], xyz[known]
+    starts, slots = sparse_map.observations(points)
+    seen = np.diff(starts)
+    which = np.repeat(np.arange(len(points)), seen)
+    keep = (seen >= 2)[which] & (number[sparse_map.keypoints.row[slots]] >= 0)
+    renumber = np.cumsum(seen >= 2) - 1
+    pairs = np.stack([number[sparse_map.keypoints.row[slots[keep]]], renumber[which[keep]]], 1).astype(np.int64)
+    points, xyz = points[seen >= 2], xyz[seen >= 2]
+    for submap in sorted(placements):
+        inside = sparse_map.point_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
+        T = placements[submap] @ sim3.inverse(sparse_map.frame(submap))
+        xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
+    return GridView(
+        sparse_map.keyframes.id[rows].copy(),
+        np.array(positions).reshape(-1, 3),
+        sparse_map.point_ids(points),
+        xyz,
+        pairs,
+        np.array(metric, np.bool_),
+    )

@@ -1,0 +1,182 @@
+"""The essential graph: keyframes held together by their spanning tree, by strong covisibility and by loops.
+
+Source: H. Strasdat et al., "Double window optimisation for constant time visual SLAM", and the essential graph of
+ORB-SLAM2; solved by Gauss-Newton in gtsam. Loops count less the more they contradict the rest (Huber).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GraphConfig
+from kiteline_core.geometry import se3
+
+if TYPE_CHECKING:
+    import gtsam
+
+Bools = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class GraphInputs:
+    """A pose graph. keyframes: (n,) ids. T_w_k: (n,4,4) the start. held: (n,) which do not move.
+
+    edges: (m,2) rows a, b. T_a_b: (m,4,4). sigma: (m,2) m and rad. loop: (m,) which may be wrong. scaled: where the
+    unit of length may drift along the way, else None.
+    """
+
+    keyframes: I64
+    T_w_k: F64
+    held: Bools
+    edges: I64
+    T_a_b: F64
+    sigma: F64
+    loop: Bools
+    config: GraphConfig
+    scaled: Scaled | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scaled:
+    """Seven degrees of freedom. free: (n,) keyframes before which lengths may grow. scale: (m,) of an edge, how much
+    longer a has what b has. sigma: (m,) of its logarithm.
+    """
+
+    free: Bools
+    scale: F64
+    sigma: F64
+
+
+@dataclass(frozen=True, slots=True)
+class GraphResult:
+    """T_w_k: (n,4,4). scale: (n,) by which lengths before each keyframe grow. residual: (m,) deviations by which each
+    edge is off. cost_ops: arithmetic operations.
+    """
+
+    keyframes: I64
+    T_w_k: F64
+    scale: F64
+    residual: F64
+    cost_ops: int
+
+
+def optimise(inputs: GraphInputs) -> GraphResult:
+    """Where the keyframes lie when all edges are heard."""
+    return _with_scale(inputs, inputs.scaled) if inputs.scaled is not None else _rigid(inputs)
+
+
+def _rigid(inputs: GraphInputs) -> GraphResult:
+    import gtsam  # heavy, and needed only here
+
+    noises: dict[tuple[float, ...], gtsam.noiseModel.Base] = {}
+    for row in np.unique(np.column_stack([inputs.sigma, inputs.loop]), axis=0):
+        sigmas = np.array([row[1]] * 3 + [row[0]] * 3)  # gtsam has rotation first
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        if row[2]:
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(inputs.config.huber)
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
+        noises[tuple(row.tolist())] = noise
+    start = gtsam.Values()
+    for i, pose in enumerate(inputs.T_w_k):
+        start.insert(i, gtsam.Pose3(pose))
+    graph = gtsam.NonlinearFactorGraph()
+    firm = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    for i in np.flatnonzero(inputs.held).tolist():
+        graph.add(gtsam.PriorFactorPose3(i, gtsam.Pose3(inputs.T_w_k[i]), firm))
+    keys = np.column_stack([inputs.sigma, inputs.loop]).tolist()
+    for (a, b), T, key in zip(inputs.edges.tolist(), inputs.T_a_b, keys):
+        graph.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T), noises[tuple(key)]))
+    params = gtsam.GaussNewtonParams()
+    params.setMaxIterations(inputs.config.iterations)
+    params.setRelativeErrorTol(inputs.config.stop)
+    optimiser = gtsam.GaussNewtonOptimizer(graph, start, params)
+    values = optimiser.optimize()
+    poses = np.stack([values.atPose3(i).matrix() for i in range(len(inputs.T_w_k))])
+    if not np.isfinite(poses).all():
+        poses = inputs.T_w_k.copy()
+    poses[inputs.held] = inputs.T_w_k[inputs.held]
+    work = int(optimiser.iterations()) * (8_000 * len(inputs.edges) + 6_000 * len(poses))
+    return GraphResult(
+        inputs.keyframes, poses, np.ones(len(poses)), residuals(inputs, poses),
+        300_000 + 6_000 * len(inputs.edges) + work // 4,
+    )  # fmt: skip
+
+
+def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
+    """The same over similarities (H. Strasdat et al., "Scale drift-aware large scale monocular SLAM", 2010)."""
+    import gtsam
+
+    config = inputs.config
+    noises: dict[tuple[float, ...], gtsam.noiseModel.Base] = {}
+    rows = np.column_stack([inputs.sigma, scaled.sigma, inputs.loop])
+    for row in np.unique(rows, axis=0):
+        sigmas = np.array([row[1]] * 3 + [row[0]] * 3 + [row[2]])  # gtsam: rotation, translation, scale
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        if row[3]:
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(config.huber)
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
+        noises[tuple(row.tolist())] = noise
+    start = gtsam.Values()
+    graph = gtsam.NonlinearFactorGraph()
+    firm = gtsam.noiseModel.Isotropic.Sigma(7, 1e-6)
+    one = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e6] * 6 + [1e-6]))
+    for i, pose in enumerate(inputs.T_w_k):
+        here = _similarity(pose, 1.0)
+        start.insert(i, here)
+        if inputs.held[i] or not scaled.free[i]:
+            graph.add(gtsam.PriorFactorSimilarity3(i, here, firm if inputs.held[i] else one))
+    for (a, b), T, scale, key in zip(inputs.edges.tolist(), inputs.T_a_b, scaled.scale.tolist(), rows.tolist()):
+        graph.add(gtsam.BetweenFactorSimilarity3(a, b, _similarity(T, scale), noises[tuple(key)]))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(config.scaled_iterations)
+    params.setRelativeErrorTol(config.stop)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
+    values = optimiser.optimize()
+    found = [values.atSimilarity3(i) for i in range(len(inputs.T_w_k))]
+    scale = np.array([S.scale() for S in found])
+    poses = np.stack([se3.from_rt(S.rotation().matrix(), S.scale() * S.translation()) for S in found])
+    if not (np.isfinite(poses).all() and np.isfinite(scale).all() and (scale > 0.0).all()):
+        poses, scale = inputs.T_w_k.copy(), np.ones(len(poses))
+    poses[inputs.held], scale[inputs.held] = inputs.T_w_k[inputs.held], 1.0
+    scale[~scaled.free] = 1.0
+    work = int(optimiser.iterations()) * (12_000 * len(inputs.edges) + 9_000 * len(poses))
+    off = residuals(inputs, poses, scale)
+    return GraphResult(inputs.keyframes, poses, scale, off, 300_000 + 9_000 * len(inputs.edges) + work // 4)
+
+
+def _similarity(T: F64, scale: float) -> gtsam.Similarity3:
+    """gtsam's p -> scale (R p + t)."""
+    import gtsam
+
+    return gtsam.Similarity3(gtsam.Rot3(T[:3, :3]), T[:3, 3] / scale, scale)
+
+
+def residuals(inputs: GraphInputs, T_w_k: F64, scale: F64 | None = None) -> F64:
+    """By how many deviations (m,) each edge is off. scale: (n,) by which lengths before the keyframes grew."""
+    if len(inputs.edges) == 0:
+        return np.empty(0)
+    T_a_b = _inverses(T_w_k[inputs.edges[:, 0]]) @ T_w_k[inputs.edges[:, 1]]
+    if scale is not None and inputs.scaled is not None:
+        T_a_b[:, :3, 3] /= scale[inputs.edges[:, 0], None]
+        grown = scale[inputs.edges[:, 1]] / scale[inputs.edges[:, 0]]
+        stretch = np.log(grown / inputs.scaled.scale) / inputs.scaled.sigma
+    else:
+        stretch = np.zeros(len(T_a_b))
+    error = _inverses(inputs.T_a_b) @ T_a_b
+    shift = np.linalg.norm(error[:, :3, 3], axis=1) / inputs.sigma[:, 0]
+    chord = np.linalg.norm(error[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    turn = 2.0 * np.arcsin(np.minimum(chord, 1.0)) / inputs.sigma[:, 1]
+    return np.asarray(np.sqrt(shift**2 + turn**2 + stretch**2))
+
+
+def _inverses(poses: F64) -> F64:
+    out = np.tile(np.eye(4), (len(poses), 1, 1))
+    out[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], poses[:, :3, 3])
+    return out

@@ -1,0 +1,304 @@
+"""Proves that a keyframe looks at what older keyframes saw: by the points that both see, and by where they lie.
+
+Guided matching, absolute pose by RANSAC, then the neighbours' points, as in ORB-SLAM2 section III-E; what looks alike
+must also fill the image, stand in several depths, and be found where it is foreseen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.map.covisibility import covisible_keyframes
+from kiteline_basestation.map.map_tables import BIRTH
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.refind import foresee
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.imaging import matching
+from kiteline_core.imaging.descriptors import comparable
+from kiteline_core.pose import pnp
+from kiteline_core.pose.pose_kernels import optimise_pose
+
+Bools = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+
+
+_UNIT_RATIO = 1.15  # of depths: what drifts of one eye leave; another unit is farther off
+_UNIT_POINTS = 8  # with depth in both maps; fewer say nothing
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a keyframe sees, one row an observation.
+
+    slots, points: (n,) observations and roots. uv: (n,2) px. disparity: (n,) px, -1 none. octave, angle: (n,).
+    descriptor: (n,32). xyz: (n,3) m in w. known: (n,) whether xyz means something.
+    """
+
+    slots: I32
+    points: I32
+    uv: F64
+    disparity: F64
+    octave: U8
+    angle: U8
+    descriptor: U8
+    xyz: F64
+    known: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """A keyframe `new` that proved to see what `old` saw. T_old_new: (4,4). inliers: points that agree.
+
+    mine, theirs: (k,) slots of points of the new and of the old that are one. depth_m: median depth of them. Lengths
+    are in units of the old one's submap. scale: how many of these one unit of the new one's is, where the two stand.
+    """
+
+    new: KeyframeId
+    old: KeyframeId
+    T_old_new: F64
+    inliers: int
+    mine: I32
+    theirs: I32
+    depth_m: float
+    scale: float = 1.0
+
+
+def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
+    """All that a keyframe sees; what was born elsewhere is described by its birth, turned as the keyframe sees it."""
+    table = sparse_map.keypoints
+    row = sparse_map.rows[keyframe]
+    slots = sparse_map.observed(keyframe)
+    points = table.root[slots]
+    from_birth = np.where(table.kind[slots] == BIRTH, slots, points)
+    T = sparse_map.keyframes.T_w_k
+    turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[from_birth], :3, :3])
+    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    angle = (table.angle[from_birth].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
+    xyz, known = sparse_map.positions(points)
+    bf = sparse_map.keyframes.camera[row, 4]
+    ranged = (table.inv_depth[slots] > 0) & (bf > 0) & (not sparse_map.own_unit(submap_of_keyframe(keyframe)))
+    measured = np.where(ranged, bf * table.inv_depth[slots].astype(np.float64), -1.0)
+    return View(
+        slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle.astype(np.uint8),
+        table.descriptor[from_birth], xyz, known,
+    )  # fmt: skip
+
+
+def find_overlap(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig, view: View | None = None
+) -> Overlap | None:  # fmt: skip
+    """Whether `new` sees what `old` and its neighbours saw, and how the two then lie; None without proof.
+
+    The poses of both are taken from their own maps; how these lie to each other is not used. view: of `new`, if known.
+    """
+    mine = view_of(sparse_map, new) if view is None else view
+    theirs = view_of(sparse_map, old)
+    wanted, offered = comparable(mine.descriptor, theirs.descriptor)
+    pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
+    a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
+    if len(a) < config.min_inliers:
+        return None
+    free = any(sparse_map.own_unit(submap_of_keyframe(k)) for k in (new, old))
+    if free:
+        mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # of another metre than the old map's
+    start = _with_scale(sparse_map, new, old, mine, theirs, a, b, config) if free else None
+    start = start or _by_pixels(sparse_map, new, old, mine, theirs, a, b, config)
+    if start is None:
+        return None
+    observed = np.column_stack([mine.uv, mine.disparity])
+    found = _with_neighbours(sparse_map, new, old, mine, observed, start[0], start[1] if free else 1.0, config)
+    if found is None:
+        return None
+    T_c_w, which, points, share = found
+    if len(which) < config.min_inliers_all or share < config.min_share:
+        return None
+    if not spread_out(sparse_map, new, mine.uv[which], config):
+        return None
+    xyz, _ = sparse_map.positions(points)
+    depth = se3.transform(T_c_w, xyz)[:, 2]
+    T_old_new = se3.orthonormalise(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[old]]) @ se3.inverse(T_c_w))
+    if not free:
+        if not _one_unit(sparse_map, new, mine, which, depth):
+            return None
+        return Overlap(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
+    scale = depth_scale(_own_depth(sparse_map, new, mine, which), depth[mine.known[which]], config)
+    if scale is None:
+        return None
+    unit_new, unit_old = (float(sparse_map.keyframes.unit[sparse_map.rows[k]]) for k in (new, old))
+    return Overlap(
+        new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), mine.points[which], points,
+        float(np.median(depth)) / unit_old, scale * unit_new / unit_old,
+    )  # fmt: skip
+
+
+def _by_pixels(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
+    config: LoopConfig,
+) -> tuple[F64, float] | None:  # fmt: skip
+    """T_c_w (4,4) of the new camera in the old map, by the old map's points, and how much longer that map has what the
+    new one's has, roughly.
+    """
+    rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
+    observed = np.column_stack([mine.uv, mine.disparity])
+    camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
+    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old), config.ransac)
+    if fit is None or fit.inliers < config.min_inliers:
+        return None
+    a, b = a[fit.inlier], b[fit.inlier]
+    other = se3.transform(fit.T_c_m, theirs.xyz[b])[mine.known[a], 2]
+    ratio = other / np.maximum(_own_depth(sparse_map, new, mine, a), 1e-3)
+    return fit.T_c_m, float(np.median(ratio)) if len(ratio) else 1.0
+
+
+def _with_scale(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
+    config: LoopConfig,
+) -> tuple[F64, float] | None:  # fmt: skip
+    """T_c_w (4,4) of the new camera in the old map, and how much longer that map has what the new one's has: by points
+    that both maps have, in either's image (B. Horn, 1987, in RANSAC, as ORB-SLAM does for one eye). Where too few are
+    known to both, pixels say the pose, and the scale follows from what the neighbours know.
+    """
+    both = mine.known[a]
+    a, b = a[both], b[both]
+    if len(a) < config.min_inliers:
+        return None
+    rows = [sparse_map.rows[k] for k in (old, new)]
+    T_old, T_new = sparse_map.keyframes.T_w_k[rows]
+    lens_old, lens_new = sparse_map.keyframes.camera[rows]
+    fit = pnp.align_views(
+        se3.transform(se3.inverse(T_old), theirs.xyz[b]), theirs.uv[b], theirs.octave[b], lens_old,
+        se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
+        True, _seed(new, old), config.ransac,
+    )  # fmt: skip
+    if fit is None or fit.inliers < config.min_inliers or not np.isfinite(fit.S_a_b).all():
+        return None
+    return se3.inverse(se3.orthonormalise(T_old @ sim3.rigid(fit.S_a_b))), fit.scale
+
+
+def _seed(new: KeyframeId, old: KeyframeId) -> int:
+    return int(new) ^ (int(old) << 1)
+
+
+def _own_depth(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32) -> F64:
+    """Depths (k,) in the new camera, by its own map in w, of those rows of its view that have one."""
+    xyz = mine.xyz[which[mine.known[which]]]
+    return se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[new]]), xyz)[:, 2]
+
+
+def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
+    """How much longer one map has what another has, by the depths (n,) of the same points in both; None where these do
+    not say one thing, well enough.
+    """
+    if len(own) < config.scale_points:
+        return None
+    ratio = np.log(np.maximum(other, 1e-3) / np.maximum(own, 1e-3))
+    middle = float(np.median(ratio))
+    apart = np.abs(ratio - middle)
+    close = apart < config.scale_spread
+    sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # of a median
+    if float(np.mean(close)) < config.scale_share or sigma > config.scale_sigma:
+        return None
+    return float(np.exp(middle))
+
+
+def _one_unit(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32, depth: F64) -> bool:
+    """Whether the new keyframe's map has the unit of length of the other, by the depths (k,) m of points seen in both.
+
+    One eye alone has a unit of its own in each submap; a pose from points cannot tell.
+    """
+    known = mine.known[which]
+    if np.count_nonzero(known) < _UNIT_POINTS:
+        return True
+    own = _own_depth(sparse_map, new, mine, which)
+    ratio = float(np.median(depth[known] / np.maximum(own, 1e-3)))
+    return 1.0 / _UNIT_RATIO < ratio < _UNIT_RATIO
+
+
+def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: LoopConfig) -> bool:
+    """Whether pixels (n,2) lie in enough parts of the image: a poster that hangs twice fills only one."""
+    camera = sparse_map.cameras[agent_of_keyframe(keyframe)]
+    column = np.clip(uv[:, 0] * (config.columns / camera.width), 0, config.columns - 1).astype(np.int64)
+    row = np.clip(uv[:, 1] * (config.rows / camera.height), 0, config.rows - 1).astype(np.int64)
+    filled = np.bincount(row * config.columns + column, minlength=config.rows * config.columns)
+    return int(np.count_nonzero(filled >= config.cell_points)) >= config.min_cells
+
+
+def _with_neighbours(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, observed: F64, T_c_w: F64, scale: float,
+    config: LoopConfig,
+) -> tuple[F64, I32, I32, float] | None:  # fmt: skip
+    """Look for all that the old keyframe and its neighbours saw, twice, the second time closer.
+
+    scale: how much longer the old map has what the new one's has. Returns the pose, rows of `mine` and points
+    (k,) that agree, and the share of what should be seen that is.
+    """
+    around = [old, *covisible_keyframes(sparse_map, old, 1)[: config.neighbours]]
+    points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in around]))
+    _, known = sparse_map.positions(points)
+    points = points[known]
+    size = sparse_map.cameras[agent_of_keyframe(new)]
+    camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
+    T = T_c_w
+    for radius in (config.radius_px, 0.5 * config.radius_px):
+        seen, uv, octave, _, _ = foresee(sparse_map, points, new, se3.inverse(T))
+        if len(seen) < config.min_inliers:
+            return None
+        wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)
+        near = matching.match_near(
+            uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave,
+            offered, (size.width, size.height), config.octave_gap, config.match,
+        )  # fmt: skip
+        if len(near.a) < config.min_inliers:
+            return None
+        a, b = near.b, seen[near.a]
+        xyz, _ = sparse_map.positions(b)
+        inlier = np.ones(len(a), np.bool_)
+        T = T.copy()
+        sigma = config.ransac.sigma_px * np.ldexp(1.0, mine.octave[a].astype(np.int32))
+        optimise_pose(
+            T, xyz, _depth_rays(sparse_map, b, xyz, config), np.ascontiguousarray(observed[a]), sigma, camera, T.copy(),
+            np.zeros(6), 3, 5, config.ransac.chi2, inlier, np.zeros((6, 6)),
+        )  # fmt: skip
+        if not np.isfinite(T).all():
+            return None
+    # Of what the new keyframe measured with depth inside the old views, how much is one with what they saw?
+    first, unique = np.unique(a[inlier], return_index=True)
+    share = len(first) / max(1, min(len(seen), _inside(sparse_map, mine, T, scale, new, around)))
+    return T, first.astype(np.int32), np.asarray(b[inlier][unique]), share
+
+
+def _inside(
+    sparse_map: SparseMap, mine: View, T_c_w: F64, scale: float, new: KeyframeId, around: list[KeyframeId]
+) -> int:
+    """How many points of the new keyframe should lie inside the image of one of the old keyframes."""
+    row = sparse_map.rows[new]
+    local = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[row]), mine.xyz)
+    xyz = se3.transform(se3.inverse(T_c_w), scale * local)[mine.known]
+    inside = np.zeros(len(xyz), np.bool_)
+    for keyframe in around:
+        other = sparse_map.rows[keyframe]
+        fx, fy, cx, cy, _ = sparse_map.keyframes.camera[other]
+        there = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[other]), xyz)
+        z = np.maximum(there[:, 2], 1e-3)
+        u, v = fx * there[:, 0] / z + cx, fy * there[:, 1] / z + cy
+        size = sparse_map.cameras[agent_of_keyframe(keyframe)]
+        inside |= (there[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < size.width) & (v < size.height)
+    return int(np.count_nonzero(inside))
+
+
+def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig) -> F64:
+    """One deviation (n,3) m of points along the rays on which they hang."""
+    rows = sparse_map.keypoints.row[points]
+    pose = sparse_map.keyframes.T_w_k[rows]
+    ray = xyz - pose[:, :3, 3]
+    depth = np.maximum(np.einsum("ni,ni->n", pose[:, :3, 2], ray), 1e-3)
+    bf = np.maximum(sparse_map.keyframes.camera[rows, 4], 1.0)
+    own = depth / sparse_map.keyframes.unit[rows]
+    return np.ascontiguousarray(ray * (config.sigma_disparity_px * own / bf)[:, None])

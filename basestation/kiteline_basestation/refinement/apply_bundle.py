@@ -1,0 +1,158 @@
+"""Takes the result of a bundle into the map: poses, points, and the observations that did not agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import CullConfig, PublishConfig
+from kiteline_basestation.map.covisibility import Window
+from kiteline_basestation.map.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
+from kiteline_basestation.map.publisher import Publisher
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_codec.schema import Kind
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_core.optimisation.bundle import BundleResult
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+_AROUND = 8  # keyframes of a submap before which its agent flies, or where it began
+_ENOUGH = 20  # points that tell how much lengths have grown there
+
+
+def apply_bundle(
+    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, cull: CullConfig,
+    publish: PublishConfig,
+) -> None:  # fmt: skip
+    """Write what a bundle found where it differs enough from what both sides hold."""
+    if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
+        return
+    before = sparse_map.keyframes.T_w_k[window.rows].copy()
+    _poses(sparse_map, window, result, publisher, publish)
+    _culled_follow(sparse_map, window, before, publisher)
+    dropped = _observations(sparse_map, window, result, publisher, cull)
+    _points(sparse_map, window, result, dropped, publisher, cull, publish)
+
+
+def _poses(
+    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, publish: PublishConfig
+) -> None:
+    for i in np.flatnonzero(window.problem.free).tolist():
+        row = int(window.rows[i])
+        keyframe = KeyframeId(int(sparse_map.keyframes.id[row]))
+        new = np.linalg.inv(result.T_c_m[i])
+        old = sparse_map.keyframes.T_w_k[row]
+        moved = float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
+        turned = float(np.linalg.norm(new[:3, :3] - old[:3, :3])) / np.sqrt(2.0)  # chord: the angle when small
+        first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # said once, so that an older base's value goes
+        if first or moved > publish.pose_m or turned > publish.pose_rad:
+            sparse_map.set_world_pose(keyframe, new)
+            publisher.touch(Kind.POSE, keyframe)
+
+
+def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher: Publisher) -> None:
+    """A culled keyframe sees nothing that could move it: it goes with the one from which it was measured."""
+    table = sparse_map.keyframes
+    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    for row in np.flatnonzero(table.culled[: len(sparse_map)]).tolist():
+        parent = KeyframeId(int(table.parent[row]))
+        while parent in sparse_map and parent not in number and table.culled[sparse_map.rows[parent]]:
+            parent = KeyframeId(int(table.parent[sparse_map.rows[parent]]))
+        i = number.get(parent)
+        if i is None or np.array_equal(before[i], table.T_w_k[window.rows[i]]) or int(table.id[row]) in number:
+            continue
+        keyframe = KeyframeId(int(table.id[row]))
+        moved = table.T_w_k[window.rows[i]] @ np.linalg.inv(before[i]) @ table.T_w_k[row]
+        sparse_map.set_world_pose(keyframe, se3.orthonormalise(moved))
+        publisher.touch(Kind.POSE, keyframe)
+
+
+def _observations(
+    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, cull: CullConfig
+) -> NDArray[np.bool_]:
+    """Remove outliers. Returns which points of the window (n,) have too few observations left, and drops them."""
+    table = sparse_map.keypoints
+    starts = window.problem.starts
+    which = np.repeat(np.arange(len(window.points)), np.diff(starts))
+    current = table.root[window.slots] == window.points[which]  # else it was fused or taken away meanwhile
+    bad = window.slots[~result.inlier & current]
+    if len(bad):
+        sparse_map.set_flags(bad, REMOVED)
+        publisher.touch_slots(Kind.REMOVED, bad)
+    left = np.diff(sparse_map.observations(window.points)[0])
+    dropped = np.asarray((left < cull.min_observations) & (table.root[window.points] == window.points))
+    drop_points(sparse_map, window.points[dropped], publisher)
+    return dropped
+
+
+def _points(
+    sparse_map: SparseMap, window: Window, result: BundleResult, dropped: NDArray[np.bool_], publisher: Publisher,
+    cull: CullConfig, publish: PublishConfig,
+) -> None:  # fmt: skip
+    table = sparse_map.keypoints
+    alive = ~dropped & (table.root[window.points] == window.points) & (table.flags[window.points] & CULLED == 0)
+    points, positions = window.points[alive], result.points[alive]
+    inv, offset, ahead = sparse_map.bearing_of(points, positions)
+    far_off = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > cull.max_offset_px * np.exp2(table.octave[points]))
+    drop_points(sparse_map, points[far_off], publisher)
+    points, inv, offset = points[~far_off], inv[~far_off], offset[~far_off]
+    bf = sparse_map.keyframes.camera[table.row[points], 4]
+    change = np.maximum(
+        np.abs(inv - sparse_map.inverse_depths(points)) * bf,
+        np.abs(offset - table.offset[points]).max(axis=1, initial=0.0),
+    )
+    moved = points[change > publish.depth_px]
+    if len(moved):
+        sparse_map.set_depths(moved, inv[change > publish.depth_px], offset[change > publish.depth_px])
+        publisher.touch_slots(Kind.DEPTHS, moved)
+
+
+def keep_units(
+    sparse_map: SparseMap, island: SubmapId, window: Window, result: BundleResult
+) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
+    """What a bundle of a whole map did to the units of one eye's submaps is said by their scale, as far as it did it
+    before the newest keyframes: lengths there stay as the agent has them. In a map without a metre, lengths before the
+    oldest keyframes stay as they were in w. Returns the result so, and by what units grew.
+    """
+    own = [submap for submap in sparse_map.island(island) if sparse_map.own_unit(submap)]
+    growth = {s: _growth(sparse_map, sparse_map.submaps[s][-_AROUND:], window, result) for s in own}
+    eldest = sparse_map.island_of(island)
+    if eldest in growth:
+        whole = _growth(sparse_map, sparse_map.submaps[eldest][:_AROUND], window, result)
+        centre = sim3.place(sparse_map.frame(eldest), sparse_map.beginning(eldest))[:3, 3]
+        poses = np.linalg.inv(result.T_c_m)
+        poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
+        result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
+        growth = {submap: more / whole for submap, more in growth.items()}
+    for submap, more in growth.items():
+        sparse_map.stretch_submap(submap, more)
+    return result, growth
+
+
+def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: Window, result: BundleResult) -> float:
+    """By what a bundle stretched depths before keyframes: the median."""
+    table = sparse_map.keyframes
+    rows = [sparse_map.rows[k] for k in keyframes]
+    anchors = sparse_map.keypoints.row[window.points]
+    number = np.full(len(sparse_map), -1, np.int64)
+    number[window.rows] = np.arange(len(window.rows))
+    here = np.isin(anchors, rows) & (number[anchors] >= 0)
+    if np.count_nonzero(here) < _ENOUGH:
+        return 1.0
+    T = result.T_c_m[number[anchors[here]]]
+    after = np.einsum("nj,nj->n", T[:, 2, :3], result.points[here]) + T[:, 2, 3]
+    inverse = sparse_map.inverse_depths(window.points[here]) / table.unit[anchors[here]]
+    good = (after > 0.0) & (inverse > 0.0)
+    return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _ENOUGH else 1.0
+
+
+def drop_points(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:
+    """Cull points (n,) by their slots."""
+    points = points[sparse_map.keypoints.kind[points] == BIRTH]
+    if len(points):
+        sparse_map.set_flags(points, CULLED)
+        publisher.touch_slots(Kind.CULLED, points)

@@ -1,0 +1,152 @@
+"""Recognises known points where the agent bore new ones, in both directions, and fuses them.
+
+Old points are looked for among a new keyframe's births, and its new points among the births of older keyframes
+("DS-PTAM: a distributed stereo PTAM", sections 2.4.4 and 3.1.2). Of two points that prove to be one, the older is the
+root.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import RefindConfig
+from kiteline_basestation.map.covisibility import covisible_keyframes
+from kiteline_basestation.map.map_tables import BIRTH, CULLED, NO_POSE, REFINED, REMOVED
+from kiteline_basestation.map.publisher import Publisher
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement import refind_kernels as kernels
+from kiteline_codec.schema import Kind
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.imaging.descriptors import comparable
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U64 = NDArray[np.uint64]
+
+
+def refind(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig, publisher: Publisher) -> int:
+    """Search both ways between a new keyframe and those that look at the same place. Returns how many points fused."""
+    others = candidates(sparse_map, keyframe, config)
+    if not others:
+        return 0
+    found = 0
+    known = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in others]))
+    known = known[~np.isin(known, sparse_map.points_of(keyframe))]
+    found += _search(sparse_map, known, keyframe, config, publisher)
+    for other in others:
+        new = sparse_map.points_of(keyframe)
+        born_here = new[sparse_map.keypoints.row[new] == sparse_map.rows[keyframe]]
+        found += _search(sparse_map, born_here, other, config, publisher)
+    return found
+
+
+def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig) -> list[KeyframeId]:
+    """Covisible keyframes, then those that stand near and look the same way; never ones without a pose."""
+    covisible = covisible_keyframes(sparse_map, keyframe, 1)[: config.keyframes]
+    table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
+    points = sparse_map.points_of(keyframe)
+    inverse = sparse_map.inverse_depths(points) / table.unit[sparse_map.keypoints.row[points]]
+    inverse = inverse[inverse > 0]
+    if len(inverse) == 0:
+        return covisible
+    reach = config.near_ratio / float(np.median(inverse))
+    same = [k for s in sparse_map.island(submap_of_keyframe(keyframe)) for k in sparse_map.submaps[s]]
+    rows = np.array([sparse_map.rows[k] for k in same], np.int32)
+    poses = table.T_w_k[rows]
+    distance = np.linalg.norm(poses[:, :3, 3] - table.T_w_k[row, :3, 3], axis=1)
+    cosine = poses[:, :3, 2] @ table.T_w_k[row, :3, 2]
+    near = (distance < reach) & (cosine > config.near_cosine) & (table.pose_source[rows] != NO_POSE)
+    near &= (rows != row) & (table.culled[rows] == 0)
+    order = np.argsort(distance[near], kind="stable")
+    taken = set(covisible)
+    extra = [same[i] for i in np.flatnonzero(near)[order].tolist() if same[i] not in taken]
+    return covisible + extra[: config.near_keyframes]
+
+
+def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: RefindConfig, publisher: Publisher) -> int:
+    """Match points (n,) (roots) with the births of a keyframe and fuse what is one."""
+    table = sparse_map.keypoints
+    slots = sparse_map.slots_of(target)
+    slots = slots[(table.kind[slots] == BIRTH) & (table.flags[slots] & (REMOVED | CULLED) == 0)]
+    slots = slots[table.flags[table.root[slots]] & CULLED == 0]
+    if len(points) == 0 or len(slots) == 0:
+        return 0
+    points, uv, octave, angle, disparity = foresee(sparse_map, points, target)
+    if len(points) == 0:
+        return 0
+    row = sparse_map.rows[target]
+    bf = sparse_map.keyframes.camera[row, 4]
+    ranged = (table.inv_depth[slots] > 0) & (not sparse_map.own_unit(submap_of_keyframe(target)))
+    measured = np.where(ranged, bf * table.inv_depth[slots], -1.0).astype(np.float64)
+    best = np.empty(len(points), np.int32)
+    distance = np.zeros(len(points), np.int32)
+    wanted, offered = descriptors(sparse_map, points, slots)
+    kernels.match_projected(
+        uv, octave, angle, disparity, wanted,
+        table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured,
+        offered,
+        config.radius_px, config.octave_gap, config.angle_gap, config.disparity_px, config.max_hamming, config.ratio,
+        best, distance,
+    )  # fmt: skip
+    found = 0
+    for i in np.flatnonzero(best >= 0).tolist():
+        found += fuse(sparse_map, int(points[i]), int(table.root[slots[best[i]]]), publisher)
+    return found
+
+
+def foresee(
+    sparse_map: SparseMap, points: I32, target: KeyframeId, T_w_k: F64 | None = None
+) -> tuple[I32, F64, F64, NDArray[np.uint8], F64]:  # fmt: skip
+    """How a keyframe would see points (n,): those inside its image, with pixel, octave, angle and disparity.
+
+    T_w_k: (4,4) where the keyframe is thought to be, if not where the map has it.
+    """
+    table, keyframes = sparse_map.keypoints, sparse_map.keyframes
+    row = sparse_map.rows[target]
+    xyz, known = sparse_map.positions(points)
+    points, xyz = points[known], xyz[known]
+    T = keyframes.T_w_k[row] if T_w_k is None else T_w_k
+    local = (xyz - T[:3, 3]) @ T[:3, :3]
+    fx, fy, cx, cy, bf = keyframes.camera[row]
+    z = np.maximum(local[:, 2], 1e-3)
+    uv = np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], 1)
+    camera = sparse_map.cameras[agent_of_keyframe(target)]
+    inside = (local[:, 2] > 0.1) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+    points, uv, z, xyz = points[inside], uv[inside], z[inside], xyz[inside]
+    anchors = keyframes.T_w_k[table.row[points]]
+    depth = np.einsum("ni,ni->n", anchors[:, :3, 2], xyz - anchors[:, :3, 3])
+    octave = table.octave[points] + np.log2(np.maximum(depth, 1e-3) / z)
+    turn = np.einsum("ji,njk->nik", T[:3, :3], anchors[:, :3, :3])  # R_target_anchor
+    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    angle = (table.angle[points].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
+    return points, uv, octave, angle.astype(np.uint8), bf / z
+
+
+def descriptors(sparse_map: SparseMap, a: I32, b: I32) -> tuple[U64, U64]:
+    """Descriptors (n,4) and (m,4) uint64 of two sets of births, to be compared with each other."""
+    of = sparse_map.keypoints.descriptor
+    left, right = comparable(of[a], of[b])
+    return np.ascontiguousarray(left).view(np.uint64), np.ascontiguousarray(right).view(np.uint64)
+
+
+def fuse(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
+    """Make two roots one, the older the root, unless one keyframe sees both. A depth known to one is known to both."""
+    if a == b or sparse_map.one_keyframe_sees_both(a, b):
+        return False
+    pair = np.array([a, b], np.int32)
+    ids = sparse_map.point_ids(pair)
+    parent, child = pair[np.argsort(ids)]
+    xyz, known = sparse_map.positions(pair[np.argsort(ids)])
+    if not known[0] and known[1]:
+        one = np.array([parent], np.int32)
+        inverse, offset, ahead = sparse_map.bearing_of(one, xyz[1:])
+        if not ahead[0]:
+            return False
+        sparse_map.set_depths(one, inverse, offset)
+        publisher.touch_slots(Kind.DEPTHS, one)
+    if sparse_map.keypoints.flags[child] & REFINED:
+        publisher.touch_slots(Kind.DEPTHS, np.array([child], np.int32))  # it leaves its keyframe's table
+    for keyframe in sparse_map.fuse(int(child), int(parent)):
+        publisher.touch(Kind.FOUND, keyframe)
+    return True

@@ -1,0 +1,82 @@
+"""The map in other tools' formats, as bytes: labelled PLY, TUM trajectories, g2o pose graphs.
+
+map_ply(points, labels, observations) -> base/map.ply
+tum(t_ns, T_w_b) -> base/agentN.tum
+g2o(keyframes, T_w_k, edges) -> the keyframe graph
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.tum import line
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+LABEL_COLOURS: U8 = np.array([[150, 150, 150], [88, 160, 96], [214, 96, 60]], np.uint8)  # unlabelled, ground, obstacle
+
+# One vertex, packed: 18 bytes.
+_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1"), ("observations", "<u2")])
+
+
+def map_ply(points: F64, labels: U8, observations: I64, colours: U8 | None = None) -> bytes:
+    """Map points as a binary PLY. points: (n,3) in w, m. labels: (n,) 0 unlabelled, 1 ground, 2 obstacle.
+
+    observations: (n,) how many keyframes see each point. colours: (n,3) RGB; by label when not given. Raises ValueError
+    when the lengths differ.
+    """
+    n = len(points)
+    if len(labels) != n or len(observations) != n or (colours is not None and len(colours) != n):
+        raise ValueError(f"{n} points, {len(labels)} labels, {len(observations)} observation counts: want one a point")
+    vertex = np.zeros(n, _VERTEX)
+    vertex["xyz"] = points
+    vertex["rgb"] = LABEL_COLOURS[np.minimum(labels, 2)] if colours is None else colours
+    vertex["label"] = labels
+    vertex["observations"] = np.minimum(observations, 65535)
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        "comment map points in w, metres, z up; label 0 unlabelled, 1 ground, 2 obstacle\n"
+        f"element vertex {n}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+        "property uchar label\nproperty ushort observations\nend_header\n"
+    )
+    return header.encode() + vertex.tobytes()
+
+
+def tum(t_ns: I64, poses: F64) -> bytes:
+    """A trajectory in TUM format. t_ns: (n,) int64. poses: (n,4,4), such as T_w_b. One line a pose."""
+    return "".join(line(int(t), pose) for t, pose in zip(t_ns, poses, strict=True)).encode()
+
+
+def g2o(
+    keyframes: I64, poses: F64, edges: I64, weights: F64 | None = None, scale: F64 | None = None
+) -> bytes:  # fmt: skip
+    """A pose graph for g2o and its readers. keyframes: (n,) ids. poses: (n,4,4) T_w_k. edges: (e,2) rows of poses.
+
+    Vertices are numbered by row, for many readers hold 32 bits only; a comment names each keyframe. An edge
+    measures the relative pose as it stands. weights: (e,) of the edges' information, else 1. The first vertex is fixed.
+    scale: (n,) units of w in one of those in which a keyframe's agent measures; the comment tells it where it is not 1.
+    """
+    scale = np.ones(len(keyframes)) if scale is None else scale
+    weights = np.ones(len(edges)) if weights is None else weights
+    lines = [
+        f"# vertex {i} is keyframe {k}{'' if s == 1.0 else f', scale {s:.9g}'}\n"
+        for i, (k, s) in enumerate(zip(keyframes, scale, strict=True))
+    ]
+    lines += [f"VERTEX_SE3:QUAT {i} {_pose_text(pose)}\n" for i, pose in enumerate(poses)]
+    if len(poses):
+        lines.append("FIX 0\n")
+    for (a, b), weight in zip(edges, weights, strict=True):
+        upper = " ".join(f"{weight if i == j else 0.0:.9g}" for i in range(6) for j in range(i, 6))
+        lines.append(f"EDGE_SE3:QUAT {a} {b} {_pose_text(se3.inverse(poses[a]) @ poses[b])} {upper}\n")
+    return "".join(lines).encode()
+
+
+def _pose_text(pose: F64) -> str:
+    """x y z qx qy qz qw of a pose (4,4)."""
+    return line(0, pose).split(" ", 1)[1].rstrip()

@@ -1,0 +1,141 @@
+"""How the steps of a base stand in its log: first what went in, then what came out. Pure: the log is handed in.
+
+Each step begins with a /step record. A job's result is not kept, only its fingerprint: a replay works the job out again
+from the same inputs and hands it in at the same step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.management import Command
+from kiteline_basestation.runtime.jobs import JobDone
+from kiteline_basestation.runtime.options import BaseSpec, coded_channels, from_json
+from kiteline_basestation.station import Import, Station, StationOutput
+from kiteline_basestation.store.kept import Codes, Kept, pack, unpack
+from kiteline_core import config as configuration
+from kiteline_core.ids import AgentId
+from kiteline_core.places.place_index import Vocabulary
+
+STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/import", "/command", "/answer"
+
+
+def metadata_of(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
+    """What a log says of its base, so that it can be run again."""
+    unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
+    plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
+    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
+    channel = "PlainChannel" if plain_channels else "CodedChannel"
+    return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
+
+
+def station_of(metadata: Mapping[str, str], words: Vocabulary | None) -> Station:
+    """A station as the one of a base's log was."""
+    config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
+    logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseSpec.__dataclass_fields__}
+    spec = from_json(json.dumps({"folder": "", **logged}))
+    return Station(config, coded_channels(replace(spec, link=spec.link + ":")), words)
+
+
+class StepLog(Protocol):
+    """The part of a log that steps are written with; kiteline_hw.mcap_log.LogWriter is one."""
+
+    def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
+    def json(self, topic: str, t_ns: int, value: object) -> None: ...
+
+
+class StepMessage(Protocol):
+    """What is read back; kiteline_hw.mcap_log.LogMessage is one."""
+
+    @property
+    def topic(self) -> str: ...
+    def blob(self) -> bytes: ...
+    def json(self) -> Any: ...
+
+
+def packets_in(agent: int) -> str:
+    """The topic of the packets that came from an agent."""
+    return f"/agent{agent}/packets/in"
+
+
+def packets_out(agent: int) -> str:
+    """The topic of the packets to an agent."""
+    return f"/agent{agent}/packets/out"
+
+
+def write_step(
+    log: StepLog,
+    packets: Mapping[AgentId, Sequence[bytes]],
+    done: Sequence[JobDone],
+    output: StationOutput,
+    now_ns: int,
+    log_ns: int,
+    orders: Sequence[Import | Command] = (),
+) -> None:
+    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+    log.json(
+        STEP,
+        log_ns,
+        {
+            "now_ns": now_ns,
+            "agents": {str(agent): len(packets[agent]) for agent in sorted(packets)},
+            "done": [job.id for job in done],
+            "jobs": [[job.id, job.kind] for job in output.jobs],
+            "sent": {str(agent): len(out) for agent, out in output.packets},
+        },
+    )
+    for agent in sorted(packets):
+        for packet in packets[agent]:
+            log.blob(packets_in(agent), log_ns, packet)
+    for order in orders:
+        if isinstance(order, Import):
+            log.blob(IMPORT, log_ns, pack(Kept({order.agent: Codes(dict(order.codes), {})})))
+        else:
+            log.json(COMMAND, log_ns, {"id": order.id, "verb": order.verb, "text": order.text})
+    for job in done:
+        log.json(JOB, log_ns, {"id": job.id, "cost_ops": job.cost_ops, "result": fingerprint(job)})
+    for answer in output.answers:
+        log.json(ANSWER, log_ns, {"id": answer.id, "ok": answer.ok, "text": answer.text})
+    for agent, out in output.packets:
+        for packet in out:
+            log.blob(packets_out(agent), log_ns, packet)
+
+
+def read_orders(messages: Iterable[StepMessage]) -> tuple[Import | Command, ...]:
+    """The orders of one step, in order. Raises WireError."""
+    out: list[Import | Command] = []
+    for message in messages:
+        if message.topic == IMPORT:
+            agents = unpack(message.blob()).agents
+            out += [Import(agent, tuple(codes.received.items())) for agent, codes in agents.items()]
+        elif message.topic == COMMAND:
+            out.append(Command(**message.json()))
+    return tuple(out)
+
+
+def fingerprint(done: JobDone) -> str:
+    """A digest of a job's result, equal for results that are equal bit for bit."""
+    digest = hashlib.blake2b(digest_size=16)
+    _feed(digest, done.result)
+    return digest.hexdigest()
+
+
+def _feed(digest: hashlib.blake2b, value: object) -> None:
+    """Every field by name, type, shape and content."""
+    if is_dataclass(value):
+        for field in fields(value):
+            digest.update(field.name.encode())
+            _feed(digest, getattr(value, field.name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    else:
+        digest.update(repr(value).encode())

@@ -1,0 +1,110 @@
+"""What a base's flight is told, on the command line or by `fly`, and the configuration made of it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.transport.seal import seal_bytes, suite_for
+from kiteline_core import config as configuration
+from kiteline_core.ids import AgentId
+
+
+@dataclass(frozen=True, slots=True)
+class BaseSpec:
+    """All that the base's flight is told. Plain values, so that it travels as JSON."""
+
+    folder: str  # for the log, the map and the grid
+    log_name: str = "log.mcap"
+    agents: tuple[int, ...] = ()
+    session: int = 1  # higher than that of any base before it
+    link: str = "none"  # LINK, or lockstep:ENDPOINT
+    config: str = ""  # a TOML file
+    start_ns: int = 0  # the stamp that is flight time 0, so that the log stands in the time of the first source
+    down_bytes_s: int = 0  # B/s that the link to each agent takes; 0: any number
+    key: str = ""  # a file with the keys of agents; "": packets are not sealed
+    profile: str = ""  # wifi or radio: how packets are made; "": as the link allows
+    delay_s: float = 0.0  # s that a packet is under way
+    loss: float = 0.0  # probability that a packet is lost
+    disorder: float = 0.0  # probability that it is doubled, and that it is late
+    seed: int = 0
+    kill_at_s: float = -1.0  # end like a crash at this flight time
+    kill_delay_s: float = 0.0  # s of real time after it, so that it strikes anywhere
+    store: str = ""
+    imports: tuple[str, ...] = ()
+    web: str = ""
+    quiet: bool = False  # say nothing of how the flight goes
+    maps: str = ""  # a Zenoh endpoint on which maps are managed; "": the agents' link
+
+
+def from_json(text: str) -> BaseSpec:
+    """A spec from its JSON; unknown keys are an error."""
+    values: dict[str, Any] = json.loads(text)
+    known = {f.name for f in fields(BaseSpec)}
+    if unknown := set(values) - known:
+        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
+    for name in ("agents", "imports"):
+        values[name] = tuple(values.get(name, ()))
+    return BaseSpec(**values)
+
+
+def base_config(path: str) -> BaseConfig:
+    """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
+    if not path:
+        return BaseConfig()
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise configuration.ConfigError(f"{path}: {error}") from error
+    if unknown := set(table) - {"agent", "base"}:
+        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
+    section = table.get("base", {})
+    if not isinstance(section, dict):
+        raise configuration.ConfigError(f"{path}: [base] is a section")
+    return configuration.apply(BaseConfig(), section, "base")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline base`."""
+    p = argparse.ArgumentParser(
+        prog="kiteline base",
+        description="The base station: makes one better map of what any number of agents send, and sends it back.",
+        epilog="LINK is zenoh:tcp/HOST:PORT (0.0.0.0 listens on all addresses) or serial:DEVICE:BAUD.",
+    )
+    p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
+    p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")
+    p.add_argument("--import", dest="imports", metavar="LOG", nargs="+", default=[], action="extend",
+                   help="add what agents' logs hold and no link carried; or maps: a store, a base's log")  # fmt: skip
+    p.add_argument("--maps", metavar="ENDPOINT", default="",
+                   help="answer `kiteline maps` here: tcp/HOST:PORT (default: on the link, if not sealed)")  # fmt: skip
+    p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
+    p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
+    p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; hear no agent without a key in it")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--quiet", action="store_true", help="say nothing of how the flight goes")
+    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
+    return p
+
+
+def of_arguments(a: argparse.Namespace, session: int) -> BaseSpec:
+    """What `kiteline base` was told on the command line."""
+    return BaseSpec(
+        folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
+        config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
+        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
+    )  # fmt: skip
+
+
+def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
+    """Opens our end of the codec to an agent."""
+    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)

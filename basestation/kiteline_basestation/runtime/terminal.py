@@ -1,0 +1,163 @@
+"""What a person at a terminal is told of a base: what changes, and now and then how it stands. No clock."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from kiteline_basestation.management import called
+from kiteline_basestation.merging.loop_verification import Overlap
+from kiteline_basestation.merging.merge import Merge
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel
+from kiteline_core.geometry import se3
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
+
+_EVERY_NS = 10_000_000_000  # between two lines while nothing happens
+
+
+class Narrator:
+    """Makes lines of text from a station, looked at after each step."""
+
+    def __init__(self, station: Station) -> None:
+        self._station = station
+        self._here: frozenset[AgentId] = frozenset()
+        self._gone_ns: dict[AgentId, int] = {}  # since when those that were here are out of reach
+        self._sessions: dict[AgentId, int] = {}
+        self._submaps = set(station.mapper.map.submaps)
+        self._deleted = set(station.mapper.deleted)
+        atlas = station.mapper.atlas
+        self._loops = 0 if atlas is None else atlas.loops
+        self._undone = 0 if atlas is None else atlas.undone
+        self._proofs = 0 if atlas is None else len(atlas.proved)
+        self._merges = [] if atlas is None else list(atlas.merges)
+        self._summary_ns = _EVERY_NS
+        self._bytes_down = self._bytes_up = 0
+
+    def lines(self, here: Collection[int], flight_ns: int, rss_mib: float, stored: bool | None) -> list[str]:
+        """What is to be said after a step at a time of the flight. here: agents that are reachable. rss_mib: of this
+        process at the most. stored: whether all is on disk, None without a store.
+        """
+        out = [*self._agents(frozenset(map(AgentId, here)), flight_ns), *self._maps()]
+        if flight_ns >= self._summary_ns:
+            out.append(self._status(flight_ns, rss_mib, stored))
+            self._summary_ns = flight_ns + _EVERY_NS
+        return [f"{flight_ns / 1e9:8.1f} s  {line}" for line in out]
+
+    def _agents(self, here: frozenset[AgentId], flight_ns: int) -> list[str]:
+        """Who came, who went, who began anew."""
+        out = []
+        for agent in sorted(here - self._here):
+            gone_ns = self._gone_ns.pop(agent, None)
+            away = "" if gone_ns is None else f" again after {(flight_ns - gone_ns) / 1e9:.1f} s"
+            out.append(f"agent {agent} is here{away}")
+        for agent in sorted(self._here - here):
+            self._gone_ns[agent] = flight_ns
+            out.append(f"agent {agent} is out of reach; its map stays")
+        self._here = here
+        for agent, channel in sorted(self._station.channels.items()):
+            session = channel.endpoint.peer_session if isinstance(channel, CodedChannel) else 0
+            before = self._sessions.get(agent, 0)
+            if session != before:
+                self._sessions[agent] = session
+                if before:
+                    out.append(f"agent {agent} has started again; what it sent before is kept")
+        return out
+
+    def _maps(self) -> list[str]:
+        """Maps that began, were joined, parted or deleted, and loops."""
+        mapper, out = self._station.mapper, []
+        for submap in [s for s in mapper.map.submaps if s not in self._submaps]:
+            self._submaps.add(submap)
+            out.append(f"agent {agent_of_submap(submap)} begins map {_name(submap, mapper.names)}")
+        for submap in sorted(mapper.deleted - self._deleted):
+            self._deleted.add(submap)
+            out.append(f"map {_name(submap, mapper.names)} is deleted")
+        atlas = mapper.atlas
+        if atlas is None:
+            return out
+        proved, self._proofs = atlas.proved[self._proofs :], len(atlas.proved)
+        if atlas.loops > self._loops:
+            self._loops = atlas.loops
+            out.append(f"loop closed, the {_nth(self._loops)}: {self._loop(proved)}")
+        for merge in [m for m in atlas.merges if not any(m is known for known in self._merges)]:
+            out.append(self._joined(merge))
+        if atlas.undone > self._undone:
+            self._undone = atlas.undone
+            gone = [m for m in self._merges if not any(m is kept for kept in atlas.merges)]
+            names = ", ".join(_name(m.eldest, mapper.names) for m in gone)
+            out.append(f"map {names} is taken out of the map that it was laid into")
+        self._merges = list(atlas.merges)
+        return out
+
+    def _loop(self, proved: Sequence[Overlap]) -> str:
+        """How long a loop is, and how far its ends were apart."""
+        sparse_map = self._station.mapper.map
+        vote = max(proved, key=lambda v: v.inliers, default=None)
+        old, new = (None, None) if vote is None else (sparse_map.world_pose(vote.old), sparse_map.world_pose(vote.new))
+        if vote is None or old is None or new is None:
+            return "its points were where they were foreseen"
+        off_m = float(np.linalg.norm((se3.inverse(new) @ old @ vote.T_old_new)[:3, 3]))
+        way_m = self._way_m(vote.old, vote.new)
+        return f"off by {off_m:.2f} m" + ("" if way_m is None else f" after {way_m:.0f} m of way")
+
+    def _way_m(self, old: KeyframeId, new: KeyframeId) -> float | None:
+        """Length of the way between two keyframes; None where they lie in two submaps."""
+        sparse_map = self._station.mapper.map
+        if submap_of_keyframe(old) != submap_of_keyframe(new):
+            return None
+        between = [k for k in sparse_map.submaps[submap_of_keyframe(new)] if min(old, new) <= k <= max(old, new)]
+        at = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in between], :3, 3]
+        return float(np.linalg.norm(np.diff(at, axis=0), axis=1).sum())
+
+    def _joined(self, merge: Merge) -> str:
+        mapper = self._station.mapper
+        keyframes = sum(len(mapper.map.submaps.get(submap, ())) for submap in merge.moved)
+        newer, older = _name(merge.eldest, mapper.names), _name(merge.into, mapper.names)
+        return f"map {newer} ({keyframes} keyframes) joined to map {older}"
+
+    def summary(self) -> str:
+        """The map in one line."""
+        s = self._station.mapper.summary()
+        return (
+            f"{_count(_int(s['keyframes']), 'keyframe')} and {s['points']} points in {_count(_int(s['maps']), 'map')}; "
+            f"{_count(_int(s['loops']), 'loop')}, {_count(_int(s['merges']), 'merge')}"
+        )
+
+    def _status(self, flight_ns: int, rss_mib: float, stored: bool | None) -> str:
+        """How all stands, in one line."""
+        ends = [c.endpoint.stats for c in self._station.channels.values() if isinstance(c, CodedChannel)]
+        up, down = sum(e.bytes_received for e in ends), sum(e.bytes_sent for e in ends)
+        seconds = (flight_ns - self._summary_ns + _EVERY_NS) / 1e9
+        rates = (up - self._bytes_up) / 1000 / seconds, (down - self._bytes_down) / 1000 / seconds
+        self._bytes_up, self._bytes_down = up, down
+        waits = sum(e.dirty for e in ends)
+        words = [
+            f"{_count(len(self._here), 'agent')} here",
+            self.summary(),
+            f"{rates[0]:.1f} kB/s up, {rates[1]:.1f} down"
+            + (f", {_count(waits, 'value')} to be sent" if waits else ""),
+            f"{rss_mib:.0f} MiB at most",
+        ]
+        if stored is not None:
+            words.append("all in the store" if stored else "the store is behind")
+        return "; ".join(words)
+
+
+def _name(submap: SubmapId, names: dict[SubmapId, str]) -> str:
+    return f'{called(submap)} "{names[submap]}"' if submap in names else called(submap)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _nth(number: int) -> str:
+    ending = "th" if number // 10 % 10 == 1 else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{ending}"
+
+
+def _int(value: object) -> int:
+    assert isinstance(value, int)
+    return value

@@ -1,0 +1,292 @@
+"""The base's bars: accuracy of one map and of joined ones, loops, losses, and what it costs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GraphConfig
+from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
+from kiteline_bench.base import monocular as bench_one_eye
+from kiteline_bench.base import store as bench_store
+from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
+from kiteline_bench.harness import base_memory
+from kiteline_bench.harness import ratios as bench_ratios
+from kiteline_core.geometry import se3
+from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle
+from kiteline_lab.evaluation import metrics, trajectories
+from kiteline_lab.flights import simulate
+from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.tools import logs
+
+F64 = NDArray[np.float64]
+
+_CUT_OVERLAP = 0.05  # of the uncut flight's frames, that two neighbouring pieces share
+_PIECES = 3
+_HALL_S = 100.0  # of both flights, so that they are rendered in minutes
+_AGENTS, _SECONDS = 20, 120  # of the modelled queue: one keyframe a second each
+
+
+# accuracy
+
+
+def _recordings(bench: Bench) -> list[Bar]:
+    """The recordings, beside a flight without a codec; and what bundles and graphs cost."""
+    room = _fly(bench, [bench.source("room_flight.mcap")], "room")
+    kitti = _fly(bench, [bench.source("kitti_straight")], "kitti")
+    return [
+        at_most("room_flight: ATE base", _ate(room), 0.008, "m", 4),
+        at_most("kitti_straight: ATE base", _ate(kitti), 0.06, "m"),
+        *bench_ratios.beside_monolith(bench, partial(_flown_ate, bench)),
+        *_work(bench, room),
+    ]
+
+
+def _hall(bench: Bench) -> list[Bar]:
+    """The beginnings of MH_01 and MH_03 in one hall: apart, together, one of them cut in three, and one with losses."""
+    both = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
+    apart = [_fly(bench, [str(source)], f"hall_{i}") for i, source in enumerate(both)]
+    together = _fly(bench, [str(source) for source in both], "hall_together")
+    pieces = bench_ratios.seams(bench, both[1], "hall", _PIECES, _CUT_OVERLAP)
+    cut = _fly(bench, [str(piece) for piece in pieces], "hall_cut")
+    uncut = [(name, source, _ate(report)) for name, source, report in zip(("MH_01", "MH_03"), both, apart)]
+    joint = bench_ratios.in_pieces(bench, uncut, _PIECES, _CUT_OVERLAP, partial(_flown_ate, bench))
+    lossy = _with_losses(bench, both[1])
+    lost = _fly(bench, [str(lossy)], "hall_losses")
+    agent = lost["agents"][0]
+    return [
+        at_most("MH_01 in the hall: ATE base", _ate(apart[0]), 0.02, "m", 4),
+        at_most("MH_03 in the hall: ATE base", _ate(apart[1]), 0.02, "m", 4),
+        is_true("MH_01 and MH_03 as two agents", "merged", together["base"]["merges"] == 1,
+                f"{together['base']['merges']} merges"),
+        at_most("their joint ATE", _joint_ate(bench.folder / "hall_together", both), 0.025, "m", 4),
+        is_true(f"MH_03 cut in {_PIECES} agents, overlaps of {_CUT_OVERLAP:.0%}", "one map",
+                cut["base"]["merges"] == _PIECES - 1, f"{cut['base']['merges']} merges"),
+        joint,
+        at_most("MH_03 with three forced losses: ATE base of what is placed", _ate(lost), 0.05, "m", 4),
+        is_true("MH_03 with three forced losses: tracked", "all but 3 frames a loss", agent["lost"] <= 9,
+                f"{agent['lost']} lost, {agent['submaps']} submaps, {lost['base']['merges']} merged"),
+    ]  # fmt: skip
+
+
+def _street(bench: Bench) -> list[Bar]:
+    """A loop of 1.2 km, and the memory that it takes."""
+    (source,) = _recorded(bench, "street", "street", ["KITTI_06.txt"])
+    report = _fly(bench, [str(source)], "street")
+    start = _fly(bench, [str(bench_ratios.cut(bench, source, "street_start", 0.0, 30.0))], "street_start")
+    truth = trajectories.read(f"mcap:{source}").trajectory
+    estimate = trajectories.read(str(bench.folder / "street" / "base" / "agent0.tum")).trajectory
+    drift = metrics.kitti_drift(metrics.match(estimate, truth, metrics.Alignment.SE3))
+    assert drift is not None
+    bench.say("weighing the base's parts")
+    weighed = base_memory.measured(bench.folder / "street" / "base" / "log.mcap")
+    peak = report["base"]["timing"]["rss_mib"]
+    bench.more.append(
+        "What the base of the street holds, measured as it runs again from its log. Pages of code and of libraries, "
+        f"about 270 MiB, are there from the start; at the most it had {peak:.0f} MiB.\n\n{base_memory.table(weighed)}"
+    )
+    return [
+        is_true("KITTI 06 in the street: loop", "closed", report["base"]["loops"] >= 1,
+                f"{report['base']['loops']} loops"),
+        at_most("KITTI 06 in the street: ATE base", _ate(report), 0.6, "m"),
+        at_most("KITTI 06 in the street: t_rel", drift.t_rel_percent, 0.4, "%"),
+        at_most("memory of the base for each keyframe after the first 30 s",
+                further_kb(start["base"], report["base"]), 100.0, "kB", 1),
+    ]  # fmt: skip
+
+
+def _one_eye(bench: Bench) -> list[Bar]:
+    """The loop in the street and the two flights in the hall, with one eye."""
+    (street,) = _recorded(bench, "street", "street", ["KITTI_06.txt"])
+    hall = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
+    return bench_one_eye.bars(bench, _fly(bench, [str(street)], "street_one_eye", mono=True, imu=False), hall)
+
+
+def _fly(bench: Bench, sources: Sequence[str], folder: str, **options: Any) -> dict[str, Any]:
+    bench.say(f"flying {folder}")
+    report, outcome = fly(Options(tuple(sources), bench.folder / folder, **options), quiet=True)
+    if outcome.failed:
+        raise RuntimeError(f"{folder}: {outcome.notes}")
+    return dict(report)
+
+
+def _ate(report: dict[str, Any], agent: int = 0) -> float:
+    return float(report["agents"][agent]["accuracy"]["base"]["ate_m"])
+
+
+def _flown_ate(bench: Bench, sources: Sequence[Path], folder: str, mode: str) -> float:
+    """The joint ATE of a flight of one agent or of several."""
+    _fly(bench, [str(source) for source in sources], folder, mode=mode)
+    return _joint_ate(bench.folder / folder, sources)
+
+
+def _joint_ate(folder: Path, sources: Sequence[Path]) -> float:
+    """All agents' refined trajectories, laid on the truth as one body; an agent without a place makes it infinite."""
+    ours, theirs = [], []
+    for i, source in enumerate(sources):
+        path = folder / "base" / f"agent{i}.tum"
+        if not path.exists() or not path.read_text().strip():
+            return float("inf")
+        estimate, truth = trajectories.read(str(path)).trajectory, trajectories.read(f"mcap:{source}").trajectory
+        found, true = metrics.truth_at(estimate.t_ns, truth)
+        ours.append(estimate.T_w_b[found, :3, 3])
+        theirs.append(true[:, :3, 3])
+    a, b = np.concatenate(ours), np.concatenate(theirs)
+    T, _ = metrics.umeyama(a, b)
+    return float(np.sqrt(np.mean(np.sum((se3.transform(T, a) - b) ** 2, axis=1))))
+
+
+def _recorded(bench: Bench, name: str, scene: str, paths: Sequence[str], seconds: float = 0.0) -> list[Path]:
+    """Simulated flights in one world, so many seconds of them (0: all); rendered once, if the folder is kept."""
+    out = [bench.folder / (f"{name}-{i}.mcap" if i else f"{name}.mcap") for i in range(len(paths))]
+    if not all(path.exists() for path in out):
+        bench.say(f"rendering {name}")
+        files = [bench.source(f"trajectories/{path}") for path in paths]
+        length = ["--seconds", f"{seconds:g}"] if seconds else []
+        also = ["--also", *files[1:]] if files[1:] else []
+        bench.folder.mkdir(parents=True, exist_ok=True)
+        simulate.main([scene, "--trajectory", files[0], "--out", str(out[0]), *length, *also])
+    return out
+
+
+def _with_losses(bench: Bench, source: Path) -> Path:
+    """The same flight with three holes of 6 s, after which the camera is somewhere else."""
+    length = bench_ratios.length_s(source)
+    holes = [length * part for part in (0.25, 0.5, 0.75)]
+    begins, ends = [0.0, *(hole + 6.0 for hole in holes)], [*holes, length]
+    parts = [bench_ratios.cut(bench, source, f"part{i}", a, b) for i, (a, b) in enumerate(zip(begins, ends))]
+    out = bench.folder / "losses.mcap"
+    logs.main(["merge", "--force", str(out), *map(str, parts)])
+    return out
+
+
+# cost
+
+
+def _work(bench: Bench, room: dict[str, Any]) -> list[Bar]:
+    bench.say("timing bundles and pose graphs")
+    local = _least_ms(lambda: bundle(row_of_cameras(20, 1400, 10), BundleConfig()))
+    whole = _least_ms(lambda: bundle(row_of_cameras(100, 10_000, 99), BundleConfig()))
+    graph = ring_of_poses(1000, 20)
+    posed = _least_ms(lambda: optimise(graph))
+    base = room["base"]
+    cost_ms = base["timing"]["bundle_ms"]["mean"] + base["timing"]["step_ms"]["mean"]
+    wait_s = queue_p95_s(np.full(_AGENTS, cost_ms / 1000.0))
+    return [
+        at_most("local bundle of 10 + 10 keyframes", local, 12.0, "ms", 1),
+        at_most("full bundle of 100 keyframes and 10,000 points", whole, 150.0, "ms", 1),
+        at_most("pose graph of 1000 keyframes", posed, 50.0, "ms", 1),
+        at_most(f"{_AGENTS} agents at a keyframe a second on one core: wait, p95 (modelled queue)", wait_s, 1.0, "s"),
+        at_most("memory of a keyframe in the map", map_bytes_a_keyframe() / 1000.0, 100.0, "kB", 1),
+    ]
+
+
+def _least_ms(work: Any) -> float:
+    """CPU of the quickest of three runs after one that compiles."""
+    work()
+    took = []
+    for _ in range(3):
+        begin_ns = time.process_time_ns()
+        work()
+        took.append((time.process_time_ns() - begin_ns) / 1e6)
+    return min(took)
+
+
+def row_of_cameras(cameras: int, points: int, free: int, seed: int = 0) -> BundleProblem:
+    """Cameras that pass a wall, disturbed: each point is seen by its nearest few. The last `free` may move."""
+    rng = np.random.default_rng(seed)
+    lens = np.tile([420.0, 420.0, 376.0, 240.0, 46.0], (cameras, 1))
+    true = np.tile(np.eye(4), (cameras, 1, 1))
+    true[:, 0, 3] = -0.25 * np.arange(cameras)  # T_c_m
+    world = np.column_stack(
+        [rng.uniform(-1.0, 0.25 * cameras + 1.0, points), rng.uniform(-1.5, 1.5, points), rng.uniform(2.5, 6.0, points)]
+    )
+    nearest = np.clip(np.rint(world[:, 0] / 0.25), 0, cameras - 1).astype(np.int64)
+    seen = np.clip(nearest[:, None] + np.arange(-2, 3), 0, cameras - 1)
+    rows = [np.unique(line) for line in seen]
+    starts = np.concatenate([[0], np.cumsum([len(line) for line in rows])]).astype(np.int32)
+    camera, which = np.concatenate(rows).astype(np.int32), np.repeat(np.arange(points), np.diff(starts))
+    local = np.einsum("nij,nj->ni", true[camera, :3, :3], world[which]) + true[camera, :3, 3]
+    measured = np.column_stack(
+        [420 * local[:, 0] / local[:, 2] + 376, 420 * local[:, 1] / local[:, 2] + 240, 46.0 / local[:, 2]]
+    ) + rng.normal(0, 0.3, (len(camera), 3))
+    start = np.stack([se3.exp(rng.normal(0, 0.004, 6)) @ T for T in true])
+    moves = np.arange(cameras) >= cameras - free
+    start[~moves] = true[~moves]
+    sigma = np.full((len(camera), 2), 0.3)
+    return BundleProblem(
+        start, lens, moves, world + rng.normal(0, 0.02, world.shape), starts, camera, measured, sigma
+    )  # fmt: skip
+
+
+def ring_of_poses(count: int, loops: int, seed: int = 0) -> GraphInputs:
+    """Four turns of drifting odometry with loops between them."""
+    rng = np.random.default_rng(seed)
+    turn = count // 4
+    angle = 2 * np.pi * np.arange(count) / turn
+    places = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.zeros(count)])
+    true = np.stack([se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, a])), t) for a, t in zip(angle.tolist(), places)])
+    start, edges, between = [true[0]], [], []
+    for i in range(1, count):
+        noise = se3.exp(np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, 0.001, 3)]))
+        between.append(se3.inverse(true[i - 1]) @ true[i] @ noise)
+        edges.append((i - 1, i))
+        start.append(start[-1] @ between[-1])
+    for i in range(2, count, 2):
+        edges.append((i - 2, i))
+        between.append(se3.inverse(start[i - 2]) @ start[i])
+    near = len(edges)
+    for a in rng.integers(0, count - turn, loops).tolist():
+        edges.append((a, a + turn))
+        between.append(se3.inverse(true[a]) @ true[a + turn])
+    held = np.arange(count) == 0
+    return GraphInputs(
+        np.arange(count), np.stack(start), held, np.array(edges), np.stack(between),
+        np.tile([0.01, 0.003], (len(edges), 1)), np.arange(len(edges)) >= near, GraphConfig(),
+    )  # fmt: skip
+
+
+def queue_p95_s(cost_s: F64, seed: int = 0) -> float:
+    """Wait and work of a keyframe at one server, 95 % of them: each agent sends one a second, at its own moment."""
+    rng = np.random.default_rng(seed)
+    at = np.sort((rng.random(len(cost_s))[:, None] + np.arange(_SECONDS)).ravel())
+    free_s, took = 0.0, []
+    for arrival in at.tolist():
+        free_s = max(free_s, arrival) + float(cost_s.mean()) * float(rng.gamma(2.0, 0.5))
+        took.append(free_s - arrival)
+    return float(np.percentile(took, 95))
+
+
+def further_kb(short: dict[str, Any], long: dict[str, Any]) -> float:
+    """Resident memory of the base's process, all that it holds included, by which a longer flight's base is larger, in
+    kB for each keyframe more.
+    """
+    more = (long["timing"]["rss_mib"] - short["timing"]["rss_mib"]) * 2**20 / 1000.0
+    return float(more / (long["keyframes"] - short["keyframes"]))
+
+
+def map_bytes_a_keyframe(keyframes: int = 400, keypoints: int = 400) -> float:
+    """Bytes by which the map grows with each keyframe of a usual size."""
+    from kiteline_basestation.map.sparse_map import SparseMap
+    from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
+
+    sparse_map, submap = SparseMap(), submap_id(0, 0, 0)
+    for k in range(keyframes):
+        parent = NO_KEYFRAME if k == 0 else keyframe_id(submap, k - 1)
+        sparse_map.add_keyframe(keyframe_id(submap, k), k, parent, np.eye(4), keypoints)
+    return sparse_map.nbytes() / keyframes
+
+
+PARTS = {
+    "recordings": ("The base's mapper", _recordings),
+    "hall": (f"The base's mapper: a hall, two agents, losses (the first {_HALL_S:g} s of both flights)", _hall),
+    "street": ("The base's mapper: a street, a loop", _street),
+    "one-eye": ("The base's mapper: one eye without IMU", _one_eye),
+    "store": ("The base's store", bench_store.run),
+}

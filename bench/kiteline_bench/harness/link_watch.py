@@ -1,0 +1,84 @@
+"""What crossed a link, read from the logs of a flight: bytes in any second, how late headers and poses came."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from kiteline_agent.runtime import flight_log as agent_log
+from kiteline_basestation.runtime import flight_log as base_log
+from kiteline_codec.coding import messages
+from kiteline_codec.schema import Head, Kind, Live, WireError
+from kiteline_codec.sync.packet import parse
+from kiteline_hw.logs.mcap_log_read import LogReader
+from kiteline_hw.ports import SourceError
+from kiteline_lab.replay.replay import steps
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """Of one direction, or of one agent's values on the base. Times in s, of flight."""
+
+    most_bytes_s: int  # in any one-second window, overhead included
+    head_delays_s: list[float]  # from capture to arrival of each keyframe's header, before the flight's last second
+    pose_gaps_s: list[float]  # between arrivals of live poses
+
+
+def most_in_a_second(log: Path, topic: str, overhead_bytes: int) -> int:
+    """The most bytes that left in any window of one second, both ends included."""
+    window: deque[tuple[int, int]] = deque()
+    most = total = 0
+    with LogReader(log) as reader:
+        for step in steps(reader):
+            now_ns = int(step.head["now_ns"])
+            sent = sum(len(packet) + overhead_bytes for packet in step.blobs(topic))
+            window.append((now_ns, sent))
+            total += sent
+            while now_ns - window[0][0] > _SECOND_NS:
+                total -= window.popleft()[1]
+            most = max(most, total)
+    return most
+
+
+def live_shift_ns(agent_log_path: Path) -> int:
+    """Of a live flight: the stamp of a frame less the time on this machine's clock at which it was taken."""
+    with LogReader(agent_log_path) as reader:
+        frames = [(int(s.head["frame_ns"]), int(s.head["now_ns"])) for s in steps(reader) if s.head["frame_ns"]]
+    if not frames:
+        raise SourceError(f"{agent_log_path}: no frames in this log")
+    return max(t_ns - now_ns for t_ns, now_ns in frames)
+
+
+def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float], list[float]]:
+    """How late each header came, and the gaps between live poses, in s. shift_ns: stamps less the base's clock."""
+    heads: dict[int, float] = {}
+    poses_ns: list[int] = []
+    with LogReader(base_folder / "log.mcap") as reader:
+        for step in steps(reader):
+            now_ns = int(step.head["now_ns"])
+            for packet in step.blobs(base_log.packets_in(agent)):
+                try:
+                    _, items = parse(packet, 1 << 20)
+                except WireError:
+                    continue
+                for item in items:
+                    if item.key.kind not in (Kind.HEAD, Kind.LIVE) or not item.whole:
+                        continue
+                    record = messages.decode(item.key, item.data)
+                    if isinstance(record, Head):
+                        heads.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
+                    elif isinstance(record, Live):
+                        poses_ns.append(now_ns)
+    gaps = [(b - a) / 1e9 for a, b in pairwise(poses_ns)]
+    return list(heads.values()), gaps
+
+
+def watch(folder: Path, agent: int, shift_ns: int, overhead_bytes: int) -> Watched:
+    """All of an agent's link, upwards. shift_ns: stamps of frames less the clock of the flight."""
+    delays, gaps = arrivals(folder / "base", agent, shift_ns)
+    most = most_in_a_second(folder / f"agent{agent}" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
+    return Watched(most, delays, gaps)

@@ -1,0 +1,188 @@
+"""Bytes from numbers and back: variable-length integers, floats, and columns of integers."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_codec.coding.packing_kernels import pack_columns, unpack_columns
+from kiteline_codec.coding.residual_column_kernels import LIMIT, pack_tight, unpack_tight
+from kiteline_codec.schema import WireError
+
+I64 = NDArray[np.int64]
+
+_F64 = struct.Struct("<d")
+_F32 = struct.Struct("<f")
+_MAX_VARINT_BYTES = 10  # 64 bits in groups of seven
+
+
+def zigzag(value: int) -> int:
+    """Signed to unsigned, small magnitudes first: 0, -1, 1, -2 become 0, 1, 2, 3."""
+    return 2 * value if value >= 0 else -2 * value - 1
+
+
+def unzigzag(value: int) -> int:
+    """The inverse of `zigzag`."""
+    return (value >> 1) ^ -(value & 1)
+
+
+def varint_bytes(value: int) -> int:
+    """How many bytes `Writer.varint` takes for a value."""
+    return max(1, (value.bit_length() + 6) // 7)
+
+
+class Writer:
+    """Grows a code from its front to its end."""
+
+    __slots__ = ("_out",)
+
+    def __init__(self) -> None:
+        self._out = bytearray()
+
+    def __len__(self) -> int:
+        return len(self._out)
+
+    def u8(self, value: int) -> None:
+        """One byte. Raises ValueError when it does not fit."""
+        self._out.append(value)
+
+    def varint(self, value: int) -> None:
+        """An unsigned number in groups of seven bits, lowest first; the top bit says that more follow."""
+        if value < 0:
+            raise ValueError(f"an unsigned number is expected, found {value}")
+        out = self._out
+        while value >= 128:
+            out.append(value & 127 | 128)
+            value >>= 7
+        out.append(value)
+
+    def signed(self, value: int) -> None:
+        """A signed number, zigzag then varint."""
+        self.varint(zigzag(value))
+
+    def f64(self, value: float) -> None:
+        """A float, IEEE double, little endian."""
+        self._out += _F64.pack(value)
+
+    def f32(self, value: float) -> None:
+        """A float, IEEE single, little endian."""
+        self._out += _F32.pack(value)
+
+    def raw(self, data: bytes) -> None:
+        """Bytes as they are."""
+        self._out += data
+
+    def columns(self, values: I64) -> None:
+        """Columns (c, n) of integers, |value| < 2^38; nothing is written for n = 0."""
+        c, n = values.shape
+        if n and c:
+            out = np.zeros(c * (5 * n + 16) + 8, np.uint8)
+            self._out += out[: pack_columns(values, out)].tobytes()
+
+    def tight(self, values: I64) -> None:
+        """Columns (c, n) of integers, |value| < 2^30, as short as can be; nothing is written for n = 0."""
+        c, n = values.shape
+        if n and c:
+            if max(int(values.max()), -int(values.min())) >= LIMIT:
+                raise ValueError(f"numbers below {LIMIT} are expected, found {values.min()}..{values.max()}")
+            out = np.zeros(c * (7 * n + 16) + 8, np.uint8)
+            self._out += out[: pack_tight(np.ascontiguousarray(values), out)].tobytes()
+
+    def bytes(self) -> bytes:
+        """What has been written."""
+        return bytes(self._out)
+
+
+class Reader:
+    """Takes a code apart from its front. Every method raises WireError, and nothing else, on bytes that do not fit."""
+
+    __slots__ = ("_at", "_data")
+
+    def __init__(self, data: bytes, at: int = 0) -> None:
+        self._data = data
+        self._at = at
+
+    @property
+    def left(self) -> int:
+        """How many bytes remain."""
+        return len(self._data) - self._at
+
+    def u8(self) -> int:
+        """One byte."""
+        if self._at >= len(self._data):
+            raise WireError("the bytes end before the value does")
+        self._at += 1
+        return self._data[self._at - 1]
+
+    def varint(self, limit: int = (1 << 63) - 1) -> int:
+        """An unsigned number of at most `limit`, in its shortest form."""
+        data, at = self._data, self._at
+        value = 0
+        for i in range(_MAX_VARINT_BYTES):
+            if at + i >= len(data):
+                raise WireError("the bytes end within a number")
+            b = data[at + i]
+            value |= (b & 127) << 7 * i
+            if b < 128:
+                if b == 0 and i:
+                    raise WireError("a number is not in its shortest form")
+                if value > limit:
+                    raise WireError(f"found the number {value}, expected at most {limit}")
+                self._at = at + i + 1
+                return value
+        raise WireError("a number is longer than 64 bits")
+
+    def signed(self, limit: int) -> int:
+        """A signed number of magnitude at most `limit`."""
+        value = unzigzag(self.varint((1 << 64) - 1))
+        if abs(value) > limit:
+            raise WireError(f"found the number {value}, expected a magnitude of at most {limit}")
+        return value
+
+    def f64(self) -> float:
+        """A finite double."""
+        return self._finite(_F64.unpack(self.raw(8))[0])
+
+    def f32(self) -> float:
+        """A finite single."""
+        return self._finite(_F32.unpack(self.raw(4))[0])
+
+    def raw(self, n: int) -> bytes:
+        """The next n bytes."""
+        if n > self.left:
+            raise WireError(f"the bytes end before the value does: {self.left} left, {n} expected")
+        self._at += n
+        return self._data[self._at - n : self._at]
+
+    def columns(self, c: int, n: int) -> I64:
+        """Columns (c, n) of integers."""
+        values = np.zeros((c, n), np.int64)
+        if n and c:
+            at = unpack_columns(np.frombuffer(self._data, np.uint8), self._at, values)
+            if at < 0:
+                raise WireError("columns are cut short or malformed")
+            self._at = at
+        return values
+
+    def tight(self, c: int, n: int) -> I64:
+        """Tight columns (c, n) of integers."""
+        values = np.zeros((c, n), np.int64)
+        if n and c:
+            at = unpack_tight(np.frombuffer(self._data, np.uint8), self._at, values)
+            if at < 0:
+                raise WireError("tight columns are cut short or malformed")
+            self._at = at
+        return values
+
+    def end(self) -> None:
+        """Nothing may follow."""
+        if self.left:
+            raise WireError(f"{self.left} bytes too many")
+
+    @staticmethod
+    def _finite(value: float) -> float:
+        if value - value != 0.0:
+            raise WireError("a number is infinite or not a number")
+        return value

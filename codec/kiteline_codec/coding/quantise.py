@@ -1,0 +1,146 @@
+"""From measured values to integers and back. Each pair is idempotent: encoding a decoded value gives the same integer.
+
+Only +, -, *, / and the square root of IEEE arithmetic are used on the way back, so every machine decodes the same bits.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_codec.coding import quantise_kernels as kernels
+from kiteline_core.geometry import se3
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+PIXEL_STEPS = 16  # per px: error <= 1/32 px, below what a corner can be measured to
+PIXEL_ORIGIN = -64.0  # px: refined keypoints may lie a little outside the image
+PIXEL_CODES = 1 << 16  # up to 4032 px
+
+OFFSET_STEPS = 32  # per px: error <= 1/64 px, finer than keypoints since the base averages many
+OFFSET_CODES = 1 << 12  # +-128 px: an offset beyond that is another point
+
+CALIBRATION_STEPS = 1024  # per px: a tenth of what an offset can be known to
+CALIBRATION_CODES = 1 << 14  # +-8 px; real ones are below two pixels, half a pixel in the middle
+
+DEPTH_SCALE = 2.0**-7  # 1/m: nearly linear below (farther than 128 m), nearly logarithmic above
+DEPTH_MANTISSA = 1 << 10  # steps an octave: error <= 2^-11 (x + 2^-7) 1/m
+DEPTH_CODES = 13 * DEPTH_MANTISSA  # up to 64 1/m, which is 16 mm
+
+TRANSLATION_STEPS = 10_000  # per m: error <= 0.05 mm an axis
+TRANSLATION_CODES = 1 << 40  # +-1.1e8 m
+
+ROTATION_STEPS = 1 << 19  # per unit of the modified Rodrigues parameters: error <= 2 sqrt(3) / 2^19 = 6.7e-6 rad
+_ROTATION_LIMIT = (1 << 38) - (1 << 12)  # squared length kept below that of half a turn, where two codes would meet
+
+MIN_SCALE, MAX_SCALE = 2.0**-20, 2.0**20  # of one unit of length over another; an IEEE single: error <= 6e-8 of it
+
+OCCUPANCY_STEPS = 14  # over 0..100 percent: error <= 3.6 percent
+
+
+def pixel_codes(uv: F32) -> I64:
+    """Codes (2, n) of pixels (n, 2). Raises ValueError outside [-64, 4031.9] px."""
+    codes = np.rint((np.asarray(uv, np.float64).T - PIXEL_ORIGIN) * PIXEL_STEPS)
+    return _checked(codes, 0, PIXEL_CODES, "pixel")
+
+
+def pixels(codes: I64) -> F32:
+    """Pixels (n, 2) of codes (2, n)."""
+    return np.ascontiguousarray((codes.T / PIXEL_STEPS + PIXEL_ORIGIN).astype(np.float32))
+
+
+def offset_codes(offset: F32) -> I64:
+    """Codes (2, n) of pixel offsets (n, 2), clipped to +-128 px. Raises ValueError where not a number."""
+    codes = np.rint(np.asarray(offset, np.float64).T * OFFSET_STEPS)
+    return _checked(np.clip(codes, 1 - OFFSET_CODES, OFFSET_CODES - 1), 1 - OFFSET_CODES, OFFSET_CODES, "offset")
+
+
+def offsets(codes: I64) -> F32:
+    """Pixel offsets (n, 2) of codes (2, n)."""
+    return np.ascontiguousarray((codes.T / OFFSET_STEPS).astype(np.float32))
+
+
+def inverse_depth_codes(inv_depth: F32) -> I64:
+    """Codes (n,) of inverse depths (n,) in 1/m: a small float of x + DEPTH_SCALE. 0 means unknown (x <= 0 or NaN).
+
+    Positive values below the least code take the least one: far, but known.
+    """
+    x = np.ascontiguousarray(inv_depth, np.float64)
+    codes = np.empty(len(x), np.int64)
+    kernels.inverse_depth_codes(x, DEPTH_SCALE, DEPTH_MANTISSA, DEPTH_CODES, codes)
+    return codes
+
+
+def inverse_depths(codes: I64) -> F32:
+    """Inverse depths (n,) in 1/m of codes (n,)."""
+    inv_depth = np.empty(len(codes), np.float32)
+    kernels.inverse_depths(np.ascontiguousarray(codes, np.int64), DEPTH_SCALE, DEPTH_MANTISSA, inv_depth)
+    return inv_depth
+
+
+def pose_codes(pose: F64) -> tuple[int, ...]:
+    """Six integers of a rigid motion (4,4): translation, then modified Rodrigues parameters q_v / (1 + q_w).
+
+    The latter are a stereographic map of the rotation: finite for every rotation, one-to-one below half a turn, and an
+    error of d in them turns the result by at most 4 d (J. Schaub, M. Junkins, "Stereographic orientation parameters
+    for attitude dynamics", 1996). Raises ValueError when the matrix is no rigid motion or too far out.
+    """
+    rotation = pose[:3, :3]
+    if not (np.isfinite(pose).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3):
+        raise ValueError(f"a rigid motion (4,4) is expected, found\n{pose}")
+    moved = [round(float(x) * TRANSLATION_STEPS) for x in pose[:3, 3]]
+    if max(map(abs, moved)) >= TRANSLATION_CODES:
+        raise ValueError(f"a translation within +-1e8 m is expected, found {pose[:3, 3]}")
+    w, x, y, z = (float(c) for c in se3.quaternion_from_rotation(rotation))
+    turned = [round(c / (1.0 + w) * ROTATION_STEPS) for c in (x, y, z)]
+    while sum(c * c for c in turned) > _ROTATION_LIMIT:
+        i = max(range(3), key=lambda k: abs(turned[k]))
+        turned[i] -= 1 if turned[i] > 0 else -1
+    return (*moved, *turned)
+
+
+def pose(codes: tuple[int, ...]) -> F64:
+    """The rigid motion (4,4) of six integers. Raises ValueError when the rotation's are too large."""
+    x, y, z = (c / ROTATION_STEPS for c in codes[3:])
+    if sum(c * c for c in codes[3:]) > _ROTATION_LIMIT:
+        raise ValueError("a rotation of less than half a turn is expected")
+    s = x * x + y * y + z * z
+    n = 1.0 + s
+    w, x, y, z = (1.0 - s) / n, 2.0 * x / n, 2.0 * y / n, 2.0 * z / n
+    norm = sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    tx, ty, tz = (c / TRANSLATION_STEPS for c in codes[:3])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), ty],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), tz],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def occupancy_codes(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """Codes 0..15 of occupancy in percent; 0 means unknown (-1). Raises ValueError outside -1..100."""
+    if cells.min() < -1 or cells.max() > 100:
+        raise ValueError(f"occupancy is -1 or 0..100, found {cells.min()}..{cells.max()}")
+    levels = (cells.astype(np.int64) * OCCUPANCY_STEPS + 50) // 100 + 1
+    return np.where(cells < 0, 0, levels).astype(np.uint8)
+
+
+def occupancy(codes: NDArray[np.uint8]) -> NDArray[np.int8]:
+    """Occupancy in percent of codes 0..15; -1 unknown."""
+    percent = ((codes.astype(np.int64) - 1) * 100 + OCCUPANCY_STEPS // 2) // OCCUPANCY_STEPS
+    return np.where(codes == 0, -1, percent).astype(np.int8)
+
+
+def _checked(codes: F64, low: int, high: int, what: str) -> I64:
+    if codes.size and not (codes.min() >= low and codes.max() < high):  # NaN fails both
+        raise ValueError(
+            f"a {what} does not fit its code: found {codes.min()}..{codes.max()}, expected {low}..{high - 1}"
+        )
+    return codes.astype(np.int64)

@@ -1,0 +1,71 @@
+"""A keyframe's keypoints in sections that are useful alone, best first, each short enough for one packet."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_codec.coding import messages
+from kiteline_codec.schema import Births, Copied, Sightings
+
+F64 = NDArray[np.float64]
+
+SECTION_BYTES = 1000  # leaves room for headers and a live pose in a packet of 1200 bytes
+
+_Section = TypeVar("_Section", Births, Sightings, Copied)
+
+
+def split_births(births: Births, value: F64, section_bytes: int = SECTION_BYTES) -> list[Births]:
+    """Births (n rows) as parts 0, 1, … by falling value (n,); within a part the index increases.
+
+    Codes are shortest where rows with neighbouring indices lie near each other in the image. Raises ValueError when a
+    single row does not fit, or for values that have no code.
+    """
+    return _split(births, value, section_bytes)
+
+
+def split_sightings(sightings: Sightings, value: F64, section_bytes: int = SECTION_BYTES) -> list[Sightings]:
+    """Sightings (n rows) as parts 0, 1, … by falling value (n,); within a part the index increases.
+
+    Codes are shortest where the order of indices is that of point ids. Raises ValueError as `split_births` does.
+    """
+    return _split(sightings, value, section_bytes)
+
+
+def split_copied(copied: Copied, value: F64, section_bytes: int = SECTION_BYTES) -> list[Copied]:
+    """Points of a copied keyframe (n rows) as parts 0, 1, … by falling value (n,), as `split_births` does."""
+    return _split(copied, value, section_bytes)
+
+
+def _split(record: _Section, value: F64, section_bytes: int) -> list[_Section]:
+    best = np.argsort(-np.asarray(value), kind="stable")
+    parts: list[_Section] = []
+    start, rows = 0, max(1, section_bytes // 32)
+    may_grow = True
+    while start < len(best):
+        chosen = best[start : start + rows]
+        part = replace(take(record, chosen[np.argsort(record.index[chosen], kind="stable")]), part=len(parts))
+        size = len(messages.encode(part))
+        if size > section_bytes:
+            if len(chosen) == 1:
+                raise ValueError(f"one keypoint takes {size} bytes, expected at most {section_bytes}")
+            may_grow = False
+            rows = min(len(chosen) - 1, max(1, len(chosen) * (section_bytes - 8) // size))
+            continue
+        more = len(chosen) * section_bytes // size
+        if may_grow and start + len(chosen) < len(best) and more > len(chosen) * 1.15:
+            rows = max(len(chosen) + 1, int(0.95 * more))  # a larger part is worth another try
+            continue
+        parts.append(part)
+        start += len(chosen)
+        may_grow = True
+    return parts
+
+
+def take(record: _Section, rows: NDArray[np.int64]) -> _Section:
+    """Some rows of a record."""
+    arrays = {f.name: getattr(record, f.name)[rows] for f in fields(record) if f.name not in ("keyframe", "part")}
+    return replace(record, **arrays)

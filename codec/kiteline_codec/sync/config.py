@@ -1,0 +1,121 @@
+"""How an endpoint uses its link, in which order values leave, and what is known of it in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from kiteline_codec.schema import Key, Kind
+from kiteline_codec.sync.entries import Order
+from kiteline_codec.sync.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
+from kiteline_codec.sync.remembered import KIND as REMEMBERED
+
+_RANKS = {
+    Kind.LIVE: 0,
+    Kind.CAMERA: 0,  # nothing can be made of keypoints without it
+    Kind.PLACEMENT: 0,  # few bytes, and all that a pose in the world is wrong by
+    Kind.LEVEL: 0,
+    Kind.UNIT: 0,
+    Kind.POSE: 1,
+    Kind.DEPTHS: 1,
+    Kind.FOUND: 1,
+    Kind.REMOVED: 1,
+    Kind.CULLED: 1,
+    Kind.CALIBRATION: 1,
+    Kind.HEAD: 2,
+    Kind.BIRTHS: 3,
+    Kind.SIGHTINGS: 4,  # after the births, so that the next keyframe's sightings may build upon them
+    Kind.COPY: 5,
+    Kind.COPIED: 5,
+    Kind.TILE: 6,
+}
+_FIRST_PARTS = 4  # births: what makes a keyframe useful where a thin link has them short
+_RANK_OTHER_PARTS = 5
+_RANK_UNKNOWN = 6
+MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
+
+
+def default_order(key: Key) -> Order:
+    """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
+    if key.kind == REMEMBERED:
+        return (0, 0, key.part)  # it saves more than it costs
+    rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
+    if key.part >= (_FIRST_PARTS if key.kind == Kind.BIRTHS else 1):
+        rank = max(rank, _RANK_OTHER_PARTS)
+    return (rank, -key.id, key.part)
+
+
+@dataclass(frozen=True, slots=True)
+class SyncConfig:
+    """How an endpoint uses its link."""
+
+    packet_bytes: int = 1200  # largest packet: fits an Ethernet frame inside any tunnel; a MAVLink tunnel wants 128
+    overhead_bytes: int = 28  # a packet costs on the wire beyond its own bytes: IPv4 and UDP
+    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
+    window_packets: int = 64  # on their way at once: what one acknowledgement can tell of
+    ack_delay_ns: int = 20_000_000  # waiting a little lets an acknowledgement ride on a packet with values
+    ack_packets: int = 16  # acknowledge at once after so many: well inside the window
+    reorder_packets: int = (
+        3  # overtaken by so many, a packet that took longer than a round trip and 2 deviations is lost (as RFC 9002)
+    )
+    first_rto_ns: int = 500_000_000  # patience before any round trip has been measured
+    min_rto_ns: int = 100_000_000  # an idle process may take so long to answer
+    max_rto_ns: int = 2_000_000_000  # a link that comes back is found again within this time
+    hello_ns: int = 250_000_000  # between greetings while the peer is unknown
+    heartbeat_ns: int = 1_000_000_000  # longest silence while the peer is known
+    oldest_every: int = (
+        8  # in every eighth packet the value that has waited longest follows the poses, so that none starves
+    )
+    max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
+    max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
+    max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
+    resident_bytes: int = 0  # of memory for values of keyframes, their pages in the archive apart; 0: any number
+    resident_inbox_bytes: int = 0  # the same of what the peer says of keyframes, where there is a spill
+    order: Callable[[Key], Order] = default_order
+
+    def __post_init__(self) -> None:
+        if not MIN_PACKET_BYTES <= self.packet_bytes <= 1 << 16:
+            raise ValueError(f"packet_bytes is {self.packet_bytes}, expected {MIN_PACKET_BYTES}..65536")
+        least = 2 * (MIN_PACKET_BYTES + self.overhead_bytes)
+        if self.budget_bytes and self.budget_bytes < least:
+            raise ValueError(f"budget_bytes is {self.budget_bytes}, expected 0 (unlimited) or at least {least}")
+
+    @property
+    def filled_bytes(self) -> int:
+        """How long packets are made: within a tight budget no longer than a quarter of it, or the pose would wait."""
+        if not self.budget_bytes:
+            return self.packet_bytes
+        return max(MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 4 - self.overhead_bytes))
+
+    @property
+    def burst_bytes(self) -> int:
+        """How many bytes may leave at once: a packet, and what adds up between two frames at 10 Hz."""
+        return max(self.filled_bytes + self.overhead_bytes, self.budget_bytes // 8)
+
+
+@dataclass(frozen=True, slots=True)
+class SyncStats:
+    """Numbers of an endpoint since its start. Bytes are those on the wire, overhead included."""
+
+    bytes_sent: int
+    packets_sent: int
+    bytes_received: int
+    packets_received: int
+    lost: int  # packets taken for lost
+    duplicates: int  # packets received again, or too late
+    rejected: int
+    reasons: tuple[tuple[str, int], ...]  # why packets were rejected, how many
+    rtt_ns: int  # smoothed round trip; 0 before the first
+    dirty: int  # values that the peer is not known to hold
+    in_flight: int  # packets
+    values: int  # that the peer's session wrote
+    legacy: int  # that earlier sessions of the peer wrote and its present one has not replaced
+    peer_session: int  # 0: no peer has been heard
+    restarts: int  # of the peer, noticed
+    mismatches: int  # digests that differed: a defect, mended by sending everything again
+    backlog_bytes: int = 0  # of values that the peer is not known to hold
+    resident_bytes: int = 0  # of memory that values of keyframes take, about
+    archived: int = 0  # values that are kept out of memory
+    dropped: int = 0  # values given up for want of memory
+    throughput_bytes_s: int = 0  # what the link delivered lately while values waited; 0: nothing had to wait
+    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited

@@ -1,0 +1,244 @@
+"""What one session of the peer wrote, as far as it has arrived.
+
+Memory is bounded where a bound and a place beside it are given: what the peer says of keyframes that it did not touch
+for long waits there, and comes back when it is asked for or replaced.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+from kiteline_codec.coding import ranges
+from kiteline_codec.schema import Key, Kind
+from kiteline_codec.sync.archive import Archive, Row, Spill
+from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
+from kiteline_codec.sync.packet import MASK_BITS, Item
+from kiteline_codec.sync.resident import Resident
+
+_MASK = (1 << MASK_BITS) - 1
+_BULK_KINDS = frozenset({int(k) for k in (Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED)})
+_VALUE_BYTES = 350  # of memory that a value takes beside its code, about
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """A value that the peer wrote, or took back (code None)."""
+
+    key: Key
+    code: bytes | None
+
+
+@dataclass(slots=True)
+class _Assembly:
+    version: int
+    data: bytearray
+    got: ranges.Ranges
+
+
+class Inbox:
+    """Packet numbers, values, removals and unfinished values of one session of the peer."""
+
+    def __init__(self, resident_bytes: int = 0, spill: Spill | None = None) -> None:
+        """resident_bytes: of memory for what the peer says of keyframes, about; 0, or without a spill: any number."""
+        self._values: dict[Key, tuple[int, bytes]] = {}
+        self._archive = Archive(spill)
+        self._resident = Resident(0 if spill is None else resident_bytes, _BULK_KINDS, _VALUE_BYTES)
+        self.digest = Digest()
+        self.value_bytes = 0
+        self.assembly_bytes = 0
+        self.newest = 0  # highest version seen
+        self.watermark = 0  # all versions up to it have arrived, or do not matter any more
+        self._removed: dict[Key, int] = {}
+        self._removed_order: list[tuple[int, Key]] = []
+        self._assemblies: dict[Key, _Assembly] = {}
+        self._last = 0
+        self._seen = 0  # bit i: packet last - 1 - i has arrived
+
+    def __len__(self) -> int:
+        return len(self._values) + self._archive.values
+
+    def held(self, key: Key) -> tuple[int, bytes] | None:
+        """Version and code of a value, None when there is none."""
+        if key.kind in _BULK_KINDS and key.id in self._archive:
+            self._fetch(key.id)
+            self._make_room(key.id)
+        return self._values.get(key)
+
+    def codes(self) -> dict[Key, bytes]:
+        """The codes of all values."""
+        self._fetch_all()
+        out = {key: code for key, (_, code) in self._values.items()}
+        self._make_room()
+        return out
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory that takes what the peer says of keyframes, about; 0 where it is not bounded."""
+        return self._resident.bytes + self._archive.resident_bytes
+
+    @property
+    def assembling(self) -> int:
+        """How many values have arrived in part."""
+        return len(self._assemblies)
+
+    @property
+    def tombstones(self) -> int:
+        """How many removals are remembered."""
+        return len(self._removed)
+
+    def acknowledgement(self) -> tuple[int, int] | None:
+        """The last packet number and a mask of those missing before it; None when nothing has arrived."""
+        if not self._last:
+            return None
+        return self._last, ~self._seen & (1 << min(MASK_BITS, self._last - 1)) - 1
+
+    def is_new(self, number: int) -> bool:
+        """Whether a packet is neither a repetition nor older than an acknowledgement can tell."""
+        behind = self._last - number
+        return behind < 0 or (0 < behind <= MASK_BITS and not self._seen >> behind - 1 & 1)
+
+    def mark(self, number: int) -> None:
+        """A new packet has been taken in."""
+        ahead = number - self._last
+        if ahead > MASK_BITS:
+            self._last, self._seen = number, 0
+        elif ahead > 0:
+            self._seen = (self._seen << ahead | (1 << ahead - 1 if self._last else 0)) & _MASK
+            self._last = number
+        else:
+            self._seen |= 1 << -ahead - 1
+
+    def room_for(self, items: list[Item], max_values: int, max_assemblies: int) -> bool:
+        """Whether memory for the items is within the limits, in bytes."""
+        assemblies, values = self.assembly_bytes, self.value_bytes
+        for item in items:
+            if item.total is None:
+                continue
+            values += len(item.data)
+            if not item.whole and item.key not in self._assemblies:
+                assemblies += item.total
+        return values <= max_values and assemblies <= max_assemblies
+
+    def raise_watermark(self, version: int) -> None:
+        """The peer knows that all its versions up to this one have arrived: forget removals up to it."""
+        if version <= self.watermark:
+            return
+        self.watermark = version
+        while self._removed_order and self._removed_order[0][0] <= version:
+            removed, key = heapq.heappop(self._removed_order)
+            if self._removed.get(key) == removed:
+                del self._removed[key]
+        for key in [k for k, a in self._assemblies.items() if a.version <= version]:
+            self._drop_assembly(key)
+
+    def reset(self, version: int) -> list[Key]:
+        """The peer voids its values up to a version. Returns their keys."""
+        self._fetch_all()
+        void = sorted(k for k, (v, _) in self._values.items() if v <= version)
+        for key in void:
+            self._drop_value(key)
+        self.raise_watermark(version)
+        self.newest = max(self.newest, version)
+        return void
+
+    def apply(self, item: Item) -> Update | None:
+        """Take in an item. Returns what became known by it, if anything."""
+        key, version = item.key, item.version
+        self.newest = max(self.newest, version)
+        held = self.held(key)
+        known = held[0] if held is not None else max(self._removed.get(key, 0), self.watermark)
+        if version <= known:
+            return None
+        if item.total is None:
+            self._drop_assembly(key, version)
+            self._drop_value(key)
+            self._removed[key] = version
+            heapq.heappush(self._removed_order, (version, key))
+            return Update(key, None)
+        data = item.data if item.whole else self._assemble(item)
+        if data is None:
+            return None
+        self._drop_assembly(key, version)
+        self._drop_value(key)
+        self._removed.pop(key, None)
+        self._values[key] = (version, data)
+        self.value_bytes += len(data)
+        self.digest.add(key, version, data)
+        self._resident.count(key, len(data))
+        self._make_room(key.id)
+        return Update(key, data)
+
+    def _assemble(self, item: Item) -> bytes | None:
+        assert item.total is not None
+        part = self._assemblies.get(item.key)
+        if part is not None and (part.version > item.version or len(part.data) != item.total):
+            if part.version >= item.version:
+                return None
+            part = None
+        if part is None or part.version < item.version:
+            self._drop_assembly(item.key)
+            part = _Assembly(item.version, bytearray(item.total), ranges.NONE)
+            self._assemblies[item.key] = part
+            self.assembly_bytes += item.total
+        stop = item.offset + len(item.data)
+        part.data[item.offset : stop] = item.data
+        part.got = ranges.add(part.got, item.offset, stop)
+        return bytes(part.data) if part.got == ((0, item.total),) else None
+
+    def _drop_assembly(self, key: Key, up_to: int | None = None) -> None:
+        part = self._assemblies.get(key)
+        if part is not None and (up_to is None or part.version <= up_to):
+            self.assembly_bytes -= len(part.data)
+            del self._assemblies[key]
+
+    def _drop_value(self, key: Key) -> None:
+        held = self._values.pop(key, None)
+        if held is not None:
+            self.digest.discard(key, *held)
+            self.value_bytes -= len(held[1])
+            self._resident.uncount(key, len(held[1]))
+
+    # ---- memory
+
+    def _make_room(self, wanted: int = -1) -> None:
+        """Beyond the bound, archive what was not touched for long, down to 3/4; never the id that is wanted now."""
+        if not self._resident.full:
+            return
+        for id_ in self._resident.ids():
+            if self._resident.roomy or (id_ != wanted and not self._to_archive(id_)):
+                return
+
+    def _to_archive(self, id_: int) -> bool:
+        """Move the values of an id out of memory. False where they cannot be kept elsewhere: then all stay here."""
+        keys = self._resident.keys(id_)
+        rows, hashes = [], 0
+        for key in keys:
+            version, code = self._values[key]
+            rows.append(Row(key.kind, key.part, version, True, True, False, len(code), code))
+            hashes += hash_value(key, version, code)
+        self._archive.put(id_, rows, hashes % MODULUS)
+        if not self._archive.readable(id_):
+            self._archive.take(id_)
+            self._resident.unbound()
+            return False
+        for key in keys:
+            self._resident.uncount(key, len(self._values.pop(key)[1]))
+        return True
+
+    def _fetch_all(self) -> None:
+        for id_ in list(self._archive):
+            self._fetch(id_)
+
+    def _fetch(self, id_: int) -> None:
+        """Take the values of an id back into memory. Where they are lost, digests differ, and the peer sends again."""
+        hashes = self._archive.hashes(id_)
+        rows = self._archive.take(id_)
+        if any(row.code is None for row in rows):
+            self.digest.leave(hashes)
+            self.value_bytes -= sum(row.size for row in rows)
+            return
+        for row in rows:
+            key, code = Key(row.kind, id_, row.part), row.code or b""
+            self._values[key] = row.version, code
+            self._resident.count(key, len(code))

@@ -1,0 +1,295 @@
+"""Camera models, and rectification computed once from calibration.
+
+Optical frames: x right, y down, z forward. Pixel (0, 0) is the centre of the first pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry import se3
+from kiteline_core.imaging.stereo_kernels import GRID_STEP
+
+U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
+
+WIDEST = 1.75  # x/z at the side of a rectified image, 60 degrees: wider costs resolution in the middle
+LEAST_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 degrees little is seen by both eyes
+VIRTUAL_BASELINE_M = 0.1  # gives cameras without a right eye a scale for coded inverse depths
+
+
+class CalibrationError(ValueError):
+    """A calibration that cannot be used; the text says why and what was expected."""
+
+
+class Lens(Enum):
+    """How a ray direction bends on its way to the sensor."""
+
+    NONE = "none"
+    RADTAN = "radtan"  # k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV and EuRoC write them
+    EQUIDISTANT = "equidistant"  # k1 k2 k3 k4 (Kannala-Brandt), as OpenCV's fisheye
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """A pinhole camera behind a lens. Focal lengths and centre in px, size in px."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    lens: Lens = Lens.NONE
+    distortion: tuple[float, ...] = ()
+
+    def matrix(self) -> F64:
+        """The 3x3 camera matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRig:
+    """What the vehicle carries: a left camera, perhaps a right one, perhaps depth aligned with the left.
+
+    T_b_c: (4,4) left camera in the body. T_c_r: (4,4) right camera in the left one, or None without a right camera.
+    has_body: False where the source knows no body frame (then T_b_c is the identity and poses are camera poses).
+    """
+
+    left: CameraModel
+    right: CameraModel | None
+    T_b_c: F64
+    T_c_r: F64 | None
+    has_depth: bool = False
+    has_body: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class RectifiedCamera:
+    """An ideal pinhole; a stereo partner lies at +baseline_m along x. T_b_c: (4,4) of the *rectified* left camera.
+
+    Without a right eye (`stereo` False) baseline_m is VIRTUAL_BASELINE_M: disparity = fx * baseline_m / depth is then
+    only a unit of inverse depth.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline_m: float
+    stereo: bool
+    T_b_c: F64
+
+    @property
+    def bf(self) -> float:
+        """fx * baseline in px*m: disparity_px = bf / depth_m."""
+        return self.fx * self.baseline_m
+
+
+class Rectifier:
+    """Maps raw images onto the ideal camera. Built once; a pair that is already rectified costs nothing."""
+
+    def __init__(self, rig: CameraRig) -> None:
+        left = rig.left
+        self._size = (left.width, left.height)
+        self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and matrix behind its maps
+        self._depth_map: NDArray[np.int16] | None = None
+        self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self.blank = np.zeros((left.height, left.width), np.uint8)
+        self.right_grid: NDArray[np.float32] | None = (
+            None  # see _grid; None where the right image needs no rectification
+        )
+        if rig.right is None:
+            if left.lens is not Lens.NONE:
+                self._maps[0] = _undistortion_maps(left, np.eye(3), left.matrix())
+            self.camera = RectifiedCamera(
+                left.width, left.height, left.fx, left.fy, left.cx, left.cy,
+                VIRTUAL_BASELINE_M, False, rig.T_b_c.copy(),
+            )  # fmt: skip
+            return
+        assert rig.T_c_r is not None
+        if (rig.right.width, rig.right.height) != self._size:
+            raise CalibrationError(
+                f"left camera is {left.width}x{left.height} px, right camera {rig.right.width}x{rig.right.height}: "
+                "a stereo pair needs one size"
+            )
+        baseline_m = float(np.linalg.norm(rig.T_c_r[:3, 3]))
+        if not 1e-4 < baseline_m < 100.0:
+            raise CalibrationError(f"stereo baseline is {baseline_m} m: expected the right camera beside the left one")
+        if _is_rectified(rig):
+            self.camera = RectifiedCamera(
+                left.width, left.height, left.fx, left.fy, left.cx, left.cy, baseline_m, True, rig.T_b_c.copy()
+            )
+            return
+        r_left, r_right, new = _stereo_rotations(rig)
+        self._maps[0] = _undistortion_maps(left, r_left, new)
+        self._right = (rig.right, r_right, new)
+        self.right_grid = _grid(rig.right, r_right, new)
+        # A point of the raw left camera is turned by r_left into the rectified one.
+        t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
+        self.camera = RectifiedCamera(
+            left.width,
+            left.height,
+            float(new[0, 0]),
+            float(new[1, 1]),
+            float(new[0, 2]),
+            float(new[1, 2]),
+            baseline_m,
+            True,
+            t_b_c,
+        )
+
+    @property
+    def bends(self) -> bool:
+        """Whether images have to be remapped at all."""
+        return self._maps[0] is not None
+
+    def rectify(self, eye: int, image: U8) -> U8:
+        """Rectify the image of an eye (0 left, 1 right). Raises CalibrationError as `left` does."""
+        return self._apply(eye, image)
+
+    def half(self, eye: int, image: U8) -> U8:
+        """Level 1 of the rectified image's pyramid ((h+1)//2, (w+1)//2), from level 1 of the raw one's."""
+        self.check_size(image)
+        return self.halved(eye, np.asarray(cv2.pyrDown(image), np.uint8))
+
+    def halved(self, eye: int, small: U8) -> U8:
+        """The same from level 1 ((h+1)//2, (w+1)//2) of a raw image's pyramid."""
+        halves = self._halves[eye]
+        if halves is None:
+            maps = self._whole(eye)
+            if maps is None:
+                return small
+            x, y = cv2.convertMaps(maps[0][::2, ::2], maps[1][::2, ::2], cv2.CV_32FC1)
+            fixed = cv2.convertMaps(0.5 * x, 0.5 * y, cv2.CV_16SC2)
+            halves = self._halves[eye] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
+        return np.asarray(cv2.remap(small, halves[0], halves[1], cv2.INTER_LINEAR), np.uint8)
+
+    def left(self, image: U8) -> U8:
+        """Rectify a left image (h, w) uint8. Raises CalibrationError when its size is not the calibrated one."""
+        return self._apply(0, image)
+
+    def right(self, image: U8) -> U8:
+        """Rectify a right image (h, w) uint8. Raises CalibrationError when its size is not the calibrated one."""
+        return self._apply(1, image)
+
+    def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Bring depth (h, w) onto the rectified left pixels, without blending across edges."""
+        if depth_m.shape != (self._size[1], self._size[0]):
+            raise CalibrationError(
+                f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
+            )
+        if self._depth_map is None:
+            maps = self._maps[0]
+            if maps is None:
+                return depth_m
+            # Fixed-point maps hold whole pixels rounded down, and the rest in 1/32 px (5 bits for x, 5 for y).
+            whole, rest = maps[0].astype(np.int32), maps[1].astype(np.int32)
+            rest_xy = np.stack([rest & 31, (rest >> 5) & 31], axis=-1)
+            self._depth_map = (whole + (rest_xy >= 16)).astype(np.int16)
+        return np.asarray(cv2.remap(depth_m, self._depth_map, np.empty(0), cv2.INTER_NEAREST), np.float32)
+
+    def check_size(self, image: U8) -> None:
+        """Raises CalibrationError when an image has not the calibrated size."""
+        if image.shape != (self._size[1], self._size[0]):
+            raise CalibrationError(
+                f"image is {image.shape[1]}x{image.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
+            )
+
+    def _apply(self, eye: int, image: U8) -> U8:
+        self.check_size(image)
+        if eye == 1:
+            self._maps[1] = self._whole(1)
+        maps = self._maps[eye]
+        if maps is None:
+            return image
+        return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR), np.uint8)
+
+    def _whole(self, eye: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
+        """The maps of an eye. Those of the right one are kept only once a whole right image was asked for."""
+        if self._maps[eye] is None and eye == 1 and self._right is not None:
+            return _undistortion_maps(*self._right)
+        return self._maps[eye]
+
+
+def _is_rectified(rig: CameraRig) -> bool:
+    left, right = rig.left, rig.right
+    assert right is not None and rig.T_c_r is not None
+    return (
+        left.lens is Lens.NONE
+        and right.lens is Lens.NONE
+        and np.allclose(left.matrix(), right.matrix(), atol=1e-6)
+        and np.allclose(rig.T_c_r[:3, :3], np.eye(3), atol=1e-9)
+        and np.allclose(rig.T_c_r[1:3, 3], 0.0, atol=1e-9)
+        and bool(rig.T_c_r[0, 3] > 0)
+    )
+
+
+def _undistortion_maps(camera: CameraModel, rotation: F64, new: F64) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    size = (camera.width, camera.height)
+    d = np.array(camera.distortion, np.float64)
+    if camera.lens is Lens.EQUIDISTANT:
+        return cv2.fisheye.initUndistortRectifyMap(camera.matrix(), d, rotation, new, size, cv2.CV_16SC2)  # type: ignore[return-value]
+    return cv2.initUndistortRectifyMap(camera.matrix(), d, rotation, new, size, cv2.CV_16SC2)  # type: ignore[return-value]
+
+
+def _grid(camera: CameraModel, rotation: F64, new: F64) -> NDArray[np.float32]:
+    """Raw pixels (gh, gw, 2) float32 of every GRID_STEP-th rectified pixel, the far border included."""
+    size = (camera.width + GRID_STEP, camera.height + GRID_STEP)
+    d = np.array(camera.distortion, np.float64)
+    undistort = cv2.fisheye.initUndistortRectifyMap if camera.lens is Lens.EQUIDISTANT else cv2.initUndistortRectifyMap
+    x, y = undistort(camera.matrix(), d, rotation, new, size, cv2.CV_32FC1)
+    return np.ascontiguousarray(np.stack([x, y], axis=-1)[::GRID_STEP, ::GRID_STEP], np.float32)
+
+
+def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:
+    """Rotations raw -> rectified of both eyes and the camera matrix they share (A. Fusiello et al., 2000).
+
+    Each eye turns by half of their relative rotation, then both turn x onto the baseline. The shared focal length is
+    chosen so that the middle of each image side stays in view: what is cropped is only the far corners of the lens.
+    """
+    assert rig.right is not None and rig.T_c_r is not None
+    half = se3.so3_exp(0.5 * se3.so3_log(rig.T_c_r[:3, :3]))  # maps the middle orientation into the left camera
+    baseline = half.T @ rig.T_c_r[:3, 3]
+    if abs(baseline[0]) < abs(baseline[1]) or baseline[0] < 0:
+        raise CalibrationError("the right camera must lie to the right of the left one (x of T_c_r positive)")
+    x = baseline / np.linalg.norm(baseline)
+    y = np.cross(np.array([0.0, 0.0, 1.0]), x)
+    y /= np.linalg.norm(y)
+    turn = np.stack([x, y, np.cross(x, y)])
+    r_left = turn @ half.T
+    r_right = turn @ half.T @ rig.T_c_r[:3, :3]
+    if min(r_left[2, 2], r_right[2, 2]) < LEAST_COSINE:
+        raise CalibrationError("the two cameras hardly look the same way: expected the extrinsics of a stereo pair")
+    sides = [_side_rays(rig.left, r_left), _side_rays(rig.right, r_right)]
+    left, right = max(s[0] for s in sides), min(s[1] for s in sides)
+    top, bottom = max(s[2] for s in sides), min(s[3] for s in sides)
+    width, height = rig.left.width, rig.left.height
+    focal = max((width - 1) / (right - left), (height - 1) / (bottom - top))
+    cx = 0.5 * (width - 1) - focal * 0.5 * (left + right)
+    cy = 0.5 * (height - 1) - focal * 0.5 * (top + bottom)
+    return r_left, r_right, np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+
+
+def _side_rays(camera: CameraModel, rotation: F64) -> tuple[float, float, float, float]:
+    """x/z at the middle of the left and right side, y/z at the middle of the top and bottom side, after rotation."""
+    w, h = camera.width - 1.0, camera.height - 1.0
+    pixels = np.array([[[0.0, h / 2]], [[w, h / 2]], [[w / 2, 0.0]], [[w / 2, h]]])
+    d = np.array(camera.distortion, np.float64)
+    if camera.lens is Lens.EQUIDISTANT:
+        rays = cv2.fisheye.undistortPoints(pixels, camera.matrix(), d, R=rotation)
+    else:
+        rays = cv2.undistortPoints(pixels, camera.matrix(), d, R=rotation)
+    x, y = rays.reshape(4, 2).T
+    # Beyond 180 degrees a lens has no such point, and far below that the ideal image is mostly stretched corners.
+    left, top = (v if -WIDEST < v < 0 else -WIDEST for v in (float(x[0]), float(y[2])))
+    right, bottom = (v if 0 < v < WIDEST else WIDEST for v in (float(x[1]), float(y[3])))
+    return left, right, top, bottom

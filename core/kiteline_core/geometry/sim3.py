@@ -1,0 +1,70 @@
+"""Similarities as 4x4 float64 arrays: `S_a_b` maps points of frame b into a, whose unit of length may be another.
+
+The upper left part is a scale times a rotation: lengths of b, times the scale, are lengths of a. A rigid motion is a
+similarity of scale 1, and is treated to the last bit as `se3` treats it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+_ONE = 1e-9  # a scale nearer to 1 is 1: rotations are orthonormal to no more
+
+
+def scale_of(S: F64) -> float:
+    """How many units of a one unit of b is."""
+    scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
+    return 1.0 if abs(scale - 1.0) < _ONE else scale
+
+
+def of(scale: float, T: F64) -> F64:
+    """The similarity (4,4) with the rotation and the translation of a rigid motion, and a scale."""
+    S = np.array(T, np.float64)
+    S[:3, :3] *= scale
+    return S
+
+
+def rigid(S: F64) -> F64:
+    """The rigid motion (4,4) with the rotation and the translation of a similarity."""
+    scale = scale_of(S)
+    return se3.orthonormalise(S if scale == 1.0 else se3.from_rt(S[:3, :3] / scale, S[:3, 3]))
+
+
+def inverse(S: F64) -> F64:
+    """S_b_a of S_a_b."""
+    scale = scale_of(S)
+    if scale == 1.0:
+        return se3.inverse(S)
+    back = S[:3, :3].T / scale**2
+    return se3.from_rt(back, -(back @ S[:3, 3]))
+
+
+def normalise(S: F64) -> F64:
+    """The similarity nearest to S: products of many drift off the manifold."""
+    scale = scale_of(S)
+    return se3.orthonormalise(S) if scale == 1.0 else of(scale, rigid(S))
+
+
+def grown(S_a_b: F64, factor: float, T_b_k: F64) -> F64:
+    """The similarity (4,4) with so many times the scale, by which a body at T_b_k (4,4) stands where it stood."""
+    there = of(scale_of(S_a_b) * factor, rigid(place(S_a_b, T_b_k)))
+    return normalise(there @ se3.inverse(T_b_k))
+
+
+def place(S_a_b: F64, T_b_k: F64) -> F64:
+    """Where bodies that stand at rigid motions T_b_k (4,4) or (n,4,4) stand in a: rigid motions again."""
+    scale = scale_of(S_a_b)
+    out = np.asarray(S_a_b @ T_b_k)
+    if scale != 1.0:
+        out[..., :3, :3] /= scale
+    return out
+
+
+def stretched(T: F64, factor: float) -> F64:
+    """A rigid motion (4,4) with its translation multiplied by `factor`."""
+    return se3.from_rt(T[:3, :3], T[:3, 3] * factor)

@@ -1,0 +1,73 @@
+"""Which descriptor of one view shows the same thing as which of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.imaging import matching_kernels as kernels
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True)
+class MatchConfig:
+    """What counts as the same descriptor."""
+
+    max_hamming: int = 64  # bits of 256: unrelated descriptors differ in 128 +- 8, re-seen ones in 20 to 60
+    ratio: float = 0.85  # of the best distance to the second best: above it, the texture repeats
+    turn_bins: int = 16  # bins of the histogram of turns between the two views; 22.5 degrees each
+    turn_kept: int = 3  # bins that stay: neighbours share a turn that falls between them
+    cell_px: float = 32.0  # cells of the guided search
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """a, b: (n,) int32 indices that belong together. distance: (n,) int32 bits."""
+
+    a: I32
+    b: I32
+    distance: I32
+
+
+def words(descriptors: U8) -> U64:
+    """Descriptors (n,32) uint8 as (n,4) uint64, which is what the kernels compare."""
+    return np.ascontiguousarray(descriptors).view(np.uint64).reshape(len(descriptors), 4)
+
+
+def match(a: U8, angle_a: U8, b: U8, angle_b: U8, config: MatchConfig) -> Matches:
+    """Brute force: descriptors (n,32) and (m,32) with their angles in 1/256 turns. One match each at most."""
+    best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
+    kernels.match_all(words(a), words(b), config.max_hamming, config.ratio, best, distance)
+    kernels.agree_in_turn(best, angle_a, angle_b, config.turn_bins, config.turn_kept)
+    return _pairs(best, distance)
+
+
+def match_near(
+    uv: F64, radius_px: F64, octave: F64, a: U8, uv2: F64, octave2: U8, b: U8, size: tuple[int, int],
+    octave_gap: float, config: MatchConfig,
+) -> Matches:  # fmt: skip
+    """Guided: each foreseen pixel uv (n,2) looks within radius_px (n,) among measured uv2 (m,2).
+
+    octave: (n,) foreseen pyramid level; octave2: (m,) measured. size: width, height px of the image.
+    """
+    columns = -(-size[0] // int(config.cell_px))
+    rows = -(-size[1] // int(config.cell_px))
+    start, item = np.empty((rows, columns + 1), np.int32), np.empty(len(uv2), np.int32)
+    kernels.fill_cells(uv2, config.cell_px, start, item)
+    best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
+    kernels.match_cells(
+        uv, radius_px, octave, words(a), uv2, octave2, words(b), config.cell_px, start, item,
+        octave_gap, config.max_hamming, config.ratio, best, distance,
+    )  # fmt: skip
+    return _pairs(best, distance)
+
+
+def _pairs(best: I32, distance: I32) -> Matches:
+    kept = np.flatnonzero(best >= 0).astype(np.int32)
+    return Matches(kept, best[kept], distance[kept])

@@ -1,0 +1,180 @@
+"""Places recognised by their descriptors: a tree of binary words, and an inverted index of which place has which.
+
+(D. Galvez-Lopez, J. Tardos, "Bags of binary words for fast place recognition in image sequences", 2012.) The tree is
+trained once and handed in; places come and go. Whether successive candidates agree is the caller's business.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.imaging.matching import words
+from kiteline_core.places import place_kernels as kernels
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
+
+_MAGIC = b"KLW1"
+_HEADER = struct.Struct("<4sBB")
+_IDF_STEP = 1.0 / 24.0  # of the packed logarithm: 255 steps reach words that 1 of 40,000 images has
+
+
+@dataclass(frozen=True, slots=True)
+class Vocabulary:
+    """centres: (nodes,4) uint64, level by level. weight: (branching^levels,) float32 inverse document frequency."""
+
+    branching: int
+    levels: int
+    centres: U64
+    weight: F32
+
+    def words_of(self, descriptors: U8) -> I32:
+        """The word (n,) of each descriptor (n,32)."""
+        out = np.empty(len(descriptors), np.int32)
+        kernels.find_words(words(descriptors), self.centres, self.branching, self.levels, out)
+        return out
+
+
+def nodes(branching: int, levels: int) -> int:
+    """How many centres a tree has; the root needs none."""
+    return sum(branching**level for level in range(1, levels + 1))
+
+
+def pack(vocabulary: Vocabulary) -> bytes:
+    """A vocabulary as the bytes that `unpack` reads; weights are rounded to 1/24."""
+    weight = np.clip(np.rint(vocabulary.weight / _IDF_STEP), 0, 255).astype(np.uint8)
+    head: bytes = _HEADER.pack(_MAGIC, vocabulary.branching, vocabulary.levels)
+    return b"".join((head, vocabulary.centres.astype("<u8").tobytes(), weight.tobytes()))
+
+
+def unpack(data: bytes) -> Vocabulary:
+    """A vocabulary from its bytes. Raises ValueError when they are none."""
+    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+        raise ValueError(f"no packed words: expected {_MAGIC!r} first, found {data[:4]!r}")
+    _, branching, levels = _HEADER.unpack_from(data)
+    if not (2 <= branching <= 64 and 1 <= levels <= 6):
+        raise ValueError(f"packed words: a tree of branching {branching} and {levels} levels; expected 2..64 and 1..6")
+    count, leaves = nodes(branching, levels), branching**levels
+    expected = _HEADER.size + 32 * count + leaves
+    if len(data) != expected:
+        raise ValueError(f"packed words: found {len(data)} bytes, expected {expected} for {branching}^{levels} words")
+    centres = np.frombuffer(data, "<u8", 4 * count, _HEADER.size).astype(np.uint64).reshape(count, 4)
+    weight = np.frombuffer(data, np.uint8, leaves, _HEADER.size + 32 * count).astype(np.float32) * np.float32(_IDF_STEP)
+    return Vocabulary(branching, levels, centres, weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """keys: (n,) int64 of places, the most alike first. score: (n,) likeness in [0, 1]."""
+
+    keys: I64
+    score: F64
+
+
+class PlaceIndex:
+    """Which places look like this one? Keys are the caller's (keyframe ids). Grows as it is filled."""
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        self._vocabulary = vocabulary
+        n = len(vocabulary.weight)
+        self._scratch = np.zeros(n)
+        # A word's postings (which place has it, and how much) are a run: start, size, and room to grow.
+        self._start, self._size, self._room = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+        self._top = np.zeros(1, np.int32)
+        self._owner, self._worth = np.empty(0, np.int32), np.empty(0, np.float32)
+        self._row: dict[int, int] = {}
+        self._key = np.empty(0, np.int64)  # of each row; -1 unused
+        self._entries: list[tuple[I32, F64]] = []
+        self._unused: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._row
+
+    @property
+    def keys(self) -> list[int]:
+        """Keys of all places, in the order in which they came."""
+        return list(self._row)
+
+    def add(self, key: int, descriptors: U8) -> None:
+        """Remember a place by its descriptors (n,32); what it had before is replaced."""
+        self.remove(key)
+        word, value = self._vector(descriptors)
+        row = self._unused.pop() if self._unused else len(self._entries)
+        if row == len(self._entries):
+            self._entries.append((word, value))
+            if row == len(self._key):
+                self._key = np.concatenate([self._key, np.full(max(64, row), -1, np.int64)])
+        self._entries[row] = (word, value)
+        self._key[row], self._row[key] = key, row
+        done = 0
+        while True:
+            done = kernels.insert(
+                word, value, done, row, self._top, self._start, self._size, self._room, self._owner, self._worth
+            )
+            if done == len(word):
+                return
+            self._grow()
+
+    def remove(self, key: int) -> None:
+        """Forget a place; unknown keys are no error."""
+        row = self._row.pop(key, None)
+        if row is None:
+            return
+        word, _ = self._entries[row]
+        kernels.remove(word, row, self._start, self._size, self._owner, self._worth)
+        self._entries[row] = (np.empty(0, np.int32), np.empty(0))
+        self._key[row] = -1
+        self._unused.append(row)
+
+    def query(self, descriptors: U8, exclude: Collection[int] = (), limit: int = 10) -> Places:
+        """The `limit` places most alike to descriptors (n,32), without those excluded. Places that share no word
+        never come; of equally alike ones the smaller key comes first.
+        """
+        total = self._scores(self._vector(descriptors))
+        for key in exclude:
+            if (row := self._row.get(key)) is not None:
+                total[row] = 0.0
+        rows = np.flatnonzero(total > 0.0)
+        if len(rows) > 4 * limit:
+            rows = rows[total[rows] >= np.partition(total[rows], len(rows) - limit)[len(rows) - limit]]
+        rows = rows[np.lexsort((self._key[rows], -total[rows]))[:limit]]
+        return Places(self._key[rows], total[rows])
+
+    def likeness(self, key: int, others: Collection[int]) -> F64:
+        """Likeness (n,) of a known place to others, 0 for unknown ones: what a true candidate has to beat."""
+        total = self._scores(self._entries[self._row[key]])
+        return np.array([total[self._row[k]] if k in self._row else 0.0 for k in others])
+
+    def _scores(self, vector: tuple[I32, F64]) -> F64:
+        total = np.zeros(len(self._entries))
+        kernels.score(vector[0], vector[1], self._start, self._size, self._owner, self._worth, total)
+        return total
+
+    def _vector(self, descriptors: U8) -> tuple[I32, F64]:
+        word = self._vocabulary.words_of(descriptors)
+        out, value = np.empty(len(word), np.int32), np.empty(len(word))
+        n = kernels.histogram(word, self._vocabulary.weight, self._scratch, out, value)
+        return out[:n].copy(), value[:n].copy()
+
+    def _grow(self) -> None:
+        wanted = np.where(self._size > 0, np.maximum(4, self._size + self._size // 2), 0)
+        self._room = np.minimum(self._room, wanted).astype(np.int32)
+        held, widest = int(self._room.sum()), int(self._room.max())
+        capacity = held + max(held // 2, 2 * widest) + 4096  # any run finds room at the top now
+        owner, worth = np.empty(capacity, np.int32), np.empty(capacity, np.float32)
+        kernels.move_runs(
+            self._top, self._start, self._size, self._room, self._owner, self._worth, owner, worth
+        )  # fmt: skip
+        self._owner, self._worth = owner, worth

@@ -1,0 +1,364 @@
+"""An MCAP recording as a source: ROS 2 bags, Foxglove recordings, our own logs (which give the very same frames)."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core import odometry
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
+from kiteline_core.geometry.cameras import CameraRig
+from kiteline_hw.bags.mcap_messages import (
+    KINDS,
+    BadMessage,
+    Calibration,
+    Kind,
+    MessageReader,
+    Transform,
+    calibration_of,
+    child_of,
+    frame_of,
+    image_of,
+    imu_of,
+    is_depth,
+    odometry_of,
+    pose_of,
+    stamp_ns,
+    transforms_of,
+)
+from kiteline_hw.bags.mcap_rig import ImageTopic, Selection, TransformTree, select
+from kiteline_hw.logs.mcap_file import McapFile, RawMessage
+from kiteline_hw.logs.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, ODOMETER, RIG, RIGHT
+from kiteline_hw.logs.rig_json import rig_from_json
+from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.sensors.assemble import DEPTH_TOLERANCE_NS, PAIR_TOLERANCE_NS, Capture, deliver, pair_by_time
+from kiteline_hw.sensors.images import ImageRef
+from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
+from kiteline_hw.sensors.odometry_buffer import OdometerStream, before_frames
+from kiteline_hw.sensors.raw_pixels import RawPixels
+from kiteline_hw.sources.tables import trajectory
+
+_HOLD_NS = 200_000_000  # ns; how long a message waits for older ones that were recorded later
+_HOLD_MOST_NS = 1_000_000_000  # ns; how long it waits for a stream that has fallen behind or silent
+_TRUTH_WORDS = ("truth", "ground", "gt", "vicon", "mocap", "optitrack", "leica")
+_SEEN_WORDS = ("vio", "visual", "vins", "slam", "kiteline", "lidar", "icp", "gps", "gnss")  # no wheels
+_GRAVITY_MESSAGES = 200  # messages that tell the unit of acceleration: a second or so
+STANDARD_GRAVITY = 9.80665  # m/s^2
+_DYNAMIC_MOST = 2000  # messages of moving transforms that are looked at when static ones do not connect the sensors
+
+
+def open_mcap(path: Path, *, mono: bool = False, imu: bool = True) -> McapSource:
+    """Open a recording. Raises SourceError."""
+    return McapSource(McapFile(path), mono, imu)
+
+
+class McapSource:
+    """A FrameSource over an MCAP file. Messages are read while iterating."""
+
+    def __init__(self, file: McapFile, mono: bool, imu: bool) -> None:
+        self.name = f"mcap:{file.path}"
+        self.report = SourceReport()
+        self._file = file
+        self._reader = MessageReader()
+        self._in_g = False
+        self._truth: Trajectory | None = None
+        self._truth_read = False
+        self._notes: tuple[str, ...] = ()
+        self._odometer_channel: int | None = None
+        self._T_b_d: NDArray[np.float64] | None = None  # the odometer's frame in the body; None: it speaks of the body
+        rig_channel = self._by_schema("kiteline.Rig")
+        if rig_channel is not None:
+            self._open_own(rig_channel, mono)
+        else:
+            self._open_foreign(mono)
+        if not imu:
+            self.imu = None
+
+    rig: CameraRig
+    imu: ImuCalibration | None
+
+    @property
+    def frame_count(self) -> int | None:
+        """Images of the left camera."""
+        return self._file.counts.get(self._left, 0)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Poses of the body that the recording calls truth, or the only poses that it has; read when first asked."""
+        if not self._truth_read:
+            self._truth_read = True
+            channel = self._truth_channel()
+            if channel is not None:
+                poses = []
+                for raw in self._file.messages((channel,)):
+                    try:
+                        message = self._decode(raw)
+                        poses.append((stamp_ns(message, raw.log_ns), pose_of(message)))
+                    except BadMessage:
+                        continue
+                self._truth = trajectory(poses) if poses else None
+        return self._truth
+
+    def close(self) -> None:
+        """Nothing is held open between two readings."""
+
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
+        self.report.skipped.clear()
+        self.report.notes.clear()
+        self.report.notes.extend(self._notes)
+        if self._file.cut:
+            self.report.skip("file cut", self._file.cut)
+        stream = ImuStream(self.report) if self.imu is not None else None
+        odometer = OdometerStream(self.report)
+        captures = self._captures(stream, odometer)
+        items = deliver(captures, stream if stream is not None else NoImu(), self.rig, self.report, self.name)
+        return before_frames(items, odometer) if self._odometer_channel is not None else items
+
+    # Opening
+
+    def _open_own(self, rig_channel: int, mono: bool) -> None:
+        raw = self._file.first(rig_channel)
+        if raw is None:
+            raise SourceError(f"{self.name}: the log was cut before its calibration")
+        try:
+            rig, self.imu = rig_from_json(json.loads(raw.data))
+        except ValueError as error:
+            raise SourceError(f"{self.name}: unusable calibration on {RIG} ({error})") from error
+        if mono:
+            rig = replace(rig, right=None, T_c_r=None, has_depth=False)
+        self.rig = rig
+        topics = {c.topic: i for i, c in self._file.channels.items()}
+        if LEFT not in topics:
+            several = sorted(topic for topic in topics if topic.endswith(LEFT))
+            why = f"it merges several recordings ({', '.join(several)})" if several else "a base station's log has none"
+            raise SourceError(f"{self.name}: no images on {LEFT}: {why}")
+        self._left = topics[LEFT]
+        self._right = topics.get(RIGHT) if rig.right is not None else None
+        self._depth = topics.get(DEPTH) if rig.has_depth else None
+        self._imu_channel = topics.get(IMU)
+        self._odometer_channel = topics.get(ODOMETER)
+        self._truth_topic: int | None = topics.get(GROUND_TRUTH)
+        self._own = True
+
+    def _open_foreign(self, mono: bool) -> None:
+        images, calibrations, imu_channel, imu_frame = self._discover()
+        tree = TransformTree(self._transforms())
+        found = select(self.name, images, calibrations, tree, imu_frame, mono)
+        self._truth_topic = None
+        self._own = False
+        self.rig, self._notes = found.rig, found.notes
+        self._left = found.left.channel
+        self._right = found.right.channel if found.right is not None else None
+        self._depth = found.depth.channel if found.depth is not None else None
+        self._imu_channel = imu_channel if found.imu_usable else None
+        self.imu = None
+        if self._imu_channel is not None:
+            self.imu = ImuCalibration(rate_hz=self._rate_hz(self._imu_channel) or ImuCalibration().rate_hz)
+            self._in_g = self._accelerations_in_g(self._imu_channel)
+            if self._in_g:
+                self._notes += ("accelerations were in g and are turned to m/s^2",)
+        self._choose_odometer(tree, found)
+
+    def _choose_odometer(self, tree: TransformTree, found: Selection) -> None:
+        """The odometer of a foreign recording: no truth, rather no other SLAM, and its place in the body is known."""
+        truth = self._truth_channel(named_only=True)
+        topics = [
+            c for c, kind in self._channels() if kind is Kind.ODOMETRY and c != truth and self._file.counts.get(c)
+        ]
+
+        def rank(channel: int) -> tuple[bool, bool, int]:
+            name = self._file.channels[channel].topic.lower()
+            return not any(word in name for word in _SEEN_WORDS), "wheel" in name, self._file.counts.get(channel, 0)
+
+        for channel in sorted(topics, key=rank, reverse=True):
+            topic, raw = self._file.channels[channel].topic, self._file.first(channel)
+            if raw is None or any(word in topic.lower() for word in _TRUTH_WORDS):
+                continue
+            try:
+                child = child_of(self._decode(raw))
+            except BadMessage:
+                continue
+            T_l_d = tree.between(found.left.frame_id, child)
+            if T_l_d is not None:
+                self._odometer_channel, self._T_b_d = channel, found.T_b_l @ T_l_d
+                self._notes += (f"odometry is that of {topic}",)
+                return
+            frames = f"its frame {child!r} and the camera's {found.left.frame_id!r}"
+            self._notes += (f"odometry of {topic} left out: no static transform between {frames}",)
+
+    def _discover(self) -> tuple[list[ImageTopic], list[tuple[str, Calibration]], int | None, str | None]:
+        images: list[ImageTopic] = []
+        calibrations: list[tuple[str, Calibration]] = []
+        imus: list[tuple[int, int, str]] = []
+        faults: list[str] = []
+        for channel, kind in self._channels():
+            topic = self._file.channels[channel].topic
+            raw = self._file.first(channel)
+            if raw is None:
+                continue
+            try:
+                message = self._decode(raw)
+                if kind is Kind.IMAGE:
+                    image = image_of(message, self._file.channels[channel].metadata)
+                    encoded = not isinstance(image, RawPixels)
+                    count = self._file.counts.get(channel, 0)
+                    images.append(ImageTopic(channel, topic, frame_of(message), count, is_depth(image), encoded))
+                elif kind is Kind.CALIBRATION:
+                    calibrations.append((topic, calibration_of(message)))
+                elif kind is Kind.IMU:
+                    row = imu_of(message, raw.log_ns)[0][1]
+                    if any(row[:3]) and any(row[3:]):  # some drivers send gyro and accelerometer on topics of their own
+                        imus.append((self._file.counts.get(channel, 0), channel, frame_of(message)))
+            except BadMessage as error:
+                faults.append(str(error))
+        if faults and not images:
+            raise SourceError(f"{self.name}: {faults[0]}")
+        best = max(imus, default=None)
+        return images, calibrations, best[1] if best else None, best[2] if best else None
+
+    def _accelerations_in_g(self, channel: int) -> bool:
+        """Some drivers send g where ROS wants m/s^2: then gravity has a length near 1."""
+        norms = []
+        for raw in islice(self._file.messages((channel,), ordered=False), _GRAVITY_MESSAGES):
+            with suppress(BadMessage):
+                norms += [float(np.linalg.norm(row[3:])) for _, row in imu_of(self._decode(raw), raw.log_ns)]
+        return bool(norms) and 0.5 < float(np.median(norms)) < 2.0
+
+    def _transforms(self) -> list[Transform]:
+        channels = [c for c, kind in self._channels() if kind is Kind.TRANSFORM]
+        static = [c for c in channels if "static" in self._file.channels[c].topic]
+        out: list[Transform] = []
+        for group, most in ((static, None), ([c for c in channels if c not in static], _DYNAMIC_MOST)):
+            if not group:
+                continue
+            for i, raw in enumerate(self._file.messages(group, ordered=False)):
+                if most is not None and i >= most:
+                    break
+                try:
+                    out.extend(transforms_of(self._decode(raw)))
+                except BadMessage:
+                    continue
+        return out
+
+    def _truth_channel(self, *, named_only: bool = False) -> int | None:
+        if self._own:
+            return self._truth_topic
+        kinds = (Kind.POSE, Kind.ODOMETRY)
+        poses = [c for c, kind in self._channels() if kind in kinds and self._file.counts.get(c)]
+        named = [c for c in poses if any(w in self._file.channels[c].topic.lower() for w in _TRUTH_WORDS)]
+        if named:
+            return max(named, key=lambda c: self._file.counts.get(c, 0))
+        return poses[0] if len(poses) == 1 and not named_only else None
+
+    def _channels(self) -> Iterator[tuple[int, Kind]]:
+        for channel in sorted(self._file.channels):
+            schema = self._file.schema_of(channel)
+            kind = KINDS.get(schema.name) if schema is not None else None
+            if kind is not None:
+                yield channel, kind
+
+    def _by_schema(self, name: str) -> int | None:
+        for channel in sorted(self._file.channels):
+            schema = self._file.schema_of(channel)
+            if schema is not None and schema.name == name:
+                return channel
+        return None
+
+    def _rate_hz(self, channel: int) -> float:
+        span_s = (self._file.last_ns - self._file.first_ns) * 1e-9
+        return round(self._file.counts.get(channel, 0) / span_s, 1) if span_s > 0 else 0.0
+
+    def _decode(self, raw: RawMessage) -> Any:
+        return self._reader.decode(self._file.channels[raw.channel], self._file.schema_of(raw.channel), raw.data)
+
+    # Reading
+
+    def _captures(self, imu: ImuStream | None, odometer: OdometerStream) -> Iterator[Capture]:
+        sides = {self._left: 0}
+        partner = self._right if self._right is not None else self._depth
+        if partner is not None:
+            sides[partner] = 1
+        depths: deque[tuple[int, ImageRef]] = deque()
+        both = self._right is not None and self._depth is not None
+
+        def images() -> Iterator[tuple[int, int, ImageRef]]:
+            for t_ns, channel, item in self._in_order(imu is not None):
+                if channel == self._imu_channel:
+                    assert imu is not None
+                    imu.add(t_ns, (*item[:3], *(a * STANDARD_GRAVITY for a in item[3:])) if self._in_g else item)
+                elif channel == self._odometer_channel:
+                    odometer.add(item if self._T_b_d is None else odometry.in_body(item, self._T_b_d))
+                elif both and channel == self._depth:
+                    depths.append((t_ns, item))
+                else:
+                    yield t_ns, sides[channel], item
+
+        if partner is None:
+            for t, _, image in images():
+                yield Capture(t, image)
+            return
+        stereo = self._right is not None
+        most_ns = PAIR_TOLERANCE_NS if stereo else DEPTH_TOLERANCE_NS
+        rate_hz = self._rate_hz(self._left)
+        tolerance_ns = min(most_ns, int(0.5e9 / rate_hz)) if stereo and rate_hz > 0 else most_ns
+        names = ("left image", "right image" if stereo else "depth image")
+        for t, left, other in pair_by_time(images(), tolerance_ns, names, self.report):
+            if not both:
+                yield Capture(t, left, other) if stereo else Capture(t, left, depth=other)
+                continue
+            while depths and depths[0][0] < t:
+                depths.popleft()
+            yield Capture(t, left, other, depths.popleft()[1] if depths and depths[0][0] == t else None)
+
+    def _in_order(self, with_imu: bool) -> Iterator[tuple[int, int, Any]]:
+        """Images and samples (t_ns, channel, item) in order of their own stamps, not of their recording."""
+        wanted = [c for c in (self._left, self._right, self._depth) if c is not None]
+        if with_imu and self._imu_channel is not None:
+            wanted.append(self._imu_channel)
+        if self._odometer_channel is not None:
+            wanted.append(self._odometer_channel)
+        newest = dict.fromkeys(wanted, 0)
+        heap: list[tuple[int, int, int, int, Any]] = []
+        order = 0
+        for raw in self._file.messages(wanted):
+            try:
+                message = self._decode(raw)
+                if raw.channel == self._imu_channel:
+                    items: list[tuple[int, Any]] = list(imu_of(message, raw.log_ns))
+                elif raw.channel == self._odometer_channel:
+                    batch = odometry_of(message, raw.log_ns)
+                    items = [(int(batch.t_ns[-1]), batch)] if len(batch.t_ns) else []
+                else:
+                    notes = self._file.channels[raw.channel].metadata
+                    items = [(stamp_ns(message, raw.log_ns), image_of(message, notes))]
+            except BadMessage as error:
+                self.report.skip("unreadable message", str(error))
+                continue
+            for t_ns, item in items:
+                # At one instant: samples, then depth, then the eyes.
+                sampled = raw.channel in (self._imu_channel, self._odometer_channel)
+                rank = 0 if sampled else 1 if raw.channel == self._depth else 2
+                heapq.heappush(heap, (t_ns, rank, order, raw.channel, item))
+                order += 1
+                newest[raw.channel] = max(newest[raw.channel], t_ns)
+            front, back = max(newest.values()), min(newest.values())
+            while heap and (
+                heap[0][0] < front - _HOLD_MOST_NS or (heap[0][0] < front - _HOLD_NS and heap[0][0] <= back)
+            ):
+                t_ns, _, _, channel, item = heapq.heappop(heap)
+                yield t_ns, channel, item
+        while heap:
+            t_ns, _, _, channel, item = heapq.heappop(heap)
+            yield t_ns, channel, item
+        for note in self._file.notes:
+            self.report.skip("damaged chunk", note)

@@ -1,0 +1,133 @@
+"""Questions of other programs over Zenoh: a queryable that keeps them until the loop asks, and the one who asks.
+
+Key: kiteline/1/GROUP/SERVICE/VERB. The payload, or else the selector's parameters, is what is asked; the reply, or the
+error reply, is a text.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import zenoh
+
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.ports import LinkError
+
+_RETRY_S = 0.1  # s between two questions that nobody answered
+_WAITING = 64  # questions that may wait; more are refused
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """One question. number: to answer it by. verb: the last part of its key. text: JSON."""
+
+    number: int
+    verb: str
+    text: str
+
+
+def prefix(service: str, group: str = "default") -> str:
+    """The key of a service, without its verb."""
+    return f"kiteline/1/{group}/{service}"
+
+
+class QueryServer:
+    """Takes questions on a session, or on one of its own that listens on an endpoint. Raises LinkError."""
+
+    def __init__(self, service: str, session: zenoh.Session | None = None, endpoint: str = "") -> None:
+        self._own = open_session(endpoint, "base") if session is None else None
+        self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._open: dict[int, Any] = {}
+        self._number = 0
+        self.callback_errors = 0
+        where = self._own if session is None else session
+        assert where is not None
+        try:
+            self._queryable = where.declare_queryable(f"{prefix(service)}/*", direct(self._on_query), complete=True)
+        except zenoh.ZError as error:
+            self.close()
+            raise LinkError(f"cannot answer questions on {prefix(service)}: {error}") from error
+
+    def _on_query(self, query: Any) -> None:
+        try:
+            if self._arrived.qsize() >= _WAITING:
+                _reply(query, False, json.dumps({"error": "too many questions wait; ask again"}))
+            else:
+                self._arrived.put(query)
+        except Exception:
+            self.callback_errors += 1
+
+    def questions(self) -> list[Question]:
+        """What came since the last call. Never blocks."""
+        out: list[Question] = []
+        while True:
+            try:
+                query = self._arrived.get_nowait()
+            except queue.Empty:
+                return out
+            self._number += 1
+            self._open[self._number] = query
+            raw = query.payload.to_bytes() if query.payload is not None else b""
+            text = raw.decode(errors="replace") or _as_json(str(query.parameters))
+            out.append(Question(self._number, str(query.key_expr).rsplit("/", 1)[-1], text))
+
+    def answer(self, number: int, ok: bool, text: str) -> None:
+        """Answer a question; who asked may be gone."""
+        query = self._open.pop(number, None)
+        if query is not None:
+            _reply(query, ok, text)
+
+    def close(self) -> None:
+        """Take no more questions."""
+        if self._own is not None:
+            close_session(self._own)
+
+
+def _as_json(parameters: str) -> str:
+    """Selector parameters, name=value;name=value, as a JSON object of texts."""
+    pairs = [pair.partition("=") for pair in parameters.split(";") if pair]
+    return json.dumps({name: value for name, _, value in pairs})
+
+
+def _reply(query: Any, ok: bool, text: str) -> None:
+    with contextlib.suppress(zenoh.ZError), query:
+        if ok:
+            query.reply(query.key_expr, text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
+        else:
+            query.reply_err(text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def ask(endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10.0) -> tuple[bool, str]:
+    """Ask, again while nobody answers yet. Returns whether it was done, and the answer. Raises LinkError."""
+    deadline_s = time.monotonic() + timeout_s
+    session = open_session(endpoint, "client", connect_timeout_s=timeout_s)
+    try:
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()
+            session.get(
+                f"{prefix(service)}/{verb}", direct(partial(_take, replies), partial(replies.put, None)),
+                payload=text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=left_s,
+            )  # fmt: skip
+            with contextlib.suppress(queue.Empty):
+                first = replies.get(timeout=left_s + 1.0)
+                if first is not None:
+                    return first
+            time.sleep(_RETRY_S)  # the base is just starting: it listens, and reads its store
+        raise LinkError(f"no base at {endpoint} answers {service}/{verb}: is it one that serves its maps there?")
+    except zenoh.ZError as error:
+        raise LinkError(f"the link to {endpoint} broke: {error}") from error
+    finally:
+        close_session(session)
+
+
+def _take(replies: queue.SimpleQueue[tuple[bool, str] | None], reply: Any) -> None:
+    if reply.ok is not None:
+        replies.put((True, reply.ok.payload.to_bytes().decode(errors="replace")))
+    elif reply.err is not None:
+        replies.put((False, reply.err.payload.to_bytes().decode(errors="replace")))

@@ -1,0 +1,331 @@
+"""Logs: one MCAP file a process, readable by Foxglove and Lichtblick, recoverable when cut, reproducible in every byte.
+
+Write::
+
+    log = LogWriter(path, {"role": "agent", "agent": "0"})      # metadata record "kiteline"
+    log.rig(t_ns, source.rig, source.imu)                       # once, so that the log opens as a source again
+    log.frame(frame)                                            # /left/image, /right/image, /depth/image
+    log.imu(IMU, t_ns, batch);  log.odometer(ODOMETER, t_ns, batch)
+    log.blob("/packets/in", t_ns, packet)                       # opaque bytes
+    log.json("/events", t_ns, {"reset": 1})
+    log.transform("/tf", t_ns, "map", "body", T_map_body);  log.pose("/pose", t_ns, "world", T_w_b)
+    log.poses("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.scan(...);  log.text("/log", t_ns, "info", "…")
+    log.close()                                                 # also a context manager
+
+Every call takes the flight time that the caller hands in as log time; nothing here reads a clock, so equal calls give
+equal bytes. Chunks close at 64 KiB and after one second of flight time, so that a cut file loses little.
+
+Read::
+
+    with LogReader(path) as log:
+        log.metadata["role"];  log.topics;  log.cut             # cut: None, or where a broken file ends
+        for m in log.messages(["/packets/in", "/left/image"]):  # in the order in which they were written
+            m.topic, m.t_ns;  m.blob() | m.json() | m.image() | m.imu() | m.odometry() | m.pose() | m.transform()
+
+`read_frame(images, t_ns, has_depth)` decodes logged images to the Frame that the source gave. The whole log is a source
+as well: `open_source("mcap:agent0/log.mcap")` yields the same Frames, ImuBatches and OdometryBatches.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.logs import mcap_schemas as schemas
+from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
+from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sensors.images import encode_depth, encode_image
+
+F64 = NDArray[np.float64]
+
+__all__ = [
+    "DEPTH", "GROUND_TRUTH", "IMU", "LEFT", "ODOMETER", "RIG", "RIGHT", "LogMessage", "LogReader", "LogWriter",
+    "read_frame",
+]  # fmt: skip
+
+LEFT, RIGHT, DEPTH = "/left/image", "/right/image", "/depth/image"
+IMU, ODOMETER, RIG, GROUND_TRUTH = "/imu", "/odometer", "/rig", "/ground_truth"
+
+CHUNK_BYTES = 64 * 1024  # bytes; an unfinished chunk is what a cut may lose
+FLUSH_NS = 1_000_000_000  # ns of flight time after which an unfinished chunk is written out
+LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+
+
+class LogWriter:
+    """Writes one log. rotate_bytes: start a new file NAME_1.mcap, NAME_2.mcap… at this size. cap_bytes: never hold more
+    on disk: with rotation the oldest files go, without it writing stops there and `dropped` counts what was left out.
+
+    Raises SourceError when the file cannot be created; a full disk later counts as dropped too.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        metadata: Mapping[str, str],
+        *,
+        rotate_bytes: int | None = None,
+        cap_bytes: int | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.dropped = 0
+        self._metadata = dict(metadata)
+        self._rotate_bytes, self._cap_bytes = rotate_bytes, cap_bytes
+        self._files: list[Path] = []
+        self._head: list[tuple[int, CameraRig, ImuCalibration | None]] = []
+        self._open()
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # What a source delivers
+
+    def rig(self, t_ns: int, rig: CameraRig, imu: ImuCalibration | None) -> None:
+        """Calibration: exact on /rig (JSON), and as Foxglove CameraCalibration and FrameTransforms for viewers."""
+        self._head = [(t_ns, rig, imu)]
+        self.json(RIG, t_ns, rig_to_json(rig, imu), "kiteline.Rig")
+        self.calibration("/left/calibration", t_ns, rig.left, "left", 0.0)
+        self.transform("/tf_static", t_ns, "body", "left", rig.T_b_c)
+        if rig.right is not None and rig.T_c_r is not None:
+            self.calibration("/right/calibration", t_ns, rig.right, "right", float(rig.T_c_r[0, 3]))
+            self.transform("/tf_static", t_ns, "left", "right", rig.T_c_r)
+
+    def frame(self, frame: Frame) -> None:
+        """The images of a frame, as the source held them; raw ones are coded as PNG."""
+        t, kept = frame.t_ns, list(frame.encoded)
+        if not kept:
+            kept.append(encode_image(frame.left))
+            if frame.right is not None:
+                kept.append(encode_image(frame.right))
+            if frame.depth_m is not None:
+                kept.append(encode_depth(frame.depth_m))
+        self.image(LEFT, t, kept[0], "left")
+        if frame.right is not None:
+            self.image(RIGHT, t, kept[1], "right")
+        if frame.depth_m is not None:
+            self.image(DEPTH, t, kept[-1], "left")
+
+    def image(self, topic: str, t_ns: int, image: EncodedImage, frame_id: str) -> None:
+        """An encoded image. A depth format "png/5000" leaves "png" in the message and its scale in the channel."""
+        kind, _, scale = image.format.partition("/")
+        message = schemas.CompressedImage(frame_id=frame_id, format=kind)
+        self._stamp(message, t_ns)
+        notes = {"depth_scale": scale} if scale else {}
+        self._add(topic, t_ns, message, notes, schemas.bytes_field(schemas.CompressedImage, "data", image.data))
+
+    def imu(self, topic: str, t_ns: int, batch: ImuBatch) -> None:
+        """A batch of inertial samples."""
+        message = schemas.Imu(
+            t_ns=batch.t_ns.tolist(), gyro=batch.gyro.ravel().tolist(), accel=batch.accel.ravel().tolist()
+        )
+        self._add(topic, t_ns, message)
+
+    def odometer(self, topic: str, t_ns: int, batch: OdometryBatch) -> None:
+        """A batch of velocities."""
+        message = schemas.Odometry(
+            t_ns=batch.t_ns.tolist(), velocity=batch.velocity.ravel().tolist(), rate=batch.rate.ravel().tolist(),
+            velocity_cov=batch.velocity_cov.ravel().tolist(), rate_cov=batch.rate_cov.ravel().tolist(),
+        )  # fmt: skip
+        self._add(topic, t_ns, message)
+
+    def ground_truth(self, truth: Trajectory) -> None:
+        """All poses of a known trajectory, each at its own time."""
+        for t, pose in zip(truth.t_ns, truth.T_w_b, strict=True):
+            self.pose(GROUND_TRUTH, int(t), "world", pose)
+
+    # For eyes
+
+    def calibration(self, topic: str, t_ns: int, camera: CameraModel, frame_id: str, baseline_m: float) -> None:
+        """A lens. baseline_m: how far this camera stands to the right of the left one."""
+        k = camera.matrix()
+        p = np.hstack([k, [[-camera.fx * baseline_m], [0.0], [0.0]]])
+        message = schemas.CameraCalibration(
+            frame_id=frame_id, width=camera.width, height=camera.height, K=k.ravel(), R=np.eye(3).ravel(), P=p.ravel(),
+            distortion_model=LENS_NAMES[camera.lens], D=camera.distortion,
+        )  # fmt: skip
+        self._stamp(message, t_ns)
+        self._add(topic, t_ns, message)
+
+    def transform(self, topic: str, t_ns: int, parent: str, child: str, t_parent_child: F64) -> None:
+        """Where frame `child` lies in frame `parent`."""
+        message = schemas.FrameTransform(parent_frame_id=parent, child_frame_id=child)
+        self._stamp(message, t_ns)
+        _fill_pose(message.translation, message.rotation, t_parent_child)
+        self._add(topic, t_ns, message)
+
+    def pose(self, topic: str, t_ns: int, frame_id: str, pose: F64) -> None:
+        """A pose (4,4) in a frame."""
+        message = schemas.PoseInFrame(frame_id=frame_id)
+        self._stamp(message, t_ns)
+        _fill_pose(message.pose.position, message.pose.orientation, pose)
+        self._add(topic, t_ns, message)
+
+    def poses(self, topic: str, t_ns: int, frame_id: str, poses: F64) -> None:
+        """Poses (n,4,4) in a frame."""
+        message = schemas.PosesInFrame(frame_id=frame_id)
+        self._stamp(message, t_ns)
+        for pose in poses:
+            item = message.poses.add()
+            _fill_pose(item.position, item.orientation, pose)
+        self._add(topic, t_ns, message)
+
+    def scan(self, topic: str, t_ns: int, frame_id: str, angles_rad: tuple[float, float], ranges_m: F64) -> None:
+        """Ranges (n,) over equal steps between the first and the last angle."""
+        message = schemas.LaserScan(
+            frame_id=frame_id, start_angle=angles_rad[0], end_angle=angles_rad[1], ranges=ranges_m.tolist()
+        )
+        self._stamp(message, t_ns)
+        message.pose.orientation.w = 1.0
+        self._add(topic, t_ns, message)
+
+    def grid(
+        self,
+        topic: str,
+        t_ns: int,
+        frame_id: str,
+        cells: NDArray[np.int8],
+        cell_m: float,
+        corner_m: tuple[float, float],
+    ) -> None:
+        """Occupancy (rows, columns) int8, 0..100 percent, -1 unknown; row 0 is the lowest y, corner_m lower left."""
+        message = schemas.Grid(frame_id=frame_id, column_count=cells.shape[1], row_stride=cells.shape[1], cell_stride=1)
+        self._stamp(message, t_ns)
+        message.pose.position.x, message.pose.position.y = corner_m
+        message.pose.orientation.w = 1.0
+        message.cell_size.x = message.cell_size.y = cell_m
+        message.fields.add(name="occupancy", offset=0, type=2)  # INT8
+        message.data = np.ascontiguousarray(cells).tobytes()
+        self._add(topic, t_ns, message)
+
+    def text(self, topic: str, t_ns: int, level: str, text: str, name: str = "kiteline") -> None:
+        """A line of text; level: debug, info, warning, error, fatal."""
+        message = schemas.Log(level=LEVELS[level], message=text, name=name)  # type: ignore[arg-type]
+        self._stamp(message, t_ns)
+        self._add(topic, t_ns, message)
+
+    # For replay
+
+    def blob(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Opaque bytes."""
+        self._add(topic, t_ns, schemas.Blob(data=data))
+
+    def json(self, topic: str, t_ns: int, value: object, schema: str = "kiteline.Json") -> None:
+        """Anything that JSON can hold; keys keep their order."""
+        data = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+        self._write(topic, t_ns, "json", schema, "jsonschema", b'{"type":"object"}', data, {})
+
+    def flush(self) -> None:
+        """Hand all that was logged to the operating system."""
+        try:
+            self._writer.flush()
+        except OSError:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Finish the file with its index."""
+        if self._stream.closed:
+            return
+        try:
+            self._writer.finish()
+            self._stream.close()
+        except OSError:
+            self.dropped += 1
+
+    def _open(self) -> None:
+        number = len(self._files)
+        path = self.path if number == 0 else self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
+        try:
+            self._stream: BinaryIO = path.open("wb")
+        except OSError as error:
+            raise SourceError(f"{path}: cannot write the log: {error.strerror}") from error
+        self._files.append(path)
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer.start("", "kiteline")
+        self._writer.add_metadata("kiteline", self._metadata)
+        self._channels: dict[str, tuple[int, str, dict[str, str]]] = {}
+        self._schemas: dict[str, int] = {}
+        self._sequence: dict[int, int] = {}
+        self._flushed_ns: int | None = None
+        self._bytes = 0
+
+    def _stamp(self, message: Any, t_ns: int) -> None:
+        message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, 1_000_000_000)
+
+    def _add(
+        self, topic: str, t_ns: int, message: Any, notes: dict[str, str] | None = None, rest: tuple[bytes, ...] = ()
+    ) -> None:
+        name: str = message.DESCRIPTOR.full_name
+        schema = schemas.schema_data(type(message))
+        data = b"".join((message.SerializeToString(), *rest))
+        self._write(topic, t_ns, "protobuf", name, "protobuf", schema, data, notes or {})
+
+    def _write(
+        self,
+        topic: str,
+        t_ns: int,
+        encoding: str,
+        name: str,
+        kind: str,
+        schema: bytes,
+        data: bytes,
+        notes: dict[str, str],
+    ) -> None:
+        size = len(data) + 64
+        if self._cap_bytes is not None and not self._rotate_bytes and self._bytes + size > self._cap_bytes:
+            self.dropped += 1
+            return
+        if self._rotate_bytes is not None and self._bytes and self._bytes + size > self._rotate_bytes:
+            self._rotate(t_ns)
+        try:
+            known = self._channels.get(topic)
+            if known is None:
+                if name not in self._schemas:
+                    self._schemas[name] = self._writer.register_schema(name, kind, schema)
+                channel = self._writer.register_channel(topic, encoding, self._schemas[name], notes)
+                self._channels[topic] = (channel, name, notes)
+            elif known[1] != name:
+                raise ValueError(f"topic {topic} holds {known[1]}, not {name}")
+            else:
+                channel = known[0]
+            sequence = self._sequence.get(channel, 0)
+            self._sequence[channel] = sequence + 1
+            self._writer.add_message(channel, t_ns, data, t_ns, sequence)
+            self._bytes += size
+            if self._flushed_ns is None:
+                self._flushed_ns = t_ns
+            elif abs(t_ns - self._flushed_ns) >= FLUSH_NS:
+                self._flushed_ns = t_ns
+                self._writer.flush()
+        except OSError:
+            self.dropped += 1
+
+    def _rotate(self, t_ns: int) -> None:
+        self.close()
+        if self._cap_bytes is not None and self._rotate_bytes is not None:
+            most = max(1, self._cap_bytes // self._rotate_bytes - 1)
+            for path in self._files[:-most]:
+                path.unlink(missing_ok=True)
+        self._open()
+        for _, rig, imu in self._head:
+            self.rig(t_ns, rig, imu)
+
+
+def _fill_pose(position: Any, orientation: Any, pose: F64) -> None:
+    position.x, position.y, position.z = (float(v) for v in pose[:3, 3])
+    q = se3.quaternion_from_rotation(pose[:3, :3])
+    orientation.w, orientation.x, orientation.y, orientation.z = (float(v) for v in q)

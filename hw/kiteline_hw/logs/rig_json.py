@@ -1,0 +1,56 @@
+"""A camera rig and its IMU as JSON, exact to the last bit: what a log keeps on /rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
+from kiteline_hw.ports import SourceError
+
+LENS_NAMES = {Lens.NONE: "plumb_bob", Lens.RADTAN: "plumb_bob", Lens.EQUIDISTANT: "kannala_brandt"}  # Foxglove's names
+
+
+def rig_to_json(rig: CameraRig, imu: ImuCalibration | None) -> dict[str, Any]:
+    """The rig and the IMU's calibration as a JSON object."""
+    return {
+        "left": _camera_to_json(rig.left),
+        "right": _camera_to_json(rig.right) if rig.right is not None else None,
+        "T_b_c": rig.T_b_c.tolist(),
+        "T_c_r": rig.T_c_r.tolist() if rig.T_c_r is not None else None,
+        "has_depth": rig.has_depth,
+        "has_body": rig.has_body,
+        "imu": asdict(imu) if imu is not None else None,
+    }
+
+
+def rig_from_json(value: Mapping[str, Any]) -> tuple[CameraRig, ImuCalibration | None]:
+    """The rig and the IMU's calibration of such an object. Raises SourceError."""
+    try:
+        rig = CameraRig(
+            _camera_from_json(value["left"]),
+            _camera_from_json(value["right"]) if value["right"] is not None else None,
+            np.array(value["T_b_c"], np.float64).reshape(4, 4),
+            np.array(value["T_c_r"], np.float64).reshape(4, 4) if value["T_c_r"] is not None else None,
+            bool(value["has_depth"]),
+            bool(value["has_body"]),
+        )
+        imu = value["imu"]
+        known = {f.name for f in fields(ImuCalibration)}
+        return rig, ImuCalibration(**{k: float(v) for k, v in imu.items() if k in known}) if imu is not None else None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise SourceError(f"unusable rig in the log ({error!r})") from error
+
+
+def _camera_to_json(camera: CameraModel) -> dict[str, Any]:
+    return {**asdict(camera), "lens": camera.lens.value, "distortion": list(camera.distortion)}
+
+
+def _camera_from_json(value: Mapping[str, Any]) -> CameraModel:
+    distortion = tuple(float(d) for d in value["distortion"])
+    fx, fy, cx, cy = (float(value[key]) for key in ("fx", "fy", "cx", "cy"))
+    return CameraModel(int(value["width"]), int(value["height"]), fx, fy, cx, cy, Lens(value["lens"]), distortion)

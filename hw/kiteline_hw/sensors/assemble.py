@@ -1,0 +1,149 @@
+"""From captures (images at one instant, still encoded) and inertial samples to Frames and ImuBatches.
+
+Shared by all recordings: matches the two halves of a pair by time, decodes, checks sizes, and counts what it skips.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch
+from kiteline_core.geometry.cameras import CameraRig
+from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.sensors.images import ImageRef, decode_depth, decode_grey
+from kiteline_hw.sensors.imu_buffer import ImuSamples
+from kiteline_hw.sensors.raw_pixels import BadImage
+
+PAIR_TOLERANCE_NS = 5_000_000  # ns; unsynchronised halves further apart than this are no pair for a moving vehicle
+DEPTH_TOLERANCE_NS = 20_000_000  # ns; what the TUM tools use: free-running depth cameras lag by up to half a period
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """What was taken at one instant, not yet decoded."""
+
+    t_ns: int
+    left: ImageRef
+    right: ImageRef | None = None
+    depth: ImageRef | None = None
+
+
+def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANCE_NS) -> int:
+    """How far apart two halves may be: at most half the frame period, so that a half never matches two frames."""
+    if len(stamps_ns) < 2:
+        return most_ns
+    return min(most_ns, int(np.median(np.diff(stamps_ns))) // 2)
+
+
+def pair_by_time(
+    items: Iterable[tuple[int, int, T]], tolerance_ns: int, names: tuple[str, str], report: SourceReport
+) -> Iterator[tuple[int, T, T]]:
+    """Match items (t_ns, side 0 or 1, item), which come in order of time, into (t_ns of side 0, item 0, item 1).
+
+    Each item is matched to the nearest of the other side within the tolerance; one that stays alone is counted as
+    "missing <name>". Holds no more than the items of one tolerance.
+    """
+    waiting: tuple[deque[tuple[int, T]], deque[tuple[int, T]]] = (deque(), deque())
+
+    def settle(now_ns: int | None) -> Iterator[tuple[int, T, T]]:
+        # An item is settled once nothing nearer can come: its own time plus the tolerance has passed.
+        while waiting[0] or waiting[1]:
+            side = 0 if waiting[0] and (not waiting[1] or waiting[0][0][0] <= waiting[1][0][0]) else 1
+            mine, other = waiting[side], waiting[1 - side]
+            t, item = mine[0]
+            if other and other[0][0] == t:
+                mine.popleft()
+                _, partner = other.popleft()
+                yield (t, item, partner) if side == 0 else (t, partner, item)
+                continue
+            gap = other[0][0] - t if other else None
+            if gap is None or gap > tolerance_ns:
+                if now_ns is not None and now_ns <= t + tolerance_ns:
+                    return
+                mine.popleft()
+                report.skip(f"missing {names[1 - side]}", f"{names[side]} at {t} ns has no partner")
+                continue
+            # The partner lies later: a later item of this side may be nearer to it.
+            t_other = other[0][0]
+            rival = mine[1][0] if len(mine) > 1 else None
+            if rival is not None and abs(rival - t_other) < t_other - t:
+                mine.popleft()
+                report.skip(f"missing {names[1 - side]}", f"{names[side]} at {t} ns has no partner")
+                continue
+            if rival is None and now_ns is not None and now_ns <= t_other + (t_other - t):
+                return
+            mine.popleft()
+            _, partner = other.popleft()
+            yield (t, item, partner) if side == 0 else (t_other, partner, item)
+
+    for t_ns, side, item in items:
+        waiting[side].append((t_ns, item))
+        yield from settle(t_ns)
+    yield from settle(None)
+
+
+def deliver(
+    captures: Iterable[Capture], imu: ImuSamples, rig: CameraRig, report: SourceReport, name: str
+) -> Iterator[Frame | ImuBatch]:
+    """Decode captures into Frames, each after the ImuBatch that leads up to it.
+
+    Unreadable images, images of another size and stamps that do not increase are skipped and counted.
+    Raises SourceError when not one frame came of it.
+    """
+    last_ns = -(2**63)
+    delivered = 0
+    for capture in captures:
+        if capture.t_ns <= last_ns:
+            report.skip("frame stamp not increasing", f"{capture.t_ns} ns after {last_ns} ns")
+            continue
+        try:
+            frame = _decode(capture, rig)
+        except BadImage as error:
+            report.skip("unreadable image", f"at {capture.t_ns} ns: {error}")
+            continue
+        except _WrongSize as error:
+            report.skip("image of another size", f"at {capture.t_ns} ns: {error}")
+            continue
+        last_ns = capture.t_ns
+        batch = imu.take_until(capture.t_ns)
+        if batch is not None:
+            yield batch
+        delivered += 1
+        yield frame
+    if delivered == 0:
+        why = "; ".join(report.notes) or "it holds no images"
+        raise SourceError(f"{name}: not one usable frame ({why})")
+
+
+class _WrongSize(Exception):
+    pass
+
+
+def _decode(capture: Capture, rig: CameraRig) -> Frame:
+    left, left_bytes = decode_grey(capture.left)
+    _check_size("left", left.shape, rig.left.height, rig.left.width)
+    kept = [left_bytes]
+    right = depth = None
+    if capture.right is not None and rig.right is not None:
+        right, right_bytes = decode_grey(capture.right)
+        _check_size("right", right.shape, rig.right.height, rig.right.width)
+        kept.append(right_bytes)
+    if capture.depth is not None and rig.has_depth:
+        depth, depth_bytes = decode_depth(capture.depth)
+        _check_size("depth", depth.shape, rig.left.height, rig.left.width)
+        kept.append(depth_bytes)
+    encoded: tuple[EncodedImage, ...] = tuple(image for image in kept if image is not None)
+    return Frame(capture.t_ns, left, right, depth, encoded if len(encoded) == len(kept) else ())
+
+
+def _check_size(what: str, shape: tuple[int, ...], height: int, width: int) -> None:
+    if shape != (height, width):
+        raise _WrongSize(f"{what} image is {shape[1]}x{shape[0]} px, calibration says {width}x{height}")

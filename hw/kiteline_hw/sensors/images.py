@@ -1,0 +1,117 @@
+"""Images as sources and logs hold them: encoded bytes, a file, or raw pixels, decoded only when a frame is made.
+
+Grey images are (h, w) uint8. A depth image is 16-bit PNG whose format carries its scale: "png/5000" means that the
+stored value divided by 5000 is metres, 0 unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.frame import EncodedImage
+from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+
+DEPTH_FORMAT = "png/1000"  # millimetres: what our own logs write when a source holds no encoded depth
+
+_FORMATS = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\x00": "tiff", b"MM\x00*": "tiff"}
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFile:
+    """An image in a file of its own. format: as EncodedImage's, or "" to find it by the first bytes."""
+
+    path: Path
+    format: str = ""
+
+
+ImageRef = ImageFile | EncodedImage | RawPixels
+
+
+def sniff(data: bytes) -> str:
+    """The format of encoded bytes by their first bytes; raises BadImage when they are no image."""
+    for magic, name in _FORMATS.items():
+        if data.startswith(magic):
+            return name
+    if data[:2] == b"P5" or data[:2] == b"P6":
+        return "pnm"
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "webp"
+    raise BadImage("empty file" if not data else f"starts with {data[:8]!r}, which is no PNG, JPEG, TIFF, BMP or PGM")
+
+
+def _encoded(ref: ImageFile | EncodedImage) -> EncodedImage:
+    if isinstance(ref, EncodedImage):
+        sniff(ref.data)
+        return ref
+    try:
+        data = ref.path.read_bytes()
+    except OSError as error:
+        raise BadImage(f"{ref.path.name}: {error.strerror}") from error
+    try:
+        return EncodedImage(data, ref.format or sniff(data))
+    except BadImage as error:
+        raise BadImage(f"{ref.path.name}: {error}") from error
+
+
+def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
+    """Grey pixels (h, w) uint8 and the bytes that they came from (None for raw pixels). Raises BadImage."""
+    if isinstance(ref, RawPixels):
+        return ref.grey(), None
+    image = _encoded(ref)
+    pixels = _imdecode(image, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(pixels, np.uint8), image
+
+
+def decode_depth(ref: ImageRef) -> tuple[F32, EncodedImage | None]:
+    """Depth (h, w) float32 in metres, 0 unknown, and the bytes that it came from. Raises BadImage."""
+    if isinstance(ref, RawPixels):
+        return ref.metres(), None
+    image = _encoded(ref)
+    raw = _imdecode(image, cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise BadImage(f"depth image is {raw.dtype} with {raw.ndim} axes: expected 16-bit grey")
+    return raw.astype(np.float32) * np.float32(1.0 / depth_scale(image.format)), image
+
+
+def depth_scale(image_format: str) -> float:
+    """Stored units a metre of a depth format such as "png/5000". Raises BadImage."""
+    _, slash, scale = image_format.partition("/")
+    try:
+        value = float(scale) if slash else float("nan")
+    except ValueError:
+        value = float("nan")
+    if not 0.0 < value < float("inf"):
+        raise BadImage(f"depth format {image_format!r} names no scale: expected one like 'png/5000'")
+    return value
+
+
+def encode_image(pixels: U8) -> EncodedImage:
+    """Code grey pixels (h, w) uint8 without loss, fast rather than small."""
+    _, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return EncodedImage(data.tobytes(), "png")
+
+
+def encode_depth(depth_m: F32) -> EncodedImage:
+    """Code depth (h, w) float32 metres in millimetres; beyond 65.5 m it becomes unknown (0)."""
+    units = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0) * depth_scale(DEPTH_FORMAT)
+    units = np.where((units > 0.0) & (units < 65535.5), np.rint(units), 0.0).astype(np.uint16)
+    _, data = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return EncodedImage(data.tobytes(), DEPTH_FORMAT)
+
+
+def _imdecode(image: EncodedImage, flags: int) -> NDArray[np.generic]:
+    try:
+        pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags)
+    except cv2.error as error:
+        raise BadImage(f"{len(image.data)} bytes of {image.format} cannot be decoded") from error
+    if pixels is None:
+        raise BadImage(f"{len(image.data)} bytes of {image.format} cannot be decoded")
+    return np.asarray(pixels)

@@ -1,0 +1,124 @@
+"""A modelled flight controller that routes MAVLink between a companion and its telemetry radio. Pure, a model.
+
+The radio is a half-duplex pair like SiK's: the two sides take turns, each with a window of time on air, and a buffer in
+front whose free share RADIO_STATUS tells. The controller itself sends telemetry; it forwards without any priority, as
+ArduPilot's and PX4's routers do: first come, first served.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from kiteline_hw.mavlink.messages import MavlinkCodec
+
+
+@dataclass(frozen=True, slots=True)
+class RadioConfig:
+    """A pair of radios."""
+
+    air_bytes_s: int = 8000  # while a side has its turn: 64 kb/s
+    window_ns: int = 130_000_000  # ns of a turn (SiK: about 130 ms at full load)
+    gap_ns: int = 10_000_000  # ns between turns
+    buffer_bytes: int = 4096  # of each side; what does not fit is lost
+    status_ns: int = 500_000_000  # ns between RADIO_STATUS
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryConfig:
+    """What the controller sends on its own."""
+
+    bytes_s: int = 500
+    message_bytes: int = 50  # of one message, about an ATTITUDE or a GLOBAL_POSITION_INT
+
+
+class _Side:
+    """One radio's send buffer."""
+
+    def __init__(self, config: RadioConfig, turn: int) -> None:
+        self._config = config
+        self._turn = turn  # 0: first half of the period, 1: second
+        self._waiting: deque[tuple[int, bytes, bool]] = deque()  # ns handed in, message, whether it is telemetry
+        self._bytes = 0
+        self._air_ns = 0  # until when the air is known to be used
+        self.lost = 0
+        self.telemetry_delay_ns: list[int] = []
+
+    @property
+    def free_percent(self) -> int:
+        return max(0, 100 - 100 * self._bytes // self._config.buffer_bytes)
+
+    def push(self, message: bytes, now_ns: int, telemetry: bool = False) -> None:
+        if self._bytes + len(message) > self._config.buffer_bytes:
+            self.lost += 1
+            return
+        self._waiting.append((now_ns, message, telemetry))
+        self._bytes += len(message)
+
+    def advance(self, now_ns: int) -> list[bytes]:
+        """The messages that are through by now."""
+        out = []
+        while self._waiting:
+            since_ns, message, telemetry = self._waiting[0]
+            end_ns = self._through(max(self._air_ns, since_ns), len(message))
+            if end_ns > now_ns:
+                break
+            self._air_ns = end_ns
+            self._waiting.popleft()
+            self._bytes -= len(message)
+            if telemetry:
+                self.telemetry_delay_ns.append(end_ns - since_ns)
+            out.append(message)
+        return out
+
+    def _through(self, begin_ns: int, n_bytes: int) -> int:
+        """When so many bytes, begun at a time, have been sent in this side's turns."""
+        c = self._config
+        left_ns = n_bytes * 1_000_000_000 // c.air_bytes_s
+        half_ns = c.window_ns + c.gap_ns
+        at = begin_ns
+        while True:
+            start = (at - self._turn * half_ns) // (2 * half_ns) * (2 * half_ns) + self._turn * half_ns
+            if at < start + c.window_ns:
+                used = min(left_ns, start + c.window_ns - at)
+                left_ns -= used
+                at += used
+                if left_ns == 0:
+                    return at
+            at = start + 2 * half_ns
+
+
+class RoutingController:
+    """Companion on one port, a pair of radios on the other, ground at its far end."""
+
+    def __init__(self, radio: RadioConfig | None = None, telemetry: TelemetryConfig | None = None) -> None:
+        self.radio = radio or RadioConfig()
+        self.telemetry = telemetry or TelemetryConfig()
+        self.up = _Side(self.radio, 0)
+        self.down = _Side(self.radio, 1)
+        self._codec = MavlinkCodec(1, 1)
+        self._telemetry_due_ns = 0
+        self._status_due_ns = 0
+
+    def step(
+        self, from_companion: list[bytes], from_ground: list[bytes], now_ns: int
+    ) -> tuple[list[bytes], list[bytes]]:
+        """Messages in; messages for the companion and for the ground out. Heartbeats and tunnels are forwarded."""
+        t = self.telemetry
+        if t.bytes_s:
+            period_ns = t.message_bytes * 1_000_000_000 // t.bytes_s
+            while self._telemetry_due_ns <= now_ns:
+                self.up.push(bytes(t.message_bytes), self._telemetry_due_ns, telemetry=True)
+                self._telemetry_due_ns += period_ns
+        for message in from_companion:
+            self.up.push(message, now_ns)
+        for message in from_ground:
+            self.down.push(message, now_ns)
+        to_ground = [m for m in self.up.advance(now_ns) if m[0] == 0xFD]
+        to_companion = self.down.advance(now_ns)
+        if now_ns >= self._status_due_ns:
+            self._status_due_ns = now_ns + self.radio.status_ns
+            # A radio tells the side that it hangs on; the controller hands it on to its companion.
+            to_companion.append(self._codec.radio_status(self.up.free_percent))
+            to_ground.append(self._codec.radio_status(self.down.free_percent))
+        return to_companion, to_ground

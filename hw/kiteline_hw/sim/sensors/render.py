@@ -1,0 +1,84 @@
+"""One camera's view of the world, from light to grey values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel
+from kiteline_hw.sim.sensors import lens
+from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
+from kiteline_hw.sim.world.raycast_kernels import TILE, render, tile_lists, visible_boxes
+from kiteline_hw.sim.world.textures import DETAIL_M
+from kiteline_hw.sim.world.world import World
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+
+
+class Eye:
+    """A camera in a world. `see` may be called from several threads on different eyes, not on the same one."""
+
+    def __init__(self, world: World, camera: CameraModel, T_b_c: F64) -> None:
+        self.world = world
+        self.T_b_c = T_b_c
+        self._rays = lens.rays(camera)
+        self._fall_off = lens.fall_off(self._rays)
+        shape = (camera.height, camera.width)
+        inner = self._rays[1:-1, 1:-1].reshape(-1, 3).astype(np.float64)
+        axis = inner.mean(0)
+        self._axis = axis / np.linalg.norm(axis)
+        self._half_angle = float(np.arccos(np.clip((inner @ self._axis).min(), -1, 1))) + 0.01
+        self._pixel = 2.0 / (camera.fx + camera.fy)
+        n = len(world.boxes)
+        tiles = ((camera.height + TILE - 1) // TILE) * ((camera.width + TILE - 1) // TILE)
+        self._near = np.empty(n)
+        self._items = np.empty(n, np.int32)
+        self._lists = np.empty((tiles, n), np.int32)
+        self._lengths = np.empty(tiles, np.int32)
+        self._radiance = np.empty(shape, np.float32)
+        self._streaked = np.empty(shape, np.float32)
+        self._distance = np.empty(shape, np.float32)
+        self._hits = np.empty(shape, np.int32)
+
+    def cast(self, T_w_b: F64) -> tuple[F32, F32, I32]:
+        """Radiance, distance in m along the ray (inf for the sky) and hit of every pixel, each (h, w); overwritten by
+        the next call.
+        """
+        w = self.world
+        t_w_c = T_w_b @ self.T_b_c
+        o, rot = np.ascontiguousarray(t_w_c[:3, 3]), np.ascontiguousarray(t_w_c[:3, :3])
+        near, items = self._near, self._items
+        count = visible_boxes(w.boxes, w.shell, o, rot @ self._axis, self._half_angle, near, items)
+        count = int(np.searchsorted(near[:count], w.far_m))
+        tile_lists(w.boxes, items, count, o, rot, self._rays, self._lists, self._lengths)
+        render(
+            w.boxes, w.faces, w.shell, w.field, w.field_frame, w.ground, w.pool.atlas, w.pool.table, DETAIL_M,
+            o, rot, self._rays, self._pixel, w.far_m, near, items, self._lists, self._lengths,
+            self._radiance, self._distance, self._hits,
+        )  # fmt: skip
+        return self._radiance, self._distance, self._hits
+
+    def depth(self) -> F32:
+        """Depth (h, w) in m along the optical axis of the last cast, 0 where there is sky."""
+        z = self._distance * self._rays[1:-1, 1:-1, 2]
+        return np.where(np.isfinite(z), z, 0.0).astype(np.float32)
+
+    def see(
+        self, T_w_b: F64, velocity: F64, rate: F64, exposure_s: float, gain: float, noise: tuple[float, float], key: int
+    ) -> U8:
+        """The image (h, w) taken around this pose.
+
+        velocity (3,) in w, rate (3,) in b. noise: read and shot (see `expose`), drawn from `key`.
+        """
+        radiance, distance, _ = self.cast(T_w_b)
+        to_camera = (T_w_b[:3, :3] @ self.T_b_c[:3, :3]).T
+        angular = self.T_b_c[:3, :3].T @ rate
+        linear = to_camera @ (velocity + T_w_b[:3, :3] @ (se3.skew(rate) @ self.T_b_c[:3, 3]))
+        motion_blur(radiance, distance, self._rays, linear, angular, exposure_s, self._streaked)
+        out = np.empty(radiance.shape, np.uint8)
+        expose(self._streaked, self._fall_off, gain, noise[0], noise[1], np.uint64(key), out)
+        return out

@@ -1,0 +1,97 @@
+"""A source with something left out (the right eye and depth, or the inertial samples), or with another IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from kiteline_core import odometry
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraRig
+from kiteline_core.geometry.se3 import F64
+from kiteline_hw.ports import FrameSource, SourceReport
+
+
+def reduced(source: FrameSource, mono: bool, imu: bool) -> FrameSource:
+    """The source itself when nothing is left out, else a view of it."""
+    return source if imu and not mono else _Reduced(source, mono, imu)
+
+
+class _Reduced:
+    def __init__(self, source: FrameSource, mono: bool, imu: bool) -> None:
+        self._source, self._mono, self._imu = source, mono, imu
+
+    @property
+    def name(self) -> str:
+        return self._source.name
+
+    @property
+    def rig(self) -> CameraRig:
+        rig = self._source.rig
+        return replace(rig, right=None, T_c_r=None, has_depth=False) if self._mono else rig
+
+    @property
+    def imu(self) -> ImuCalibration | None:
+        return self._source.imu if self._imu else None
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        return self._source.ground_truth
+
+    @property
+    def report(self) -> SourceReport:
+        return self._source.report
+
+    @property
+    def frame_count(self) -> int | None:
+        return self._source.frame_count
+
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
+        for item in self._source:
+            if isinstance(item, ImuBatch):
+                if self._imu:
+                    yield item
+            elif self._mono and isinstance(item, Frame):
+                yield Frame(item.t_ns, item.left, encoded=item.encoded[:1])
+            else:
+                yield item
+
+    def close(self) -> None:
+        self._source.close()
+
+
+def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> FrameSource:
+    """A view of a source whose inertial samples come from elsewhere: its own are left out. T_b_c: (4,4) left camera in
+    the body frame of that IMU, which becomes the body of all; None: that of the source stays.
+    """
+    return _OtherImu(source, imu, T_b_c)
+
+
+class _OtherImu(_Reduced):
+    def __init__(self, source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> None:
+        super().__init__(source, mono=False, imu=False)
+        self._calibration, self._T_b_c = imu, T_b_c
+
+    @property
+    def rig(self) -> CameraRig:
+        rig = self._source.rig
+        return rig if self._T_b_c is None else replace(rig, T_b_c=self._T_b_c, has_body=True)
+
+    @property
+    def imu(self) -> ImuCalibration | None:
+        return self._calibration
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        truth = self._source.ground_truth
+        if truth is None or self._T_b_c is None:
+            return truth
+        return Trajectory(truth.t_ns, truth.T_w_b @ self._source.rig.T_b_c @ se3.inverse(self._T_b_c))
+
+    def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
+        for item in super().__iter__():
+            if self._T_b_c is not None and isinstance(item, OdometryBatch):
+                yield odometry.in_body(item, self._T_b_c @ se3.inverse(self._source.rig.T_b_c))
+            else:
+                yield item

@@ -1,0 +1,123 @@
+"""`kiteline eval EST GT`: how far a trajectory is from the truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+
+from kiteline_core.frame import Trajectory
+from kiteline_lab.evaluation import metrics
+from kiteline_lab.evaluation.metrics import Alignment, Evaluation, Relative
+from kiteline_lab.evaluation.trajectories import TrajectoryError, TrajectoryFile, read
+
+
+def evaluate_files(
+    estimate: str, truth: str, alignment: Alignment = Alignment.SE3, max_difference_ns: int = metrics.MAX_DIFFERENCE_NS
+) -> Evaluation:
+    """Read both and compare. Raises TrajectoryError."""
+    est, true = load(estimate, truth)
+    try:
+        return metrics.evaluate(est, true, alignment, max_difference_ns)
+    except ValueError as error:
+        raise TrajectoryError(f"{estimate} against {truth}: {error}") from error
+
+
+def load(estimate: str, truth: str) -> tuple[Trajectory, Trajectory]:
+    """Both trajectories on one clock. KITTI poses without times take those of the other one, pose for pose."""
+    est, true = read(estimate), read(truth)
+    if not true.timed and est.timed:
+        true = _timed_by(true, est.trajectory)
+    elif not est.timed and true.timed:
+        est = _timed_by(est, true.trajectory)
+    return est.trajectory, true.trajectory
+
+
+def _timed_by(poses: TrajectoryFile, clock: Trajectory) -> TrajectoryFile:
+    """In order where both have as many poses; else the poses stay at 10 Hz from 0, as KITTI's sources stamp them."""
+    if len(poses.trajectory.t_ns) != len(clock.t_ns):
+        return poses
+    return TrajectoryFile(replace(poses.trajectory, t_ns=clock.t_ns))
+
+
+def table(e: Evaluation) -> str:
+    """The figures as text of a few lines."""
+    fitted = {
+        "se3": "rotation and translation fitted",
+        "sim3": f"scale {e.scale:.4f} fitted too",
+        "origin": "on the first pose",
+    }[e.alignment]
+    a = e.ate_m
+    lines = [
+        f"poses      {e.matched} of {e.estimated} matched; {e.coverage:.1%} of the time covered; path {e.path_m:.1f} m",
+        f"ATE        rmse {a.rmse:.4f} m   mean {a.mean:.4f} m   max {a.max:.4f} m   ({fitted})",
+        _relative_line("RPE/frame", e.rpe_frame),
+        _relative_line("RPE/s", e.rpe_second),
+    ]
+    if e.kitti is None:
+        lines.append(f"KITTI      needs at least {metrics.KITTI_LENGTHS_M[0]:.0f} m of way")
+    else:
+        k = e.kitti
+        lines.append(
+            f"KITTI      t_rel {k.t_rel_percent:.3f} %   r_rel {k.r_rel_deg_per_100m:.3f} deg/100 m   "
+            f"({k.segments} segments)"
+        )
+    return "\n".join(lines)
+
+
+def _relative_line(name: str, r: Relative | None) -> str:
+    if r is None:
+        return f"{name:10} no pair of poses that far apart"
+    t, a = r.translation_m, r.rotation_deg
+    return (
+        f"{name:10} rmse {1e3 * t.rmse:.2f} mm   mean {1e3 * t.mean:.2f} mm   max {1e3 * t.max:.2f} mm   |   "
+        f"rmse {a.rmse:.4f} deg   mean {a.mean:.4f} deg   max {a.max:.4f} deg"
+    )
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline eval`."""
+    p = argparse.ArgumentParser(
+        prog="kiteline eval",
+        description="Compare a trajectory with the truth. Either may be a TUM file (t x y z qx qy qz qw), KITTI poses "
+        "(12 columns) or EuRoC's data.csv; the truth may also be a recording that holds it (mcap:FILE, euroc:DIR, "
+        "a folder). KITTI poses take their times from times.txt beside them; without it, from the other trajectory "
+        "in order when both have as many poses, else they stand for 10 Hz from 0.",
+    )
+    p.add_argument("estimate", metavar="EST", help="the trajectory to judge")
+    p.add_argument("truth", metavar="GT", help="the truth")
+    how = p.add_mutually_exclusive_group()
+    how.add_argument("--scale", action="store_true", help="fit scale as well (Sim3): for a mono camera")
+    how.add_argument(
+        "--origin", action="store_true", help="lay the first pose on the first pose instead of the best fit"
+    )
+    p.add_argument(
+        "--max-difference",
+        type=float,
+        default=metrics.MAX_DIFFERENCE_NS / 1e9,
+        metavar="S",
+        help="truth sparser than 20 Hz: poses further apart in time are not compared (default %(default)s s)",
+    )
+    p.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    p.add_argument("--plot", metavar="F.png", help="draw both: from above, height and error over time")
+    return p
+
+
+def main(argv: list[str]) -> int:
+    """Run `kiteline eval`; the exit status."""
+    a = parser().parse_args(argv)
+    alignment = Alignment.SIM3 if a.scale else Alignment.ORIGIN if a.origin else Alignment.SE3
+    est, true = load(a.estimate, a.truth)
+    limit_ns = round(a.max_difference * 1e9)
+    try:
+        result = metrics.evaluate(est, true, alignment, limit_ns)
+    except ValueError as error:
+        raise TrajectoryError(f"{a.estimate} against {a.truth}: {error}") from error
+    if a.plot:
+        from kiteline_lab.plots.plot import Line, plot_trajectories
+
+        matched = metrics.match(est, true, alignment, limit_ns)
+        line = Line("estimate", Trajectory(matched.t_ns, matched.estimate))
+        plot_trajectories(a.plot, [line], true, f"ATE {result.ate_m.rmse:.3f} m rmse over {result.path_m:.0f} m")
+    print(json.dumps(result.as_dict(), indent=2) if a.json else table(result))
+    return 0

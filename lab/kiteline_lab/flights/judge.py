@@ -1,0 +1,123 @@
+"""From the outcome of a flight to its folder: refined trajectories, accuracy against the truth, plot, report.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.runtime.flight_log import ESTIMATE, estimate_from_json
+from kiteline_agent.runtime.options import AgentSpec
+from kiteline_agent.runtime.tally import Tally, live_pose
+from kiteline_agent.step import Estimate
+from kiteline_core.frame import Trajectory
+from kiteline_core.geometry.cameras import Rectifier
+from kiteline_hw.logs.mcap_log import LogReader
+from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_lab.evaluation import metrics
+from kiteline_lab.evaluation.metrics import Alignment
+from kiteline_lab.flights.flight import Outcome
+from kiteline_lab.flights.flight_report import Report, compose, statistic, write_report, write_tum
+from kiteline_lab.plots.plot import Line, plot_trajectories
+
+F64 = NDArray[np.float64]
+
+_SAMPLES = ("cpu_ms_per_frame", "decode_ms", "bundle_ms", "grid_ms", "step_ms")  # lists that become statistics
+
+
+def judge(
+    out: Path, sources: Sequence[FrameSource], agents: Sequence[AgentSpec], outcome: Outcome, align_scale: bool = False
+) -> Report:
+    """Write what the processes themselves did not, and report.json; the report."""
+    alignment = Alignment.SIM3 if align_scale else Alignment.SE3
+    report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": sorted(outcome.notes)}
+    lines: list[Line] = []
+    for k, (source, spec) in enumerate(zip(sources, agents, strict=True)):
+        estimates = read_estimates(Path(spec.folder) / "log.mcap")
+        part = outcome.agents[k]
+        mine: Report = _with_statistics(part) if part is not None else _from_log(source, estimates)
+        mine.pop("drain", None)
+        truth = source.ground_truth
+        live = [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]
+        if part is None:  # it may have died between a line of its trajectories and its log: the log counts
+            write_tum(out / f"agent{k}" / "live.tum", live)
+            write_tum(out / f"agent{k}" / "odometry.tum", [(e.t_ns, e.T_o_b) for e in estimates])
+        mine["accuracy"] = {
+            "live": _accuracy(live, truth, alignment),
+            "odometry": _accuracy([(e.t_ns, e.T_o_b) for e in estimates], truth, alignment),
+        }
+        label = f"agent {k}" if len(sources) > 1 else ""
+        lines.append(Line(f"{label} live".strip(), _trajectory(live)))
+        drained: Report = dict(part["drain"]) if part is not None else {}
+        if outcome.base is not None:
+            T_b_c = Rectifier(source.rig).camera.T_b_c
+            refined = compose(estimates, outcome.flown, T_b_c)
+            write_tum(out / "base" / f"agent{k}.tum", refined)
+            mine["accuracy"]["base"] = _accuracy(refined, truth, alignment)
+            lines.append(Line(f"{label} base".strip(), _trajectory(refined)))
+            drained["accuracy"] = _accuracy(compose(estimates, outcome.drained, T_b_c), truth, alignment)
+        report["agents"].append(mine)
+        report["drain"]["agents"].append(drained)
+    if outcome.base is not None:
+        base = _with_statistics(outcome.base)
+        report["drain"]["base"] = base.pop("drain")
+        report["base"] = base
+    _plot(out / "trajectory.png", lines, sources, align=True)
+    write_report(out / "report.json", report)
+    return report
+
+
+def read_estimates(log: Path) -> list[Estimate]:
+    """Every estimate in an agent's log, also in one that was cut. Empty when there is no log."""
+    if not log.exists():
+        return []
+    try:
+        with LogReader(log) as reader:
+            return [estimate_from_json(message.json()) for message in reader.messages((ESTIMATE,))]
+    except SourceError:
+        return []  # it was cut before anything was written
+
+
+def _with_statistics(part: Report) -> Report:
+    timing = {key: statistic(value) if key in _SAMPLES else value for key, value in part["timing"].items()}
+    return {**part, "timing": timing}
+
+
+def _from_log(source: FrameSource, estimates: Sequence[Estimate]) -> Report:
+    """The report of an agent that ended without one: what its log says."""
+    tally = Tally()
+    for estimate in estimates:
+        tally.count(estimate)
+    timing = {"cpu_ms_per_frame": statistic([]), "decode_ms": statistic([]), "rss_mib": 0.0}
+    return {"source": source.name, **tally.as_report(), "ended_early": True, "timing": timing}
+
+
+def _trajectory(poses: Sequence[tuple[int, F64]]) -> Trajectory:
+    t_ns = np.array([t for t, _ in poses], np.int64)
+    return Trajectory(t_ns, np.array([pose for _, pose in poses], np.float64).reshape(-1, 4, 4))
+
+
+def _accuracy(
+    poses: Sequence[tuple[int, F64]], truth: Trajectory | None, alignment: Alignment
+) -> dict[str, float] | None:
+    """Errors against the truth; None where there is none to compare with."""
+    if truth is None or not poses:
+        return None
+    try:
+        found = metrics.evaluate(_trajectory(poses), truth, alignment)
+    except ValueError:
+        return None
+    out = {"matched": found.matched, "ate_m": round(found.ate_m.rmse, 6), "ate_max_m": round(found.ate_m.max, 6)}
+    if found.rpe_frame is not None:
+        out["rpe_mm"] = round(1000.0 * found.rpe_frame.translation_m.rmse, 4)
+        out["rpe_deg"] = round(found.rpe_frame.rotation_deg.rmse, 5)
+    return out
+
+
+def _plot(path: Path, lines: Sequence[Line], sources: Sequence[FrameSource], align: bool) -> None:
+    truth = sources[0].ground_truth if len(sources) == 1 else None
+    drawn = [line for line in lines if len(line.trajectory.t_ns)]
+    title = sources[0].name if len(sources) == 1 else f"{len(sources)} agents"
+    plot_trajectories(path, drawn, truth, title, align=align)

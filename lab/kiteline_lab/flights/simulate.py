@@ -1,0 +1,119 @@
+"""`kiteline sim SCENE --trajectory F --out F.mcap`: record a flight through a simulated world, with its truth."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
+from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sensors.images import encode_depth, encode_image
+from kiteline_hw.sim.config import SimConfig, read_config
+from kiteline_hw.sim.source import SimSource
+from kiteline_hw.sim.world.world import World, occupancy, write_occupancy
+from kiteline_lab.flights.out_file import whole_file
+from kiteline_lab.flights.progress import Progress
+
+GRID_LOW_M, GRID_HIGH_M = 0.1, 2.0  # above the floor: what stands in the way of a small vehicle
+GRID_CELL_M = 0.05
+JPEG_QUALITY = 92
+COURSE = "course"  # in place of a trajectory: the scene's own course
+
+
+def main(argv: list[str]) -> int:
+    """Run the command. Raises SourceError."""
+    p = argparse.ArgumentParser(
+        prog="kiteline sim",
+        description="Record a simulated flight: images, inertial samples and true poses as a log that flies like any "
+        "other, and the true occupancy beside it (F.yaml, F.pgm).",
+        epilog="The same scene, seed and trajectories give the same bytes.",
+    )
+    p.add_argument("scene", metavar="SCENE", help="room, hall, corridor or street, perhaps with options: room?seed=3")
+    p.add_argument("--trajectory", metavar="F", help="TUM or KITTI file to fly; without it the scene's own course")
+    p.add_argument("--out", metavar="F.mcap", type=Path, required=True, help="the log; more agents get F-1.mcap, …")
+    p.add_argument("--also", metavar="F", nargs="+", action="extend", default=[],
+                   help=f"what further agents fly in the same world; {COURSE!r}: the scene's own course")  # fmt: skip
+    p.add_argument("--seed", type=int, help="of textures, furniture and noise (default 0)")
+    p.add_argument("--seconds", type=float, help="length of the flight (default: all of F, or 20 of the course)")
+    p.add_argument("--start", type=float, help="s into the trajectory (default 0)")
+    p.add_argument("--lens", choices=("radtan", "equidistant", "none"), help="default radtan")
+    p.add_argument("--mono", action="store_true", default=None, help="no right eye")
+    p.add_argument("--depth", action="store_true", default=None, help="true depth in place of the right eye")
+    p.add_argument("--no-imu", dest="imu", action="store_false", default=None, help="no inertial samples")
+    p.add_argument("--odometry", metavar="HZ", type=float, help="record an odometer's velocities at this rate; options "
+                   "of SCENE make it worse: room?odometry_scale=1.05&odometry_slip=0.2&odometry_noise=0.1, or that of "
+                   "wheels: odometry_wheels=1")  # fmt: skip
+    p.add_argument("--png", action="store_true", help=f"images without loss (default JPEG {JPEG_QUALITY})")
+    p.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="threads that render (default: all cores)")
+    o = p.parse_args(argv)
+    names = ("trajectory", "seed", "seconds", "start", "lens", "mono", "depth", "imu", "odometry")
+    options: dict[str, object] = {name: getattr(o, name) for name in names if getattr(o, name) is not None}
+    if o.also:
+        options["also"] = tuple("" if name == COURSE else name for name in o.also)
+    config = read_config(o.scene, **options)
+    world: World | None = None
+    for agent in range(1 + len(config.also)):
+        source = SimSource(replace(config, agent=agent), o.workers, world)
+        world = source.world
+        out = o.out if agent == 0 else o.out.with_name(f"{o.out.stem}-{agent}{o.out.suffix}")
+        with whole_file(out, True) as part:
+            samples = record(source, part, o.png)
+        print(f"{out}: {source.frame_count} frames, {samples} imu samples, {out.stat().st_size / 1e6:.1f} MB")
+    assert world is not None
+    grid = o.out.with_suffix(".yaml")
+    image, origin = occupancy(world, GRID_LOW_M, GRID_HIGH_M, cell_m(config))
+    write_occupancy(image, origin, cell_m(config), grid)
+    print(f"{grid}: true occupancy from {GRID_LOW_M:g} to {GRID_HIGH_M:g} m above the floor")
+    return 0
+
+
+def cell_m(config: SimConfig) -> float:
+    """Side of a cell of the true grid: a street is too large for fine ones."""
+    return 0.2 if config.scene == "street" else GRID_CELL_M
+
+
+def record(source: SimSource, path: Path, png: bool = False) -> int:
+    """Write a flight as a log; how many inertial samples it has. Raises SourceError."""
+    truth = source.ground_truth
+    assert truth is not None
+    frames = samples = 0
+    with (
+        LogWriter(path, {"role": "recording", "source": source.name}) as log,
+        Progress(f"rendering {path.stem.strip('.').removesuffix('.mcap')}", source.frame_count, "frames") as progress,
+    ):
+        log.rig(int(truth.t_ns[0]), source.rig, source.imu)
+        for item in source:
+            if isinstance(item, ImuBatch):
+                log.imu(IMU, int(item.t_ns[-1]), item)
+                samples += len(item.t_ns)
+                continue
+            if isinstance(item, OdometryBatch):
+                log.odometer(ODOMETER, int(item.t_ns[-1]), item)
+                continue
+            log.pose(GROUND_TRUTH, item.t_ns, "world", truth.T_w_b[frames])
+            log.frame(replace(item, encoded=encode(item, png)))
+            frames += 1
+            progress.update(frames)
+    if log.dropped:
+        raise SourceError(f"{path.parent}: disk full: {log.dropped} messages could not be written")
+    return samples
+
+
+def encode(frame: Frame, png: bool) -> tuple[EncodedImage, ...]:
+    """The images of a frame as a log holds them: left, right, depth, as far as there are any."""
+    images = [image for image in (frame.left, frame.right) if image is not None]
+    coded = []
+    for image in images:
+        if png:
+            coded.append(encode_image(image))
+        else:
+            _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            coded.append(EncodedImage(data.tobytes(), "jpeg"))
+    if frame.depth_m is not None:
+        coded.append(encode_depth(frame.depth_m))
+    return tuple(coded)

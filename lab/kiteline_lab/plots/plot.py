@@ -1,0 +1,159 @@
+"""Draw trajectories: from above, height over time, and the error over time where the truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.frame import Trajectory
+from kiteline_lab.evaluation.metrics import Alignment, match, position_errors, truth_at
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+F64 = NDArray[np.float64]
+
+COLOURS = ("#1f6fb2", "#d1495b", "#2a9d5c", "#8e5ea2", "#e08e20", "#3bb0bf")  # told apart by colour-blind eyes too
+TRUTH_COLOUR = "#9a9a9a"
+INK = "#333333"
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One estimated trajectory and its name in the legend."""
+
+    name: str
+    trajectory: Trajectory
+
+
+def plot_trajectories(
+    path: str | Path, lines: Sequence[Line], truth: Trajectory | None = None, title: str = "", align: bool = False
+) -> None:
+    """Write a PNG. truth: grey below the lines; with it comes a panel of errors.
+
+    align: lay each line onto the truth by rotation and translation first (as ATE does); a line that has too few poses
+    in common with it is drawn as it is.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn = [_aligned(line, truth) for line in lines] if align and truth is not None else list(lines)
+    across, along, up, sign = _axes(truth if truth is not None else drawn[0].trajectory if drawn else None)
+    start_ns = min([int(line.trajectory.t_ns[0]) for line in drawn if len(line.trajectory.t_ns)], default=0)
+    if truth is not None and drawn:
+        truth = _during(truth, drawn)
+
+    figure = Figure(figsize=(11.0, 5.6), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    top, height, error = _panels(figure, truth is not None)
+    if truth is not None and len(truth.t_ns):
+        p = truth.T_w_b[:, :3, 3]
+        top.plot(p[:, across], p[:, along], color=TRUTH_COLOUR, lw=2.6, label="truth", zorder=1)
+        height.plot((truth.t_ns - start_ns) / 1e9, sign * p[:, up], color=TRUTH_COLOUR, lw=2.2, zorder=1)
+    errors: list[tuple[F64, F64, str]] = []
+    for i, line in enumerate(drawn):
+        colour = COLOURS[i % len(COLOURS)]
+        t_s = (line.trajectory.t_ns - start_ns) / 1e9
+        p = line.trajectory.T_w_b[:, :3, 3]
+        if len(p) == 0:
+            continue
+        _, way = _with_gaps(t_s, p[:, [across, along]])
+        top.plot(way[:, 0], way[:, 1], color=colour, lw=1.3, label=line.name, zorder=2)
+        top.plot(p[:1, across], p[:1, along], "o", color=colour, ms=5, zorder=3)
+        height.plot(*_with_gaps(t_s, sign * p[:, up]), color=colour, lw=1.2, zorder=2)
+        if error is not None and truth is not None:
+            i_est, true = truth_at(line.trajectory.t_ns, truth)
+            off = np.linalg.norm(p[i_est] - true[:, :3, 3], axis=1)
+            errors.append((t_s[i_est], off, colour))
+    if error is not None:
+        _draw_errors(error, errors)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
+    if top.get_legend_handles_labels()[0]:
+        top.legend(frameon=False, fontsize=9, labelcolor=INK)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={"Software": None})  # no version inside: equal runs give equal files
+
+
+def _panels(figure: Figure, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
+    top = figure.add_subplot(grid[:, 0])
+    height = figure.add_subplot(grid[0, 1] if with_error else grid[:, 1])
+    error = figure.add_subplot(grid[1, 1], sharex=height) if with_error else None
+    top.set_aspect("equal", adjustable="datalim")
+    _style(top, "from above, m", "", "")
+    _style(height, "height, m", "" if with_error else "time, s", "")
+    if error is not None:
+        _style(error, "", "time, s", "")
+    return top, height, error
+
+
+def _draw_errors(axes: Axes, errors: Sequence[tuple[F64, F64, str]]) -> None:
+    """Distances in the unit in which the largest reads well."""
+    largest_m = max((float(off.max()) for _, off, _ in errors if len(off)), default=0.0)
+    per_m, unit = (1e3, "mm") if largest_m < 0.1 else (1e2, "cm") if largest_m < 1.0 else (1.0, "m")
+    for t_s, off, colour in errors:
+        axes.plot(*_with_gaps(t_s, per_m * off), color=colour, lw=1.2)
+    axes.set_title(f"distance from the truth, {unit}", loc="left", fontsize=10, color=INK)
+    axes.set_ylim(bottom=0.0)
+
+
+def _style(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, loc="left", fontsize=10, color=INK)
+    axes.set_xlabel(x, fontsize=9, color=INK)
+    axes.set_ylabel(y, fontsize=9, color=INK)
+    axes.grid(True, color="#e6e6e6", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8, color="#cccccc", labelcolor=INK)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color("#cccccc")
+
+
+def _aligned(line: Line, truth: Trajectory) -> Line:
+    try:
+        matched = match(line.trajectory, truth, Alignment.SE3)
+    except ValueError:
+        return line
+    return Line(f"{line.name}  ({_length(position_errors(matched))})", Trajectory(matched.t_ns, matched.estimate))
+
+
+def _length(errors: F64) -> str:
+    rmse = float(np.sqrt((errors**2).mean()))
+    if rmse >= 1.0:
+        return f"{rmse:.2f} m"
+    return f"{1000 * rmse:.1f} mm" if rmse < 0.01 else f"{1000 * rmse:.0f} mm"
+
+
+def _axes(reference: Trajectory | None) -> tuple[int, int, int, float]:
+    """Columns drawn across, along and up, and the sign of up: z is up, but y down for camera poses as KITTI's."""
+    if reference is not None and len(reference.t_ns):
+        extent = np.ptp(reference.T_w_b[:, :3, 3], axis=0)
+        if float(np.mean(reference.T_w_b[:, 1, 1])) > 0.8 and extent[1] < 0.5 * extent[2]:
+            return 0, 2, 1, -1.0
+    return 0, 1, 2, 1.0
+
+
+def _during(truth: Trajectory, lines: Sequence[Line]) -> Trajectory:
+    """The part of the truth within the time of the lines: a long flight judged by its start is not dwarfed."""
+    times = [line.trajectory.t_ns for line in lines if len(line.trajectory.t_ns)]
+    if not times:
+        return truth
+    inside = (truth.t_ns >= min(t[0] for t in times)) & (truth.t_ns <= max(t[-1] for t in times))
+    return replace(truth, t_ns=truth.t_ns[inside], T_w_b=truth.T_w_b[inside]) if inside.any() else truth
+
+
+def _with_gaps(t_s: F64, values: F64) -> tuple[F64, F64]:
+    """Put a NaN into each long gap, so that no line is drawn across missing poses."""
+    steps = np.diff(t_s)
+    if len(steps) == 0:
+        return t_s, values
+    gaps = np.flatnonzero(steps > 5.0 * np.median(steps)) + 1
+    return np.insert(t_s, gaps, t_s[gaps - 1]), np.insert(values, gaps, np.nan, axis=0)

@@ -1,0 +1,112 @@
+"""`kiteline export STORE --format tum|ply|pgm|g2o --out F`: a base's map in the formats of other tools."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.map.covisibility import covisible_keyframes
+from kiteline_basestation.mapper import Mapper
+from kiteline_basestation.runtime.export import g2o, tum
+from kiteline_basestation.runtime.outputs import keyframe_poses, map_files
+from kiteline_basestation.station import Station
+from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.store import StoreError, read
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.schema import WireError
+from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_core.geometry import sim3
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
+
+I64 = NDArray[np.int64]
+
+FORMATS = ("tum", "ply", "pgm", "g2o")
+ESSENTIAL_POINTS = 100  # points that two keyframes share for an edge of the essential graph (ORB-SLAM2)
+
+
+class ExportError(Exception):
+    """A map that cannot be exported so. The text says what was found and what was expected."""
+
+
+def load(store: Path) -> Mapper:
+    """The map that a base kept. store: the folder of `--store`, or the file in it. Raises ExportError."""
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    try:
+        for fault in restore(station, read(store), 0).faults:
+            print(f"{store}: {fault}", file=sys.stderr)
+    except (StoreError, WireError) as e:
+        raise ExportError(str(e)) from None
+    return station.mapper
+
+
+def files(mapper: Mapper, kind: str, name: str, agent: int | None = None) -> dict[str, bytes]:
+    """The files of one format by name. name: of the main file. agent: whose trajectory, or None where there is one.
+
+    tum: camera poses of keyframes in w. g2o: keyframes with edges to parents, and to covisible ones. pgm brings a YAML
+    file beside it. Raises ExportError.
+    """
+    if kind == "tum":
+        return {name: _trajectory(mapper, agent)}
+    if kind == "g2o":
+        return {name: _graph(mapper)}
+    made = map_files(mapper)
+    if kind == "ply":
+        return {name: made["map.ply"]}
+    text = made["grid.yaml"].replace(b"image: grid.pgm\n", f"image: {name}\n".encode())
+    return {name: made["grid.pgm"], str(Path(name).with_suffix(".yaml")): text}
+
+
+def _trajectory(mapper: Mapper, agent: int | None) -> bytes:
+    poses = keyframe_poses(mapper)
+    here = sorted({int(agent_of_keyframe(k)) for k in poses})
+    if agent is None and len(here) > 1:
+        raise ExportError(f"the map holds agents {here}: a trajectory is of one of them, choose with --agent")
+    if agent is not None and agent not in here:
+        raise ExportError(f"the map holds agents {here}, none with number {agent}")
+    mine = [k for k in poses if agent is None or agent_of_keyframe(k) == AgentId(agent)]
+    stamps = np.array([mapper.map.keyframes.t_ns[mapper.map.rows[k]] for k in mine], np.int64)
+    order = np.argsort(stamps, kind="stable")
+    return tum(stamps[order], np.array([sim3.rigid(poses[mine[i]]) for i in order]).reshape(-1, 4, 4))
+
+
+def _graph(mapper: Mapper) -> bytes:
+    poses = keyframe_poses(mapper)
+    number = {k: i for i, k in enumerate(poses)}
+    pairs: set[tuple[int, int]] = set()
+    for k, i in number.items():
+        parent = KeyframeId(int(mapper.map.keyframes.parent[mapper.map.rows[k]]))
+        near = [parent] if parent != NO_KEYFRAME else []
+        near += covisible_keyframes(mapper.map, k, ESSENTIAL_POINTS)
+        pairs |= {(min(i, number[n]), max(i, number[n])) for n in near if n in number}
+    edges: I64 = np.array(sorted(pairs), np.int64).reshape(-1, 2)
+    scale = np.array([sim3.scale_of(S) for S in poses.values()])
+    rigid = np.array([sim3.rigid(S) for S in poses.values()]).reshape(-1, 4, 4)
+    return g2o(np.array(list(poses), np.int64), rigid, edges, scale=scale)
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; the exit status."""
+    parser = argparse.ArgumentParser(prog="kiteline export", description="A base's map in the formats of other tools.")
+    parser.add_argument("store", type=Path, metavar="STORE", help="the folder given to `kiteline base --store`")
+    parser.add_argument("--format", choices=FORMATS, required=True)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="F", help="file to write; pgm: a YAML file beside it"
+    )
+    parser.add_argument("--agent", type=int, help="tum: whose trajectory, where there are several")
+    args = parser.parse_args(argv)
+    try:
+        made = files(load(args.store), args.format, args.out.name, args.agent)
+    except ExportError as e:
+        print(f"kiteline export: {e}", file=sys.stderr)
+        return 2
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    for name, content in made.items():
+        (args.out.parent / name).write_bytes(content)
+        print(args.out.parent / name)
+    return 0

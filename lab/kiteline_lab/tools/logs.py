@@ -1,0 +1,220 @@
+"""`kiteline log info|recover|cut|merge`: look into MCAP files and mend them; works on any MCAP file, not only our own.
+
+Messages, schemas, channels and metadata are carried over as they are; attachments are not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from kiteline_hw.logs.mcap_file import McapFile, RawMessage
+from kiteline_hw.ports import SourceError
+from kiteline_lab.flights.out_file import whole_file
+
+_STICKY = ("kiteline.Rig", "sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
+
+
+def main(argv: list[str]) -> int:
+    """Run the command. Raises SourceError."""
+    p = argparse.ArgumentParser(prog="kiteline log", description="Look into logs and mend them.")
+    commands = p.add_subparsers(dest="command", required=True, metavar="info|recover|cut|merge")
+    info = commands.add_parser("info", help="what a file holds, and whether it is whole")
+    info.add_argument("file", metavar="FILE", type=Path)
+    info.add_argument("--json", action="store_true", help="as JSON")
+    recover = commands.add_parser("recover", help="all that a cut or damaged file still holds, as a whole file")
+    recover.add_argument("file", metavar="FILE", type=Path)
+    recover.add_argument("out", metavar="OUT", type=Path)
+    cut = commands.add_parser("cut", help="a stretch of time, calibration included")
+    cut.add_argument("file", metavar="FILE", type=Path)
+    cut.add_argument("out", metavar="OUT", type=Path)
+    cut.add_argument("--from", dest="begin_s", metavar="S", type=float, default=0.0, help="seconds from the start")
+    cut.add_argument("--to", dest="end_s", metavar="S", type=float, default=float("inf"), help="seconds from the start")
+    merge = commands.add_parser("merge", help="one file of several, in order of time")
+    merge.add_argument("out", metavar="OUT", type=Path)
+    merge.add_argument("files", metavar="FILE", type=Path, nargs="+")
+    for command in (recover, cut, merge):
+        command.add_argument("--force", action="store_true", help="overwrite OUT")
+    o = p.parse_args(argv)
+    if o.command == "info":
+        return _info(o.file, o.json)
+    if o.command == "recover":
+        return _recover(o.file, o.out, o.force)
+    if o.command == "cut":
+        return _cut(o.file, o.out, o.begin_s, o.end_s, o.force)
+    return _merge(o.out, o.files, o.force)
+
+
+def _info(path: Path, as_json: bool) -> int:
+    file = McapFile(path)
+    for _ in () if not file.indexed else file.messages(ordered=False):
+        pass  # reading is the check: damaged chunks are noted on the way
+    topics = []
+    span_s = (file.last_ns - file.first_ns) * 1e-9
+    for number, channel in sorted(file.channels.items(), key=lambda item: item[1].topic):
+        schema, count = file.schema_of(number), file.counts.get(number, 0)
+        hz = round(count / span_s, 1) if span_s > 0 and count > 1 else None
+        name = schema.name if schema is not None else ""
+        topics.append(
+            {
+                "topic": channel.topic,
+                "messages": count,
+                "hz": hz,
+                "schema": name,
+                "encoding": channel.message_encoding,
+            }
+        )
+    facts = {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "seconds": round(span_s, 6),
+        "first_ns": file.first_ns,
+        "last_ns": file.last_ns,
+        "indexed": file.indexed,
+        "cut": file.cut,
+        "damage": file.notes,
+        "metadata": {record.name: record.metadata for record in file.metadata},
+        "topics": topics,
+    }
+    if as_json:
+        print(json.dumps(facts, indent=2))
+    else:
+        _print(facts, topics, file)
+    return 0
+
+
+def _print(facts: dict[str, object], topics: list[dict[str, object]], file: McapFile) -> None:
+    state = file.cut or ("whole, with index" if file.indexed else "whole, without index")
+    print(f"{facts['file']}: {facts['seconds']:.1f} s, {facts['bytes']} bytes, {state}")
+    for note in file.notes:
+        print(f"  {note}")
+    if file.cut or file.notes:
+        print("  mend it with: kiteline log recover FILE OUT")
+    for record in file.metadata:
+        for key, text in record.metadata.items():
+            value = " ".join(text.split())
+            print(f"  {record.name}.{key}: {value if len(value) <= 100 else value[:97] + '...'}")
+    width = max((len(str(t["topic"])) for t in topics), default=0)
+    for t in topics:
+        hz = f"{t['hz']:.1f} Hz" if t["hz"] is not None else ""
+        print(f"  {t['topic']:{width}}  {t['messages']:>8}  {hz:>10}  {t['schema']} ({t['encoding']})")
+
+
+def _recover(path: Path, out: Path, force: bool) -> int:
+    file = McapFile(path)
+    with whole_file(out, force) as part:
+        count = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
+    print(f"{out}: {count} messages; {path} was {file.cut or 'whole'}")
+    for note in file.notes:
+        print(f"  {note}")
+    return 0
+
+
+def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> int:
+    if not begin_s < end_s:
+        raise SourceError(f"nothing lies between {begin_s:g} s and {end_s:g} s: expected --from before --to")
+    file = McapFile(path)
+    begin_ns = file.first_ns + round(begin_s * 1e9)
+    end_ns = file.first_ns + round(end_s * 1e9) if end_s != float("inf") else 2**64 - 1
+    if begin_ns > file.last_ns:
+        raise SourceError(
+            f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"
+        )
+    with whole_file(out, force) as part:
+        count = _write(part, [file], ((0, m) for m in _stretch(file, begin_ns, end_ns)), [""])
+    print(f"{out}: {count} messages")
+    return 0
+
+
+def _stretch(file: McapFile, begin_ns: int, end_ns: int) -> Iterator[RawMessage]:
+    """Messages of a stretch; before them calibration and static transforms said earlier, moved to its start."""
+    sticky = [c for c in file.channels if _is_sticky(file, c)]
+    latest: dict[int, list[RawMessage]] = {}
+    for m in file.messages(sticky):
+        if m.log_ns < begin_ns:
+            kept = latest.setdefault(m.channel, [])
+            if "static" not in file.channels[m.channel].topic:
+                kept.clear()
+            kept.append(m)
+    for messages in latest.values():
+        for m in messages:
+            yield m._replace(log_ns=begin_ns, publish_ns=begin_ns)
+    for m in file.messages():
+        if begin_ns <= m.log_ns <= end_ns:
+            yield m
+
+
+def _is_sticky(file: McapFile, channel: int) -> bool:
+    schema = file.schema_of(channel)
+    return "static" in file.channels[channel].topic or (schema is not None and schema.name in _STICKY)
+
+
+def _merge(out: Path, paths: list[Path], force: bool) -> int:
+    files: list[McapFile] = []
+    for path in paths:
+        files.append(McapFile(path))
+    numbered = [_numbered(i, file) for i, file in enumerate(files)]
+    merged = heapq.merge(*numbered, key=lambda item: (item[1].log_ns, item[0]))
+    with whole_file(out, force) as part:
+        count = _write(part, files, merged, _prefixes(files))
+    print(f"{out}: {count} messages of {len(paths)} files")
+    return 0
+
+
+def _numbered(number: int, file: McapFile) -> Iterator[tuple[int, RawMessage]]:
+    for message in file.messages():
+        yield number, message
+
+
+def _prefixes(files: list[McapFile]) -> list[str]:
+    """Nothing for the parts of one recording; a name before each topic where files speak of the same time."""
+    spans = sorted((f.first_ns, f.last_ns) for f in files if f.counts)
+    topics = [c.topic for f in files for c in f.channels.values()]
+    overlap = any(a[1] > b[0] for a, b in pairwise(spans))
+    if not overlap or len(set(topics)) == len(topics):
+        return [""] * len(files)
+    names = [f.path.parent.name if f.path.stem == "log" else f.path.stem for f in files]
+    return [f"/{name}" if names.count(name) == 1 else f"/{name}_{i}" for i, name in enumerate(names)]
+
+
+def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawMessage]], prefixes: list[str]) -> int:
+    """Write messages (number of file, message); how many. Channels that agree in all but their file become one."""
+    count = 0
+    schemas: dict[tuple[str, str, bytes], int] = {}
+    channels: dict[tuple[str, str, int, str], int] = {}
+    known: dict[tuple[int, int], int] = {}
+    try:
+        with path.open("wb") as stream:
+            writer = Writer(stream, compression=CompressionType.ZSTD)
+            writer.start("", "kiteline")
+            for file in files:
+                for record in file.metadata:
+                    writer.add_metadata(record.name, record.metadata)
+            for number, m in messages:
+                target = known.get((number, m.channel))
+                if target is None:
+                    file = files[number]
+                    channel, schema = file.channels[m.channel], file.schema_of(m.channel)
+                    schema_id = 0
+                    if schema is not None:
+                        key = (schema.name, schema.encoding, schema.data)
+                        if key not in schemas:
+                            schemas[key] = writer.register_schema(*key)
+                        schema_id = schemas[key]
+                    topic, notes = prefixes[number] + channel.topic, json.dumps(channel.metadata, sort_keys=True)
+                    name = (topic, channel.message_encoding, schema_id, notes)
+                    if name not in channels:
+                        channels[name] = writer.register_channel(*name[:3], channel.metadata)
+                    target = known[(number, m.channel)] = channels[name]
+                writer.add_message(target, m.log_ns, m.data, m.publish_ns, m.sequence)
+                count += 1
+            writer.finish()
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be written: {error.strerror}") from error
+    return count

@@ -1,0 +1,82 @@
+"""`kiteline maps list|get|name|merge|split|delete`: the maps of a running base, asked for and changed by hand."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from kiteline_hw.links.zenoh_queries import ask
+
+_DEFAULT = "tcp/127.0.0.1:7447"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of `kiteline maps`."""
+    p = argparse.ArgumentParser(
+        prog="kiteline maps",
+        description="The maps of a running base. A map is called by its id (AGENT.BOOT.NUMBER) or its name.",
+        epilog="Other programs ask the same over Zenoh: docs/map-management.md.",
+    )
+    p.add_argument("--base", metavar="ENDPOINT", default=_DEFAULT, help="where the base listens (default: %(default)s)")
+    p.add_argument("--json", action="store_true", help="print the answer as it came")
+    verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs.add_parser("list", help="all maps")
+    one = {
+        "get": "one map, with the poses of its keyframes",
+        "split": "take a map out of the one into which it was merged, for good",
+        "delete": "forget a map",
+    }
+    for verb, what in one.items():
+        verbs.add_parser(verb, help=what).add_argument("map", metavar="MAP")
+    name = verbs.add_parser("name", help="call a map by a name")
+    name.add_argument("map", metavar="MAP")
+    name.add_argument("name", metavar="NAME", help='"" takes the name back')
+    merge = verbs.add_parser("merge", help="lay a map into another: they overlap, or lie as --at says")
+    merge.add_argument("map", metavar="MAP")
+    merge.add_argument("into", metavar="INTO")
+    merge.add_argument("--at", metavar="N", type=float, nargs=16, help="T_into_map, 16 numbers in rows")
+    return p
+
+
+def question(a: argparse.Namespace) -> dict[str, Any]:
+    """What is asked of the base."""
+    given = {key: getattr(a, key) for key in ("map", "name", "into") if hasattr(a, key)}
+    if getattr(a, "at", None) is not None:
+        given["T_into_map"] = a.at
+    return given
+
+
+def table(answer: Mapping[str, Any]) -> str:
+    """An answer for people."""
+    if "maps" not in answer and "id" not in answer:
+        return json.dumps(answer)
+    lines = [f"{'map':10} {'name':16} {'agents':8} {'keyframes':>9} {'points':>8}  placed  unit   submaps"]
+    for m in answer.get("maps", [answer]):
+        agents, submaps = ",".join(map(str, m["agents"])), " ".join(map(_submap, m["submaps"]))
+        placed = "yes" if m["placed"] else "no"
+        lines.append(
+            f"{m['id']:10} {m['name'][:16]:16} {agents:8} {m['keyframes']:9} {m['points']:8}  {placed:6}  "
+            f"{m['unit']:5}  {submaps}"
+        )
+    return "\n".join(lines)
+
+
+def _submap(told: Mapping[str, Any]) -> str:
+    """A submap's id, and its scale where that is not 1."""
+    return str(told["id"]) if told["scale"] == 1.0 else f"{told['id']} (x{told['scale']:.4g})"
+
+
+def main(argv: list[str]) -> int:
+    """Run `kiteline maps`; 1 when the base refused."""
+    a = parser().parse_args(argv)
+    ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, json.dumps(question(a)))
+    if a.json:
+        print(text)
+    elif ok:
+        print(table(json.loads(text)))
+    else:
+        print(f"kiteline maps: {json.loads(text)['error']}", file=sys.stderr)
+    return 0 if ok else 1
