@@ -17,7 +17,7 @@ from kiteline_agent.tracking.image_pair import RightEye, rectified
 from kiteline_agent.tracking.image_shift import Glimpse
 from kiteline_agent.tracking.tracker import Track, Tracker, View
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Camera, Live, Record, Tile
+from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraRig
@@ -63,7 +63,7 @@ class Agent:
         self._glimpse = Glimpse(s.camera)
         self._bridged = False  # the last pose is that of IMU or odometer alone
         self._lost = False  # the last frame had no pose
-        channel.put(Camera(identity.agent, s.camera))
+        channel.put(CameraIntrinsics(identity.agent, s.camera))
 
     # one step
 
@@ -276,7 +276,7 @@ class Agent:
         return self._submaps.active
 
     @property
-    def tiles(self) -> dict[tuple[int, int], Tile]:
+    def tiles(self) -> dict[tuple[int, int], GridTile]:
         """The grid as the base sent it, by column and row."""
         return self._s.base.tiles
 
@@ -320,7 +320,7 @@ class Agent:
             quality = -1
         keyframe, T_k_c = self._reference.keyframe, self._reference.T_k_c
         if keyframe != NO_KEYFRAME:
-            self._s.channel.put(Live(self._identity.agent, t_ns, keyframe, T_k_c, quality))
+            self._s.channel.put(LivePose(self._identity.agent, t_ns, keyframe, T_k_c, quality))
         T_w_b = self._s.base.in_world(self.submap, T_m_b, self._pose.T_o_m, t_ns)
         return Estimate(
             t_ns,

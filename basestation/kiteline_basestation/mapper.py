@@ -18,7 +18,7 @@ from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.intake.placements import World
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.map.covisibility import Window, local_window
-from kiteline_basestation.map.map_tables import BIRTH, CULLED
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.publisher import Published, Publisher, adopt
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.map.world_view import world_view
@@ -30,7 +30,7 @@ from kiteline_basestation.refinement.odometry_links import with_links, without_l
 from kiteline_basestation.refinement.whole_maps import WholeMaps
 from kiteline_basestation.runtime.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.store.state import Json, Memory, matrix, parsed, plain, similarity_of
-from kiteline_codec.schema import Calibration, Key, Kind, Live, Record
+from kiteline_codec.schema import DisparityCalibration, Key, Kind, LivePose, Record
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
@@ -222,9 +222,9 @@ class Mapper:
         for submap in submaps:
             for keyframe in self.map.submaps.get(submap, []):
                 slots = self.map.slots_of(keyframe)
-                self.map.set_flags(slots[self.map.keypoints.kind[slots] == BIRTH], CULLED)
+                self.map.set_flags(slots[self.map.keypoints.kind[slots] == LANDMARK], CULLED)
                 self.map.cull_keyframe(keyframe)
-                self._publisher.touch(Kind.CULLED, keyframe)
+                self._publisher.touch(Kind.CULLED_LANDMARKS, keyframe)
             self._stale.pop(submap, None)
             self.placements.pop(submap, None)
             self.names.pop(submap, None)
@@ -284,7 +284,7 @@ class Mapper:
             "jobs_open": len(self._windows) + (self._grid_job != 0) + (self.atlas.jobs_open if self.atlas else 0),
         }
 
-    def live(self, agent: AgentId) -> Live | None:
+    def live(self, agent: AgentId) -> LivePose | None:
         """The newest pose that an agent told."""
         return self._intake.live.get(agent)
 
@@ -356,7 +356,7 @@ class Mapper:
         for agent, offset in sorted(self.map.disparity_offset_px.items(), key=lambda item: item[0]):
             if not np.array_equal(self._told.get(agent, 0.0), offset):
                 self._told[agent] = offset
-                self._publisher.send(agent, Calibration(agent, offset))
+                self._publisher.send(agent, DisparityCalibration(agent, offset))
 
     def _next_job(self) -> int:
         self._last_job += 1

@@ -9,7 +9,7 @@ from kiteline_codec.coding import messages
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, PROFILES, RADIO, Profile
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Head, Key, Live, Record, WireError
+from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Record, WireError
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig, SyncStats
 
@@ -156,14 +156,14 @@ class CodedChannel:
 
     def put(self, record: Record) -> Record:
         """Code and share a record, but for a live pose that is not due. Raises ValueError where there is no code."""
-        if isinstance(record, Live) and not self._live_is_due(record.t_ns):
+        if isinstance(record, LivePose) and not self._live_is_due(record.t_ns):
             return record
         key = messages.key(record)
         code = messages.encode(record)
         self.endpoint.put(key, code)
-        if isinstance(record, Head):
+        if isinstance(record, KeyframeHeader):
             self._pacer.keyframe(record.t_ns)
-        if self.noting and not isinstance(record, Live):
+        if self.noting and not isinstance(record, LivePose):
             self._noted[key] = code
         return messages.decode(key, code)
 

@@ -31,27 +31,27 @@ class WireError(Exception):
 class Kind(IntEnum):
     """What a value is. Below 16 the agent writes, from 16 on the base."""
 
-    CAMERA = 1
-    LIVE = 2
-    HEAD = 3
-    BIRTHS = 4
-    SIGHTINGS = 5
-    LEVEL = 6
-    UNIT = 7
-    POSE = 16
-    DEPTHS = 17
-    FOUND = 18
-    REMOVED = 19
-    CULLED = 20
-    PLACEMENT = 21
-    TILE = 22
-    COPY = 23
-    COPIED = 24
-    CALIBRATION = 25
+    CAMERA_INTRINSICS = 1
+    LIVE_POSE = 2
+    KEYFRAME_HEADER = 3
+    NEW_LANDMARKS = 4
+    OBSERVATIONS = 5
+    GRAVITY_ALIGNMENT = 6
+    SUBMAP_SCALE = 7
+    KEYFRAME_POSE = 16
+    REFINED_LANDMARKS = 17
+    FUSED_LANDMARKS = 18
+    REMOVED_OBSERVATIONS = 19
+    CULLED_LANDMARKS = 20
+    SUBMAP_PLACEMENT = 21
+    GRID_TILE = 22
+    CACHED_KEYFRAME = 23
+    CACHED_LANDMARKS = 24
+    DISPARITY_CALIBRATION = 25
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class CameraIntrinsics:
     """The ideal camera to which an agent's keypoints refer."""
 
     agent: AgentId
@@ -59,7 +59,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class Live:
+class LivePose:
     """An agent's newest pose, relative to a keyframe. T_k_c: (4,4) camera in the keyframe. quality: -1, 0, 1..100."""
 
     agent: AgentId
@@ -70,7 +70,7 @@ class Live:
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class KeyframeHeader:
     """A keyframe's header. T_p_k: (4,4) this keyframe's camera in its parent's; for the first of a submap
     (parent NO_KEYFRAME) in the submap frame m, whose z points up.
     """
@@ -83,7 +83,7 @@ class Head:
 
 
 @dataclass(frozen=True, slots=True)
-class Births:
+class NewLandmarks:
     """New keypoints of a keyframe, best first over the parts. index: (n,) increasing within a part. uv: (n,2) px.
     inv_depth: (n,) 1/m as seen. octave: (n,) pyramid level (scale 2 per level). angle: (n,) in 1/256 turns.
     descriptor: (n,32).
@@ -100,7 +100,7 @@ class Births:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class Observations:
     """Observations of points born in other keyframes. point: (n,) PointId. inv_depth: (n,) 1/m from stereo, 0 none."""
 
     keyframe: KeyframeId
@@ -113,7 +113,7 @@ class Sightings:
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class GravityAlignment:
     """A submap that began in motion lies askew until its agent knows which way is up. T_l_m: (4,4) sets it upright."""
 
     submap: SubmapId
@@ -121,7 +121,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Unit:
+class SubmapScale:
     """What one eye's agent has learnt of a submap's unit of length. metres: of one unit; a submap begun in metres has
     1. Of a submap of which nothing is said the unit is its own.
     """
@@ -131,7 +131,7 @@ class Unit:
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class KeyframePose:
     """The base's pose of a keyframe. T_m_k: (4,4) camera in the submap frame."""
 
     keyframe: KeyframeId
@@ -139,7 +139,7 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
-class Depths:
+class RefinedLandmarks:
     """The base's positions of points born in a keyframe. index: (n,) keypoints. inv_depth: (n,) 1/m.
     offset: (n,2) px added to the keypoint's pixel to give the bearing.
     """
@@ -151,7 +151,7 @@ class Depths:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FusedLandmarks:
     """Births that the base recognised as older points: keypoint index[i] of the keyframe shows point[i] (a root).
     The point born at that keypoint is thereby an alias of the root.
     """
@@ -162,7 +162,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True)
-class Removed:
+class RemovedObservations:
     """Observations that the base rejected: keypoints of the keyframe that no longer count (as sighting or as birth)."""
 
     keyframe: KeyframeId
@@ -170,7 +170,7 @@ class Removed:
 
 
 @dataclass(frozen=True, slots=True)
-class Culled:
+class CulledLandmarks:
     """Points born in the keyframe that the base dropped; `keyframe_too` drops the keyframe's observations as well."""
 
     keyframe: KeyframeId
@@ -179,7 +179,7 @@ class Culled:
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class SubmapPlacement:
     """Where a submap lies, and in which unit of length. S_w_m: (4,4) similarity: a rigid motion where that is w's."""
 
     submap: SubmapId
@@ -187,7 +187,7 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True)
-class Tile:
+class GridTile:
     """A square of the occupancy grid. cells: (32,32) int8, 0..100 occupied percent, -1 unknown; row 0 is the lowest y.
     column, row: tile numbers; the tile's corner lies at (column, row) * 32 * cell_m in w.
     """
@@ -199,7 +199,7 @@ class Tile:
 
 
 @dataclass(frozen=True, slots=True)
-class Copy:
+class CachedKeyframe:
     """A keyframe that its reader does not have, another agent's or one that it forgot. T_m_k: (4,4) camera in the
     reader's `submap`.
     """
@@ -210,7 +210,7 @@ class Copy:
 
 
 @dataclass(frozen=True, slots=True)
-class Copied:
+class CachedLandmarks:
     """Points that were born in a copied keyframe, where the base has them. index: (n,) keypoints, increasing within a
     part. uv: (n,2) px as the reader's own camera would see them from the keyframe. The rest as in Births.
     """
@@ -226,7 +226,7 @@ class Copied:
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class DisparityCalibration:
     """What the base found of an agent's cameras. disparity_px: (5,) what its disparities are too large by, as factors
     of 1, x, y, x^2, x y in normalised image coordinates (`kiteline_core.geometry.disparity_offset`).
     """
@@ -236,23 +236,23 @@ class Calibration:
 
 
 Record = (
-    Camera
-    | Live
-    | Head
-    | Births
-    | Sightings
-    | Level
-    | Unit
-    | Pose
-    | Depths
-    | Found
-    | Removed
-    | Culled
-    | Placement
-    | Tile
-    | Copy
-    | Copied
-    | Calibration
+    CameraIntrinsics
+    | LivePose
+    | KeyframeHeader
+    | NewLandmarks
+    | Observations
+    | GravityAlignment
+    | SubmapScale
+    | KeyframePose
+    | RefinedLandmarks
+    | FusedLandmarks
+    | RemovedObservations
+    | CulledLandmarks
+    | SubmapPlacement
+    | GridTile
+    | CachedKeyframe
+    | CachedLandmarks
+    | DisparityCalibration
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.schema import Births, Camera, Depths, Head, Sightings
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, RefinedLandmarks
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
@@ -24,19 +24,19 @@ def warm() -> None:
     point = (first << KEYPOINT_BITS) + np.arange(n, dtype=np.int64)
     camera = RectifiedCamera(752, 480, 450.0, 450.0, 376.0, 240.0, 0.1, True, np.eye(4))
     agent, base = coded_channel(1), coded_channel(1)
-    agent.put(Camera(AgentId(0), camera))
+    agent.put(CameraIntrinsics(AgentId(0), camera))
     for tick in range(_TICKS):
         if tick == 2:
-            agent.put(Head(first, 0, NO_KEYFRAME, np.eye(4), n))
-            agent.put(Births(first, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
+            agent.put(KeyframeHeader(first, 0, NO_KEYFRAME, np.eye(4), n))
+            agent.put(NewLandmarks(first, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
         if tick == 4:
-            agent.put(Head(second, _TICK_NS, first, np.eye(4), n))
-            agent.put(Births(second, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
-            agent.put(Sightings(second, 0, index + np.uint16(n), uv + 1.0, depth, flat, point))
-            base.put(Depths(first, index, depth, np.zeros((n, 2), np.float32)))
+            agent.put(KeyframeHeader(second, _TICK_NS, first, np.eye(4), n))
+            agent.put(NewLandmarks(second, 0, index, uv, depth, flat, flat, np.zeros((n, 32), np.uint8)))
+            agent.put(Observations(second, 0, index + np.uint16(n), uv + 1.0, depth, flat, point))
+            base.put(RefinedLandmarks(first, index, depth, np.zeros((n, 2), np.float32)))
         if tick == 6:  # points of two keyframes
             both = np.where(np.arange(n) < n // 2, point, point + ((second - first) << KEYPOINT_BITS))
-            agent.put(Head(third, 2 * _TICK_NS, second, np.eye(4), n))
-            agent.put(Sightings(third, 0, index, uv + 1.0, depth, flat, both))
+            agent.put(KeyframeHeader(third, 2 * _TICK_NS, second, np.eye(4), n))
+            agent.put(Observations(third, 0, index, uv + 1.0, depth, flat, both))
         base.receive(agent.poll(tick * _TICK_NS), tick * _TICK_NS)
         agent.receive(base.poll(tick * _TICK_NS), tick * _TICK_NS)

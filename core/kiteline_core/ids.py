@@ -12,7 +12,7 @@ from typing import NewType
 AgentId = NewType("AgentId", int)
 SubmapId = NewType("SubmapId", int)
 KeyframeId = NewType("KeyframeId", int)
-PointId = NewType("PointId", int)
+LandmarkId = NewType("LandmarkId", int)
 
 BOOT_BITS = 14
 SUBMAP_BITS = 12
@@ -26,7 +26,7 @@ MAX_KEYFRAMES = 1 << SEQUENCE_BITS
 MAX_KEYPOINTS = 1 << KEYPOINT_BITS
 
 NO_KEYFRAME = KeyframeId(-1)
-NO_POINT = PointId(-1)
+NO_LANDMARK = LandmarkId(-1)
 
 
 def submap_id(agent: int, boot: int, submap: int) -> SubmapId:
@@ -43,19 +43,19 @@ def keyframe_id(submap: SubmapId, sequence: int) -> KeyframeId:
     return KeyframeId(submap << SEQUENCE_BITS | sequence)
 
 
-def point_id(keyframe: KeyframeId, keypoint: int) -> PointId:
+def point_id(keyframe: KeyframeId, keypoint: int) -> LandmarkId:
     """The id of the point born at `keypoint` of `keyframe`. Raises ValueError when the index does not fit its bits."""
     if not 0 <= keypoint < MAX_KEYPOINTS:
         raise ValueError(f"keypoint index out of range: {keypoint}")
-    return PointId(keyframe << KEYPOINT_BITS | keypoint)
+    return LandmarkId(keyframe << KEYPOINT_BITS | keypoint)
 
 
-def keyframe_of_point(point: PointId) -> KeyframeId:
+def keyframe_of_point(point: LandmarkId) -> KeyframeId:
     """The keyframe on which a point hangs."""
     return KeyframeId(point >> KEYPOINT_BITS)
 
 
-def keypoint_of_point(point: PointId) -> int:
+def keypoint_of_point(point: LandmarkId) -> int:
     """The index of the keypoint at which a point was born."""
     return point & (MAX_KEYPOINTS - 1)
 

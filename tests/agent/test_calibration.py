@@ -6,7 +6,7 @@ import numpy as np
 
 from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_codec.schema import Depths, Head
+from kiteline_codec.schema import KeyframeHeader, RefinedLandmarks
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
@@ -19,7 +19,7 @@ def held_map(disparity: list[float]) -> LocalMap:
     held = LocalMap(CAMERA, LocalMapConfig(), DepthFilterConfig())
     n = len(disparity)
     held.add(
-        Head(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0), np.array(disparity) / CAMERA.bf,
+        KeyframeHeader(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0), np.array(disparity) / CAMERA.bf,
         np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8),
         np.zeros((n, 3, 21, 21), np.uint8), 0,
     )  # fmt: skip
@@ -30,7 +30,7 @@ def held_map(disparity: list[float]) -> LocalMap:
 def test_measured_depths_follow_and_others_stay() -> None:
     held = held_map([10.0, 8.0, 0.0])  # the last is a bearing
     one = np.array([1], np.uint16)
-    held.apply(Depths(FIRST, one, np.array([0.2], np.float32), np.zeros((1, 2), np.float32)))
+    held.apply(RefinedLandmarks(FIRST, one, np.array([0.2], np.float32), np.zeros((1, 2), np.float32)))
     bearing = float(held.rho[0, 2])
     held.calibrate(CONSTANT)
     assert np.allclose(held.rho[0, :3], [9.9 / CAMERA.bf, 0.2, bearing], atol=1e-7)

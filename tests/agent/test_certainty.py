@@ -14,7 +14,7 @@ from kiteline_agent.covariance.pose_covariance import Certainty, adjoint, probab
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.tracker import Track
-from kiteline_codec.schema import Head
+from kiteline_codec.schema import KeyframeHeader
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
@@ -49,7 +49,7 @@ def map_of(observed: F64, T_m_k: F64 | None = None) -> LocalMap:
     local_map = LocalMap(CAMERA, config.local_map, config.depth_filter)
     n = len(observed)
     local_map.add(
-        Head(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k, observed[:, :2],
+        KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k, observed[:, :2],
         observed[:, 2] / CAMERA.bf, np.full(n, 1e-4), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
         np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), 0,
     )  # fmt: skip

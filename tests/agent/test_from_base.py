@@ -10,7 +10,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import FromBase
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import Window
-from kiteline_codec.schema import Key, Kind, Placement
+from kiteline_codec.schema import Key, Kind, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, submap_id
@@ -34,9 +34,9 @@ def base() -> FromBase:
 
 def say(base: FromBase, T_w_first: NDArray[np.float64], T_first_young: NDArray[np.float64] | None) -> bool:
     """A base says where submaps lie; whether the young one counts as placed."""
-    records = [Placement(FIRST, T_w_first)]
+    records = [SubmapPlacement(FIRST, T_w_first)]
     if T_first_young is not None:
-        records = [Placement(YOUNG, T_w_first @ T_first_young), *records]
+        records = [SubmapPlacement(YOUNG, T_w_first @ T_first_young), *records]
     base.take(records, [], [])
     return base.has_placed(YOUNG)
 
@@ -53,5 +53,5 @@ def test_a_base_that_takes_the_odometrys_word_has_placed_nothing(base: FromBase)
 def test_a_submap_that_had_no_place_is_placed_where_it_is_recognised(base: FromBase) -> None:
     assert not say(base, np.eye(4), None)
     assert say(base, np.eye(4), FOUND)
-    base.take([], [Key(int(Kind.PLACEMENT), int(YOUNG), 0)], [])
+    base.take([], [Key(int(Kind.SUBMAP_PLACEMENT), int(YOUNG), 0)], [])
     assert not base.has_placed(YOUNG)

@@ -21,7 +21,7 @@ from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracking.tracker import View
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import Births
+from kiteline_codec.schema import NewLandmarks
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
@@ -149,7 +149,7 @@ def test_points_too_far_for_stereo_get_their_depth_from_motion() -> None:
         estimate = step(one, both)
         assert estimate.tracked
         made.setdefault(int(estimate.keyframe), k)
-    open_ = [(r.keyframe, r.index[r.inv_depth == 0]) for r in far.receive((), 0) if isinstance(r, Births)]
+    open_ = [(r.keyframe, r.index[r.inv_depth == 0]) for r in far.receive((), 0) if isinstance(r, NewLandmarks)]
     ratios = []
     for keyframe, index in open_:
         slot = one.map.slot_of(keyframe)
@@ -218,7 +218,7 @@ def test_an_imu_gives_metres() -> None:
     moves = np.diff([e.T_o_b[:3, 3] for e in estimates], axis=0)
     assert np.linalg.norm(moves, axis=1).max() < 0.1, "what flies must not jump"
     # What is shared of the new submap is in metres, and nothing of the old one is changed.
-    births = [r for r in far.receive((), 0) if isinstance(r, Births) and (r.inv_depth > 0).any()]
+    births = [r for r in far.receive((), 0) if isinstance(r, NewLandmarks) and (r.inv_depth > 0).any()]
     first = [r for r in births if submap_of_keyframe(r.keyframe) == estimates[-1].submap]
     depth = room(path(begin + metric[0]))[1]
     ratio = [1.0 / r.inv_depth / depth[r.uv[:, 1].astype(int), r.uv[:, 0].astype(int)] for r in first]

@@ -14,7 +14,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import AloneChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_codec.schema import Head, Record
+from kiteline_codec.schema import KeyframeHeader, Record
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraRig
@@ -31,10 +31,10 @@ class Listening(AloneChannel):
     """Keeps the heads of the keyframes that were shared."""
 
     def __init__(self) -> None:
-        self.heads: list[Head] = []
+        self.heads: list[KeyframeHeader] = []
 
     def put(self, record: Record) -> Record:
-        if isinstance(record, Head):
+        if isinstance(record, KeyframeHeader):
             self.heads.append(record)
         return record
 
@@ -46,7 +46,7 @@ class Flown:
     agent: Agent
     estimates: list[Estimate]
     events: list[tuple[str, ...]]
-    heads: list[Head]
+    heads: list[KeyframeHeader]
 
     @property
     def submaps(self) -> list[int]:
@@ -188,7 +188,7 @@ def test_a_young_submap_is_joined_where_the_old_place_comes_back(room: Recording
     assert np.linalg.norm((T_0_1 @ T_1_b)[:3, 3] - expected[:3, 3]) < 0.05
 
 
-def pose_of(agent: Agent, head: Head) -> np.ndarray:
+def pose_of(agent: Agent, head: KeyframeHeader) -> np.ndarray:
     slot = agent.map.slot_of(head.keyframe)
     assert slot >= 0
     return agent.map.T_m_k[slot]
@@ -250,7 +250,7 @@ def copy_map(agent: Agent, shift_m: np.ndarray) -> None:
         T_m_k[:3, 3] += shift_m
         copy = KeyframeId(int(m.keyframe[slot]) + 1000)
         m.add(
-            Head(copy, 0, NO_KEYFRAME, T_m_k, n), T_m_k, m.uv[slot, :n].copy(), m.rho[slot, :n].copy(),
+            KeyframeHeader(copy, 0, NO_KEYFRAME, T_m_k, n), T_m_k, m.uv[slot, :n].copy(), m.rho[slot, :n].copy(),
             m.sigma_rho[slot, :n].copy(), m.octave[rows].copy(), m.angle[rows].copy(), m.descriptor[rows].copy(),
             m.templates[rows].copy(), 0,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.relocalisation.map_cache import Seen, Window
-from kiteline_codec.schema import Copied, Copy, Key, Kind
+from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
@@ -50,15 +50,17 @@ class World:
         rows = np.flatnonzero((local[:, 2] > 0.3) & (uv > 8).all(1) & (uv < (744, 472)).all(1))
         return rows, uv[rows], z[rows]
 
-    def copy(self, keyframe: KeyframeId, submap: SubmapId, T_m_k: F64, points: int = 100) -> list[Copy | Copied]:
+    def copy(
+        self, keyframe: KeyframeId, submap: SubmapId, T_m_k: F64, points: int = 100
+    ) -> list[CachedKeyframe | CachedLandmarks]:
         """A keyframe that bore the first points in its view, in two parts."""
         rows, uv, z = self.in_view(T_m_k)
         halves = np.array_split(np.arange(min(points, len(rows))), 2)
         zeros = [np.zeros(len(h), np.uint8) for h in halves]
         return [
-            Copy(keyframe, submap, T_m_k),
+            CachedKeyframe(keyframe, submap, T_m_k),
             *(
-                Copied(
+                CachedLandmarks(
                     keyframe, part, h.astype(np.uint16), uv[h].astype(np.float32), (1.0 / z[h]).astype(np.float32),
                     zeros[part], zeros[part], self.descriptor[rows[h]],
                 )
@@ -161,7 +163,7 @@ def test_what_is_taken_back_is_gone_and_the_number_is_bounded(world: World) -> N
     assert set(box.keyframe.tolist()) == {keyframe_id(THERE, k) for k in range(4, 12)}, "the oldest make room"
     true = look(2 * np.pi * 8 / 12)
     assert box.find(world.seen(true, rng), {HERE}, 0) is not None
-    box.take_back([Key(int(Kind.COPY), int(keyframe_id(THERE, k))) for k in range(4, 12)])
+    box.take_back([Key(int(Kind.CACHED_KEYFRAME), int(keyframe_id(THERE, k))) for k in range(4, 12)])
     assert len(box) == 0
     assert not box.lies_in(HERE)
     assert box.find(world.seen(true, rng), {HERE}, 0) is None

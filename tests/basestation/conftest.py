@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, Record
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
@@ -36,7 +36,7 @@ class Flight:
 
     def all_records(self) -> list[Record]:
         """Everything in order, the camera first."""
-        return [Camera(self.agent, self.camera), *(r for part in self.records for r in part)]
+        return [CameraIntrinsics(self.agent, self.camera), *(r for part in self.records for r in part)]
 
 
 @dataclass
@@ -125,14 +125,16 @@ def fly(
         known = np.array([r in tracked and n - tracked[r][1] <= memory for r in rows.tolist()], bool)
         ids = np.array([tracked[r][0] if k else -1 for r, k in zip(rows.tolist(), known, strict=True)], np.int64)
         flips = np.packbits(rng.random((len(rows), 256)) < 0.06, axis=1)
-        made: list[Record] = [Head(keyframe, 10**9 + submap * 10**12 + n * 250_000_000, parent, T_p_k, len(rows))]
+        made: list[Record] = [
+            KeyframeHeader(keyframe, 10**9 + submap * 10**12 + n * 250_000_000, parent, T_p_k, len(rows))
+        ]
         index = np.arange(len(rows), dtype=np.uint16)
         for kind, mask in (("birth", ~known), ("sighting", known)):
             for part, some in enumerate(np.array_split(np.flatnonzero(mask), 3)):
                 if kind == "birth":
                     angle = ((direction[rows[some]] + rng.integers(-5, 6, len(some))) & 255).astype(np.uint8)
                     made.append(
-                        Births(
+                        NewLandmarks(
                             keyframe,
                             part,
                             index[some],
@@ -145,7 +147,9 @@ def fly(
                     )
                 else:
                     made.append(
-                        Sightings(keyframe, part, index[some], measured[some], inverse[some], octave[some], ids[some])
+                        Observations(
+                            keyframe, part, index[some], measured[some], inverse[some], octave[some], ids[some]
+                        )
                     )
         flight.sightings |= {(keyframe, int(i)) for i in np.flatnonzero(known)}
         flight.wild |= {(keyframe, int(i)) for i in np.flatnonzero(wild & known)}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
-from kiteline_codec.schema import Births, Camera, Record, Sightings
+from kiteline_codec.schema import CameraIntrinsics, NewLandmarks, Observations, Record
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 
@@ -27,7 +27,7 @@ CONSTANT = np.array([0.12, 0.0, 0.0, 0.0, 0.0])
 
 
 def shifted(record: Record, offset: F64) -> Record:
-    if isinstance(record, Births | Sightings):
+    if isinstance(record, NewLandmarks | Observations):
         by = terms((record.uv - [CX, CY]) / FOCAL) @ offset
         deep = record.inv_depth > 0
         return replace(record, inv_depth=np.where(deep, record.inv_depth + by / BF, 0.0).astype(np.float32))
@@ -39,7 +39,7 @@ def fly(mapper: Mapper, flight: Any, offset: F64) -> list[Job]:
     jobs: list[Job] = []
     for n in range(len(flight.records) + 30):
         records = flight.records[n] if n < len(flight.records) else []
-        first = [Camera(flight.agent, flight.camera)] if n == 0 else []
+        first = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
         given = tuple(first) + tuple(shifted(r, offset) for r in records)
         output = mapper.step(MapperInput(((flight.agent, given),), done), n * 250_000_000)
         done = tuple(run_job(job) for job in output.jobs)

@@ -40,7 +40,7 @@ class Flown:
 
 
 def kept_heads(folder: Path) -> int:
-    return sum(key.kind == Kind.HEAD for codes in read(folder).agents.values() for key in codes.received)
+    return sum(key.kind == Kind.KEYFRAME_HEADER for codes in read(folder).agents.values() for key in codes.received)
 
 
 def test_a_disk_that_refuses_for_a_while_loses_nothing(

@@ -14,7 +14,7 @@ from kiteline_basestation.config import BaseConfig, RefindConfig
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_detector import Shares
 from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
-from kiteline_codec.schema import Camera, Pose, Record
+from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record
 from kiteline_core.ids import AgentId
 
 F64 = NDArray[np.float64]
@@ -31,7 +31,7 @@ def feed(mapper: Mapper, flights: list[Any], late: int = 0) -> tuple[list[Record
     for n in range(max(len(f.records) for f in flights) + 60 + 2 * late):
         arrivals = []
         for flight in flights:
-            records: list[Record] = [Camera(flight.agent, flight.camera)] if n == 0 else []
+            records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
             records += flight.records[n] if n < len(flight.records) else []
             arrivals.append((flight.agent, tuple(records)))
         done = tuple(d for at, d in open_jobs if at <= n)
@@ -74,7 +74,7 @@ def test_a_ring_is_closed_while_new_keyframes_come(around: Any, late: int) -> No
     assert {"graph", "full"} <= {job.kind for job in jobs}
     assert mapper.idle
     assert np.mean(errors_m(mapper, flight)[-8:]) < 0.3 * np.mean(errors_m(blind, flight)[-8:])
-    last = {r.keyframe: r.T_m_k for r in published if isinstance(r, Pose)}
+    last = {r.keyframe: r.T_m_k for r in published if isinstance(r, KeyframePose)}
     for keyframe in flight.keyframes[1:]:  # what was published is what the map holds
         assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
 

@@ -14,7 +14,7 @@ from kiteline_basestation.management import VERBS, Answer, Command, called
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.store.integrity import contradictions
-from kiteline_codec.schema import Camera, Culled, Live, Record
+from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
 
@@ -44,7 +44,7 @@ class Base:
         for n in range(max(len(f.records) for f in flights) + 40):
             arrivals = []
             for flight in flights:
-                records: list[Record] = [Camera(flight.agent, flight.camera)] if n == 0 else []
+                records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
                 arrivals.append((flight.agent, (*records, *(flight.records[n] if n < len(flight.records) else ()))))
             self.step(arrivals)
 
@@ -150,13 +150,15 @@ def test_a_deleted_map_is_gone_for_agents_and_for_good(make_flight: MakeFlight, 
     b = make_flight(keyframes=12, turns=0.2, seed=4, agent=1)
     base.fly([a, b])
     last = b.keyframes[-1]
-    base.step([(b.agent, (Live(b.agent, 1, last, np.eye(4), 90),))])
+    base.step([(b.agent, (LivePose(b.agent, 1, last, np.eye(4), 90),))])
     assert "flies in" in base.ask("delete", map="1.1.0")["error"]
     base.rest()
     base.published.clear()
     assert base.ask("delete", map="1.1.0") == {"deleted": ["1.1.0"]}
     culled = [
-        r for r in base.published if isinstance(r, Culled) and submap_of_keyframe(r.keyframe) == submap_id(1, 1, 0)
+        r
+        for r in base.published
+        if isinstance(r, CulledLandmarks) and submap_of_keyframe(r.keyframe) == submap_id(1, 1, 0)
     ]
     assert len(culled) == 12 and all(r.keyframe_too for r in culled)
     for records in b.records:  # its agent says it all again

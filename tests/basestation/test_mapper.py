@@ -12,13 +12,25 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
-from kiteline_basestation.map.map_tables import BIRTH, CULLED, REFINED_POSE, REMOVED
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
 from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.store.state import Scribe
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Births, Camera, Culled, Depths, Found, Head, Live, Placement, Pose, Record, Removed
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    CulledLandmarks,
+    FusedLandmarks,
+    KeyframeHeader,
+    KeyframePose,
+    LivePose,
+    NewLandmarks,
+    Record,
+    RefinedLandmarks,
+    RemovedObservations,
+    SubmapPlacement,
+)
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 
@@ -31,7 +43,7 @@ def feed(mapper: Mapper, flight: Any, groups: Sequence[Sequence[Record]]) -> lis
     """Hand in one group of records a step, run every job at once, and collect all that is published."""
     done: tuple[JobDone, ...] = ()
     published: list[Record] = []
-    for n, records in enumerate([[Camera(flight.agent, flight.camera)], *groups, *[[]] * 12]):
+    for n, records in enumerate([[CameraIntrinsics(flight.agent, flight.camera)], *groups, *[[]] * 12]):
         output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * STEP_NS)
         done = tuple(run_job(job) for job in output.jobs)
         for _, out in output.publish:
@@ -61,7 +73,7 @@ def test_refind_fuses_doubles_and_nothing_else(make_flight: MakeFlight) -> None:
     mapper = Mapper()
     feed(mapper, flight, flight.records)
     table = mapper.map.keypoints
-    slots = np.flatnonzero((table.kind == BIRTH) & (table.root != np.arange(len(table.root)))).astype(np.int32)
+    slots = np.flatnonzero((table.kind == LANDMARK) & (table.root != np.arange(len(table.root)))).astype(np.int32)
     aliases, roots = mapper.map.point_ids(slots).tolist(), mapper.map.point_ids(table.root[slots]).tolist()
     doubles = len(flight.point_of) - len(set(flight.point_of.values()))
     assert len(aliases) > 0.8 * doubles
@@ -91,7 +103,7 @@ def test_wild_observations_are_removed_and_good_ones_kept(make_flight: MakeFligh
     slots = np.flatnonzero(table.flags & REMOVED).astype(np.int32)
     keyframes = mapper.map.keyframes.id[table.row[slots]].tolist()
     removed = set(zip(keyframes, mapper.map.keypoint_of(slots).tolist()))
-    assert removed == {(r.keyframe, int(i)) for r in published if isinstance(r, Removed) for i in r.index}
+    assert removed == {(r.keyframe, int(i)) for r in published if isinstance(r, RemovedObservations) for i in r.index}
     sightings = {(k, int(i)) for k, i in flight.sightings if k in flight.keyframes[2:-2]}
     wild = flight.wild & sightings
     assert len(removed & wild) > 0.9 * len(wild) > 50
@@ -104,10 +116,10 @@ def test_points_that_are_not_seen_again_are_culled(make_flight: MakeFlight) -> N
     rng = np.random.default_rng(3)
     records = []
     for part in flight.records:
-        head = next(r for r in part if isinstance(r, Head))
+        head = next(r for r in part if isinstance(r, KeyframeHeader))
         index = np.arange(head.keypoints, head.keypoints + 15, dtype=np.uint16)
         ghosts |= {(head.keyframe, int(i)) for i in index}
-        births = Births(
+        births = NewLandmarks(
             head.keyframe, 9, index, rng.uniform(300, 450, (15, 2)).astype(np.float32),
             np.full(15, 0.4, np.float32), np.zeros(15, np.uint8), np.zeros(15, np.uint8),
             rng.integers(0, 256, (15, 32), dtype=np.uint8),
@@ -115,7 +127,7 @@ def test_points_that_are_not_seen_again_are_culled(make_flight: MakeFlight) -> N
         records.append([replace(head, keypoints=head.keypoints + 15), *part[1:], births])
     mapper = Mapper()
     published = feed(mapper, flight, records)
-    last = {r.keyframe: r for r in published if isinstance(r, Culled)}
+    last = {r.keyframe: r for r in published if isinstance(r, CulledLandmarks)}
     culled = {(k, int(i)) for k, r in last.items() for i in r.index}
     judged = {g for g in ghosts if g[0] <= flight.keyframes[-5]}
     assert len(culled & judged) > 0.8 * len(judged)
@@ -139,7 +151,7 @@ def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight
     error = np.linalg.norm(xyz[placed] - truth, axis=1)
     assert placed.sum() > 30
     assert np.median(error) < 0.08
-    assert any(isinstance(r, Depths) for r in published)
+    assert any(isinstance(r, RefinedLandmarks) for r in published)
 
 
 def test_strict_new_point_rules_refuse_two_views_that_are_one(make_flight: MakeFlight) -> None:
@@ -178,7 +190,7 @@ def test_late_sections_are_waited_for_then_done_without_and_taken_up_when_they_c
     flight = make_flight(keyframes=8, turns=0.2)
     late = flight.records[5].pop()
     mapper = Mapper()
-    camera: tuple[Record, ...] = (Camera(flight.agent, flight.camera),)
+    camera: tuple[Record, ...] = (CameraIntrinsics(flight.agent, flight.camera),)
     now_ns = 0
     for part in flight.records:
         mapper.step(MapperInput(((flight.agent, (*camera, *part)),)), now_ns)
@@ -198,19 +210,19 @@ def test_what_is_published_replaces_older_values_and_matches_the_map(make_flight
     mapper = Mapper()
     published = feed(mapper, flight, flight.records)
     first = flight.keyframes[0]
-    assert [r.submap for r in published if isinstance(r, Placement)] == [submap_of_keyframe(first)]
-    poses = {r.keyframe: r.T_m_k for r in published if isinstance(r, Pose)}
+    assert [r.submap for r in published if isinstance(r, SubmapPlacement)] == [submap_of_keyframe(first)]
+    poses = {r.keyframe: r.T_m_k for r in published if isinstance(r, KeyframePose)}
     assert first not in poses  # the first keyframe of a submap holds the gauge
     for keyframe, T_m_k in poses.items():
         held = mapper.map.pose(keyframe)
         assert held is not None
         assert np.array_equal(held, T_m_k)
         assert np.allclose(T_m_k[:3, :3] @ T_m_k[:3, :3].T, np.eye(3), atol=1e-12)
-    found = {r.keyframe: r for r in published if isinstance(r, Found)}
+    found = {r.keyframe: r for r in published if isinstance(r, FusedLandmarks)}
     for keyframe, same in found.items():
         births = mapper.map.slots_of(keyframe)[same.index]
         assert np.array_equal(mapper.map.point_ids(mapper.map.keypoints.root[births]), same.point)
-    for record in {r.keyframe: r for r in published if isinstance(r, Depths)}.values():
+    for record in {r.keyframe: r for r in published if isinstance(r, RefinedLandmarks)}.values():
         births = mapper.map.slots_of(record.keyframe)[record.index]
         current = mapper.map.keypoints.root[births] == births
         assert current.all()
@@ -222,7 +234,7 @@ def test_a_superseded_or_unknown_job_changes_nothing(make_flight: MakeFlight) ->
     mapper = Mapper()
     jobs = []
     for n, part in enumerate(flight.records):
-        camera: list[Record] = [Camera(flight.agent, flight.camera)]
+        camera: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)]
         output = mapper.step(MapperInput(((flight.agent, tuple(camera + part)),)), n * STEP_NS)
         jobs += [job for job in output.jobs if job.kind == "bundle"]
     assert len(jobs) == 1  # one bundle at a time
@@ -238,7 +250,7 @@ def test_a_superseded_or_unknown_job_changes_nothing(make_flight: MakeFlight) ->
 def test_a_base_without_its_store_begins_at_the_oldest_keyframe_it_gets(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=12, turns=0.3)
     mapper = Mapper()
-    camera: tuple[Record, ...] = (Camera(flight.agent, flight.camera),)
+    camera: tuple[Record, ...] = (CameraIntrinsics(flight.agent, flight.camera),)
     for part in flight.records[4:]:
         mapper.step(MapperInput(((flight.agent, (*camera, *part)),)), 0)
         camera = ()
@@ -255,7 +267,7 @@ def test_a_base_without_its_store_begins_at_the_oldest_keyframe_it_gets(make_fli
 def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=5, turns=0.1, agent=3)
     mapper = Mapper()
-    live = Live(flight.agent, 77, flight.keyframes[-1], np.eye(4), 80)
+    live = LivePose(flight.agent, 77, flight.keyframes[-1], np.eye(4), 80)
     feed(mapper, flight, [*flight.records, [live]])
     summary = mapper.summary()
     agents = summary["agents"]
@@ -276,7 +288,7 @@ def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFligh
     flight = make_flight(keyframes=24, turns=1.2, memory=3)
     first = Mapper()
     published = feed(first, flight, flight.records[:20])
-    received = (Camera(flight.agent, flight.camera), *(r for part in flight.records[:20] for r in part))
+    received = (CameraIntrinsics(flight.agent, flight.camera), *(r for part in flight.records[:20] for r in part))
     own = {messages.key(r): r for r in published}
     second = Mapper()
     second.restore(flight.agent, received, tuple(own[key] for key in sorted(own)), 0)
@@ -310,11 +322,11 @@ def test_a_backlog_is_worked_off_from_the_oldest_on(make_flight: MakeFlight) -> 
 def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) -> None:
     flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
     mapper = Mapper()
-    seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, Head)) - 10**9
-    live = Live(flight.agent, seen_ns, flight.keyframes[2], se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0])), 80)
+    seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, KeyframeHeader)) - 10**9
+    live = LivePose(flight.agent, seen_ns, flight.keyframes[2], se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0])), 80)
     feed(mapper, flight, [*flight.records, [live]])
     published = feed(mapper, later, later.records)
-    (placement,) = [r for r in published if isinstance(r, Placement)]
+    (placement,) = [r for r in published if isinstance(r, SubmapPlacement)]
     left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
     assert left is not None and begin is not None
     assert np.allclose(placement.S_w_m @ begin, left @ live.T_k_c, atol=1e-9)
@@ -323,9 +335,9 @@ def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) 
 def test_a_submap_that_begins_long_after_the_last_was_left_has_no_place(make_flight: MakeFlight) -> None:
     flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
     mapper = Mapper()
-    seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, Head)) - 5 * 10**9
-    tracked = Live(flight.agent, seen_ns, flight.keyframes[2], np.eye(4), 80)
-    guessed = Live(flight.agent, seen_ns + 49 * 10**8, flight.keyframes[2], np.eye(4), -1)
+    seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, KeyframeHeader)) - 5 * 10**9
+    tracked = LivePose(flight.agent, seen_ns, flight.keyframes[2], np.eye(4), 80)
+    guessed = LivePose(flight.agent, seen_ns + 49 * 10**8, flight.keyframes[2], np.eye(4), -1)
     feed(mapper, flight, [*flight.records, [tracked], [guessed]])
-    assert not any(isinstance(r, Placement) for r in feed(mapper, later, later.records))
+    assert not any(isinstance(r, SubmapPlacement) for r in feed(mapper, later, later.records))
     assert submap_of_keyframe(later.keyframes[0]) not in mapper.placements

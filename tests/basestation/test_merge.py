@@ -15,7 +15,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import Camera, Key, Kind, Placement, Record
+from kiteline_codec.schema import CameraIntrinsics, Key, Kind, Record, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import submap_of_keyframe
 
@@ -34,7 +34,7 @@ def feed(mapper: Mapper, flights: Sequence[Any], delays: Sequence[int] = ()) -> 
     for n in range(steps + 60):
         arrivals = []
         for flight, delay in zip(flights, delays):
-            records: list[Record] = [Camera(flight.agent, flight.camera)] if n == 0 else []
+            records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
             if 0 <= n - delay < len(flight.records):
                 records += flight.records[n - delay]
             arrivals.append((flight.agent, tuple(records)))
@@ -65,7 +65,9 @@ def test_two_agents_in_one_room_get_one_map(make_flight: MakeFlight, words: Any)
     published = feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
-    last = [r for r in published if isinstance(r, Placement) and r.submap == submap_of_keyframe(b.keyframes[0])][-1]
+    last = [r for r in published if isinstance(r, SubmapPlacement) and r.submap == submap_of_keyframe(b.keyframes[0])][
+        -1
+    ]
     assert np.allclose(last.S_w_m, ELSEWHERE, atol=0.03)
 
 
@@ -137,7 +139,7 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     assert mapper.summary()["maps"] == 2
     young = submap_of_keyframe(b.keyframes[0])
     output = mapper.step(MapperInput(((a.agent, ()),)), 10**12)
-    assert output.withdrawn == ((a.agent, Key(int(Kind.PLACEMENT), young, 0)),)  # its place was the merge's
+    assert output.withdrawn == ((a.agent, Key(int(Kind.SUBMAP_PLACEMENT), young, 0)),)  # its place was the merge's
     assert young not in mapper.placements and submap_of_keyframe(a.keyframes[0]) in mapper.placements
     assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
 
@@ -154,13 +156,13 @@ def test_an_agent_hears_that_its_map_has_no_place_any_more(make_flight: MakeFlig
     for n in range(70):
         for flight in (a, b):
             if n == 0:
-                theirs[flight.agent].put(Camera(flight.agent, flight.camera))
+                theirs[flight.agent].put(CameraIntrinsics(flight.agent, flight.camera))
             for record in flight.records[n] if n < len(flight.records) else []:
                 theirs[flight.agent].put(record)
         done = tuple(run_job(job) for job in station.step({a.agent: (), b.agent: ()}, done, n * STEP_NS).jobs)
-    assert any(isinstance(r, Placement) and r.submap == young for r in theirs[b.agent].receive((), 0))
+    assert any(isinstance(r, SubmapPlacement) and r.submap == young for r in theirs[b.agent].receive((), 0))
     assert station.mapper.atlas is not None
     assert station.mapper.atlas.split(young)
     station.step({}, (), 100 * STEP_NS)
-    assert theirs[b.agent].take_removed() == [Key(int(Kind.PLACEMENT), young, 0)]
-    assert not any(isinstance(r, Placement) for r in theirs[b.agent].receive((), 0))
+    assert theirs[b.agent].take_removed() == [Key(int(Kind.SUBMAP_PLACEMENT), young, 0)]
+    assert not any(isinstance(r, SubmapPlacement) for r in theirs[b.agent].receive((), 0))

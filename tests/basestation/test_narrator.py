@@ -13,7 +13,7 @@ from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.runtime.terminal import Narrator
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.schema import Camera
+from kiteline_codec.schema import CameraIntrinsics
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3
 
@@ -37,7 +37,7 @@ def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[lis
         packets = {}
         for f in flights:
             if n == 0:
-                ends[f.agent].put(Camera(f.agent, f.camera))
+                ends[f.agent].put(CameraIntrinsics(f.agent, f.camera))
             for record in f.records[n] if n < len(f.records) else ():
                 ends[f.agent].put(record)
             packets[f.agent] = ends[f.agent].poll(n * STEP_NS)

@@ -22,7 +22,16 @@ from kiteline_basestation.runtime.outputs import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import Camera, Copied, Copy, Head, Live, Placement, Record, Unit
+from kiteline_codec.schema import (
+    CachedKeyframe,
+    CachedLandmarks,
+    CameraIntrinsics,
+    KeyframeHeader,
+    LivePose,
+    Record,
+    SubmapPlacement,
+    SubmapScale,
+)
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
@@ -39,7 +48,7 @@ def in_own_unit(flight: Any, unit: float, growth: float = 0.0) -> Any:
     assert not flight.camera.stereo
     for n, records in enumerate(flight.records):
         head = records[0]
-        assert isinstance(head, Head)
+        assert isinstance(head, KeyframeHeader)
         grown = unit * (1.0 + growth) ** max(n - 0.5, 0.0)
         records[0] = replace(head, T_p_k=sim3.stretched(head.T_p_k, grown))
     return flight
@@ -65,7 +74,7 @@ def feed(
     for n in range(max(d + len(f.records) for d, f in zip(delays, flights)) + 70):
         arrivals = []
         for flight, delay in zip(flights, delays):
-            records: list[Record] = [Camera(flight.agent, flight.camera)] if n == 0 else []
+            records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
             if 0 <= n - delay < len(flight.records):
                 records += flight.records[n - delay]
             arrivals.append((flight.agent, tuple(records)))
@@ -125,7 +134,7 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
     assert abs(np.median(mended[:8]) / np.median(drifted[:8]) - 1.0) < 0.05  # the world keeps its unit
     # Where the agent flies nothing was stretched: its place says how long its unit has become.
     submap = submap_of_keyframe(flight.keyframes[0])
-    last = [r for r in published if isinstance(r, Placement)][-1]
+    last = [r for r in published if isinstance(r, SubmapPlacement)][-1]
     assert np.allclose(last.S_w_m, mapper.placements[submap], atol=1e-5)
     assert sim3.scale_of(last.S_w_m) < 1.0 - 50 * growth
     steps = [np.array([m.map.pose(k)[:3, 3] for k in flight.keyframes[-9:]]) for m in (blind, mapper)]  # type: ignore[index]
@@ -146,7 +155,7 @@ def test_one_eye_takes_on_the_metre_of_a_pair(make_flight: MakeFlight, words: An
     assert error < 0.01
     assert abs(scale - 1.0) < 0.005
     of = {submap_of_keyframe(f.keyframes[0]): f for f in flights}
-    last = {r.submap: r.S_w_m for r in published if isinstance(r, Placement)}
+    last = {r.submap: r.S_w_m for r in published if isinstance(r, SubmapPlacement)}
     assert set(last) == set(of)
     for submap, S_w_m in last.items():
         assert np.array_equal(S_w_m, mapper.placements[submap])
@@ -190,13 +199,13 @@ def test_what_one_eye_is_lent_is_said_in_its_unit(make_flight: MakeFlight, words
     feed(mapper, [pair, eye])
     base, reader = plain_pair()
     supply = Supply(replace(BaseConfig().supply, min_cosine=-1.0, reach=9.0), BaseConfig().loops, mapper.map)
-    supply.serve(eye.agent, Live(eye.agent, 10**9, eye.keyframes[-1], np.eye(4), 90), base, 10**9)
+    supply.serve(eye.agent, LivePose(eye.agent, 10**9, eye.keyframes[-1], np.eye(4), 90), base, 10**9)
     records = reader.receive((), 0)
-    copies = {r.keyframe: r for r in records if isinstance(r, Copy)}
+    copies = {r.keyframe: r for r in records if isinstance(r, CachedKeyframe)}
     assert any(k in pair.keyframes for k in copies)
     S_w_m = mapper.map.frame(submap_of_keyframe(eye.keyframes[0]))
     compared = 0
-    for copied in (r for r in records if isinstance(r, Copied)):
+    for copied in (r for r in records if isinstance(r, CachedLandmarks)):
         T_m_k, camera = copies[copied.keyframe].T_m_k, eye.camera
         z = 1.0 / copied.inv_depth.astype(np.float64)
         x, y = ((copied.uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
@@ -297,17 +306,17 @@ def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched
     later = make_flight(keyframes=8, turns=0.15, start=0.15, submap=1, stereo=False)
     before, after = (submap_of_keyframe(f.keyframes[0]) for f in (flight, later))
     t_ns = later.records[0][0].t_ns - 10**8
-    left = Live(flight.agent, t_ns, flight.keyframes[-1], np.eye(4), 80)
+    left = LivePose(flight.agent, t_ns, flight.keyframes[-1], np.eye(4), 80)
     for first in (True, False):  # whether the unit is heard of before the new map
         mapper = Mapper()
-        said: list[Record] = [Unit(before, 2.0), Unit(after, 1.0)]
-        batches = [[Camera(flight.agent, flight.camera)], *flight.records, [left]]
+        said: list[Record] = [SubmapScale(before, 2.0), SubmapScale(after, 1.0)]
+        batches = [[CameraIntrinsics(flight.agent, flight.camera)], *flight.records, [left]]
         batches += [said, *later.records] if first else [*later.records, said]
         placed_at: dict[int, F64] = {}
         for n, batch in enumerate([*batches, [], []]):
             output = mapper.step(MapperInput(((flight.agent, tuple(batch)),)), n * STEP_NS)
             for _, out in output.publish:
-                placed_at |= {r.submap: r.S_w_m for r in out if isinstance(r, Placement)}
+                placed_at |= {r.submap: r.S_w_m for r in out if isinstance(r, SubmapPlacement)}
         assert np.isclose(sim3.scale_of(placed_at[before]), 2.0)
         assert sim3.scale_of(placed_at[after]) == 1.0
         begin, end = mapper.map.pose(later.keyframes[0]), mapper.map.pose(flight.keyframes[-1])
@@ -316,6 +325,6 @@ def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched
 
 
 def agent_of_record(record: Any) -> int:
-    if isinstance(record, Placement):
+    if isinstance(record, SubmapPlacement):
         return int(agent_of_submap(record.submap))
     return int(agent_of_keyframe(record.keyframe)) if hasattr(record, "keyframe") else -1

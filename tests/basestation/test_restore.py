@@ -22,7 +22,16 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Camera, Found, Head, Key, Kind, Placement, Pose, WireError
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    FusedLandmarks,
+    Key,
+    KeyframeHeader,
+    KeyframePose,
+    Kind,
+    SubmapPlacement,
+    WireError,
+)
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, keyframe_id, submap_of_keyframe
@@ -44,7 +53,7 @@ class Agents:
         self.flights = flights
         self.ends = {f.agent: CodedChannel(SyncConfig(), 1) for f in flights}
         for flight in flights:
-            self.ends[flight.agent].put(Camera(flight.agent, flight.camera))
+            self.ends[flight.agent].put(CameraIntrinsics(flight.agent, flight.camera))
         self.now_ns = 0
         self.done: list[JobDone] = []
         self.down: Mapping[AgentId, tuple[bytes, ...]] = {}
@@ -160,15 +169,17 @@ def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, St
     kept = snapshot(first, Kept())
     keyframe = agents.flights[0].keyframes[10]
     nowhere = keyframe_id(submap_of_keyframe(keyframe), 999)
-    nowhere_map = replace(Placement(submap_of_keyframe(keyframe), np.eye(4)), submap=submap_of_keyframe(keyframe) + 7)
+    nowhere_map = replace(
+        SubmapPlacement(submap_of_keyframe(keyframe), np.eye(4)), submap=submap_of_keyframe(keyframe) + 7
+    )
     index, ids = np.array([5], np.uint16), np.array([nowhere << 11], np.int64)
     far = np.array([2000], np.uint16)
-    head = kept.agents[AgentId(0)].received[Key(Kind.HEAD, keyframe)]
+    head = kept.agents[AgentId(0)].received[Key(Kind.KEYFRAME_HEADER, keyframe)]
     cases = {
-        "cannot be read": ({Key(Kind.HEAD, keyframe): head + b"!"}, {}),
-        "tells of a keyframe that is not there": ({}, _coded(Pose(nowhere, np.eye(4)))),
-        "names points of a keyframe that is not there": ({}, _coded(Found(keyframe, index, ids))),
-        "tells of keypoint 2000": ({}, _coded(Found(keyframe, far, ids))),
+        "cannot be read": ({Key(Kind.KEYFRAME_HEADER, keyframe): head + b"!"}, {}),
+        "tells of a keyframe that is not there": ({}, _coded(KeyframePose(nowhere, np.eye(4)))),
+        "names points of a keyframe that is not there": ({}, _coded(FusedLandmarks(keyframe, index, ids))),
+        "tells of keypoint 2000": ({}, _coded(FusedLandmarks(keyframe, far, ids))),
         "places a submap without keyframes": ({}, _coded(nowhere_map)),
     }
     for words_told, (received, own) in cases.items():
@@ -189,7 +200,7 @@ def _coded(record: Any) -> dict[Key, bytes]:
 def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     kept = snapshot(first, Kept())
-    alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == Kind.HEAD)[3]
+    alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == Kind.KEYFRAME_HEADER)[3]
     bare = Kept({AgentId(2): Codes(kept.agents[AgentId(2)].received, {})})
     checked = sound(spoilt(bare, 2, {}, {}, alone))
     assert checked.faults == ()
@@ -292,7 +303,7 @@ def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFli
     assert all(station.mapper.map.pose(k) is not None for k in flight.keyframes)
     assert contradictions(station.mapper) == []
     assert station.touched is not None
-    heads = {KeyframeId(key.id) for _, ours, key in station.touched if not ours and key.kind == Kind.HEAD}
+    heads = {KeyframeId(key.id) for _, ours, key in station.touched if not ours and key.kind == Kind.KEYFRAME_HEADER}
     assert heads == set(flight.keyframes[5:12])  # the others were here
 
 
@@ -300,7 +311,7 @@ def test_heads_are_what_they_were(joined: tuple[Agents, Station]) -> None:
     agents, first = joined
     kept = snapshot(first, Kept())
     for flight in agents.flights:
-        heads = [k for k in kept.agents[flight.agent].received if k.kind == Kind.HEAD]
+        heads = [k for k in kept.agents[flight.agent].received if k.kind == Kind.KEYFRAME_HEADER]
         assert sorted(k.id for k in heads) == flight.keyframes
         decoded = messages.decode(heads[0], kept.agents[flight.agent].received[heads[0]])
-        assert isinstance(decoded, Head)
+        assert isinstance(decoded, KeyframeHeader)

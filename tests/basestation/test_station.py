@@ -11,7 +11,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.runtime.jobs import run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
-from kiteline_codec.schema import Camera, Depths, Pose, Record
+from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record, RefinedLandmarks
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.ids import AgentId
 
@@ -20,7 +20,7 @@ STEP_NS = 100_000_000
 
 def fly(station: Station, agent_end: RecordChannel, flight: Any) -> list[Record]:
     heard: list[Record] = []
-    agent_end.put(Camera(flight.agent, flight.camera))
+    agent_end.put(CameraIntrinsics(flight.agent, flight.camera))
     done: list[Any] = []
     packets: tuple[bytes, ...] = ()
     for n in range(len(flight.records) + 30):
@@ -40,8 +40,8 @@ def test_the_agent_holds_what_the_base_computes_with(make_flight: Callable[..., 
     station = Station(BaseConfig(), lambda agent: base_end)
     heard = fly(station, agent_end, flight)
     sparse_map = station.mapper.map
-    poses = {r.keyframe: r for r in heard if isinstance(r, Pose)}
-    depths = {r.keyframe: r for r in heard if isinstance(r, Depths)}
+    poses = {r.keyframe: r for r in heard if isinstance(r, KeyframePose)}
+    depths = {r.keyframe: r for r in heard if isinstance(r, RefinedLandmarks)}
     assert len(poses) == 11
     assert len(depths) > 5
     for keyframe, pose in poses.items():

@@ -63,16 +63,19 @@ def test_a_batch_leads_from_one_map_to_the_other(tmp_path_factory: pytest.TempPa
 
 def test_nothing_is_left_of_a_deleted_submap(tmp_path: Path) -> None:
     doomed, other = submap_id(3, 1, 0), submap_id(3, 1, 1)
-    received = {Key(Kind.HEAD, s << SEQUENCE_BITS | 5): b"head" for s in (doomed, other)}
-    received |= {Key(Kind.LEVEL, s): b"level" for s in (doomed, other)}
-    own = {Key(Kind.DEPTHS, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
+    received = {Key(Kind.KEYFRAME_HEADER, s << SEQUENCE_BITS | 5): b"head" for s in (doomed, other)}
+    received |= {Key(Kind.GRAVITY_ALIGNMENT, s): b"level" for s in (doomed, other)}
+    own = {Key(Kind.REFINED_LANDMARKS, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
     store = Store(tmp_path)
     store.write(batch_of(Kept({AgentId(3): Codes(received, own)}), Kept()))
     store.write(Batch(deleted=[doomed]))
     left = store.load().agents[AgentId(3)]
     store.close()
-    assert set(left.received) == {Key(Kind.HEAD, other << SEQUENCE_BITS | 5), Key(Kind.LEVEL, other)}
-    assert set(left.own) == {Key(Kind.DEPTHS, other << SEQUENCE_BITS | 5)}
+    assert set(left.received) == {
+        Key(Kind.KEYFRAME_HEADER, other << SEQUENCE_BITS | 5),
+        Key(Kind.GRAVITY_ALIGNMENT, other),
+    }
+    assert set(left.own) == {Key(Kind.REFINED_LANDMARKS, other << SEQUENCE_BITS | 5)}
 
 
 def test_a_store_serves_one_base_and_any_number_of_readers(tmp_path: Path) -> None:

@@ -19,7 +19,15 @@ from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, plain_pair
 from kiteline_codec.coding import messages
 from kiteline_codec.pacing.profiles import RADIO
-from kiteline_codec.schema import Camera, Copied, Copy, Key, Live, Placement, Record
+from kiteline_codec.schema import (
+    CachedKeyframe,
+    CachedLandmarks,
+    CameraIntrinsics,
+    Key,
+    LivePose,
+    Record,
+    SubmapPlacement,
+)
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, keyframe_id, submap_id, submap_of_keyframe
@@ -35,7 +43,7 @@ class Base:
         self.map = SparseMap()
         intake = Intake(BaseConfig().intake, self.map)
         for flight in flights:
-            intake.take(flight.agent, (Camera(flight.agent, flight.camera), *flight.all_records()), 0)
+            intake.take(flight.agent, (CameraIntrinsics(flight.agent, flight.camera), *flight.all_records()), 0)
         self.agent = flights[0].agent
         config = replace(SupplyConfig(), **supply)
         self.supply = Supply(config, replace(BaseConfig().loops, share=share), self.map)
@@ -48,7 +56,7 @@ class Base:
         """So many looks while the agent is at a keyframe; what it then holds."""
         for _ in range(turns):
             self.now_ns += SECOND_NS
-            live = Live(self.agent, self.now_ns, keyframe, np.eye(4), 100)
+            live = LivePose(self.agent, self.now_ns, keyframe, np.eye(4), 100)
             self.supply.serve(self.agent, live, self.here, self.now_ns)
             self.heard += self.there.receive((), 0)
             self.taken_back += self.there.take_removed()
@@ -64,7 +72,7 @@ def test_own_keyframes_come_back_where_they_are_seen_again(make_flight: MakeFlig
     assert max(numbers) < 60, "the agent remembers the newest twenty itself"
     there = [n for n in numbers if 4 <= n <= 24]  # a whole turn before the last keyframe is number 15
     assert len(there) > 0.7 * len(numbers)
-    copies = {r.keyframe: r for r in base.heard if isinstance(r, Copy)}
+    copies = {r.keyframe: r for r in base.heard if isinstance(r, CachedKeyframe)}
     assert set(copies) == set(lent)
     for keyframe, copy in copies.items():
         assert copy.submap == submap_of_keyframe(keyframe)
@@ -77,7 +85,7 @@ def test_points_are_said_as_the_readers_camera_would_see_them(make_flight: MakeF
     camera = replace(flight.camera, fx=300.0, fy=310.0, cx=300.0, cy=200.0)
     base.map.cameras[flight.agent] = camera  # the reader has got another camera since
     base.serve(flight.keyframes[-1])
-    parts = [r for r in base.heard if isinstance(r, Copied)]
+    parts = [r for r in base.heard if isinstance(r, CachedLandmarks)]
     assert parts
     for part in parts:
         points = base.map.slots_of(part.keyframe)[part.index]
@@ -128,9 +136,9 @@ def test_a_copy_moves_with_the_map_and_leaves_with_it(make_flight: MakeFlight) -
     assert not base.heard, "nothing moved"
     base.map.move_submap(b, se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])))
     base.serve(mine.keyframes[-1])
-    moved = {r.keyframe for r in base.heard if isinstance(r, Copy)}
+    moved = {r.keyframe for r in base.heard if isinstance(r, CachedKeyframe)}
     assert moved == set(lent)
-    assert not any(isinstance(r, Copied) for r in base.heard if r.keyframe in lent)  # type: ignore[union-attr]
+    assert not any(isinstance(r, CachedLandmarks) for r in base.heard if r.keyframe in lent)  # type: ignore[union-attr]
     del base.map.islands[b]  # the merge is taken back
     assert not base.serve(mine.keyframes[-1])
     assert {key.id for key in base.taken_back} == set(lent)
@@ -142,7 +150,7 @@ def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
     base.here.profile = RADIO  # type: ignore[misc]
     base.serve(flight.keyframes[-1])
     for keyframe in base.supply.lent(flight.agent):
-        parts = [r for r in base.heard if isinstance(r, Copied) and r.keyframe == keyframe]
+        parts = [r for r in base.heard if isinstance(r, CachedLandmarks) and r.keyframe == keyframe]
         assert 0 < sum(len(p.index) for p in parts) <= RADIO.copied
     assert len(base.supply.lent(flight.agent)) == 1
     base.here.arrived = lambda key: False  # type: ignore[method-assign]
@@ -157,16 +165,16 @@ def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: M
     flight = make_flight(keyframes=60, turns=1.2, points=1500)
     base = Base(flight, remembered=10)
     base.serve(flight.keyframes[-1])
-    lent = [r for r in base.heard if isinstance(r, Copy | Copied)]
+    lent = [r for r in base.heard if isinstance(r, CachedKeyframe | CachedLandmarks)]
     assert lent
     submap = submap_of_keyframe(flight.keyframes[0])
-    own = {messages.key(r): messages.encode(r) for r in [Placement(submap, np.eye(4)), *lent]}
+    own = {messages.key(r): messages.encode(r) for r in [SubmapPlacement(submap, np.eye(4)), *lent]}
     station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 2))
     received = {messages.key(r): messages.encode(r) for r in flight.records[0]}
     restore(station, Kept({flight.agent: Codes(received, own)}), 0)
     channel = station.channels[flight.agent]
     assert isinstance(channel, CodedChannel)
-    assert list(channel.endpoint.own_values()) == [messages.key(Placement(submap, np.eye(4)))]
+    assert list(channel.endpoint.own_values()) == [messages.key(SubmapPlacement(submap, np.eye(4)))]
 
 
 def test_an_agent_that_starts_again_is_heard_whatever_its_clock_says() -> None:
@@ -174,5 +182,5 @@ def test_an_agent_that_starts_again_is_heard_whatever_its_clock_says() -> None:
     agent = AgentId(2)
     old, new = (keyframe_id(submap_id(agent, boot, 0), 0) for boot in (4, 5))
     for keyframe, t_ns in ((old, 900), (old, 800), (new, 5), (old, 950)):
-        intake.take(agent, (Live(agent, t_ns, keyframe, np.eye(4), 80),), 0)
+        intake.take(agent, (LivePose(agent, t_ns, keyframe, np.eye(4), 80),), 0)
     assert (intake.live[agent].keyframe, intake.live[agent].t_ns) == (new, 5)

@@ -6,12 +6,22 @@ import numpy as np
 
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Copied, Copy, Key, Kind, Placement, Pose, Record, Removed, Tile
+from kiteline_codec.schema import (
+    CachedKeyframe,
+    CachedLandmarks,
+    GridTile,
+    Key,
+    KeyframePose,
+    Kind,
+    Record,
+    RemovedObservations,
+    SubmapPlacement,
+)
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 
-POSE = Pose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))
+POSE = KeyframePose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))
 
 
 def cross(a: RecordChannel, b: RecordChannel, ticks: int = 10) -> tuple[list[Record], list[Key]]:
@@ -27,15 +37,15 @@ def cross(a: RecordChannel, b: RecordChannel, ticks: int = 10) -> tuple[list[Rec
 def test_coded_records_arrive_as_the_writer_was_told() -> None:
     a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
     kept = a.put(POSE)
-    assert isinstance(kept, Pose)
+    assert isinstance(kept, KeyframePose)
     assert np.abs(kept.T_m_k - POSE.T_m_k).max() > 0
     (got,), removed = cross(a, b)
-    assert isinstance(got, Pose)
+    assert isinstance(got, KeyframePose)
     assert np.array_equal(got.T_m_k, kept.T_m_k)
     assert removed == []
     assert a.endpoint.digest_equal
     again = a.put(kept)
-    assert isinstance(again, Pose)
+    assert isinstance(again, KeyframePose)
     assert np.array_equal(again.T_m_k, kept.T_m_k)
     assert a.endpoint.digest_equal  # nothing new
     a.remove(messages.key(POSE))
@@ -46,7 +56,7 @@ def test_coded_records_arrive_as_the_writer_was_told() -> None:
 def test_values_of_another_schema_are_counted() -> None:
     a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
     a.endpoint.put(Key(50, 1), b"of the future")
-    a.endpoint.put(Key(Kind.POSE, 1), b"damaged")
+    a.endpoint.put(Key(Kind.KEYFRAME_POSE, 1), b"damaged")
     a.put(POSE)
     records, _ = cross(a, b)
     assert len(records) == 1
@@ -55,7 +65,7 @@ def test_values_of_another_schema_are_counted() -> None:
 
 def test_plain_records_pass_as_they_are() -> None:
     a, b = plain_pair()
-    removed = Removed(KeyframeId(1), np.array([3], np.uint16))
+    removed = RemovedObservations(KeyframeId(1), np.array([3], np.uint16))
     assert a.put(POSE) is POSE
     b.put(removed)
     assert a.poll(0) == []
@@ -77,14 +87,14 @@ def test_a_thin_link_carries_corrections_first_then_copies_then_tiles() -> None:
     cross(a, b)  # greetings
     index, flat = np.arange(6, dtype=np.uint16), np.zeros(6, np.uint8)
     uv, depth = rng.uniform(0, 400, (6, 2)).astype(np.float32), np.full(6, 0.2, np.float32)
-    a.put(Tile(0, 0, 0.1, rng.integers(0, 101, (32, 32)).astype(np.int8)))
+    a.put(GridTile(0, 0, 0.1, rng.integers(0, 101, (32, 32)).astype(np.int8)))
     for k in range(3):
-        a.put(Copy(KeyframeId(k), SubmapId(0), POSE.T_m_k))
+        a.put(CachedKeyframe(KeyframeId(k), SubmapId(0), POSE.T_m_k))
         described = rng.integers(0, 256, (6, 32), dtype=np.uint8)
-        a.put(Copied(KeyframeId(k), 0, index, uv, depth, flat, flat, described))
+        a.put(CachedLandmarks(KeyframeId(k), 0, index, uv, depth, flat, flat, described))
     for k in range(6):
-        a.put(Pose(KeyframeId(100 + k), POSE.T_m_k))
-    a.put(Placement(SubmapId(0), POSE.T_m_k))
+        a.put(KeyframePose(KeyframeId(100 + k), POSE.T_m_k))
+    a.put(SubmapPlacement(SubmapId(0), POSE.T_m_k))
     order: list[str] = []
     for tick in range(20, 300):
         now_ns = tick * 50_000_000
@@ -94,6 +104,6 @@ def test_a_thin_link_carries_corrections_first_then_copies_then_tiles() -> None:
     first = {name: order.index(name) for name in last}
     assert max(last["Pose"], last["Placement"]) < first["Copied"]
     assert last["Copied"] < first["Tile"]
-    assert a.arrived(messages.key(Copy(KeyframeId(0), SubmapId(0), POSE.T_m_k)))
-    a.put(Copy(KeyframeId(0), SubmapId(3), POSE.T_m_k))
-    assert not a.arrived(Key(Kind.COPY, 0)), "a newer version is not there yet"
+    assert a.arrived(messages.key(CachedKeyframe(KeyframeId(0), SubmapId(0), POSE.T_m_k)))
+    a.put(CachedKeyframe(KeyframeId(0), SubmapId(3), POSE.T_m_k))
+    assert not a.arrived(Key(Kind.CACHED_KEYFRAME, 0)), "a newer version is not there yet"

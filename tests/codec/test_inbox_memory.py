@@ -10,7 +10,13 @@ from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 100_000
-KINDS = (Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED)
+KINDS = (
+    Kind.KEYFRAME_POSE,
+    Kind.REFINED_LANDMARKS,
+    Kind.FUSED_LANDMARKS,
+    Kind.REMOVED_OBSERVATIONS,
+    Kind.CULLED_LANDMARKS,
+)
 
 
 class Line:
@@ -51,8 +57,10 @@ def test_memory_is_bounded_and_the_two_sides_agree() -> None:
     assert most <= LIMIT + pages
     assert line.b.stats.values == 1500
     line.say(3)  # an old one is corrected
-    assert line.b.peer_value(Key(int(Kind.DEPTHS), 3)) == line.a.own_value(Key(int(Kind.DEPTHS), 3))
-    line.a.remove(Key(int(Kind.FOUND), 7))
+    assert line.b.peer_value(Key(int(Kind.REFINED_LANDMARKS), 3)) == line.a.own_value(
+        Key(int(Kind.REFINED_LANDMARKS), 3)
+    )
+    line.a.remove(Key(int(Kind.FUSED_LANDMARKS), 7))
     line.settle()
     assert line.b.peer_values() == line.a.own_values()
     assert line.b._in.resident_bytes <= LIMIT + pages

@@ -16,26 +16,26 @@ from hypothesis import strategies as st
 
 from kiteline_codec.coding import messages, sections
 from kiteline_codec.schema import (
-    Births,
-    Calibration,
-    Camera,
-    Copied,
-    Copy,
-    Culled,
-    Depths,
-    Found,
-    Head,
+    CachedKeyframe,
+    CachedLandmarks,
+    CameraIntrinsics,
+    CulledLandmarks,
+    DisparityCalibration,
+    FusedLandmarks,
+    GravityAlignment,
+    GridTile,
     Key,
+    KeyframeHeader,
+    KeyframePose,
     Kind,
-    Level,
-    Live,
-    Placement,
-    Pose,
+    LivePose,
+    NewLandmarks,
+    Observations,
     Record,
-    Removed,
-    Sightings,
-    Tile,
-    Unit,
+    RefinedLandmarks,
+    RemovedObservations,
+    SubmapPlacement,
+    SubmapScale,
     WireError,
 )
 from kiteline_core.geometry import se3, sim3
@@ -59,28 +59,28 @@ def some_records(seed: int, n: int) -> list[Record]:
     T_b_c = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, -0.05, 0.025]))
     camera = RectifiedCamera(752, 480, 458.5, 457.25, 367.0, 248.5, 0.11, bool(rng.integers(2)), T_b_c)
     return [
-        Camera(AgentId(3), camera),
-        Live(AgentId(63), int(rng.integers(1 << 62)), keyframe, pose, int(rng.integers(-1, 101))),
-        Live(AgentId(0), 0, NO_KEYFRAME, np.eye(4), -1),
-        Head(keyframe, int(rng.integers(1 << 62)), KeyframeId(keyframe - 3), pose, n),
-        Head(keyframe, 5, NO_KEYFRAME, pose, 0),
-        Births(
+        CameraIntrinsics(AgentId(3), camera),
+        LivePose(AgentId(63), int(rng.integers(1 << 62)), keyframe, pose, int(rng.integers(-1, 101))),
+        LivePose(AgentId(0), 0, NO_KEYFRAME, np.eye(4), -1),
+        KeyframeHeader(keyframe, int(rng.integers(1 << 62)), KeyframeId(keyframe - 3), pose, n),
+        KeyframeHeader(keyframe, 5, NO_KEYFRAME, pose, 0),
+        NewLandmarks(
             keyframe, 4, index, uv, inv_depth, octave, rng.integers(0, 256, n).astype(np.uint8),
             rng.integers(0, 256, (n, 32)).astype(np.uint8),
         ),
-        Sightings(keyframe, 2, rng.permutation(index), uv, inv_depth, octave, point),
-        Level(submap, pose),
-        Unit(submap, 0.73),
-        Pose(keyframe, pose),
-        Depths(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
-        Found(keyframe, index, point),
-        Removed(keyframe, index),
-        Culled(keyframe, index, int(rng.integers(2))),
-        Placement(submap, sim3.of(1.0 + 0.37 * n, pose)),
-        Calibration(AgentId(3), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0),
-        Tile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
-        Copy(keyframe, submap_id(2, 1, 7), pose),
-        Copied(
+        Observations(keyframe, 2, rng.permutation(index), uv, inv_depth, octave, point),
+        GravityAlignment(submap, pose),
+        SubmapScale(submap, 0.73),
+        KeyframePose(keyframe, pose),
+        RefinedLandmarks(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
+        FusedLandmarks(keyframe, index, point),
+        RemovedObservations(keyframe, index),
+        CulledLandmarks(keyframe, index, int(rng.integers(2))),
+        SubmapPlacement(submap, sim3.of(1.0 + 0.37 * n, pose)),
+        DisparityCalibration(AgentId(3), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0),
+        GridTile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
+        CachedKeyframe(keyframe, submap_id(2, 1, 7), pose),
+        CachedLandmarks(
             keyframe, 3, index, uv, inv_depth, octave, rng.integers(0, 256, n).astype(np.uint8),
             rng.integers(0, 256, (n, 32)).astype(np.uint8),
         ),
@@ -127,8 +127,8 @@ def test_decoding_gives_what_encodes_to_the_same_code(seed: int, n: int) -> None
         for name in ("index", "octave", "angle", "descriptor", "point", "t_ns", "quality", "parent", "keypoints"):
             if hasattr(record, name):
                 assert np.array_equal(getattr(record, name), getattr(decoded, name)), name
-        if isinstance(record, Births | Sightings):
-            assert isinstance(decoded, Births | Sightings)
+        if isinstance(record, NewLandmarks | Observations):
+            assert isinstance(decoded, NewLandmarks | Observations)
             assert np.abs(record.uv - decoded.uv).max(initial=0.0) <= 1 / 32 + 1e-4
 
 
@@ -160,25 +160,25 @@ def test_errors_say_what_was_expected() -> None:
     with pytest.raises(WireError, match="kind 9 is unknown"):
         messages.decode(Key(9, 0), b"")
     with pytest.raises(WireError, match="out of range"):
-        messages.decode(Key(Kind.LIVE, 64), b"")
-    pose = messages.encode(Pose(KeyframeId(1), np.eye(4)))
+        messages.decode(Key(Kind.LIVE_POSE, 64), b"")
+    pose = messages.encode(KeyframePose(KeyframeId(1), np.eye(4)))
     with pytest.raises(WireError, match="1 bytes too many"):
-        messages.decode(Key(Kind.POSE, 1), pose + b"\0")
+        messages.decode(Key(Kind.KEYFRAME_POSE, 1), pose + b"\0")
     with pytest.raises(ValueError, match="indices must increase"):
-        messages.encode(Removed(KeyframeId(1), np.array([2, 2], np.uint16)))
+        messages.encode(RemovedObservations(KeyframeId(1), np.array([2, 2], np.uint16)))
     with pytest.raises(ValueError, match="rigid motion"):
-        messages.encode(Placement(SubmapId(1), np.zeros((4, 4))))
+        messages.encode(SubmapPlacement(SubmapId(1), np.zeros((4, 4))))
     births = some_records(0, 3)[5]
-    assert isinstance(births, Births)
+    assert isinstance(births, NewLandmarks)
     with pytest.raises(ValueError, match="descriptors"):
         messages.encode(replace(births, descriptor=births.descriptor[:2]))
-    tile = next(r for r in some_records(0, 1) if isinstance(r, Tile))
+    tile = next(r for r in some_records(0, 1) if isinstance(r, GridTile))
     code = messages.encode(tile)
     with pytest.raises(WireError, match="tile"):
         messages.decode(messages.key(tile), code[:-3])
 
 
-def a_keyframe() -> tuple[Head, Births, Sightings]:
+def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:
     """300 sightings of points from 12 keyframes and 180 births, in an image of 752x480 px. Indices as an agent gives
     them: sightings by point id, then births by image row.
     """
@@ -195,13 +195,13 @@ def a_keyframe() -> tuple[Head, Births, Sightings]:
         }
 
     point = np.sort((keyframe - rng.integers(1, 13, 300)) << 11 | rng.integers(0, 480, 300))
-    sightings = Sightings(keyframe, 0, np.arange(300, dtype=np.uint16), point=point, **keypoints(300))
-    births = Births(
+    sightings = Observations(keyframe, 0, np.arange(300, dtype=np.uint16), point=point, **keypoints(300))
+    births = NewLandmarks(
         keyframe, 0, np.arange(300, 480, dtype=np.uint16), angle=rng.integers(0, 256, 180).astype(np.uint8),
         descriptor=rng.integers(0, 256, (180, 32)).astype(np.uint8), **keypoints(180),
     )  # fmt: skip
     T_p_k = se3.exp(np.array([0.2, 0.01, 0.1, 0.02, 0.1, 0.01]))
-    return Head(keyframe, 1_700_000_000_123_456_789, KeyframeId(keyframe - 1), T_p_k, 480), births, sightings
+    return KeyframeHeader(keyframe, 1_700_000_000_123_456_789, KeyframeId(keyframe - 1), T_p_k, 480), births, sightings
 
 
 def test_a_keyframe_is_short_and_its_sections_fit_packets() -> None:
@@ -218,7 +218,7 @@ def test_a_keyframe_is_short_and_its_sections_fit_packets() -> None:
 @given(st.integers(0, 1000), st.integers(0, 200), st.integers(150, 3000))
 def test_sections_hold_each_row_once_best_first(seed: int, n: int, section_bytes: int) -> None:
     births = some_records(seed, n)[5]
-    assert isinstance(births, Births)
+    assert isinstance(births, NewLandmarks)
     value = np.random.default_rng(seed).integers(0, 50, n).astype(np.float64)
     parts = sections.split_births(births, value, section_bytes)
     assert [p.part for p in parts] == list(range(len(parts)))

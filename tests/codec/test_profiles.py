@@ -14,7 +14,7 @@ from kiteline_codec.coding import messages
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, RADIO, WIFI, Profile
 from kiteline_codec.pacing.throughput import Throughput
-from kiteline_codec.schema import Births, Head, Live, Sightings
+from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_core.imaging import descriptors
 
@@ -22,15 +22,15 @@ KEYFRAME = keyframe_id(submap_id(1, 2, 3), 40)
 SECOND = 1_000_000_000
 
 
-def a_keyframe(births: int, sightings: int, seed: int = 0) -> tuple[Births, np.ndarray, Sightings]:
+def a_keyframe(births: int, sightings: int, seed: int = 0) -> tuple[NewLandmarks, np.ndarray, Observations]:
     rng = np.random.default_rng(seed)
-    born = Births(
+    born = NewLandmarks(
         KEYFRAME, 0, np.arange(births, dtype=np.uint16), rng.uniform(0, 700, (births, 2)).astype(np.float32),
         rng.uniform(0, 1, births).astype(np.float32), rng.integers(0, 3, births).astype(np.uint8),
         rng.integers(0, 256, births).astype(np.uint8), rng.integers(0, 256, (births, 32)).astype(np.uint8),
     )  # fmt: skip
     point = np.sort(rng.permutation(4000)[:sightings]).astype(np.int64)
-    seen = Sightings(
+    seen = Observations(
         KEYFRAME, 0, np.arange(births, births + sightings, dtype=np.uint16),
         rng.uniform(0, 700, (sightings, 2)).astype(np.float32), rng.uniform(-1, 1, sightings).astype(np.float32),
         rng.integers(0, 3, sightings).astype(np.uint8), point,
@@ -169,10 +169,10 @@ def test_live_poses_are_thinned_by_their_time() -> None:
     channel = coded_channel(1, 1000)
     sent = set()
     for i in range(100):
-        channel.put(Live(AgentId(0), i * 50_000_000, KEYFRAME, np.eye(4), 50))
+        channel.put(LivePose(AgentId(0), i * 50_000_000, KEYFRAME, np.eye(4), 50))
         sent.add(next(iter(channel.endpoint.own_values().values())))
     assert len(sent) == 20  # 5 s at 4 Hz
-    channel.put(Live(AgentId(0), 0, KEYFRAME, np.eye(4), 50))
-    channel.put(Head(KEYFRAME, 0, NO_KEYFRAME, np.eye(4), 0))
+    channel.put(LivePose(AgentId(0), 0, KEYFRAME, np.eye(4), 50))
+    channel.put(KeyframeHeader(KEYFRAME, 0, NO_KEYFRAME, np.eye(4), 0))
     assert channel.report()["profile"] == "radio"
     assert channel.report()["backlog_bytes"] > 0

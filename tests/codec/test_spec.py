@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Births, Key, Kind, Record, Sightings
+from kiteline_codec.schema import Key, Kind, NewLandmarks, Observations, Record
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_codec.sync.packet import PROTOCOL_VERSION
 from kiteline_codec.transport.framing import frame
@@ -276,6 +276,6 @@ def test_the_names_in_the_specification_exist() -> None:
     text = (Path(__file__).parents[2] / "codec" / "SPEC.md").read_text()
     for kind in Kind:
         assert f"| {int(kind)} | {kind.name.capitalize()} |" in text
-    for record in (Births, Sightings):
+    for record in (NewLandmarks, Observations):
         assert record.__name__ in text
     assert f"The protocol version is **{PROTOCOL_VERSION}**" in text

@@ -16,7 +16,7 @@ import pytest
 
 from kiteline_codec.coding import messages
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Camera, Head, Key, Kind, Sightings
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, Kind, Observations
 
 
 def load(name: str) -> ModuleType:
@@ -117,7 +117,9 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
     s = SPEC.Source(form)
     n, step = s.varint(), s.varint()
     records = {k: messages.decode(k, code) for k, (_, code) in values.items()}
-    heads = {k.id: (values[k][0], r.parent, r.T_p_k.tolist()) for k, r in records.items() if isinstance(r, Head)}
+    heads = {
+        k.id: (values[k][0], r.parent, r.T_p_k.tolist()) for k, r in records.items() if isinstance(r, KeyframeHeader)
+    }
     if step:
         heads[key.id] = (0, key.id - step, s.pose())
     table, last = [], key.id
@@ -158,8 +160,8 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
         on_way |= {k: heads[k][0] for k in above + down[:-1]}
     if ways:
         used += [on_way[k] for k in sorted(on_way)]
-        used.append(next(v for k, (v, _) in values.items() if k.kind == Kind.CAMERA))
-    camera = next(r.camera for r in records.values() if isinstance(r, Camera))
+        used.append(next(v for k, (v, _) in values.items() if k.kind == Kind.CAMERA_INTRINSICS))
+    camera = next(r.camera for r in records.values() if isinstance(r, CameraIntrinsics))
     seen = [foresee(b, ways[a], camera) if b else None for a, b in births]
     steps = s.u8()
     su, sd = steps >> 4, steps & 15
@@ -185,12 +187,12 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
     return columns, used, s
 
 
-@pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != Kind.HEAD or key.id % 64 < 5])
+@pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != Kind.KEYFRAME_HEADER or key.id % 64 < 5])
 def test_sightings(held: Callable[[Key], bool]) -> None:
     values = TIGHT.coded(TIGHT.flight(7, keyframes=6, births=40))
     compared = 0
     for key, (_, code) in values.items():
-        if key.kind != Kind.SIGHTINGS:
+        if key.kind != Kind.OBSERVATIONS:
             continue
         known = {k: v for k, v in values.items() if held(k)}
         form = Tightener().shrink(key, code, known.get, values.get)
@@ -198,7 +200,7 @@ def test_sightings(held: Callable[[Key], bool]) -> None:
             continue
         columns, used, s = read_sightings(key, form, known)
         record = messages.decode(key, code)
-        assert isinstance(record, Sightings)
+        assert isinstance(record, Observations)
         n = SPEC.Source(code).varint()
         plain = SPEC.Source(code[len(SPEC.varint(n)) :]).columns(5, n)
         assert [columns[c] for c in ("index", "u", "v", "depth", "octave")] == plain
@@ -213,7 +215,7 @@ def test_sightings(held: Callable[[Key], bool]) -> None:
 def test_births() -> None:
     values = TIGHT.coded(TIGHT.flight(7, keyframes=1, births=40))
     for key, (_, code) in values.items():
-        if key.kind != Kind.BIRTHS:
+        if key.kind != Kind.NEW_LANDMARKS:
             continue
         form = Tightener().shrink(key, code, {}.get, {}.get)
         assert form is not None

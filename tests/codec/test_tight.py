@@ -17,7 +17,17 @@ from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.residuals import prediction_kernels as foresee_kernels
 from kiteline_codec.residuals import predictors as references
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Births, Camera, Depths, Head, Key, Kind, Record, Sightings, WireError
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    Key,
+    KeyframeHeader,
+    Kind,
+    NewLandmarks,
+    Observations,
+    Record,
+    RefinedLandmarks,
+    WireError,
+)
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -56,7 +66,7 @@ def test_too_large_numbers_are_refused() -> None:
 def flight(seed: int, keyframes: int = 6, births: int = 60, narrow: bool = False) -> list[Record]:
     """Keyframes of a sideways flight along a wall of points, with noise; each sees what earlier ones bore."""
     rng = np.random.default_rng(seed)
-    records: list[Record] = [Camera(AgentId(3), CAMERA)]
+    records: list[Record] = [CameraIntrinsics(AgentId(3), CAMERA)]
     poses: list[NDArray[np.float64]] = []
     points: list[tuple[int, NDArray[np.float64]]] = []
     for k in range(keyframes):
@@ -71,14 +81,14 @@ def flight(seed: int, keyframes: int = 6, births: int = 60, narrow: bool = False
         uv = np.array([[u, v] for _, u, v, _ in seen]).reshape(-1, 2) + rng.normal(0, 0.3, (len(seen), 2))
         rho = np.array([r for *_, r in seen]) * rng.normal(1, 0.01, len(seen))
         rho[rng.uniform(size=len(seen)) < 0.1] = 0.0
-        records.append(Head(keyframe, k * 10**8, parent, T_p_k, births + len(seen)))
+        records.append(KeyframeHeader(keyframe, k * 10**8, parent, T_p_k, births + len(seen)))
         born_uv = np.rint(rng.uniform(20, (730, 460), (births, 2)))
         born_rho = rng.uniform(0.1, 0.5, births)
         descriptor = rng.integers(0, 256, (births, 32)).astype(np.uint8)
         half = births // 2
         for part, rows in enumerate((np.arange(half), np.arange(half, births))):
             records.append(
-                Births(
+                NewLandmarks(
                     keyframe, part, rows.astype(np.uint16), born_uv[rows].astype(np.float32),
                     born_rho[rows].astype(np.float32), rng.integers(0, 3, len(rows)).astype(np.uint8),
                     rng.integers(0, 256, len(rows)).astype(np.uint8), descriptor[rows],
@@ -86,7 +96,7 @@ def flight(seed: int, keyframes: int = 6, births: int = 60, narrow: bool = False
             )  # fmt: skip
         octave = np.zeros(len(seen), np.uint8)
         records.append(
-            Sightings(
+            Observations(
                 keyframe, 0, np.arange(births, births + len(seen), dtype=np.uint16), uv.astype(np.float32),
                 rho.astype(np.float32), octave, np.array([p for p, *_ in seen], np.int64),
             )
@@ -123,7 +133,7 @@ def test_forms_come_back_whatever_the_peer_lacks(seed: int, lacking: set[int]) -
 def test_a_sighting_is_a_few_bits_and_says_where_absolute() -> None:
     records = flight(4, keyframes=10, births=100)
     values = coded(records)
-    last = next(r for r in reversed(records) if isinstance(r, Sightings))
+    last = next(r for r in reversed(records) if isinstance(r, Observations))
     step = 2 / quantise.PIXEL_STEPS
     last = replace(last, uv=(np.rint(last.uv / step) * step).astype(np.float32))
     key, code = messages.key(last), messages.encode(last)
@@ -141,7 +151,7 @@ def test_another_version_of_what_a_form_builds_upon_is_refused() -> None:
     code = values[key][1]
     form = Tightener().shrink(key, code, values.get, values.get)
     assert form is not None
-    for other in [k for k in values if k.kind in (Kind.HEAD, Kind.BIRTHS, Kind.CAMERA)]:
+    for other in [k for k in values if k.kind in (Kind.KEYFRAME_HEADER, Kind.NEW_LANDMARKS, Kind.CAMERA_INTRINSICS)]:
         changed = {**values, other: (99, values[other][1])}
         missing = {k: v for k, v in values.items() if k != other}
         refused = 0
@@ -158,9 +168,9 @@ def test_another_version_of_what_a_form_builds_upon_is_refused() -> None:
 def test_depths_build_upon_what_the_agent_saw() -> None:
     records = flight(5)
     values = coded(records)
-    births = next(r for r in records if isinstance(r, Births))
+    births = next(r for r in records if isinstance(r, NewLandmarks))
     rng = np.random.default_rng(1)
-    depths = Depths(
+    depths = RefinedLandmarks(
         births.keyframe, births.index, births.inv_depth * rng.normal(1, 0.004, len(births.index)).astype(np.float32),
         rng.normal(0, 0.2, (len(births.index), 2)).astype(np.float32),
     )  # fmt: skip
@@ -286,7 +296,7 @@ def test_a_refused_form_is_followed_by_the_code_itself() -> None:
     for record in records[:-1]:
         a.put(messages.key(record), messages.encode(record))
     run(2000)
-    for key in [k for k in b._in._values if k.kind == Kind.BIRTHS]:
+    for key in [k for k in b._in._values if k.kind == Kind.NEW_LANDMARKS]:
         version, code = b._in._values[key]
         b._in._values[key] = (version + 1000, code)  # as if they were other versions
     a.put(messages.key(records[-1]), messages.encode(records[-1]))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_basestation.map.map_tables import CULLED, REMOVED, SIGHTING
+from kiteline_basestation.map.map_tables import CULLED, OBSERVATION, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -223,7 +223,7 @@ def test_a_sighting_that_names_no_birth_is_kept_apart() -> None:
         np.zeros(4, np.uint8), odd,
     )  # fmt: skip
     assert len(sparse_map.points_of(kf(5))) == 0
-    assert (sparse_map.keypoints.kind[sparse_map.slots_of(kf(5))] == SIGHTING).all()
+    assert (sparse_map.keypoints.kind[sparse_map.slots_of(kf(5))] == OBSERVATION).all()
 
 
 def test_memory_stays_within_its_budget() -> None:

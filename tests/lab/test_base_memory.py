@@ -8,7 +8,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Station
 from kiteline_bench.harness.base_memory import Sample, bytes_of, parts_of, table
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.schema import Camera, Head, Live
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
@@ -48,8 +48,8 @@ def test_a_base_whose_agent_stands_still_does_not_grow() -> None:
     submap, agent = submap_id(0, 0, 0), AgentId(0)
     ours, theirs = coded_channel(1), coded_channel(1)
     station = Station(BaseConfig(), lambda _: ours)
-    theirs.put(Camera(agent, RectifiedCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.1, True, np.eye(4))))
-    theirs.put(Head(keyframe_id(submap, 0), 0, NO_KEYFRAME, np.eye(4), 0))
+    theirs.put(CameraIntrinsics(agent, RectifiedCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.1, True, np.eye(4))))
+    theirs.put(KeyframeHeader(keyframe_id(submap, 0), 0, NO_KEYFRAME, np.eye(4), 0))
     held = []
     packets: tuple[bytes, ...] = ()
     for tick in range(4000):  # at 20 Hz
@@ -57,7 +57,7 @@ def test_a_base_whose_agent_stands_still_does_not_grow() -> None:
         theirs.receive(packets, now_ns)
         pose = np.eye(4)
         pose[:3, 3] = 0.001 * np.sin(tick * np.array([1.0, 2.0, 3.0]))
-        theirs.put(Live(agent, now_ns, keyframe_id(submap, 0), pose, 100))
+        theirs.put(LivePose(agent, now_ns, keyframe_id(submap, 0), pose, 100))
         packets = dict(station.step({agent: theirs.poll(now_ns)}, (), now_ns).packets)[agent]
         if tick in (500, 3999):
             held.append((sum(parts_of(station).values()), bytes_of(theirs, set())))

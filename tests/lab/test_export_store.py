@@ -13,7 +13,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.kept import Codes, Kept
 from kiteline_basestation.store.store import FILE, Store, batch_of
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Births, Camera, Head, Placement, Record
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
@@ -29,19 +29,19 @@ def records(agent: int) -> tuple[Record, ...]:
     """Three keyframes, half a metre apart, each with its own forty points."""
     rng = np.random.default_rng(agent)
     camera = RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, True, np.eye(4))
-    out: list[Record] = [Camera(AgentId(agent), camera)]
+    out: list[Record] = [CameraIntrinsics(AgentId(agent), camera)]
     submap = submap_id(agent, 1, 0)
     parent = NO_KEYFRAME
     for i in range(3):
         keyframe = keyframe_id(submap, i)
         step = se3.from_rt(LEVEL, np.zeros(3)) if i == 0 else se3.from_rt(np.eye(3), np.array([0.0, 0.0, 0.5]))
-        out.append(Head(keyframe, 1_700_000_000_123_456_789 + i * 10**9, parent, step, 40))
+        out.append(KeyframeHeader(keyframe, 1_700_000_000_123_456_789 + i * 10**9, parent, step, 40))
         index = np.arange(40, dtype=np.uint16)
         uv = rng.uniform([10, 10], [630, 470], (40, 2)).astype(np.float32)
         depth = rng.uniform(2, 6, 40).astype(np.float32)
         zeros = np.zeros(40, np.uint8)
         descriptor = rng.integers(0, 256, (40, 32), dtype=np.uint8)
-        out.append(Births(keyframe, 0, index, uv, 1 / depth, zeros, zeros, descriptor))
+        out.append(NewLandmarks(keyframe, 0, index, uv, 1 / depth, zeros, zeros, descriptor))
         parent = keyframe
     return tuple(out)
 
@@ -89,7 +89,7 @@ def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
 
 def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     codes = {messages.key(r): messages.encode(r) for r in records(0)}
-    placed = Placement(submap_id(0, 1, 0), np.eye(4))
+    placed = SubmapPlacement(submap_id(0, 1, 0), np.eye(4))
     own = {messages.key(placed): messages.encode(placed)}
     placed_at = {"frame": None, "island": None, "T_w_m": np.eye(4).ravel().tolist(), "name": None}
     memory = {

@@ -43,9 +43,9 @@ def test_no_second_exceeds_the_budget(link: str, budget: int) -> None:
         now_ns = tick * 37_000_000
         if tick % 40 == 0:
             for part in range(6):
-                ends[0].endpoint.put(Key(Kind.BIRTHS, tick, part), draw.randbytes(draw.randrange(20, 400)))
-            ends[1].endpoint.put(Key(Kind.DEPTHS, tick), draw.randbytes(300))
-        ends[0].endpoint.put(Key(Kind.LIVE, 0), draw.randbytes(29))
+                ends[0].endpoint.put(Key(Kind.NEW_LANDMARKS, tick, part), draw.randbytes(draw.randrange(20, 400)))
+            ends[1].endpoint.put(Key(Kind.REFINED_LANDMARKS, tick), draw.randbytes(300))
+        ends[0].endpoint.put(Key(Kind.LIVE_POSE, 0), draw.randbytes(29))
         for i, end in enumerate(ends):
             for packet in end.poll(now_ns):
                 sealed = sealers[i].seal(packet)

@@ -9,7 +9,7 @@ import pytest
 
 from kiteline_bench.link.cpu import flight
 from kiteline_codec.channel import CodedChannel, coded_channel
-from kiteline_codec.schema import Births, Head, Live, Sightings
+from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations
 from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 
@@ -35,10 +35,10 @@ class Flight:
             if now_ns >= next_ns and self.keyframes:
                 self.share(agent, self.keyframes.pop(0), now_ns)
                 next_ns = now_ns + max(500_000_000, agent.keyframe_gap_ns())
-            agent.put(Live(AgentId(0), now_ns, KeyframeId(0), np.eye(4), 50))
+            agent.put(LivePose(AgentId(0), now_ns, KeyframeId(0), np.eye(4), 50))
             agent.receive(wires[1].deliver(now_ns), now_ns)
             for record in base.receive(wires[0].deliver(now_ns), now_ns):
-                if isinstance(record, Live):
+                if isinstance(record, LivePose):
                     self.late_s.append((now_ns - record.t_ns) / 1e9)
             for end, wire in zip(self.ends, wires, strict=True):
                 for packet in end.poll(now_ns):
@@ -47,8 +47,8 @@ class Flight:
 
     @staticmethod
     def share(agent: CodedChannel, records: list[object], now_ns: int) -> None:
-        births = [r for r in records if isinstance(r, Births)]
-        all_births = Births(
+        births = [r for r in records if isinstance(r, NewLandmarks)]
+        all_births = NewLandmarks(
             births[0].keyframe, 0, *(np.concatenate([getattr(b, name) for b in births]) for name in
             ("index", "uv", "inv_depth", "octave", "angle", "descriptor"))
         )  # fmt: skip
@@ -58,13 +58,13 @@ class Flight:
             ("index", "uv", "inv_depth", "octave", "angle", "descriptor")}
         )  # fmt: skip
         seen = next(
-            (r for r in records if isinstance(r, Sightings)),
-            Sightings(
+            (r for r in records if isinstance(r, Observations)),
+            Observations(
                 births[0].keyframe, 0, np.zeros(0, np.uint16), np.zeros((0, 2), np.float32), np.zeros(0, np.float32),
                 np.zeros(0, np.uint8), np.zeros(0, np.int64),
             ),
         )  # fmt: skip
-        head = next(r for r in records if isinstance(r, Head))
+        head = next(r for r in records if isinstance(r, KeyframeHeader))
         agent.put(replace(head, t_ns=now_ns))
         parts, sections = agent.profile.choose(all_births, -np.arange(len(order), dtype=np.float64), seen)
         for record in (*parts, *sections):

@@ -35,8 +35,8 @@ def test_endpoints_agree_over_a_noisy_serial_line() -> None:
         down = hub.links()[1]
         try:
             for i in range(60):
-                agent.put(Key(Kind.BIRTHS, i), draw.randbytes(draw.randrange(1, 900)))
-                base.put(Key(Kind.POSE, i), draw.randbytes(20))
+                agent.put(Key(Kind.NEW_LANDMARKS, i), draw.randbytes(draw.randrange(1, 900)))
+                base.put(Key(Kind.KEYFRAME_POSE, i), draw.randbytes(20))
             end_s = time.monotonic() + 20.0
             while not (agent.quiet and base.quiet and agent.digest_equal and base.digest_equal):
                 assert time.monotonic() < end_s, (agent.stats, base.stats)

@@ -12,20 +12,20 @@ from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import Window
 from kiteline_codec.schema import (
-    Calibration,
-    Copied,
-    Copy,
-    Culled,
-    Depths,
-    Found,
+    CachedKeyframe,
+    CachedLandmarks,
+    CulledLandmarks,
+    DisparityCalibration,
+    FusedLandmarks,
+    GravityAlignment,
+    GridTile,
     Key,
+    KeyframePose,
     Kind,
-    Level,
-    Placement,
-    Pose,
     Record,
-    Removed,
-    Tile,
+    RefinedLandmarks,
+    RemovedObservations,
+    SubmapPlacement,
 )
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import MAX_SUBMAPS, SubmapId
@@ -48,29 +48,31 @@ class FromBase:
         self._told: set[SubmapId] = set()  # those of which a base has spoken
         self._heard = False  # a base has just spoken of some
         self._placed: set[SubmapId] = set()  # those that a base has put where nobody had guessed them
-        self.tiles: dict[tuple[int, int], Tile] = {}
+        self.tiles: dict[tuple[int, int], GridTile] = {}
 
     def take(self, records: Sequence[Record], removed: Sequence[Key], events: list[str]) -> bool:
         """Swap in what came, and drop what the base took back. Whether the local map moved."""
         touched = False
         for record in records:
-            if isinstance(record, Pose | Depths | Found | Removed | Culled):
+            if isinstance(
+                record, KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
+            ):
                 touched |= self._map.apply(record)
-            elif isinstance(record, Placement):
+            elif isinstance(record, SubmapPlacement):
                 self._S_w_m[record.submap] = record.S_w_m
                 self._heard = True
-            elif isinstance(record, Copy | Copied):
+            elif isinstance(record, CachedKeyframe | CachedLandmarks):
                 self._window.take(record)
-            elif isinstance(record, Calibration) and self._map.camera.stereo:
+            elif isinstance(record, DisparityCalibration) and self._map.camera.stereo:
                 self._map.calibrate(record.disparity_px)
                 events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
-            elif isinstance(record, Tile):
+            elif isinstance(record, GridTile):
                 self.tiles[record.column, record.row] = record
         if self._heard:
             self._compare()
         self._window.take_back(removed)
         for key in removed:
-            if key.kind == Kind.PLACEMENT:  # the map was taken out of a larger one, and has no place any more
+            if key.kind == Kind.SUBMAP_PLACEMENT:  # the map was taken out of a larger one, and has no place any more
                 self._S_w_m.pop(SubmapId(key.id), None)
                 self._placed.discard(SubmapId(key.id))
         if touched:
@@ -102,7 +104,7 @@ class FromBase:
             else:
                 self._placed.discard(submap)
 
-    def set_upright(self, level: Level) -> None:
+    def set_upright(self, level: GravityAlignment) -> None:
         """Where a submap lies until the base says so, who sets it upright too; over a thin link that takes seconds."""
         self._S_w_m.setdefault(level.submap, level.T_l_m)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from kiteline_codec.coding import messages
 from kiteline_codec.pacing.profiles import EXACT
-from kiteline_codec.schema import Key, Live, Record
+from kiteline_codec.schema import Key, LivePose, Record
 
 
 class AloneChannel:
@@ -28,7 +28,7 @@ class AloneChannel:
 
     def put(self, record: Record) -> Record:
         """The record as it is: no code has rounded it."""
-        if self.noting and not isinstance(record, Live):
+        if self.noting and not isinstance(record, LivePose):
             self._noted[messages.key(record)] = record
         return record
 

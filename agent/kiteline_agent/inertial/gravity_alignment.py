@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
-from kiteline_codec.schema import Level
+from kiteline_codec.schema import GravityAlignment
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -60,7 +60,7 @@ class Levelling:
             R_m_b = _AHEAD @ self._camera.T_b_c[:3, :3].T
         return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
 
-    def look(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> Level | None:
+    def look(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> GravityAlignment | None:
         """A frame was measured at T_m_b (4,4) in a submap, the first one or not, whose axes R_o_m (3,3) turns into
         those of o. What to tell the base, once.
         """
@@ -79,4 +79,4 @@ class Levelling:
             return None
         # Turned about where the vehicle is now, so that its place in the world does not jump.
         here = T_m_b[:3, 3]
-        return Level(submap, se3.from_rt(R_l_m, here - R_l_m @ here))
+        return GravityAlignment(submap, se3.from_rt(R_l_m, here - R_l_m @ here))

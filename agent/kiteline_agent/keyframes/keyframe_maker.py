@@ -12,7 +12,7 @@ from kiteline_agent.keyframes.keyframes import NewPoints, new_points
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.tracker import Track, View
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Births, Head, Sightings
+from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
@@ -81,17 +81,17 @@ class KeyframeMaker:
         sightings = self._sightings(keyframe, rows[shared], seen[shared], min(len(order), profile.births))
         sections = profile.choose(births, strength, sightings)
         n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
-        head = Head(keyframe, t_ns, parent, T_p_k, n_keypoints)
+        head = KeyframeHeader(keyframe, t_ns, parent, T_p_k, n_keypoints)
         self._work.keyframes += 1
         self._work.detected_px += view.left[max(view.first, self._config.detector.first)].size
         self._work.births += len(births.index)
         self._work.sightings += len(sightings.index)
         shared_head = self._channel.put(head)
-        assert isinstance(shared_head, Head)
+        assert isinstance(shared_head, KeyframeHeader)
         uv, rho = births.uv.astype(np.float64), births.inv_depth.astype(np.float64)
         for part in sections[0]:
             agreed = self._channel.put(part)
-            assert isinstance(agreed, Births)
+            assert isinstance(agreed, NewLandmarks)
             uv[agreed.index], rho[agreed.index] = agreed.uv, agreed.inv_depth
         for section in sections[1]:
             self._channel.put(section)
@@ -102,10 +102,10 @@ class KeyframeMaker:
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         return T_m_k
 
-    def _births(self, keyframe: KeyframeId, fresh: NewPoints, order: NDArray[np.int64]) -> tuple[Births, F64]:
+    def _births(self, keyframe: KeyframeId, fresh: NewPoints, order: NDArray[np.int64]) -> tuple[NewLandmarks, F64]:
         disparity = fresh.disparity[order]
         n = len(order)
-        births = Births(
+        births = NewLandmarks(
             keyframe,
             0,
             np.arange(n, dtype=np.uint16),
@@ -117,8 +117,8 @@ class KeyframeMaker:
         )
         return births, np.where(disparity > 0.0, 1.0, 0.0) - order / (2.0 * max(n, 1))
 
-    def _sightings(self, keyframe: KeyframeId, rows: NDArray[np.int64], seen: F64, first: int) -> Sightings:
-        return Sightings(
+    def _sightings(self, keyframe: KeyframeId, rows: NDArray[np.int64], seen: F64, first: int) -> Observations:
+        return Observations(
             keyframe,
             0,
             np.arange(first, first + len(rows), dtype=np.uint16),
@@ -133,13 +133,21 @@ class KeyframeMaker:
         raw = disparity + self._map.offset_px(uv)
         return np.where((disparity > 0.0) & (raw > 0.0), raw / self._camera.bf, 0.0).astype(np.float32)
 
-    def _placed(self, head: Head) -> F64:
+    def _placed(self, head: KeyframeHeader) -> F64:
         if head.parent == NO_KEYFRAME:
             return head.T_p_k
         return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(head.parent)] @ head.T_p_k)
 
     def _remember(
-        self, view: View, head: Head, T_m_k: F64, uv: F64, rho: F64, lent_rho: F64, births: Births, frame_number: int
+        self,
+        view: View,
+        head: KeyframeHeader,
+        T_m_k: F64,
+        uv: F64,
+        rho: F64,
+        lent_rho: F64,
+        births: NewLandmarks,
+        frame_number: int,
     ) -> None:
         octave = births.octave
         templates = np.empty(

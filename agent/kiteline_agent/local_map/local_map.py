@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
-from kiteline_codec.schema import Culled, Depths, Found, Head, Pose, Removed
+from kiteline_codec.schema import (
+    CulledLandmarks,
+    FusedLandmarks,
+    KeyframeHeader,
+    KeyframePose,
+    RefinedLandmarks,
+    RemovedObservations,
+)
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId, point_id
@@ -103,7 +110,7 @@ class LocalMap:
         return np.asarray((self.keyframe[rows // self.births] << KEYPOINT_BITS) | (rows % self.births))
 
     def add(
-        self, head: Head, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
+        self, head: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
         angle: NDArray[np.uint8], descriptor: NDArray[np.uint8], templates: NDArray[np.uint8], frame_number: int,
     ) -> int:  # fmt: skip
         """Remember a keyframe with its births; the slot that it got. The slot seen least recently makes room.
@@ -219,17 +226,19 @@ class LocalMap:
 
     # what the base made of it
 
-    def apply(self, record: Pose | Depths | Found | Removed | Culled) -> bool:
+    def apply(
+        self, record: KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
+    ) -> bool:
         """Take over one value of the base; False when its keyframe is not remembered here."""
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
-        if isinstance(record, Pose):
+        if isinstance(record, KeyframePose):
             self.T_m_k[slot] = record.T_m_k
             self.from_base[slot] = True
-        elif isinstance(record, Depths):
+        elif isinstance(record, RefinedLandmarks):
             self._apply_depths(slot, record)
-        elif isinstance(record, Found):
+        elif isinstance(record, FusedLandmarks):
             self._apply_found(slot, record)
         else:  # removed births and culled points are no longer looked for
             index = record.index.astype(np.int64)
@@ -237,7 +246,7 @@ class LocalMap:
             self.seed[slot, index[index < self.shared[slot]]] = False
         return True
 
-    def _apply_depths(self, slot: int, record: Depths) -> None:
+    def _apply_depths(self, slot: int, record: RefinedLandmarks) -> None:
         keep = (record.index < self.shared[slot]) & (record.inv_depth > 0.0)
         index = record.index[keep].astype(np.int64)
         never = ~self.usable[slot, index] & (self.tried[slot * self.births + index] == 0)
@@ -260,7 +269,7 @@ class LocalMap:
         least = self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
         self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, least)
 
-    def _apply_found(self, slot: int, record: Found) -> None:
+    def _apply_found(self, slot: int, record: FusedLandmarks) -> None:
         """A birth that shows an older point leaves, where the older one is remembered."""
         for index, point in zip(record.index.tolist(), record.point.tolist()):
             if index < self.shared[slot] and self.slot_of(point >> KEYPOINT_BITS) >= 0:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import WindowConfig
 from kiteline_agent.keyframes.keyframes import NewPoints
 from kiteline_agent.local_map import projection_kernels as kernels
-from kiteline_codec.schema import Copied, Copy, Key, Kind
+from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
@@ -95,7 +95,7 @@ class Window:
         self._counts = np.zeros(k, np.int64)
         self._touched = np.zeros(k, np.int64)  # when a copy last came or was told of
         self._clock = 0
-        self._parts: list[dict[int, Copied]] = [{} for _ in range(k)]
+        self._parts: list[dict[int, CachedLandmarks]] = [{} for _ in range(k)]
         self._usable = np.zeros((k, p), np.bool_)
         self._bearing = np.zeros((k, p, 2))
         self._rho = np.zeros((k, p))
@@ -118,12 +118,12 @@ class Window:
 
     # what the base sends
 
-    def take(self, record: Copy | Copied) -> None:
+    def take(self, record: CachedKeyframe | CachedLandmarks) -> None:
         """A copy's pose, or some of its points."""
         slot = self._slot(record.keyframe)
         self._clock += 1
         self._touched[slot] = self._clock
-        if isinstance(record, Copy):
+        if isinstance(record, CachedKeyframe):
             self._submap[slot] = record.submap
             self._T_m_k[slot] = record.T_m_k
             return
@@ -133,7 +133,7 @@ class Window:
     def take_back(self, keys: Sequence[Key]) -> None:
         """Copies that the base wants back."""
         for key in keys:
-            if key.kind == Kind.COPY:
+            if key.kind == Kind.CACHED_KEYFRAME:
                 for slot in np.flatnonzero(self.keyframe == key.id).tolist():
                     self._clear(slot)
 

@@ -10,7 +10,7 @@ from kiteline_agent.initialisation.two_view_start import Opening
 from kiteline_agent.relocalisation.map_cache import corners_of, with_depths
 from kiteline_agent.stages import Stages
 from kiteline_agent.tracking.tracker import Track, View
-from kiteline_codec.schema import Unit
+from kiteline_codec.schema import SubmapScale
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 
@@ -174,9 +174,9 @@ class MapGrowth:
         assert self._mono is not None
         self._s.events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
         self._s.carry_certainty()
-        self._s.channel.put(Unit(self._submaps.active, unit_m))
+        self._s.channel.put(SubmapScale(self._submaps.active, unit_m))
         T_n_m = self._submaps.open_in_metres(view, t_ns, self._s.frame, unit_m, born)
-        self._s.channel.put(Unit(self._submaps.active, 1.0))
+        self._s.channel.put(SubmapScale(self._submaps.active, 1.0))
         self._certainty.begin(self._pose.T_m_c @ self._s.T_c_b)
         self._note_keyframe(view, Extra.SUBMAP)
         self._inertia.begin_metres(unit_m, T_n_m)

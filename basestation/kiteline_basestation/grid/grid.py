@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.grid import grid_kernels as kernels
 from kiteline_basestation.grid.ground_height import FloorConfig, ground_heights
-from kiteline_codec.schema import Tile
+from kiteline_codec.schema import GridTile
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -100,11 +100,11 @@ class Grid:
         self.revision = 0
         self.changed: dict[tuple[int, int], int] = {}  # (row, column) -> revision of the last change
 
-    def update(self, positions: F64, points: F64, observations: I64) -> tuple[Tile, ...]:
+    def update(self, positions: F64, points: F64, observations: I64) -> tuple[GridTile, ...]:
         """Rebuild from the whole map and return the tiles that changed; arguments as those of `build`."""
         return self.adopt(build(self.config, positions, points, observations))
 
-    def adopt(self, new: GridMap) -> tuple[Tile, ...]:
+    def adopt(self, new: GridMap) -> tuple[GridTile, ...]:
         """Take a grid made by `build` and return the tiles that changed. A tile that vanished comes as unknown."""
         changed = differences(self.map, new)
         self.revision += 1
@@ -113,7 +113,7 @@ class Grid:
         return changed
 
 
-def differences(old: GridMap, new: GridMap) -> tuple[Tile, ...]:
+def differences(old: GridMap, new: GridMap) -> tuple[GridTile, ...]:
     """The tiles of `new` that `old` does not hold as they are, in order of row, column; vanished ones as unknown."""
     before, after = _by_place(old), _by_place(new)
     unknown = np.full((TILE, TILE), UNKNOWN, np.int8)
@@ -121,7 +121,7 @@ def differences(old: GridMap, new: GridMap) -> tuple[Tile, ...]:
     for place in sorted(before.keys() | after.keys()):
         cells = after.get(place, unknown)
         if place not in before or not np.array_equal(cells, before[place]):
-            out.append(Tile(place[1], place[0], new.cell_m, cells))
+            out.append(GridTile(place[1], place[0], new.cell_m, cells))
     return tuple(out)
 
 

@@ -10,7 +10,16 @@ from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.map.map_tables import NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.store.state import Json, matrix, pose_of
-from kiteline_codec.schema import Births, Camera, Head, Level, Live, Record, Sightings, Unit
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    GravityAlignment,
+    KeyframeHeader,
+    LivePose,
+    NewLandmarks,
+    Observations,
+    Record,
+    SubmapScale,
+)
 from kiteline_core.ids import (
     NO_KEYFRAME,
     SEQUENCE_BITS,
@@ -32,14 +41,16 @@ class Intake:
     def __init__(self, config: IntakeConfig, sparse_map: SparseMap) -> None:
         self._config = config
         self._map = sparse_map
-        self._pending: dict[KeyframeId, dict[tuple[bool, int], Births | Sightings]] = {}  # sections before their header
+        self._pending: dict[
+            KeyframeId, dict[tuple[bool, int], NewLandmarks | Observations]
+        ] = {}  # sections before their header
         self._pending_count = 0
         self._waiting: dict[KeyframeId, int] = {}  # not used yet -> when the header came
         self._partial: set[KeyframeId] = set()  # used before they were complete
-        self.live: dict[AgentId, Live] = {}
-        self.last_of: dict[SubmapId, Live] = {}  # the last that was heard in each submap
+        self.live: dict[AgentId, LivePose] = {}
+        self.last_of: dict[SubmapId, LivePose] = {}  # the last that was heard in each submap
         self.tracked_ns: dict[SubmapId, int] = {}  # stamp of the last pose in each submap that was no guess
-        self.levels: dict[SubmapId, Level] = {}  # what agents say of which way is up
+        self.levels: dict[SubmapId, GravityAlignment] = {}  # what agents say of which way is up
         self.units: dict[SubmapId, float] = {}  # metres in one unit of it, as far as agents know
         self.last_seen_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # of which nothing is wanted any more
@@ -51,9 +62,9 @@ class Intake:
             self.last_seen_ns[agent] = now_ns
             if self.deleted and _submap_of(record) in self.deleted:
                 continue
-            if isinstance(record, Camera):
+            if isinstance(record, CameraIntrinsics):
                 self._map.set_camera(record.agent, record.camera)
-            elif isinstance(record, Live):
+            elif isinstance(record, LivePose):
                 held = self.live.get(record.agent)
                 if held is None or _age(record) >= _age(held):
                     self.live[record.agent] = record
@@ -61,19 +72,21 @@ class Intake:
                     self.last_of[submap] = record
                     if record.quality > 0:
                         self.tracked_ns[submap] = record.t_ns
-            elif isinstance(record, Head):
+            elif isinstance(record, KeyframeHeader):
                 self._take_head(record, now_ns)
-            elif isinstance(record, Level):
+            elif isinstance(record, GravityAlignment):
                 self.levels[record.submap] = record
-            elif isinstance(record, Unit):
+            elif isinstance(record, SubmapScale):
                 self.units[record.submap] = record.metres
                 if record.metres == 1.0:
                     self._map.metric.add(record.submap)
-            elif isinstance(record, Births | Sightings):
+            elif isinstance(record, NewLandmarks | Observations):
                 if record.keyframe in self._map:
                     self._take_section(record)
                 elif self._pending_count < self._config.max_pending:
-                    self._pending.setdefault(record.keyframe, {})[isinstance(record, Births), record.part] = record
+                    self._pending.setdefault(record.keyframe, {})[isinstance(record, NewLandmarks), record.part] = (
+                        record
+                    )
                     self._pending_count += 1
                 else:
                     self.refused += 1
@@ -116,7 +129,7 @@ class Intake:
         """Go on from what a forerunner remembered."""
         if value["last"] is not None:
             agent, t_ns, keyframe, T_k_c, quality = value["last"]
-            self.last_of[submap] = Live(AgentId(agent), t_ns, KeyframeId(keyframe), pose_of(T_k_c), quality)
+            self.last_of[submap] = LivePose(AgentId(agent), t_ns, KeyframeId(keyframe), pose_of(T_k_c), quality)
         if value["tracked_ns"] is not None:
             self.tracked_ns[submap] = value["tracked_ns"]
 
@@ -134,7 +147,7 @@ class Intake:
         placed = self._map.keyframes.pose_source[self._map.rows[keyframe]] != NO_POSE
         return bool(placed) and agent_of_keyframe(keyframe) in self._map.cameras
 
-    def _take_head(self, head: Head, now_ns: int) -> None:
+    def _take_head(self, head: KeyframeHeader, now_ns: int) -> None:
         fresh = head.keyframe not in self._map
         try:
             self._map.add_keyframe(head.keyframe, head.t_ns, head.parent, head.T_p_k, head.keypoints)
@@ -148,8 +161,8 @@ class Intake:
         for _, section in sorted(sections.items(), key=lambda item: item[0]):
             self._take_section(section)
 
-    def _take_section(self, section: Births | Sightings) -> None:
-        if isinstance(section, Births):
+    def _take_section(self, section: NewLandmarks | Observations) -> None:
+        if isinstance(section, NewLandmarks):
             self._map.put_births(
                 section.keyframe, section.part, section.index, section.uv, section.inv_depth, section.octave,
                 section.angle, section.descriptor,
@@ -172,12 +185,12 @@ class Intake:
                     self._map.set_pose(keyframes[0], _LEVEL)
 
 
-def _age(live: Live) -> tuple[int, int]:
+def _age(live: LivePose) -> tuple[int, int]:
     """What tells the newer of two poses: an agent that started again may have a clock that did so too."""
     return live.keyframe >> SEQUENCE_BITS + SUBMAP_BITS, live.t_ns
 
 
 def _submap_of(record: Record) -> SubmapId | None:
-    if isinstance(record, Head | Births | Sightings | Live):
+    if isinstance(record, KeyframeHeader | NewLandmarks | Observations | LivePose):
         return submap_of_keyframe(record.keyframe)
-    return record.submap if isinstance(record, Level | Unit) else None
+    return record.submap if isinstance(record, GravityAlignment | SubmapScale) else None

@@ -115,7 +115,7 @@ class World:
             else:
                 del self.placements[submap]
                 self._publisher.forget_place(submap)
-                self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.PLACEMENT), int(submap), 0)))
+                self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.SUBMAP_PLACEMENT), int(submap), 0)))
 
     def lay_out(self, island: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place. A map in

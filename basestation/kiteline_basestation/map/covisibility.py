@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import MeasurementConfig, WindowConfig
-from kiteline_basestation.map.map_tables import BIRTH, NO_POSE
+from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.disparity_calibration import offsets
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
@@ -129,7 +129,7 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     measured[:, 2] = np.where(ranged, np.maximum(disparity, 0.0), -1.0)
     octave = table.octave[slots].astype(np.float64)
     aligned = config.sigma_growth**octave
-    fused = (table.kind[slots] == BIRTH) & (table.root[slots] != slots)
+    fused = (table.kind[slots] == LANDMARK) & (table.root[slots] != slots)
     pixel = np.where(fused, config.fused_px * config.fused_growth**octave, config.sigma_px * aligned)
     return measured, np.stack([pixel, sigma[rows] * aligned], 1)
 

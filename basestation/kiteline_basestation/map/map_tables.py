@@ -14,7 +14,7 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-EMPTY, BIRTH, SIGHTING = 0, 1, 2  # what a keypoint is
+EMPTY, LANDMARK, OBSERVATION = 0, 1, 2  # what a keypoint is
 REMOVED, CULLED, REFINED = 1, 2, 4  # bits of its flags: observation rejected; point dropped; point has a base value
 NO_POSE, COMPOSED, REFINED_POSE = 0, 1, 2  # where a keyframe's pose comes from
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.map import sparse_map_kernels as kernels
 from kiteline_basestation.map.map_tables import (
-    BIRTH,
     CULLED,
+    LANDMARK,
     NO_POSE,
     REFINED,
     KeyframeTable,
@@ -100,7 +100,7 @@ class MapView:
         table = self.keypoints
         n = self.slots
         here = np.arange(n, dtype=np.int32)
-        live = (table.kind[:n] == BIRTH) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
+        live = (table.kind[:n] == LANDMARK) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
         return self.in_order(here[live])
 
     def observations(self, points: I32) -> tuple[I32, I32]:
@@ -141,7 +141,7 @@ class MapView:
         table = self.keypoints
         rows = table.row[points]
         inv = self.inverse_depths(points)
-        valid = (inv > 0) & (self.keyframes.pose_source[rows] != NO_POSE) & (table.kind[points] == BIRTH)
+        valid = (inv > 0) & (self.keyframes.pose_source[rows] != NO_POSE) & (table.kind[points] == LANDMARK)
         z = self.keyframes.unit[rows] / np.where(valid, inv, 1.0)  # in units of w
         fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
         uv = table.uv[points].astype(np.float64) + table.offset[points]
@@ -216,5 +216,5 @@ class MapView:
         table = self.keypoints
         root = table.root[slots]
         alive = (table.usable[slots] != 0) & (root >= 0)
-        alive[alive] = (table.flags[root[alive]] & CULLED == 0) & (table.kind[root[alive]] == BIRTH)
+        alive[alive] = (table.flags[root[alive]] & CULLED == 0) & (table.kind[root[alive]] == LANDMARK)
         return np.asarray(alive)

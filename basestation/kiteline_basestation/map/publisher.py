@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.map.map_tables import BIRTH, CULLED, REFINED, REFINED_POSE, REMOVED
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED, REFINED_POSE, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_codec.schema import Culled, Depths, Found, Kind, Placement, Pose, Record, Removed
+from kiteline_codec.schema import (
+    CulledLandmarks,
+    FusedLandmarks,
+    KeyframePose,
+    Kind,
+    Record,
+    RefinedLandmarks,
+    RemovedObservations,
+    SubmapPlacement,
+)
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap
 
 F64 = NDArray[np.float64]
@@ -35,12 +44,12 @@ class Publisher:
 
     def place(self, submap: SubmapId, S_w_m: F64) -> None:
         """A submap has a new place in the world, or another unit of length in it."""
-        self._records.append((agent_of_submap(submap), Placement(submap, S_w_m)))
+        self._records.append((agent_of_submap(submap), SubmapPlacement(submap, S_w_m)))
 
     def forget_place(self, submap: SubmapId) -> None:
         """A submap has no place any more: what is not said yet is not to be said."""
         self._records = [
-            (a, r) for a, r in self._records if not (isinstance(r, Placement) and r.submap == submap)
+            (a, r) for a, r in self._records if not (isinstance(r, SubmapPlacement) and r.submap == submap)
         ]  # fmt: skip
 
     def send(self, agent: AgentId, record: Record) -> None:
@@ -64,22 +73,22 @@ class Publisher:
         sparse_map, table = self._map, self._map.keypoints
         slots = sparse_map.slots_of(keyframe)
         row = sparse_map.rows[keyframe]
-        born = table.kind[slots] == BIRTH
-        if kind is Kind.POSE:
+        born = table.kind[slots] == LANDMARK
+        if kind is Kind.KEYFRAME_POSE:
             if sparse_map.keyframes.pose_source[row] != REFINED_POSE:
                 return None
-            return Pose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
-        if kind is Kind.DEPTHS:
+            return KeyframePose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
+        if kind is Kind.REFINED_LANDMARKS:
             here = slots[born & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)]
-            return Depths(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
-        if kind is Kind.FOUND:
+            return RefinedLandmarks(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
+        if kind is Kind.FUSED_LANDMARKS:
             here = slots[born & (table.root[slots] != slots)]
-            return Found(keyframe, self._index(here), sparse_map.point_ids(table.root[here]))
-        if kind is Kind.REMOVED:
-            return Removed(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
-        if kind is Kind.CULLED:
+            return FusedLandmarks(keyframe, self._index(here), sparse_map.point_ids(table.root[here]))
+        if kind is Kind.REMOVED_OBSERVATIONS:
+            return RemovedObservations(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
+        if kind is Kind.CULLED_LANDMARKS:
             here = slots[born & (table.flags[slots] & CULLED != 0)]
-            return Culled(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
+            return CulledLandmarks(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
         raise ValueError(f"the base writes no {kind.name} of a keyframe")
 
     def _index(self, slots: I32) -> NDArray[np.uint16]:
@@ -91,26 +100,29 @@ def adopt(sparse_map: SparseMap, record: Record) -> None:
 
     Records of keyframes that are not here, and what is true already, change nothing.
     """
-    if not isinstance(record, Pose | Depths | Found | Removed | Culled) or record.keyframe not in sparse_map:
+    if (
+        not isinstance(record, KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks)
+        or record.keyframe not in sparse_map
+    ):
         return
-    if isinstance(record, Pose):
+    if isinstance(record, KeyframePose):
         sparse_map.set_pose(record.keyframe, record.T_m_k)
         return
     row = sparse_map.rows[record.keyframe]
     known = record.index < sparse_map.keyframes.count[row]
     slots = (int(sparse_map.keyframes.start[row]) + record.index[known].astype(np.int32)).astype(np.int32)
     flags = sparse_map.keypoints.flags
-    if isinstance(record, Depths):
+    if isinstance(record, RefinedLandmarks):
         sparse_map.set_depths(slots, record.inv_depth[known], record.offset[known])
-    elif isinstance(record, Found):
+    elif isinstance(record, FusedLandmarks):
         roots = sparse_map.find_points(record.point[known])
         for slot, root in zip(slots.tolist(), roots.tolist()):
             if root >= 0 and sparse_map.keypoints.root[slot] == slot != root:
                 sparse_map.fuse(slot, int(sparse_map.keypoints.root[root]))
     else:
-        bit = REMOVED if isinstance(record, Removed) else CULLED
+        bit = REMOVED if isinstance(record, RemovedObservations) else CULLED
         fresh = slots[flags[slots] & bit == 0]
         if len(fresh):
             sparse_map.set_flags(fresh, bit)
-        if isinstance(record, Culled) and record.keyframe_too:
+        if isinstance(record, CulledLandmarks) and record.keyframe_too:
             sparse_map.cull_keyframe(record.keyframe)

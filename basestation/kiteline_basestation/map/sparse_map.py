@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.map import sparse_map_kernels as kernels
 from kiteline_basestation.map.map_tables import (
-    BIRTH,
     COMPOSED,
     EMPTY,
+    LANDMARK,
     NO_POSE,
+    OBSERVATION,
     REFINED,
     REFINED_POSE,
     REMOVED,
-    SIGHTING,
     grow,
 )
 from kiteline_basestation.map.map_view import MapView
@@ -32,7 +32,7 @@ from kiteline_core.ids import (
     KEYPOINT_BITS,
     MAX_KEYPOINTS,
     NO_KEYFRAME,
-    NO_POINT,
+    NO_LANDMARK,
     AgentId,
     KeyframeId,
     SubmapId,
@@ -105,17 +105,17 @@ class SparseMap(MapView):
         angle: U8, descriptor: U8,
     ) -> None:  # fmt: skip
         """Births of a keyframe whose header is here (see codec schema Births); a newer part replaces an older one."""
-        slots, keep = self._section(keyframe, part, index, BIRTH)
+        slots, keep = self._section(keyframe, part, index, LANDMARK)
         table = self.keypoints
         table.uv[slots] = uv[keep]
         table.inv_depth[slots] = inv_depth[keep]
         table.octave[slots] = octave[keep]
         table.angle[slots] = angle[keep]
         table.descriptor[slots] = descriptor[keep]
-        fresh = slots[table.kind[slots] != BIRTH]
-        table.kind[slots] = BIRTH
+        fresh = slots[table.kind[slots] != LANDMARK]
+        table.kind[slots] = LANDMARK
         table.part[slots] = part
-        table.point[slots] = NO_POINT
+        table.point[slots] = NO_LANDMARK
         kernels.link(fresh, fresh, table.root, table.first, table.next)
         self._refresh_usable(self.rows[keyframe])
 
@@ -130,12 +130,12 @@ class SparseMap(MapView):
         point: I64,
     ) -> None:
         """Sightings of a keyframe whose header is here (see codec schema Sightings); a newer part replaces an older."""
-        slots, keep = self._section(keyframe, part, index, SIGHTING)
+        slots, keep = self._section(keyframe, part, index, OBSERVATION)
         table = self.keypoints
         table.uv[slots] = uv[keep]
         table.inv_depth[slots] = inv_depth[keep]
         table.octave[slots] = octave[keep]
-        table.kind[slots] = SIGHTING
+        table.kind[slots] = OBSERVATION
         table.part[slots] = part
         table.point[slots] = point[keep]
         if bool(np.any(inv_depth > 0)):
@@ -205,7 +205,7 @@ class SparseMap(MapView):
         one = np.array([child], np.int32)
         moved = np.empty(kernels.count(one, table.first, table.next), np.int32)
         kernels.fuse(child, parent, table.root, table.first, table.next, moved)
-        births = moved[table.kind[moved] == BIRTH]
+        births = moved[table.kind[moved] == LANDMARK]
         rows = np.union1d(table.row[births], table.row[one])
         return [KeyframeId(k) for k in np.sort(self.keyframes.id[rows]).tolist()]
 
@@ -213,7 +213,7 @@ class SparseMap(MapView):
         """The opposite of `fuse` for births at slots (n,): each is a point of its own again, seen where it is named."""
         table = self.keypoints
         kernels.link(births, births, table.root, table.first, table.next)
-        hangs = (table.kind[: self.slots] == SIGHTING) & (table.root[: self.slots] >= 0)
+        hangs = (table.kind[: self.slots] == OBSERVATION) & (table.root[: self.slots] >= 0)
         slots = np.flatnonzero(hangs).astype(np.int32)
         self._link_sightings(slots[np.isin(self.find_points(table.point[slots]), births)])
 
@@ -229,7 +229,7 @@ class SparseMap(MapView):
         table.root[new] = -1
         table.first[new] = -1
         table.next[new] = -1
-        table.point[new] = NO_POINT
+        table.point[new] = NO_LANDMARK
         return start
 
     def _section(self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], kind: int) -> tuple[I32, Bool]:
@@ -250,13 +250,13 @@ class SparseMap(MapView):
     def _link_sightings(self, slots: I32) -> None:
         """Hang sightings on the points they name; those whose keyframe is not here wait for it."""
         table = self.keypoints
-        slots = slots[table.kind[slots] == SIGHTING]
+        slots = slots[table.kind[slots] == OBSERVATION]
         named = self.find_points(table.point[slots])
         roots = np.full(len(slots), -1, np.int32)
         known = named >= 0
         target = named[known]
         # A point that was fused is followed to its root; one whose own section is still to come is its own root.
-        fused = (table.kind[target] == BIRTH) & (table.root[target] >= 0)
+        fused = (table.kind[target] == LANDMARK) & (table.root[target] >= 0)
         roots[known] = np.where(fused, table.root[target], target)
         kernels.link(slots, roots, table.root, table.first, table.next)
         for slot in slots[~known].tolist():

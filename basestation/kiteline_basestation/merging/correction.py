@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, GraphConfig, PublishConfig
 from kiteline_basestation.map.covisibility import Window, covisible_keyframes, window
-from kiteline_basestation.map.map_tables import BIRTH
+from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
@@ -118,7 +118,7 @@ def move_keyframes(
         turned = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)
         if moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, goal[keyframe])
-            publisher.touch(Kind.POSE, keyframe)
+            publisher.touch(Kind.KEYFRAME_POSE, keyframe)
     return largest
 
 
@@ -153,10 +153,10 @@ def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher:
     table, slots = sparse_map.keypoints, sparse_map.slots_of(keyframe)
     offset = table.offset[slots]
     inverse = sparse_map.inverse_depths(slots)
-    known = (table.kind[slots] == BIRTH) & (inverse > 0.0)
+    known = (table.kind[slots] == LANDMARK) & (inverse > 0.0)
     if known.any():
         sparse_map.set_depths(slots[known], (inverse[known] / factor).astype(np.float32), offset[known])
-        publisher.touch(Kind.DEPTHS, keyframe)
+        publisher.touch(Kind.REFINED_LANDMARKS, keyframe)
 
 
 def whole_window(

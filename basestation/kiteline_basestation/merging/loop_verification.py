@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.covisibility import covisible_keyframes
-from kiteline_basestation.map.map_tables import BIRTH
+from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.refind import foresee
 from kiteline_core.geometry import se3, sim3
@@ -76,7 +76,7 @@ def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
     row = sparse_map.rows[keyframe]
     slots = sparse_map.observed(keyframe)
     points = table.root[slots]
-    from_birth = np.where(table.kind[slots] == BIRTH, slots, points)
+    from_birth = np.where(table.kind[slots] == LANDMARK, slots, points)
     T = sparse_map.keyframes.T_w_k
     turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[from_birth], :3, :3])
     roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])

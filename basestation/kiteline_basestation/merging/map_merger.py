@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.map.covisibility import Window, covisible_keyframes
-from kiteline_basestation.map.map_tables import BIRTH
+from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.correction import graph_of, keyframes_of, move_keyframes, rescale, whole_window
@@ -389,8 +389,8 @@ class Atlas:
         inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, sorted(mine))
         roots = table.root[: sparse_map.slots]
         crossing = np.flatnonzero((roots >= 0) & (inside != inside[np.maximum(roots, 0)])).astype(np.int32)
-        sparse_map.part(crossing[table.kind[crossing] == BIRTH])
-        self._publisher.touch_slots(Kind.FOUND, crossing[table.kind[crossing] == BIRTH])
+        sparse_map.part(crossing[table.kind[crossing] == LANDMARK])
+        self._publisher.touch_slots(Kind.FUSED_LANDMARKS, crossing[table.kind[crossing] == LANDMARK])
         for submap, frame in merge.moved.items():
             sparse_map.islands.pop(submap, None)
             if submap != merge.eldest:

@@ -6,7 +6,7 @@ import numpy as np
 
 from kiteline_basestation.config import CullConfig
 from kiteline_basestation.map.covisibility import covisible_keyframes
-from kiteline_basestation.map.map_tables import BIRTH, CULLED, REFINED_POSE
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.apply_bundle import drop_points
@@ -24,7 +24,7 @@ def cull_weak(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, p
     judged = same[number - config.age]
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(judged)
-    own = (table.kind[slots] == BIRTH) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
+    own = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
     points = slots[own]
     visible = np.zeros(sparse_map.slots, np.int32)
     for later in same[number - config.age + 1 : number + 1]:
@@ -50,7 +50,7 @@ def cull_redundant(
             sparse_map, other, config
         ):
             sparse_map.cull_keyframe(other)
-            publisher.touch(Kind.CULLED, other)
+            publisher.touch(Kind.CULLED_LANDMARKS, other)
             out.append(other)
     return out
 

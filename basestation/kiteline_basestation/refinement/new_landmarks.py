@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import MeasurementConfig, NewPointConfig
 from kiteline_basestation.map.covisibility import covisible_keyframes
-from kiteline_basestation.map.map_tables import BIRTH, CULLED, REMOVED
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REMOVED
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import refind_kernels as kernels
@@ -101,7 +101,9 @@ def _open_births(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
     """Births of a keyframe that are their own root and have no depth."""
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(keyframe)
-    own = (table.kind[slots] == BIRTH) & (table.root[slots] == slots) & (table.flags[slots] & (REMOVED | CULLED) == 0)
+    own = (
+        (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & (REMOVED | CULLED) == 0)
+    )
     return _without_depth(sparse_map, slots[own])
 
 
@@ -115,7 +117,7 @@ def _make(
 def _set(sparse_map: SparseMap, points: I32, position: F64, publisher: Publisher) -> int:
     inverse, offset, ahead = sparse_map.bearing_of(points, position)
     sparse_map.set_depths(points[ahead], inverse[ahead], offset[ahead])
-    publisher.touch_slots(Kind.DEPTHS, points[ahead])
+    publisher.touch_slots(Kind.REFINED_LANDMARKS, points[ahead])
     return int(np.count_nonzero(ahead))
 
 

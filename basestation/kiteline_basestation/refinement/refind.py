@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import RefindConfig
 from kiteline_basestation.map.covisibility import covisible_keyframes
-from kiteline_basestation.map.map_tables import BIRTH, CULLED, NO_POSE, REFINED, REMOVED
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE, REFINED, REMOVED
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import refind_kernels as kernels
@@ -68,7 +68,7 @@ def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: Refi
     """Match points (n,) (roots) with the births of a keyframe and fuse what is one."""
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(target)
-    slots = slots[(table.kind[slots] == BIRTH) & (table.flags[slots] & (REMOVED | CULLED) == 0)]
+    slots = slots[(table.kind[slots] == LANDMARK) & (table.flags[slots] & (REMOVED | CULLED) == 0)]
     slots = slots[table.flags[table.root[slots]] & CULLED == 0]
     if len(points) == 0 or len(slots) == 0:
         return 0
@@ -144,9 +144,9 @@ def fuse(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
         if not ahead[0]:
             return False
         sparse_map.set_depths(one, inverse, offset)
-        publisher.touch_slots(Kind.DEPTHS, one)
+        publisher.touch_slots(Kind.REFINED_LANDMARKS, one)
     if sparse_map.keypoints.flags[child] & REFINED:
-        publisher.touch_slots(Kind.DEPTHS, np.array([child], np.int32))  # it leaves its keyframe's table
+        publisher.touch_slots(Kind.REFINED_LANDMARKS, np.array([child], np.int32))  # it leaves its keyframe's table
     for keyframe in sparse_map.fuse(int(child), int(parent)):
-        publisher.touch(Kind.FOUND, keyframe)
+        publisher.touch(Kind.FUSED_LANDMARKS, keyframe)
     return True

@@ -12,7 +12,7 @@ from kiteline_basestation.merging.loop_verification import find_overlap
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import Births, Camera, Head, Record, Sightings
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, Record
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 from kiteline_core.places.place_index import Vocabulary
@@ -29,7 +29,7 @@ def warm(config: BaseConfig | None = None, words: Vocabulary | None = None) -> N
     station = Station(config or BaseConfig(), lambda _: base, words)
     station.join(AgentId(0))
     done: tuple[JobDone, ...] = ()
-    agent.put(Camera(AgentId(0), RectifiedCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.1, True, np.eye(4))))
+    agent.put(CameraIntrinsics(AgentId(0), RectifiedCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.1, True, np.eye(4))))
     for k in range(_KEYFRAMES):
         for record in _keyframe(k):
             agent.put(record)
@@ -77,12 +77,12 @@ def _keyframe(k: int) -> list[Record]:
     seen = np.zeros(0, np.int64) if k == 0 else np.arange(0, _POINTS, 2)
     zeros = np.zeros(_POINTS, np.uint8)
     records: list[Record] = [
-        Head(KeyframeId(keyframe), k * 1_000_000_000, parent, T_p_k, len(born) + len(seen)),
-        Births(
+        KeyframeHeader(KeyframeId(keyframe), k * 1_000_000_000, parent, T_p_k, len(born) + len(seen)),
+        NewLandmarks(
             keyframe, 0, born.astype(np.uint16), uv[born], inv_depth[born], zeros[born], zeros[born], descriptors[born]
         ),
     ]
     if len(seen):
         names = np.array([point_id(first, int(i)) for i in seen], np.int64)
-        records.append(Sightings(keyframe, 0, seen.astype(np.uint16), uv[seen], inv_depth[seen], zeros[seen], names))
+        records.append(Observations(keyframe, 0, seen.astype(np.uint16), uv[seen], inv_depth[seen], zeros[seen], names))
     return records

@@ -23,7 +23,7 @@ def combine(first: Kept, second: Kept) -> Kept:
     new: list[int] = []
     for agent, codes in sorted(second.agents.items()):
         here = agents.get(agent, Codes({}, {}))
-        heads = {key for key in codes.received if key.kind == Kind.HEAD}
+        heads = {key for key in codes.received if key.kind == Kind.KEYFRAME_HEADER}
         for key in heads:
             if here.received.get(key, codes.received[key]) != codes.received[key]:
                 raise WireError(
@@ -40,7 +40,7 @@ def combine(first: Kept, second: Kept) -> Kept:
 
 
 def _is_news(key: Key, known: set[int]) -> bool:
-    return key.kind not in (Kind.PLACEMENT, Kind.TILE) and key.id not in known
+    return key.kind not in (Kind.SUBMAP_PLACEMENT, Kind.GRID_TILE) and key.id not in known
 
 
 def _combined(first: Mapping[str, str], second: Mapping[str, str], new: list[int]) -> dict[str, str]:

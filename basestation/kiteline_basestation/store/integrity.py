@@ -11,25 +11,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_basestation.map.map_tables import BIRTH, EMPTY, NO_POSE, SIGHTING
+from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.store.kept import Codes, Kept
 from kiteline_codec.coding import messages
 from kiteline_codec.schema import (
-    Births,
-    Culled,
-    Depths,
-    Found,
-    Head,
+    CulledLandmarks,
+    FusedLandmarks,
+    GravityAlignment,
     Key,
+    KeyframeHeader,
+    KeyframePose,
     Kind,
-    Level,
-    Placement,
-    Pose,
+    NewLandmarks,
+    Observations,
     Record,
-    Removed,
-    Sightings,
-    Unit,
+    RefinedLandmarks,
+    RemovedObservations,
+    SubmapPlacement,
+    SubmapScale,
     WireError,
 )
 from kiteline_core.ids import (
@@ -44,7 +44,7 @@ from kiteline_core.ids import (
 )
 
 _RIGID = 1e-6  # by which a turn may fail to be one
-_OF_BASE = Pose | Depths | Found | Removed | Culled
+_OF_BASE = KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +65,10 @@ def sound(kept: Kept) -> Checked:
         agent: (_decoded(agent, codes.received, faults), _decoded(agent, codes.own, faults))
         for agent, codes in sorted(kept.agents.items())
     }
-    heads: dict[KeyframeId, Head] = {}
+    heads: dict[KeyframeId, KeyframeHeader] = {}
     for agent, (received, _) in decoded.items():
         for key, record in list(received.items()):
-            if isinstance(record, Head):
+            if isinstance(record, KeyframeHeader):
                 if agent_of_keyframe(record.keyframe) != agent or not _parent_fits(record):
                     faults.append(f"keyframe {record.keyframe} of agent {agent} names parent {record.parent}: left out")
                     del received[key]
@@ -78,12 +78,12 @@ def sound(kept: Kept) -> Checked:
     awaited = sum(head.parent not in heads for head in heads.values() if head.parent != NO_KEYFRAME)
     for agent, (received, own) in decoded.items():
         for key, record in list(received.items()):
-            if isinstance(record, Births | Sightings):
+            if isinstance(record, NewLandmarks | Observations):
                 awaited += record.keyframe not in heads
                 if (why := _wrong_section(record, heads)) is not None:
                     faults.append(f"{_name(key)} of agent {agent} {why}: left out")
                     del received[key]
-            elif isinstance(record, Level | Unit):
+            elif isinstance(record, GravityAlignment | SubmapScale):
                 awaited += record.submap not in submaps
         for key, record in list(own.items()):
             if (why := _wrong_own(record, agent, heads, submaps)) is not None:
@@ -114,29 +114,31 @@ def _decoded(agent: AgentId, values: Mapping[Key, bytes], faults: list[str]) -> 
     return out
 
 
-def _parent_fits(head: Head) -> bool:
+def _parent_fits(head: KeyframeHeader) -> bool:
     older = head.parent < head.keyframe and submap_of_keyframe(head.parent) == submap_of_keyframe(head.keyframe)
     return head.parent == NO_KEYFRAME or older
 
 
-def _wrong_section(record: Births | Sightings, heads: Mapping[KeyframeId, Head]) -> str | None:
+def _wrong_section(record: NewLandmarks | Observations, heads: Mapping[KeyframeId, KeyframeHeader]) -> str | None:
     head = heads.get(record.keyframe)
     if head is not None and len(record.index) and int(record.index.max()) >= head.keypoints:
         return f"has keypoint {int(record.index.max())} of a keyframe with {head.keypoints}"
     return None
 
 
-def _wrong_own(record: Record, agent: AgentId, heads: Mapping[KeyframeId, Head], submaps: set[SubmapId]) -> str | None:
-    if isinstance(record, Placement):
+def _wrong_own(
+    record: Record, agent: AgentId, heads: Mapping[KeyframeId, KeyframeHeader], submaps: set[SubmapId]
+) -> str | None:
+    if isinstance(record, SubmapPlacement):
         if record.submap not in submaps or agent_of_submap(record.submap) != agent:
             return "places a submap without keyframes"
     elif isinstance(record, _OF_BASE):
         head = heads.get(record.keyframe)
         if head is None:
             return "tells of a keyframe that is not there"
-        if not isinstance(record, Pose) and len(record.index) and int(record.index.max()) >= head.keypoints:
+        if not isinstance(record, KeyframePose) and len(record.index) and int(record.index.max()) >= head.keypoints:
             return f"tells of keypoint {int(record.index.max())} of a keyframe with {head.keypoints}"
-        if isinstance(record, Found) and len(record.point):
+        if isinstance(record, FusedLandmarks) and len(record.point):
             named = {KeyframeId(k) for k in np.unique(record.point >> KEYPOINT_BITS).tolist()}
             if named - heads.keys():
                 return "names points of a keyframe that is not there"
@@ -195,9 +197,9 @@ def contradictions(mapper: Mapper) -> list[str]:
     aside = (root[on] != on) & (kinds[on] != EMPTY)  # a point whose section is still to come counts as a root
     if np.any(aside):
         out.append(f"{np.count_nonzero(aside)} keypoints show points that are no roots")
-    if np.any(kinds[on] == SIGHTING):
-        out.append(f"{np.count_nonzero(kinds[on] == SIGHTING)} keypoints show what no keyframe bore")
-    born = np.flatnonzero((kinds == BIRTH) & (root < 0))
+    if np.any(kinds[on] == OBSERVATION):
+        out.append(f"{np.count_nonzero(kinds[on] == OBSERVATION)} keypoints show what no keyframe bore")
+    born = np.flatnonzero((kinds == LANDMARK) & (root < 0))
     if len(born):
         out.append(f"{len(born)} births show no point")
     roots = np.unique(on).astype(np.int32)

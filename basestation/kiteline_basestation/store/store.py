@@ -27,9 +27,9 @@ FILE = "map.sqlite"
 _APPLICATION = 0x6B6C6D70  # "klmp"
 _VERSION = 2  # of the tables; a store of another version is refused
 _OF_KEYFRAMES = (
-    Kind.HEAD, Kind.BIRTHS, Kind.SIGHTINGS, Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED,
+    Kind.KEYFRAME_HEADER, Kind.NEW_LANDMARKS, Kind.OBSERVATIONS, Kind.KEYFRAME_POSE, Kind.REFINED_LANDMARKS, Kind.FUSED_LANDMARKS, Kind.REMOVED_OBSERVATIONS, Kind.CULLED_LANDMARKS,
 )  # fmt: skip
-_OF_SUBMAPS = (Kind.LEVEL, Kind.PLACEMENT)
+_OF_SUBMAPS = (Kind.GRAVITY_ALIGNMENT, Kind.SUBMAP_PLACEMENT)
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
 _TABLES = """
 CREATE TABLE code (

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig, SupplyConfig
-from kiteline_basestation.map.map_tables import BIRTH, CULLED
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_detector import Shares
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Copied, Copy, Key, Kind, Live
+from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind, LivePose
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
@@ -32,7 +32,7 @@ class _Lent:
     many of the reader's units of length were one of its own.
     """
 
-    copy: Copy
+    copy: CachedKeyframe
     keys: list[Key]
     length: float
 
@@ -62,7 +62,7 @@ class Supply:
         """The keyframes of which an agent holds copies, in order of lending."""
         return list(self._readers[agent].lent) if agent in self._readers else []
 
-    def serve(self, agent: AgentId, live: Live | None, channel: RecordChannel, now_ns: int) -> None:
+    def serve(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Now and then, see what an agent at `live` is about to need, and share it over its channel."""
         reader = self._readers.setdefault(agent, _Reader())
         if not self._config.copies or live is None or now_ns < reader.due_ns:
@@ -81,7 +81,7 @@ class Supply:
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
-    def _move(self, reader: _Reader, live: Live, submap: SubmapId, here: F64) -> None:
+    def _move(self, reader: _Reader, live: LivePose, submap: SubmapId, here: F64) -> None:
         """How the agent moves, from two of its poses in one submap that are neither too close nor too old."""
         dt_s = (live.t_ns - reader.seen_ns) * 1e-9
         reader.velocity = np.zeros(3)
@@ -146,7 +146,7 @@ class Supply:
     def _points(self, keyframe: KeyframeId) -> I32:
         """The points that hang on a keyframe and can be found again: live ones with a depth and a descriptor."""
         slots, table = self._map.slots_of(keyframe), self._map.keypoints
-        live = (table.kind[slots] == BIRTH) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
+        live = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
         live &= (self._map.inverse_depths(slots) > 0.0) & table.descriptor[slots].any(axis=1)
         return np.asarray(slots[live])
 
@@ -203,22 +203,24 @@ class Supply:
         for keyframe in [k for k in wanted if k not in reader.lent][: max(0, min(ahead, room))]:
             copy = self._copy(keyframe, submap)
             points, strength = self._copied(agent, keyframe, self._length(keyframe, submap))
-            records: list[Copy | Copied] = [copy, *channel.profile.copies(points, strength)]
+            records: list[CachedKeyframe | CachedLandmarks] = [copy, *channel.profile.copies(points, strength)]
             for record in records:
                 channel.put(record)
             keys = [messages.key(record) for record in records]
             reader.lent[keyframe] = _Lent(copy, keys, self._length(keyframe, submap))
 
-    def _copy(self, keyframe: KeyframeId, submap: SubmapId) -> Copy:
+    def _copy(self, keyframe: KeyframeId, submap: SubmapId) -> CachedKeyframe:
         T_w_k = self._map.world_pose(keyframe)
         assert T_w_k is not None
-        return Copy(keyframe, submap, se3.orthonormalise(sim3.place(sim3.inverse(self._map.frame(submap)), T_w_k)))
+        return CachedKeyframe(
+            keyframe, submap, se3.orthonormalise(sim3.place(sim3.inverse(self._map.frame(submap)), T_w_k))
+        )
 
     def _length(self, keyframe: KeyframeId, submap: SubmapId) -> float:
         """How many units of a submap one of a keyframe's is."""
         return self._map.unit(submap_of_keyframe(keyframe)) / self._map.unit(submap)
 
-    def _copied(self, agent: AgentId, keyframe: KeyframeId, length: float) -> tuple[Copied, F64]:
+    def _copied(self, agent: AgentId, keyframe: KeyframeId, length: float) -> tuple[CachedLandmarks, F64]:
         """A keyframe's points as the reader's camera would see them, its lengths so many times as long, and how often
         each was seen.
         """
@@ -231,7 +233,7 @@ class Supply:
         points, uv = points[inside], uv[inside]
         starts, _ = self._map.observations(points)
         points_seen = np.diff(starts).astype(np.float64)
-        return Copied(
+        return CachedLandmarks(
             keyframe,
             0,
             self._map.keypoint_of(points).astype(np.uint16),
@@ -249,4 +251,4 @@ def _arrived(lent: _Lent, channel: RecordChannel) -> bool:
 
 def is_copy(key: Key) -> bool:
     """Whether a key is one of a copy: those are lent anew by each base."""
-    return key.kind in (Kind.COPY, Kind.COPIED)
+    return key.kind in (Kind.CACHED_KEYFRAME, Kind.CACHED_LANDMARKS)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid import UNKNOWN, GridConfig, GridMap, differences, empty
-from kiteline_codec.schema import Tile
+from kiteline_codec.schema import GridTile
 from kiteline_core.ids import AgentId
 
 F64 = NDArray[np.float64]
@@ -157,7 +157,7 @@ def path_message(agent: int, path: F64) -> bytes:
     return _header(PATH, agent, len(path), scale) + coded
 
 
-def tiles_message(cell_m: float, tiles: tuple[Tile, ...]) -> bytes:
+def tiles_message(cell_m: float, tiles: tuple[GridTile, ...]) -> bytes:
     """Tiles of the grid."""
     places = np.array([(t.column, t.row) for t in tiles], "<i4").reshape(-1, 2)
     return _header(TILES, 0, len(tiles), cell_m) + places.tobytes() + b"".join(t.cells.tobytes() for t in tiles)

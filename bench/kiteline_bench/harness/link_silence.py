@@ -17,7 +17,7 @@ _MINUTE_NS = 60_000_000_000
 _TICK_NS = 50_000_000
 _UP_MINUTES = 10
 _GIVE_UP_MINUTES = 5
-_LIVE = Key(Kind.LIVE, 0)
+_LIVE = Key(Kind.LIVE_POSE, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def silence(folder: Path, minutes: int) -> Silence:
 
 def keyframe(agent: Endpoint, number: int, draw: random.Random) -> None:
     """Share a keyframe of 8 kB."""
-    agent.put(Key(Kind.HEAD, number), draw.randbytes(26))
+    agent.put(Key(Kind.KEYFRAME_HEADER, number), draw.randbytes(26))
     for part in range(7):
-        agent.put(Key(Kind.BIRTHS, number, part), draw.randbytes(1000))
-    agent.put(Key(Kind.SIGHTINGS, number), draw.randbytes(900))
+        agent.put(Key(Kind.NEW_LANDMARKS, number, part), draw.randbytes(1000))
+    agent.put(Key(Kind.OBSERVATIONS, number), draw.randbytes(900))

@@ -10,7 +10,7 @@ from pathlib import Path
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_basestation.runtime import flight_log as base_log
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Head, Kind, Live, WireError
+from kiteline_codec.schema import KeyframeHeader, Kind, LivePose, WireError
 from kiteline_codec.sync.packet import parse
 from kiteline_hw.logs.mcap_log_read import LogReader
 from kiteline_hw.ports import SourceError
@@ -66,12 +66,12 @@ def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float],
                 except WireError:
                     continue
                 for item in items:
-                    if item.key.kind not in (Kind.HEAD, Kind.LIVE) or not item.whole:
+                    if item.key.kind not in (Kind.KEYFRAME_HEADER, Kind.LIVE_POSE) or not item.whole:
                         continue
                     record = messages.decode(item.key, item.data)
-                    if isinstance(record, Head):
+                    if isinstance(record, KeyframeHeader):
                         heads.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
-                    elif isinstance(record, Live):
+                    elif isinstance(record, LivePose):
                         poses_ns.append(now_ns)
     gaps = [(b - a) / 1e9 for a, b in pairwise(poses_ns)]
     return list(heads.values()), gaps

@@ -10,7 +10,7 @@ import numpy as np
 from kiteline_codec.coding import messages
 from kiteline_codec.pacing.profiles import WIFI
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Births, Camera, Head, Key, Kind, Record, Sightings
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, Kind, NewLandmarks, Observations, Record
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -26,7 +26,7 @@ def flight(keyframes: int) -> list[list[Record]]:
     rng = np.random.default_rng(1)
     camera = RectifiedCamera(752, 480, 430.0, 430.0, 370.0, 240.0, 0.11, True, np.eye(4))
     submap = submap_id(0, 0, 0)
-    out: list[list[Record]] = [[Camera(AgentId(0), camera)]]
+    out: list[list[Record]] = [[CameraIntrinsics(AgentId(0), camera)]]
     born: list[tuple[np.ndarray, np.ndarray]] = []  # pixels and inverse depths of each keyframe's births
     step = 0.05  # m along x between keyframes
     for k in range(keyframes):
@@ -45,17 +45,17 @@ def flight(keyframes: int) -> list[list[Record]]:
         new_uv = np.rint(rng.uniform(20, (730, 460), (_BIRTHS, 2)))
         new_uv = new_uv[np.argsort(new_uv[:, 1] // 32, kind="stable")]
         new_rho = rng.uniform(0.1, 0.6, _BIRTHS)
-        births = Births(
+        births = NewLandmarks(
             keyframe, 0, np.arange(_BIRTHS, dtype=np.uint16), new_uv.astype(np.float32), new_rho.astype(np.float32),
             rng.integers(0, 3, _BIRTHS).astype(np.uint8), rng.integers(0, 256, _BIRTHS).astype(np.uint8),
             rng.integers(0, 256, (_BIRTHS, 32)).astype(np.uint8),
         )  # fmt: skip
-        seen = Sightings(
+        seen = Observations(
             keyframe, 0, np.arange(_BIRTHS, _BIRTHS + len(point), dtype=np.uint16), (uv + noise).astype(np.float32),
             (rho * rng.normal(1, 0.01, len(rho))).astype(np.float32), np.zeros(len(point), np.uint8), point,
         )  # fmt: skip
         parts = WIFI.choose(births, rng.uniform(size=_BIRTHS), seen)
-        out.append([Head(keyframe, k, parent, T, _BIRTHS + len(point)), *parts[0], *parts[1]])
+        out.append([KeyframeHeader(keyframe, k, parent, T, _BIRTHS + len(point)), *parts[0], *parts[1]])
         born.append((new_uv, new_rho))
     return out
 
@@ -83,9 +83,9 @@ def packet_ms() -> float:
     a, b = Endpoint(SyncConfig(), 1), Endpoint(SyncConfig(), 1)
     begin, now_ns = time.process_time(), 0
     for i in range(400):
-        a.put(Key(Kind.LIVE, 0), draw.randbytes(29))
+        a.put(Key(Kind.LIVE_POSE, 0), draw.randbytes(29))
         for part in range(4):
-            a.put(Key(Kind.BIRTHS, i, part), draw.randbytes(900))
+            a.put(Key(Kind.NEW_LANDMARKS, i, part), draw.randbytes(900))
         for _ in range(3):
             now_ns += 20_000_000
             for end, other in ((a, b), (b, a)):

@@ -14,26 +14,26 @@ from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, Writer, unzigzag, zigzag
 from kiteline_codec.coding.rows import MAX_KEYFRAME_ID, read_columns, read_points, write_columns, write_points
 from kiteline_codec.schema import (
-    Births,
-    Calibration,
-    Camera,
-    Copied,
-    Copy,
-    Culled,
-    Depths,
-    Found,
-    Head,
+    CachedKeyframe,
+    CachedLandmarks,
+    CameraIntrinsics,
+    CulledLandmarks,
+    DisparityCalibration,
+    FusedLandmarks,
+    GravityAlignment,
+    GridTile,
     Key,
+    KeyframeHeader,
+    KeyframePose,
     Kind,
-    Level,
-    Live,
-    Placement,
-    Pose,
+    LivePose,
+    NewLandmarks,
+    Observations,
     Record,
-    Removed,
-    Sightings,
-    Tile,
-    Unit,
+    RefinedLandmarks,
+    RemovedObservations,
+    SubmapPlacement,
+    SubmapScale,
     WireError,
 )
 from kiteline_core.geometry import disparity_offset, sim3
@@ -104,18 +104,18 @@ def _read_scale(source: Reader) -> float:
     return scale
 
 
-def _write_placement(out: Writer, record: Placement) -> None:
+def _write_placement(out: Writer, record: SubmapPlacement) -> None:
     scale = sim3.scale_of(record.S_w_m)
     _write_scale(out, scale)
     _write_pose(out, sim3.rigid(record.S_w_m))
 
 
-def _read_placement(source: Reader, key: Key) -> Placement:
+def _read_placement(source: Reader, key: Key) -> SubmapPlacement:
     scale = _read_scale(source)
-    return Placement(SubmapId(key.id), sim3.of(scale, _read_pose(source)))
+    return SubmapPlacement(SubmapId(key.id), sim3.of(scale, _read_pose(source)))
 
 
-def _write_camera(out: Writer, record: Camera) -> None:
+def _write_camera(out: Writer, record: CameraIntrinsics) -> None:
     c = record.camera
     out.varint(c.width)
     out.varint(c.height)
@@ -126,7 +126,7 @@ def _write_camera(out: Writer, record: Camera) -> None:
         out.f64(float(value))
 
 
-def _read_camera(source: Reader, key: Key) -> Camera:
+def _read_camera(source: Reader, key: Key) -> CameraIntrinsics:
     width, height = source.varint(_MAX_SIZE_PX), source.varint(_MAX_SIZE_PX)
     fx, fy, cx, cy, baseline_m = (source.f64() for _ in range(5))
     stereo = source.u8()
@@ -136,38 +136,40 @@ def _read_camera(source: Reader, key: Key) -> Camera:
         raise WireError("a camera has size, focal lengths and a baseline above zero")
     if np.abs(t_b_c).max() > 1e6 or np.abs(t_b_c[:3, :3] @ t_b_c[:3, :3].T - np.eye(3)).max() > 1e-3:
         raise WireError("the camera's place in the body is no rigid motion")
-    return Camera(AgentId(key.id), RectifiedCamera(width, height, fx, fy, cx, cy, baseline_m, stereo == 1, t_b_c))
+    return CameraIntrinsics(
+        AgentId(key.id), RectifiedCamera(width, height, fx, fy, cx, cy, baseline_m, stereo == 1, t_b_c)
+    )
 
 
-def _write_live(out: Writer, record: Live) -> None:
+def _write_live(out: Writer, record: LivePose) -> None:
     out.varint(record.t_ns)
     out.varint(record.keyframe + 1)
     _write_pose(out, record.T_k_c)
     out.signed(record.quality)
 
 
-def _read_live(source: Reader, key: Key) -> Live:
+def _read_live(source: Reader, key: Key) -> LivePose:
     t_ns = source.varint()
     keyframe = KeyframeId(source.varint(MAX_KEYFRAME_ID + 1) - 1)
     t_k_c = _read_pose(source)
     quality = source.signed(100)
     if quality < -1:
         raise WireError(f"quality is -1, 0 or 1..100, found {quality}")
-    return Live(AgentId(key.id), t_ns, keyframe, t_k_c, quality)
+    return LivePose(AgentId(key.id), t_ns, keyframe, t_k_c, quality)
 
 
-def _write_calibration(out: Writer, record: Calibration) -> None:
+def _write_calibration(out: Writer, record: DisparityCalibration) -> None:
     limit = quantise.CALIBRATION_CODES // 2
     for value in record.disparity_px.tolist():
         out.signed(min(max(round(value * quantise.CALIBRATION_STEPS), -limit), limit))
 
 
-def _read_calibration(source: Reader, key: Key) -> Calibration:
+def _read_calibration(source: Reader, key: Key) -> DisparityCalibration:
     codes = [source.signed(quantise.CALIBRATION_CODES // 2) for _ in range(disparity_offset.TERMS)]
-    return Calibration(AgentId(key.id), np.array(codes, np.float64) / quantise.CALIBRATION_STEPS)
+    return DisparityCalibration(AgentId(key.id), np.array(codes, np.float64) / quantise.CALIBRATION_STEPS)
 
 
-def _write_head(out: Writer, record: Head) -> None:
+def _write_head(out: Writer, record: KeyframeHeader) -> None:
     out.varint(record.t_ns)
     # Most parents are the keyframe before: their difference is 1.
     out.varint(0 if record.parent == NO_KEYFRAME else 1 + zigzag(record.keyframe - record.parent))
@@ -175,7 +177,7 @@ def _write_head(out: Writer, record: Head) -> None:
     out.varint(record.keypoints)
 
 
-def _read_head(source: Reader, key: Key) -> Head:
+def _read_head(source: Reader, key: Key) -> KeyframeHeader:
     t_ns = source.varint()
     step = source.varint()
     parent = NO_KEYFRAME
@@ -184,10 +186,10 @@ def _read_head(source: Reader, key: Key) -> Head:
         if not 0 <= parent <= MAX_KEYFRAME_ID:
             raise WireError(f"parent {parent} is no keyframe id")
     t_p_k = _read_pose(source)
-    return Head(KeyframeId(key.id), t_ns, parent, t_p_k, source.varint(MAX_KEYPOINTS))
+    return KeyframeHeader(KeyframeId(key.id), t_ns, parent, t_p_k, source.varint(MAX_KEYPOINTS))
 
 
-def _write_described(out: Writer, kind: Kind, record: Births | Copied) -> None:
+def _write_described(out: Writer, kind: Kind, record: NewLandmarks | CachedLandmarks) -> None:
     descriptor = np.ascontiguousarray(record.descriptor, np.uint8)
     if descriptor.shape != (len(record.index), DESCRIPTOR_BYTES):
         raise ValueError(f"descriptors are {descriptor.shape}, expected {(len(record.index), DESCRIPTOR_BYTES)}")
@@ -208,57 +210,57 @@ def _read_described(source: Reader, kind: Kind, key: Key) -> dict[str, Any]:
     return {"keyframe": KeyframeId(key.id), "part": key.part, "descriptor": raw, **columns}
 
 
-def _write_sightings(out: Writer, record: Sightings) -> None:
-    write_columns(out, Kind.SIGHTINGS, record)
+def _write_sightings(out: Writer, record: Observations) -> None:
+    write_columns(out, Kind.OBSERVATIONS, record)
     write_points(out, record.point)
 
 
-def _read_sightings(source: Reader, key: Key) -> Sightings:
-    n, columns = read_columns(source, Kind.SIGHTINGS)
-    return Sightings(keyframe=KeyframeId(key.id), part=key.part, point=read_points(source, n), **columns)
+def _read_sightings(source: Reader, key: Key) -> Observations:
+    n, columns = read_columns(source, Kind.OBSERVATIONS)
+    return Observations(keyframe=KeyframeId(key.id), part=key.part, point=read_points(source, n), **columns)
 
 
-def _write_found(out: Writer, record: Found) -> None:
-    write_columns(out, Kind.FOUND, record)
+def _write_found(out: Writer, record: FusedLandmarks) -> None:
+    write_columns(out, Kind.FUSED_LANDMARKS, record)
     write_points(out, record.point)
 
 
-def _read_found(source: Reader, key: Key) -> Found:
-    n, columns = read_columns(source, Kind.FOUND)
-    return Found(keyframe=KeyframeId(key.id), point=read_points(source, n), **columns)
+def _read_found(source: Reader, key: Key) -> FusedLandmarks:
+    n, columns = read_columns(source, Kind.FUSED_LANDMARKS)
+    return FusedLandmarks(keyframe=KeyframeId(key.id), point=read_points(source, n), **columns)
 
 
-def _write_culled(out: Writer, record: Culled) -> None:
-    write_columns(out, Kind.CULLED, record)
+def _write_culled(out: Writer, record: CulledLandmarks) -> None:
+    write_columns(out, Kind.CULLED_LANDMARKS, record)
     out.u8(record.keyframe_too)
 
 
-def _read_culled(source: Reader, key: Key) -> Culled:
-    _, columns = read_columns(source, Kind.CULLED)
+def _read_culled(source: Reader, key: Key) -> CulledLandmarks:
+    _, columns = read_columns(source, Kind.CULLED_LANDMARKS)
     too = source.u8()
     if too > 1:
         raise WireError(f"keyframe_too is 0 or 1, found {too}")
-    return Culled(keyframe=KeyframeId(key.id), keyframe_too=too, **columns)
+    return CulledLandmarks(keyframe=KeyframeId(key.id), keyframe_too=too, **columns)
 
 
-def _write_copy(out: Writer, record: Copy) -> None:
+def _write_copy(out: Writer, record: CachedKeyframe) -> None:
     out.varint(record.submap)
     _write_pose(out, record.T_m_k)
 
 
-def _read_copy(source: Reader, key: Key) -> Copy:
+def _read_copy(source: Reader, key: Key) -> CachedKeyframe:
     submap = SubmapId(source.varint(_MAX_SUBMAP_ID))
-    return Copy(KeyframeId(key.id), submap, _read_pose(source))
+    return CachedKeyframe(KeyframeId(key.id), submap, _read_pose(source))
 
 
-def _tile_id(record: Tile) -> int:
+def _tile_id(record: GridTile) -> int:
     column, row = record.column + _TILE_OFFSET, record.row + _TILE_OFFSET
     if not (0 <= column < 1 << _TILE_BITS and 0 <= row < 1 << _TILE_BITS):
         raise ValueError(f"tile ({record.column}, {record.row}) lies beyond +-{_TILE_OFFSET}")
     return column << _TILE_BITS | row
 
 
-def _write_tile(out: Writer, record: Tile) -> None:
+def _write_tile(out: Writer, record: GridTile) -> None:
     if record.cells.shape != (TILE_CELLS, TILE_CELLS):
         raise ValueError(f"a tile is {TILE_CELLS}x{TILE_CELLS} cells, found {record.cells.shape}")
     out.f32(record.cell_m)
@@ -267,7 +269,7 @@ def _write_tile(out: Writer, record: Tile) -> None:
     out.raw(deflate.compress((levels[0::2] | levels[1::2] << 4).tobytes()) + deflate.flush())
 
 
-def _read_tile(source: Reader, key: Key) -> Tile:
+def _read_tile(source: Reader, key: Key) -> GridTile:
     cell_m = source.f32()
     if cell_m <= 0:
         raise WireError(f"a cell has a size, found {cell_m} m")
@@ -282,7 +284,7 @@ def _read_tile(source: Reader, key: Key) -> Tile:
     pairs = np.frombuffer(data, np.uint8)
     levels = np.stack([pairs & 15, pairs >> 4], axis=1).reshape(TILE_CELLS, TILE_CELLS)
     column, row = key.id >> _TILE_BITS, key.id & (1 << _TILE_BITS) - 1
-    return Tile(column - _TILE_OFFSET, row - _TILE_OFFSET, cell_m, quantise.occupancy(levels))
+    return GridTile(column - _TILE_OFFSET, row - _TILE_OFFSET, cell_m, quantise.occupancy(levels))
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,53 +311,53 @@ def _of_agent(record: Any) -> tuple[int, ...]:
 
 
 _TABLE = (
-    _Coder(Kind.CAMERA, Camera, 63, 1, _of_agent, _write_camera, _read_camera),
-    _Coder(Kind.LIVE, Live, 63, 1, _of_agent, _write_live, _read_live),
-    _Coder(Kind.HEAD, Head, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_head, _read_head),
+    _Coder(Kind.CAMERA_INTRINSICS, CameraIntrinsics, 63, 1, _of_agent, _write_camera, _read_camera),
+    _Coder(Kind.LIVE_POSE, LivePose, 63, 1, _of_agent, _write_live, _read_live),
+    _Coder(Kind.KEYFRAME_HEADER, KeyframeHeader, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_head, _read_head),
     _Coder(
-        Kind.BIRTHS, Births, MAX_KEYFRAME_ID, MAX_PARTS, _of_part,
-        lambda out, r: _write_described(out, Kind.BIRTHS, r),
-        lambda source, key: Births(**_read_described(source, Kind.BIRTHS, key)),
+        Kind.NEW_LANDMARKS, NewLandmarks, MAX_KEYFRAME_ID, MAX_PARTS, _of_part,
+        lambda out, r: _write_described(out, Kind.NEW_LANDMARKS, r),
+        lambda source, key: NewLandmarks(**_read_described(source, Kind.NEW_LANDMARKS, key)),
     ),
-    _Coder(Kind.SIGHTINGS, Sightings, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_sightings, _read_sightings),
+    _Coder(Kind.OBSERVATIONS, Observations, MAX_KEYFRAME_ID, MAX_PARTS, _of_part, _write_sightings, _read_sightings),
     _Coder(
-        Kind.LEVEL, Level, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
+        Kind.GRAVITY_ALIGNMENT, GravityAlignment, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
         lambda out, r: _write_pose(out, r.T_l_m),
-        lambda source, key: Level(SubmapId(key.id), _read_pose(source)),
+        lambda source, key: GravityAlignment(SubmapId(key.id), _read_pose(source)),
     ),
     _Coder(
-        Kind.UNIT, Unit, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
+        Kind.SUBMAP_SCALE, SubmapScale, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
         lambda out, r: _write_scale(out, r.metres),
-        lambda source, key: Unit(SubmapId(key.id), _read_scale(source)),
+        lambda source, key: SubmapScale(SubmapId(key.id), _read_scale(source)),
     ),
     _Coder(
-        Kind.POSE, Pose, MAX_KEYFRAME_ID, 1, _of_keyframe,
+        Kind.KEYFRAME_POSE, KeyframePose, MAX_KEYFRAME_ID, 1, _of_keyframe,
         lambda out, r: _write_pose(out, r.T_m_k),
-        lambda source, key: Pose(KeyframeId(key.id), _read_pose(source)),
+        lambda source, key: KeyframePose(KeyframeId(key.id), _read_pose(source)),
     ),
     _Coder(
-        Kind.DEPTHS, Depths, MAX_KEYFRAME_ID, 1, _of_keyframe,
-        lambda out, r: write_columns(out, Kind.DEPTHS, r),
-        lambda source, key: Depths(keyframe=KeyframeId(key.id), **read_columns(source, Kind.DEPTHS)[1]),
+        Kind.REFINED_LANDMARKS, RefinedLandmarks, MAX_KEYFRAME_ID, 1, _of_keyframe,
+        lambda out, r: write_columns(out, Kind.REFINED_LANDMARKS, r),
+        lambda source, key: RefinedLandmarks(keyframe=KeyframeId(key.id), **read_columns(source, Kind.REFINED_LANDMARKS)[1]),
     ),
-    _Coder(Kind.FOUND, Found, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_found, _read_found),
+    _Coder(Kind.FUSED_LANDMARKS, FusedLandmarks, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_found, _read_found),
     _Coder(
-        Kind.REMOVED, Removed, MAX_KEYFRAME_ID, 1, _of_keyframe,
-        lambda out, r: write_columns(out, Kind.REMOVED, r),
-        lambda source, key: Removed(keyframe=KeyframeId(key.id), **read_columns(source, Kind.REMOVED)[1]),
+        Kind.REMOVED_OBSERVATIONS, RemovedObservations, MAX_KEYFRAME_ID, 1, _of_keyframe,
+        lambda out, r: write_columns(out, Kind.REMOVED_OBSERVATIONS, r),
+        lambda source, key: RemovedObservations(keyframe=KeyframeId(key.id), **read_columns(source, Kind.REMOVED_OBSERVATIONS)[1]),
     ),
-    _Coder(Kind.CULLED, Culled, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_culled, _read_culled),
+    _Coder(Kind.CULLED_LANDMARKS, CulledLandmarks, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_culled, _read_culled),
     _Coder(
-        Kind.PLACEMENT, Placement, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
+        Kind.SUBMAP_PLACEMENT, SubmapPlacement, _MAX_SUBMAP_ID, 1, lambda r: (int(r.submap),),
         _write_placement, _read_placement,
     ),
-    _Coder(Kind.CALIBRATION, Calibration, 63, 1, _of_agent, _write_calibration, _read_calibration),
-    _Coder(Kind.TILE, Tile, (1 << 2 * _TILE_BITS) - 1, 1, lambda r: (_tile_id(r),), _write_tile, _read_tile),
-    _Coder(Kind.COPY, Copy, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_copy, _read_copy),
+    _Coder(Kind.DISPARITY_CALIBRATION, DisparityCalibration, 63, 1, _of_agent, _write_calibration, _read_calibration),
+    _Coder(Kind.GRID_TILE, GridTile, (1 << 2 * _TILE_BITS) - 1, 1, lambda r: (_tile_id(r),), _write_tile, _read_tile),
+    _Coder(Kind.CACHED_KEYFRAME, CachedKeyframe, MAX_KEYFRAME_ID, 1, _of_keyframe, _write_copy, _read_copy),
     _Coder(
-        Kind.COPIED, Copied, MAX_KEYFRAME_ID, MAX_PARTS, _of_part,
-        lambda out, r: _write_described(out, Kind.COPIED, r),
-        lambda source, key: Copied(**_read_described(source, Kind.COPIED, key)),
+        Kind.CACHED_LANDMARKS, CachedLandmarks, MAX_KEYFRAME_ID, MAX_PARTS, _of_part,
+        lambda out, r: _write_described(out, Kind.CACHED_LANDMARKS, r),
+        lambda source, key: CachedLandmarks(**_read_described(source, Kind.CACHED_LANDMARKS, key)),
     ),
 )  # fmt: skip
 _CODERS: dict[int, _Coder] = {int(c.kind): c for c in _TABLE}

@@ -49,13 +49,13 @@ _FIELDS = {
 }  # fmt: skip
 
 _COLUMNS: dict[Kind, tuple[str, ...]] = {
-    Kind.BIRTHS: ("index", "uv", "inv_depth", "octave", "angle"),
-    Kind.SIGHTINGS: ("index", "uv", "inv_depth", "octave"),
-    Kind.DEPTHS: ("index", "inv_depth", "offset"),
-    Kind.FOUND: ("index",),
-    Kind.REMOVED: ("index",),
-    Kind.CULLED: ("index",),
-    Kind.COPIED: ("index", "uv", "inv_depth", "octave", "angle"),
+    Kind.NEW_LANDMARKS: ("index", "uv", "inv_depth", "octave", "angle"),
+    Kind.OBSERVATIONS: ("index", "uv", "inv_depth", "octave"),
+    Kind.REFINED_LANDMARKS: ("index", "inv_depth", "offset"),
+    Kind.FUSED_LANDMARKS: ("index",),
+    Kind.REMOVED_OBSERVATIONS: ("index",),
+    Kind.CULLED_LANDMARKS: ("index",),
+    Kind.CACHED_LANDMARKS: ("index", "uv", "inv_depth", "octave", "angle"),
 }
 
 
@@ -94,7 +94,7 @@ def write_columns(out: Writer, kind: Kind, record: Any) -> None:
         row += field.columns
     if wrong := _out_of_range(kind, values):
         raise ValueError(wrong)
-    if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
+    if kind is not Kind.OBSERVATIONS and n > 1 and np.diff(values[0]).min() <= 0:
         raise ValueError("indices must increase")
     out.columns(values)
 
@@ -119,7 +119,7 @@ def read_columns(source: Reader, kind: Kind) -> tuple[int, dict[str, Any]]:
         codes = values[row : row + field.columns]
         out[name] = field.values(codes)
         row += field.columns
-    if kind is not Kind.SIGHTINGS and n > 1 and np.diff(values[0]).min() <= 0:
+    if kind is not Kind.OBSERVATIONS and n > 1 and np.diff(values[0]).min() <= 0:
         raise WireError("indices must increase")
     return n, out
 

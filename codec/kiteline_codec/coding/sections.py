@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.coding import messages
-from kiteline_codec.schema import Births, Copied, Sightings
+from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations
 
 F64 = NDArray[np.float64]
 
 SECTION_BYTES = 1000  # leaves room for headers and a live pose in a packet of 1200 bytes
 
-_Section = TypeVar("_Section", Births, Sightings, Copied)
+_Section = TypeVar("_Section", NewLandmarks, Observations, CachedLandmarks)
 
 
-def split_births(births: Births, value: F64, section_bytes: int = SECTION_BYTES) -> list[Births]:
+def split_births(births: NewLandmarks, value: F64, section_bytes: int = SECTION_BYTES) -> list[NewLandmarks]:
     """Births (n rows) as parts 0, 1, … by falling value (n,); within a part the index increases.
 
     Codes are shortest where rows with neighbouring indices lie near each other in the image. Raises ValueError when a
@@ -27,7 +27,7 @@ def split_births(births: Births, value: F64, section_bytes: int = SECTION_BYTES)
     return _split(births, value, section_bytes)
 
 
-def split_sightings(sightings: Sightings, value: F64, section_bytes: int = SECTION_BYTES) -> list[Sightings]:
+def split_sightings(sightings: Observations, value: F64, section_bytes: int = SECTION_BYTES) -> list[Observations]:
     """Sightings (n rows) as parts 0, 1, … by falling value (n,); within a part the index increases.
 
     Codes are shortest where the order of indices is that of point ids. Raises ValueError as `split_births` does.
@@ -35,7 +35,7 @@ def split_sightings(sightings: Sightings, value: F64, section_bytes: int = SECTI
     return _split(sightings, value, section_bytes)
 
 
-def split_copied(copied: Copied, value: F64, section_bytes: int = SECTION_BYTES) -> list[Copied]:
+def split_copied(copied: CachedLandmarks, value: F64, section_bytes: int = SECTION_BYTES) -> list[CachedLandmarks]:
     """Points of a copied keyframe (n rows) as parts 0, 1, … by falling value (n,), as `split_births` does."""
     return _split(copied, value, section_bytes)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.sections import split_births, split_copied, split_sightings, take
-from kiteline_codec.schema import Births, Copied, Sightings
+from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations
 from kiteline_core.imaging.descriptors import narrowed
 
 F32 = NDArray[np.float32]
@@ -45,7 +45,9 @@ class Profile:
     copied: int = 96  # points of a copied keyframe: with its neighbours' they cover what it saw
     copies_ahead: int = 6  # copied keyframes on their way at once: the rest may prove to be of no use meanwhile
 
-    def choose(self, births: Births, strength: F64, sightings: Sightings) -> tuple[list[Births], list[Sightings]]:
+    def choose(
+        self, births: NewLandmarks, strength: F64, sightings: Observations
+    ) -> tuple[list[NewLandmarks], list[Observations]]:
         """The sections to share, best first. births: their first `births` rows are the best ones. strength: (n,)."""
         n = min(len(births.index), self.births)
         shared = take(births, np.arange(n))
@@ -76,7 +78,7 @@ class Profile:
             parts.append(replace(part, part=len(parts)))
         return parts, split_sightings(seen, np.zeros(len(seen.index)), self.sightings_bytes)
 
-    def copies(self, points: Copied, strength: F64) -> list[Copied]:
+    def copies(self, points: CachedLandmarks, strength: F64) -> list[CachedLandmarks]:
         """The sections of a copied keyframe, best first. strength: (n,)."""
         best = np.sort(np.argsort(-strength, kind="stable")[: self.copied])
         chosen = take(points, best)

@@ -13,7 +13,7 @@ from kiteline_codec.coding import messages
 from kiteline_codec.coding.packing import Reader
 from kiteline_codec.coding.rows import read_codes
 from kiteline_codec.residuals import prediction_kernels as kernels
-from kiteline_codec.schema import Camera, Head, Key, Kind, WireError
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, Kind, WireError
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId, agent_of_keyframe
 
 I32 = NDArray[np.int32]
@@ -26,7 +26,7 @@ MAX_GENERATIONS = 64  # steps along parents to a keyframe of birth: farther, the
 MASK_PARTS = 16  # parts of births that can be named
 _REMEMBERED = 256  # keyframes whose values are kept decoded
 _NO_PART = -1
-_BIRTHS, _HEAD = int(Kind.BIRTHS), int(Kind.HEAD)
+_BIRTHS, _HEAD = int(Kind.NEW_LANDMARKS), int(Kind.KEYFRAME_HEADER)
 
 
 @dataclass(slots=True)
@@ -35,7 +35,7 @@ class _Keyframe:
     there is none; as wide as the last birth asks.
     """
 
-    head: Head | None = None
+    head: KeyframeHeader | None = None
     head_version: int = 0
     part_versions: dict[int, int] = field(default_factory=dict)
     births: I32 = field(default_factory=lambda: np.empty((5, 0), np.int32))
@@ -47,7 +47,7 @@ class References:
     def __init__(self) -> None:
         self._keyframes: OrderedDict[int, _Keyframe] = OrderedDict()
         self._cameras: dict[int, tuple[int, F64]] = {}
-        self.told: Head | None = None  # a header that is used as it is, whatever is held
+        self.told: KeyframeHeader | None = None  # a header that is used as it is, whatever is held
 
     def _keyframe(self, keyframe: int) -> _Keyframe:
         entry = self._keyframes.get(keyframe)
@@ -62,17 +62,17 @@ class References:
     def camera(self, keyframe: int, held: Held) -> tuple[int, F64] | None:
         """Version, and fx, fy, cx, cy of the camera that saw a keyframe."""
         agent = int(agent_of_keyframe(KeyframeId(keyframe)))
-        now = held(Key(Kind.CAMERA, agent))
+        now = held(Key(Kind.CAMERA_INTRINSICS, agent))
         if now is None:
             return None
         if agent not in self._cameras or self._cameras[agent][0] != now[0]:
-            record = messages.decode(Key(Kind.CAMERA, agent), now[1])
-            assert isinstance(record, Camera)
+            record = messages.decode(Key(Kind.CAMERA_INTRINSICS, agent), now[1])
+            assert isinstance(record, CameraIntrinsics)
             c = record.camera
             self._cameras[agent] = now[0], np.array([c.fx, c.fy, c.cx, c.cy])
         return self._cameras[agent]
 
-    def head(self, keyframe: int, held: Held) -> tuple[int, Head] | None:
+    def head(self, keyframe: int, held: Held) -> tuple[int, KeyframeHeader] | None:
         """Version, and header."""
         if self.told is not None and self.told.keyframe == keyframe:
             return 0, self.told
@@ -81,8 +81,8 @@ class References:
             return None
         entry = self._keyframe(keyframe)
         if entry.head is None or entry.head_version != now[0]:
-            record = messages.decode(Key(Kind.HEAD, keyframe), now[1])
-            assert isinstance(record, Head)
+            record = messages.decode(Key(Kind.KEYFRAME_HEADER, keyframe), now[1])
+            assert isinstance(record, KeyframeHeader)
             entry.head, entry.head_version = record, now[0]
         return entry.head_version, entry.head
 
@@ -103,7 +103,7 @@ class References:
             versions[part] = now[0]
             if entry.part_versions.get(part) != now[0]:
                 entry.births[4, entry.births[4] == part] = _NO_PART
-                values = read_codes(Reader(now[1]), Kind.BIRTHS)
+                values = read_codes(Reader(now[1]), Kind.NEW_LANDMARKS)
                 if values.shape[1]:
                     if values[0].min() < 0 or values[0].max() >= MAX_KEYPOINTS:
                         raise WireError("a keypoint is out of range")
@@ -123,7 +123,7 @@ class References:
         versions: dict[int, int] = {}
         highest = 0
         for a in sorted(wanted):
-            below: list[tuple[int, Head, int]] = []  # from a up to below the common keyframe
+            below: list[tuple[int, KeyframeHeader, int]] = []  # from a up to below the common keyframe
             at = a
             while at not in generation and len(below) < MAX_GENERATIONS:
                 head = self.head(at, held)

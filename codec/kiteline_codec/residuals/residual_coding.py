@@ -21,15 +21,17 @@ from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.coding.rows import MAX_KEYFRAME_ID, read_codes
 from kiteline_codec.residuals import prediction_kernels as kernels
 from kiteline_codec.residuals.predictors import Held, References, parts_at
-from kiteline_codec.schema import Head, Key, Kind, WireError
+from kiteline_codec.schema import Key, KeyframeHeader, Kind, WireError
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
-TIGHT_KINDS = frozenset({int(Kind.BIRTHS), int(Kind.SIGHTINGS), int(Kind.DEPTHS)})
-BASIS_KINDS = frozenset({int(Kind.CAMERA), int(Kind.HEAD), int(Kind.BIRTHS)})  # what forms build upon
+TIGHT_KINDS = frozenset({int(Kind.NEW_LANDMARKS), int(Kind.OBSERVATIONS), int(Kind.REFINED_LANDMARKS)})
+BASIS_KINDS = frozenset(
+    {int(Kind.CAMERA_INTRINSICS), int(Kind.KEYFRAME_HEADER), int(Kind.NEW_LANDMARKS)}
+)  # what forms build upon
 _CRC_BYTES = 4
 _MAX_SHIFT = 8
 _DESCRIPTOR_SIZES = (0, 16, 32)
@@ -51,11 +53,11 @@ class Tightener:
         """
         if key.kind not in TIGHT_KINDS:
             return None
-        if key.kind == Kind.BIRTHS:
+        if key.kind == Kind.NEW_LANDMARKS:
             return self._shrink_births(key, code)
         out = Writer()
         try:
-            if key.kind == Kind.SIGHTINGS:
+            if key.kind == Kind.OBSERVATIONS:
                 versions = self._shrink_sightings(out, key, code, held, own)
             else:
                 versions = self._shrink_depths(out, key, code, held)
@@ -67,11 +69,11 @@ class Tightener:
     def grow(self, key: Key, data: bytes, held: Held) -> bytes:
         """The code of a tight form. Raises WireError, also when the values that it builds upon are not held."""
         source, out = Reader(data), Writer()
-        if key.kind == Kind.BIRTHS:
+        if key.kind == Kind.NEW_LANDMARKS:
             versions = _grow_births(out, source)
-        elif key.kind == Kind.SIGHTINGS:
+        elif key.kind == Kind.OBSERVATIONS:
             versions = self._grow_sightings(out, key, source, held)
-        elif key.kind == Kind.DEPTHS:
+        elif key.kind == Kind.REFINED_LANDMARKS:
             versions = self._grow_depths(out, key, source, held)
         else:
             raise WireError(f"kind {key.kind} has no tight form")
@@ -102,7 +104,7 @@ class Tightener:
 
     def _shrink_sightings(self, out: Writer, key: Key, code: bytes, held: Held, own: Held) -> list[int]:
         source = Reader(code)
-        values = read_codes(source, Kind.SIGHTINGS)
+        values = read_codes(source, Kind.OBSERVATIONS)
         n = values.shape[1]
         table, place, keypoint = _read_plain_points(source, n)
         source.end()
@@ -157,14 +159,14 @@ class Tightener:
         _write_plain_points(out, table, place, keypoint)
         return versions
 
-    def _untold_head(self, key: Key, held: Held, own: Held) -> Head | None:
+    def _untold_head(self, key: Key, held: Held, own: Held) -> KeyframeHeader | None:
         """The keyframe's own header, when the peer is not known to hold it."""
-        head_key = Key(Kind.HEAD, key.id)
+        head_key = Key(Kind.KEYFRAME_HEADER, key.id)
         mine = own(head_key)
         if held(head_key) is not None or mine is None:
             return None
         head = messages.decode(head_key, mine[1])
-        assert isinstance(head, Head)
+        assert isinstance(head, KeyframeHeader)
         return None if head.parent == NO_KEYFRAME or head.parent >= key.id else head
 
     def _foreseen(
@@ -208,7 +210,7 @@ class Tightener:
 
     def _shrink_depths(self, out: Writer, key: Key, code: bytes, held: Held) -> list[int]:
         source = Reader(code)
-        values = read_codes(source, Kind.DEPTHS)
+        values = read_codes(source, Kind.REFINED_LANDMARKS)
         source.end()
         versions, births = self._references.births(key.id, held)
         out.varint(values.shape[1])
@@ -234,7 +236,7 @@ class Tightener:
         return [versions[part] for part in named]
 
 
-def _read_head(source: Reader, key: Key) -> Head | None:
+def _read_head(source: Reader, key: Key) -> KeyframeHeader | None:
     step = source.varint(MAX_KEYFRAME_ID)
     if not step:
         return None
@@ -243,7 +245,7 @@ def _read_head(source: Reader, key: Key) -> Head | None:
         T_p_k = quantise.pose(tuple(codes))
     except ValueError as e:
         raise WireError(str(e)) from None
-    return Head(KeyframeId(key.id), 0, KeyframeId(key.id - step), T_p_k, 0)
+    return KeyframeHeader(KeyframeId(key.id), 0, KeyframeId(key.id - step), T_p_k, 0)
 
 
 def _checksum(code: bytes, versions: Sequence[int]) -> bytes:
@@ -252,7 +254,7 @@ def _checksum(code: bytes, versions: Sequence[int]) -> bytes:
 
 def _shrink_births(out: Writer, code: bytes) -> list[int]:
     source = Reader(code)
-    values = read_codes(source, Kind.BIRTHS)
+    values = read_codes(source, Kind.NEW_LANDMARKS)
     n = values.shape[1]
     size = source.left // n if n else 0
     if size not in _DESCRIPTOR_SIZES:

@@ -11,23 +11,23 @@ from kiteline_codec.sync.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
 from kiteline_codec.sync.remembered import KIND as REMEMBERED
 
 _RANKS = {
-    Kind.LIVE: 0,
-    Kind.CAMERA: 0,  # nothing can be made of keypoints without it
-    Kind.PLACEMENT: 0,  # few bytes, and all that a pose in the world is wrong by
-    Kind.LEVEL: 0,
-    Kind.UNIT: 0,
-    Kind.POSE: 1,
-    Kind.DEPTHS: 1,
-    Kind.FOUND: 1,
-    Kind.REMOVED: 1,
-    Kind.CULLED: 1,
-    Kind.CALIBRATION: 1,
-    Kind.HEAD: 2,
-    Kind.BIRTHS: 3,
-    Kind.SIGHTINGS: 4,  # after the births, so that the next keyframe's sightings may build upon them
-    Kind.COPY: 5,
-    Kind.COPIED: 5,
-    Kind.TILE: 6,
+    Kind.LIVE_POSE: 0,
+    Kind.CAMERA_INTRINSICS: 0,  # nothing can be made of keypoints without it
+    Kind.SUBMAP_PLACEMENT: 0,  # few bytes, and all that a pose in the world is wrong by
+    Kind.GRAVITY_ALIGNMENT: 0,
+    Kind.SUBMAP_SCALE: 0,
+    Kind.KEYFRAME_POSE: 1,
+    Kind.REFINED_LANDMARKS: 1,
+    Kind.FUSED_LANDMARKS: 1,
+    Kind.REMOVED_OBSERVATIONS: 1,
+    Kind.CULLED_LANDMARKS: 1,
+    Kind.DISPARITY_CALIBRATION: 1,
+    Kind.KEYFRAME_HEADER: 2,
+    Kind.NEW_LANDMARKS: 3,
+    Kind.OBSERVATIONS: 4,  # after the births, so that the next keyframe's sightings may build upon them
+    Kind.CACHED_KEYFRAME: 5,
+    Kind.CACHED_LANDMARKS: 5,
+    Kind.GRID_TILE: 6,
 }
 _FIRST_PARTS = 4  # births: what makes a keyframe useful where a thin link has them short
 _RANK_OTHER_PARTS = 5
@@ -40,7 +40,7 @@ def default_order(key: Key) -> Order:
     if key.kind == REMEMBERED:
         return (0, 0, key.part)  # it saves more than it costs
     rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
-    if key.part >= (_FIRST_PARTS if key.kind == Kind.BIRTHS else 1):
+    if key.part >= (_FIRST_PARTS if key.kind == Kind.NEW_LANDMARKS else 1):
         rank = max(rank, _RANK_OTHER_PARTS)
     return (rank, -key.id, key.part)
 

@@ -17,7 +17,18 @@ from kiteline_codec.sync.packet import MASK_BITS, Item
 from kiteline_codec.sync.resident import Resident
 
 _MASK = (1 << MASK_BITS) - 1
-_BULK_KINDS = frozenset({int(k) for k in (Kind.POSE, Kind.DEPTHS, Kind.FOUND, Kind.REMOVED, Kind.CULLED)})
+_BULK_KINDS = frozenset(
+    {
+        int(k)
+        for k in (
+            Kind.KEYFRAME_POSE,
+            Kind.REFINED_LANDMARKS,
+            Kind.FUSED_LANDMARKS,
+            Kind.REMOVED_OBSERVATIONS,
+            Kind.CULLED_LANDMARKS,
+        )
+    }
+)
 _VALUE_BYTES = 350  # of memory that a value takes beside its code, about
 
 

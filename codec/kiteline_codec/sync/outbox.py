@@ -22,7 +22,9 @@ Known = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value
 Shrink = Callable[[Key, bytes, Known], bytes | None]  # a shorter form of a code, None where there is none
 
 _MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
-_BULK_KINDS = frozenset({int(Kind.HEAD), int(Kind.BIRTHS), int(Kind.SIGHTINGS)})  # of keyframes: what may be archived
+_BULK_KINDS = frozenset(
+    {int(Kind.KEYFRAME_HEADER), int(Kind.NEW_LANDMARKS), int(Kind.OBSERVATIONS)}
+)  # of keyframes: what may be archived
 _ENTRY_BYTES = 700  # of memory that a value takes beside its code, about
 _FIRST = (1,)  # orders below it, poses and placements, go before what has waited longest
 _FETCHED = 16  # pages that are taken back at once when nothing else is left to be sent

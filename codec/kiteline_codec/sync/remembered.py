@@ -21,7 +21,7 @@ _LEAST_BYTES = 16  # shorter codes are not worth a word
 _PART_VALUES = 60  # told in one value: it fits a packet of a thin link in a few pieces
 _MAX_PARTS = 1 << 16
 _HASH = 0xFFFFFF
-_SEEN = frozenset({int(Kind.HEAD), int(Kind.BIRTHS), int(Kind.SIGHTINGS)})
+_SEEN = frozenset({int(Kind.KEYFRAME_HEADER), int(Kind.NEW_LANDMARKS), int(Kind.OBSERVATIONS)})
 
 
 def told(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
