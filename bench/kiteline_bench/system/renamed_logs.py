@@ -1,0 +1,167 @@
+"""Copy a log of an earlier version under today's names: `python -m kiteline_bench.system.renamed_logs OLD NEW`.
+
+A rule maps an old name to the new one, to None where the name is gone, or to (new name, function of the old value).
+All messages else are copied byte for byte, in their order.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import CompressionType, Writer
+
+from kiteline_hw.logs.mcap_file import McapFile
+from kiteline_hw.logs.mcap_log import CHUNK_BYTES
+
+Rule = str | tuple[str, Callable[[Any], Any]] | None
+Rules = Mapping[str, Rule]
+
+# dotted TOML name of an option, or of a section with all that it holds
+CONFIG: dict[str, Rules] = {
+    "agent": {},
+    "base": {},
+}
+# by topic (the base's without "/agentN"): field of the JSON message
+FIELDS: dict[str, Rules] = {}
+# option of the process, in the `spec` metadata
+SPEC: dict[str, Rules] = {
+    "agent": {},
+    "base": {},
+}
+TOPICS: dict[str, str] = {}  # without "/agentN"
+JOB_KINDS: dict[str, str] = {}  # name of a job's kind in the base's steps
+
+_AGENT_PREFIX = re.compile(r"^(/agent\d+)?(.*)$")
+
+
+def copy_renamed(old: Path, new: Path) -> None:
+    """Copy a log under new names. Raises SourceError when `old` is no MCAP file.
+
+    Where OLD.jobs.json lies beside `old`, its list replaces the logged fingerprints of the jobs' results, in order.
+    """
+    log = McapFile(old)
+    role = next((r.metadata.get("role", "") for r in log.metadata if r.name == "kiteline"), "")
+    results = _job_results(old)
+    with new.open("wb") as stream:
+        writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        writer.start("", "kiteline")
+        for record in log.metadata:
+            writer.add_metadata(record.name, renamed_metadata(record.metadata, role))
+        schemas = {0: 0}
+        for number, schema in sorted(log.schemas.items()):
+            schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        channels = {
+            number: writer.register_channel(
+                renamed_topic(channel.topic), channel.message_encoding, schemas[channel.schema_id], channel.metadata
+            )
+            for number, channel in sorted(log.channels.items())
+        }
+        for message in log.messages(ordered=False):
+            channel, data = log.channels[message.channel], message.data
+            if channel.message_encoding == "json":
+                data = renamed_message(channel.topic, data, results)
+            writer.add_message(channels[message.channel], message.log_ns, data, message.publish_ns, message.sequence)
+        writer.finish()
+
+
+def renamed_metadata(metadata: Mapping[str, str], role: str) -> dict[str, str]:
+    """The metadata with the options of `config` and `spec` renamed."""
+    out = dict(metadata)
+    if CONFIG.get(role) and "config" in out:
+        out["config"] = renamed_config(out["config"], CONFIG[role])
+    if SPEC.get(role) and "spec" in out:
+        out["spec"] = json.dumps(_renamed_fields(json.loads(out["spec"]), SPEC[role]))
+    return out
+
+
+def renamed_config(text: str, rules: Rules) -> str:
+    """A TOML text with its options renamed; the rule with the longest matching name counts."""
+    sections: dict[str, list[str]] = {"": []}
+    for name, value in _options(tomllib.loads(text), ""):
+        whole = next((name[:n] for n in _ends(name) if name[:n] in rules), None)
+        rule: Rule = name
+        if whole is not None:
+            rule = rules[whole]
+            if isinstance(rule, tuple):
+                rule, value = rule[0], rule[1](value)
+            if rule is None:
+                continue
+            rule += name[len(whole) :]
+        assert isinstance(rule, str)
+        section, _, key = rule.rpartition(".")
+        sections.setdefault(section, []).append(f"{key} = {_toml(value)}")
+    heads = {section: [f"[{section}]"] if section else [] for section in sections}
+    return "\n\n".join("\n".join(heads[s] + lines) for s, lines in sections.items() if lines) + "\n"
+
+
+def renamed_topic(topic: str) -> str:
+    """A topic under its new name."""
+    prefix, rest = _split(topic)
+    return prefix + TOPICS.get(rest, rest)
+
+
+def renamed_message(topic: str, data: bytes, results: list[str]) -> bytes:
+    """A JSON message with its fields renamed. results: fingerprints of jobs that are still to come, first one first."""
+    rules = FIELDS.get(_split(topic)[1], {})
+    is_step, is_job = topic == "/step" and bool(JOB_KINDS), topic == "/job" and bool(results)
+    if not (rules or is_step or is_job):
+        return data
+    value = json.loads(data)
+    if is_step and "jobs" in value:
+        value["jobs"] = [[number, JOB_KINDS.get(kind, kind)] for number, kind in value["jobs"]]
+    if is_job:
+        value["result"] = results.pop(0)
+    return json.dumps(_renamed_fields(value, rules), separators=(",", ":"), allow_nan=False).encode()
+
+
+def _job_results(log: Path) -> list[str]:
+    path = log.with_name(log.stem + ".jobs.json")
+    return list(json.loads(path.read_text())) if path.exists() else []
+
+
+def _renamed_fields(value: dict[str, Any], rules: Rules) -> dict[str, Any]:
+    out = {}
+    for name, field in value.items():
+        rule = rules.get(name, name)
+        if isinstance(rule, tuple):
+            rule, field = rule[0], rule[1](field)
+        if rule is not None:
+            out[rule] = field
+    return out
+
+
+def _options(table: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
+    """Dotted names and values of a TOML table, in order."""
+    out: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        out += _options(value, f"{path}{key}.") if isinstance(value, dict) else [(path + key, value)]
+    return out
+
+
+def _ends(name: str) -> list[int]:
+    """Lengths of a dotted name and of the sections that hold it, longest first."""
+    return [len(name), *(m.start() for m in reversed(list(re.finditer(r"\.", name))))]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return json.dumps(value) if isinstance(value, bool | str) else repr(value)
+
+
+def _split(topic: str) -> tuple[str, str]:
+    match = _AGENT_PREFIX.match(topic)
+    assert match is not None
+    return match.group(1) or "", match.group(2)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    copy_renamed(Path(sys.argv[1]), Path(sys.argv[2]))
