@@ -85,16 +85,12 @@ def renamed_config(text: str, rules: Rules) -> str:
     sections: dict[str, list[str]] = {"": []}
     for name, value in _options(tomllib.loads(text), ""):
         whole = next((name[:n] for n in _ends(name) if name[:n] in rules), None)
-        rule: Rule = name
         if whole is not None:
-            rule = rules[whole]
-            if isinstance(rule, tuple):
-                rule, value = rule[0], rule[1](value)
-            if rule is None:
+            new, value = _apply(rules[whole], value)
+            if new is None:
                 continue
-            rule += name[len(whole) :]
-        assert isinstance(rule, str)
-        section, _, key = rule.rpartition(".")
+            name = new + name[len(whole) :]
+        section, _, key = name.rpartition(".")
         sections.setdefault(section, []).append(f"{key} = {_toml(value)}")
     heads = {section: [f"[{section}]"] if section else [] for section in sections}
     return "\n\n".join("\n".join(heads[s] + lines) for s, lines in sections.items() if lines) + "\n"
@@ -128,12 +124,18 @@ def _job_results(log: Path) -> list[str]:
 def _renamed_fields(value: dict[str, Any], rules: Rules) -> dict[str, Any]:
     out = {}
     for name, field in value.items():
-        rule = rules.get(name, name)
-        if isinstance(rule, tuple):
-            rule, field = rule[0], rule[1](field)
-        if rule is not None:
-            out[rule] = field
+        new, field = _apply(rules.get(name, name), field)
+        if new is not None:
+            out[new] = field
     return out
+
+
+def _apply(rule: Rule, value: Any) -> tuple[str | None, Any]:
+    """New name and value."""
+    if isinstance(rule, tuple):
+        name, convert = rule
+        return name, convert(value)
+    return rule, value
 
 
 def _options(table: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
