@@ -32,8 +32,8 @@ from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.keeper import Keeper, read_imports
-from kiteline_basestation.store.kept import Kept, pack
 from kiteline_basestation.store.restore import Restored, restore
+from kiteline_basestation.store.saved_map import SavedMap, pack
 from kiteline_basestation.store.store import StoreError
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import RecordChannel
@@ -128,7 +128,7 @@ class Ground:
         SourceError, WireError.
         """
         self.keeper = Keeper(Path(self.spec.store)) if self.spec.store else None
-        held = kept = Kept() if self.keeper is None else self.keeper.load()
+        held = kept = SavedMap() if self.keeper is None else self.keeper.load()
         maps, self._imports = read_imports(self.spec.imports, lambda metadata: station_of(metadata, place_words()))
         for other in maps:
             kept = combine(kept, other)

@@ -29,7 +29,7 @@ from kiteline_core.ids import (
 
 if TYPE_CHECKING:
     from kiteline_basestation.mapper import Mapper
-    from kiteline_basestation.merging.map_merger import Atlas
+    from kiteline_basestation.merging.map_merger import MapMerger
 
 _NAME_CHARS = 64
 _FLIES_NS = 10_000_000_000  # ns after its last word that an agent counts as flying: its map is not deleted
@@ -90,14 +90,14 @@ def called(submap: SubmapId) -> str:
 
 def _list(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
     points = _points(mapper)
-    return {"maps": [_overview(mapper, island, points) for island in _islands(mapper)]}
+    return {"maps": [_overview(mapper, map_id, points) for map_id in _map_ids(mapper)]}
 
 
 def _get(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    island = _map(mapper, given, "map")
-    out = _overview(mapper, island, _points(mapper))
-    for submap, told in zip(mapper.map.island(island), out["submaps"], strict=True):
-        told["T_map_m"] = matrix(sim3.inverse(mapper.map.frame(island)) @ mapper.map.frame(submap))
+    map_id = _map(mapper, given, "map")
+    out = _overview(mapper, map_id, _points(mapper))
+    for submap, told in zip(mapper.map.submaps_of_map(map_id), out["submaps"], strict=True):
+        told["T_map_m"] = matrix(sim3.inverse(mapper.map.frame(map_id)) @ mapper.map.frame(submap))
         told["poses"] = [
             {"id": int(k), "t_ns": int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]), "T_m_k": matrix(pose)}
             for k in mapper.map.submaps[submap]
@@ -107,28 +107,31 @@ def _get(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
 
 
 def _name(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    island, name = _map(mapper, given, "map"), given.get("name")
+    map_id, name = _map(mapper, given, "map"), given.get("name")
     if not isinstance(name, str) or not name.isprintable() or len(name) > _NAME_CHARS:
         raise _Refused(f'"name" is a text of at most {_NAME_CHARS} printable characters; "" takes it back')
-    others = {text for s, text in mapper.names.items() if s != island}
+    others = {text for s, text in mapper.names.items() if s != map_id}
     if name in others or _parsed(name) is not None:
         raise _Refused(f"{name!r} is taken: names and ids of maps are told apart")
-    mapper.names.pop(island, None)
+    mapper.names.pop(map_id, None)
     if name:
-        mapper.names[island] = name
-    return _overview(mapper, island, _points(mapper))
+        mapper.names[map_id] = name
+    return _overview(mapper, map_id, _points(mapper))
 
 
 def _merge(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    atlas = _atlas(mapper)
+    merger = _merger(mapper)
     into, other = _map(mapper, given, "into"), _map(mapper, given, "map")
     if into == other:
         raise _Refused("these are one map already")
-    if atlas.busy_with(into) or atlas.busy_with(other):
+    if merger.busy_with(into) or merger.busy_with(other):
         raise _Refused("one of the two is being corrected just now; ask again in a moment")
     if "T_into_map" not in given:
-        atlas.look_for(other, into)
-        return {"merged": False, "looking": len([k for s in mapper.map.island(other) for k in mapper.map.submaps[s]])}
+        merger.look_for(other, into)
+        return {
+            "merged": False,
+            "looking": len([k for s in mapper.map.submaps_of_map(other) for k in mapper.map.submaps[s]]),
+        }
     try:
         S = similarity_of(given["T_into_map"])
     except (TypeError, ValueError) as error:
@@ -138,27 +141,27 @@ def _merge(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
     if sim3.scale_of(S) != 1.0 and not mapper.map.own_unit(other):
         raise _Refused(f"{called(other)} is in metres: it is laid into another map as long as it is")
     frames = mapper.map.frame(into), mapper.map.frame(other)
-    atlas.join(other, into, sim3.normalise(frames[0] @ S @ sim3.inverse(frames[1])))
+    merger.join(other, into, sim3.normalise(frames[0] @ S @ sim3.inverse(frames[1])))
     return {"merged": True, **_overview(mapper, into, _points(mapper))}
 
 
 def _split(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    atlas = _atlas(mapper)
+    merger = _merger(mapper)
     submap = _submap(mapper, given, "map")
-    island = mapper.map.island_of(submap)
-    if not atlas.split(submap):
+    map_id = mapper.map.map_id(submap)
+    if not merger.split(submap):
         raise _Refused(f"{called(submap)} was not merged into another map: there is nothing to be undone")
-    apart = mapper.map.island_of(submap)
+    apart = mapper.map.map_id(submap)
     points = _points(mapper)
-    return {"maps": [_overview(mapper, s, points) for s in (island, apart)]}
+    return {"maps": [_overview(mapper, s, points) for s in (map_id, apart)]}
 
 
 def _delete(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    island = _map(mapper, given, "map")
-    submaps = mapper.map.island(island)
+    map_id = _map(mapper, given, "map")
+    submaps = mapper.map.submaps_of_map(map_id)
     for submap in submaps:
-        heard_ns = mapper.heard_ns(submap)
-        if heard_ns is not None and now_ns - heard_ns < _FLIES_NS:
+        last_contact_ns = mapper.last_contact_ns(submap)
+        if last_contact_ns is not None and now_ns - last_contact_ns < _FLIES_NS:
             raise _Refused(f"agent {agent_of_submap(submap)} flies in {called(submap)} now; land it first")
     mapper.delete(submaps)
     return {"deleted": [called(s) for s in submaps]}
@@ -185,14 +188,14 @@ _KEYS: dict[str, tuple[str, ...]] = {
 # -- what they share ---------------------------------------------------------------------------------------------------
 
 
-def _islands(mapper: Mapper) -> list[SubmapId]:
-    return sorted({mapper.map.island_of(s) for s in mapper.map.submaps if s not in mapper.deleted})
+def _map_ids(mapper: Mapper) -> list[SubmapId]:
+    return sorted({mapper.map.map_id(s) for s in mapper.map.submaps if s not in mapper.deleted})
 
 
-def _atlas(mapper: Mapper) -> Atlas:
-    if mapper.atlas is None:
+def _merger(mapper: Mapper) -> MapMerger:
+    if mapper.merger is None:
         raise _Refused("this base joins no maps: gtsam is not installed, or [base.loops] enabled is false")
-    return mapper.atlas
+    return mapper.merger
 
 
 def _parsed(text: str) -> SubmapId | None:
@@ -218,7 +221,7 @@ def _submap(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
 
 
 def _map(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
-    return mapper.map.island_of(_submap(mapper, given, key))
+    return mapper.map.map_id(_submap(mapper, given, key))
 
 
 def _points(mapper: Mapper) -> dict[int, int]:
@@ -228,8 +231,8 @@ def _points(mapper: Mapper) -> dict[int, int]:
     return dict(zip(submaps.tolist(), counts.tolist(), strict=True))
 
 
-def _overview(mapper: Mapper, island: SubmapId, points: Mapping[int, int]) -> Json:
-    submaps = mapper.map.island(island)
+def _overview(mapper: Mapper, map_id: SubmapId, points: Mapping[int, int]) -> Json:
+    submaps = mapper.map.submaps_of_map(map_id)
     told: list[dict[str, Json]] = []
     for submap in submaps:
         keyframes = mapper.map.submaps[submap]
@@ -248,10 +251,10 @@ def _overview(mapper: Mapper, island: SubmapId, points: Mapping[int, int]) -> Js
             }
         )
     return {
-        "id": called(island),
-        "name": mapper.names.get(island, ""),
-        "placed": island in mapper.placements,
-        "unit": "own" if mapper.map.own_unit(island) else "metre",
+        "id": called(map_id),
+        "name": mapper.names.get(map_id, ""),
+        "placed": map_id in mapper.placements,
+        "unit": "own" if mapper.map.own_unit(map_id) else "metre",
         "agents": sorted({s["agent"] for s in told}),
         "keyframes": sum(s["keyframes"] for s in told),
         "points": sum(s["points"] for s in told),

@@ -22,7 +22,7 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.publisher import Published, Publisher, adopt
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.map.world_view import world_view
-from kiteline_basestation.merging.map_merger import Atlas
+from kiteline_basestation.merging.map_merger import MapMerger
 from kiteline_basestation.refinement import culling, refind
 from kiteline_basestation.refinement import new_landmarks as newpoints
 from kiteline_basestation.refinement.apply_bundle import apply_bundle
@@ -94,9 +94,9 @@ class Mapper:
         self._whole = WholeMaps(self.config.graph)
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
-        self.atlas: Atlas | None = None
+        self.merger: MapMerger | None = None
         if words is not None and self.config.loops.enabled:
-            self.atlas = Atlas(self.config, self.map, self._publisher, words, self._next_job)
+            self.merger = MapMerger(self.config, self.map, self._publisher, words, self._next_job)
 
     def step(self, given: MapperInput, now_ns: int) -> MapperOutput:
         """Take in what came, and say what is to be published and worked on."""
@@ -116,16 +116,16 @@ class Mapper:
             self.counts.culled += culling.cull_weak(self.map, keyframe, self.config.cull, self._publisher)
             self._cull_keyframes(keyframe)
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
-            if self.atlas is not None:
-                self.atlas.consider(keyframe)  # seen before, here or by others?
+            if self.merger is not None:
+                self.merger.consider(keyframe)  # seen before, here or by others?
             self._grid_due += 1
             self.counts.keyframes += 1
         self._go_on_with_atlas()
         self._bundle_whole_maps(now_ns)
         self._tell_calibrations()
         jobs = self._bundle_jobs() + self._grid_jobs()
-        if self.atlas is not None:
-            jobs += self.atlas.jobs()
+        if self.merger is not None:
+            jobs += self.merger.jobs()
         withdrawn = self.world.withdrawn()
         return MapperOutput(self._publisher.collect(), tuple(jobs), answers, withdrawn)
 
@@ -164,10 +164,10 @@ class Mapper:
                 "deleted": sorted(int(s) for s in self.deleted),
             }
         )
-        return out | (self.atlas.memory() if self.atlas is not None else {})
+        return out | (self.merger.memory() if self.merger is not None else {})
 
     def _submap_memory(self, submap: SubmapId) -> Json:
-        joined = self.map.islands.get(submap)
+        joined = self.map.root_submaps.get(submap)
         return {
             "frame": matrix(self.map.frames.get(submap)),
             "island": None if joined is None else int(joined),
@@ -181,7 +181,7 @@ class Mapper:
         submaps = {SubmapId(int(number)): value for (number,), value in parsed(texts, "submap")}
         for submap, value in submaps.items():
             if value["island"] is not None:
-                self.map.islands[submap] = SubmapId(value["island"])
+                self.map.root_submaps[submap] = SubmapId(value["island"])
             if value["frame"] is not None:
                 self.map.move_submap(submap, similarity_of(value["frame"]))
             if value["name"] is not None:
@@ -206,10 +206,10 @@ class Mapper:
             self._intake.deleted = {SubmapId(s) for s in value["deleted"]}
         self._intake.keep_unused(unused)
         self._grid_due = len(self.map)  # the grid is made anew
-        if self.atlas is not None:
-            self.atlas.recall(texts)
+        if self.merger is not None:
+            self.merger.recall(texts)
 
-    def heard_ns(self, submap: SubmapId) -> int | None:
+    def last_contact_ns(self, submap: SubmapId) -> int | None:
         """When the agent that flies in a submap now was last heard; None where nobody flies."""
         agent = agent_of_submap(submap)
         live = self._intake.live.get(agent)
@@ -228,10 +228,10 @@ class Mapper:
             self._stale.pop(submap, None)
             self.placements.pop(submap, None)
             self.names.pop(submap, None)
-            self.map.islands.pop(submap, None)
+            self.map.root_submaps.pop(submap, None)
         self._windows = {job: w for job, w in self._windows.items() if w[0] not in submaps}
-        if self.atlas is not None:
-            self.atlas.forget(submaps)
+        if self.merger is not None:
+            self.merger.forget(submaps)
         self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
 
     @property
@@ -247,7 +247,7 @@ class Mapper:
     @property
     def idle(self) -> bool:
         """Whether no job is open and nothing is left to be done with what came."""
-        settled = self.atlas is None or (self.atlas.idle and not self._whole.waiting(self._sizes()))
+        settled = self.merger is None or (self.merger.idle and not self._whole.waiting(self._sizes()))
         return settled and not (self._intake.backlog or self._windows or self._stale or self._grid_job)
 
     def summary(self) -> dict[str, object]:
@@ -277,11 +277,11 @@ class Mapper:
             "keyframes_culled": self.counts.keyframes_culled,
             "bundles": self.counts.bundles,
             "grids": self.counts.grids,
-            "loops": self.atlas.loops if self.atlas else 0,
-            "merges": len(self.atlas.merges) if self.atlas else 0,
-            "merges_undone": self.atlas.undone if self.atlas else 0,
-            "maps": len({self.map.island_of(s) for s in self.map.submaps}),
-            "jobs_open": len(self._windows) + (self._grid_job != 0) + (self.atlas.jobs_open if self.atlas else 0),
+            "loops": self.merger.loops if self.merger else 0,
+            "merges": len(self.merger.merges) if self.merger else 0,
+            "merges_undone": self.merger.undone if self.merger else 0,
+            "maps": len({self.map.map_id(s) for s in self.map.submaps}),
+            "jobs_open": len(self._windows) + (self._grid_job != 0) + (self.merger.jobs_open if self.merger else 0),
         }
 
     def live(self, agent: AgentId) -> LivePose | None:
@@ -291,7 +291,7 @@ class Mapper:
     # -- inside ------------------------------------------------------------------------------------------------------
 
     def _finish(self, done: JobDone, now_ns: int) -> None:
-        if self.atlas is not None and self.atlas.finish(done):
+        if self.merger is not None and self.merger.finish(done):
             if isinstance(done.result, BundleResult):
                 self._whole.done(done.cost_ops, now_ns)
             return
@@ -312,44 +312,44 @@ class Mapper:
     def _cull_keyframes(self, keyframe: KeyframeId) -> None:
         for other in culling.cull_redundant(self.map, keyframe, self.config.cull, self._publisher):
             self.counts.keyframes_culled += 1
-            if self.atlas is not None:
-                self.atlas.finder.forget(other)
+            if self.merger is not None:
+                self.merger.detector.forget(other)
 
     def _go_on_with_atlas(self) -> None:
         """Joined maps look around in each other; where a map moved as a whole, windows are void and places change."""
-        if self.atlas is None:
+        if self.merger is None:
             return
-        for keyframe in self.atlas.revisit():
+        for keyframe in self.merger.revisit():
             self._stale.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
-        self.world.part(self.atlas.parted)
-        self.atlas.parted.clear()
-        self.world.grow(self.atlas.grown)
-        self.atlas.grown.clear()
-        for island in sorted(self.atlas.moved):
+        self.world.part(self.merger.parted)
+        self.merger.parted.clear()
+        self.world.grow(self.merger.grown)
+        self.merger.grown.clear()
+        for map_id in sorted(self.merger.moved):
             for job, (submap, _) in list(self._windows.items()):
-                if self.map.island_of(submap) == island:
+                if self.map.map_id(submap) == map_id:
                     del self._windows[job]
                     waiting = self._stale.setdefault(submap, [])
                     waiting.append(self.map.submaps[submap][-1])
-            self.world.lay_out(island)
+            self.world.lay_out(map_id)
             self._grid_due = max(self._grid_due, len(self.map))  # the grid is made anew
-        self.atlas.moved.clear()
+        self.merger.moved.clear()
 
     def _bundle_whole_maps(self, now_ns: int) -> None:
         """Bundle a whole map that has grown, when there is time for it."""
-        if self.atlas is not None:
+        if self.merger is not None:
             sizes = self._sizes()
-            chosen = self._whole.next(sizes, [m for m in sizes if self.atlas.busy_with(m)], now_ns)
+            chosen = self._whole.next(sizes, [m for m in sizes if self.merger.busy_with(m)], now_ns)
             if chosen is not None:
-                self.atlas.bundle_all(chosen)
+                self.merger.bundle_all(chosen)
 
     def _sizes(self) -> dict[SubmapId, int]:
         """The number of keyframes of each map that one bundle can hold."""
         out: dict[SubmapId, int] = {}
         for submap, keyframes in self.map.submaps.items():
-            island = self.map.island_of(submap)
-            out[island] = out.get(island, 0) + len(keyframes)
-        return {island: size for island, size in out.items() if size <= self.config.graph.max_full}
+            map_id = self.map.map_id(submap)
+            out[map_id] = out.get(map_id, 0) + len(keyframes)
+        return {map_id: size for map_id, size in out.items() if size <= self.config.graph.max_full}
 
     def _tell_calibrations(self) -> None:
         """Agents track better on disparities without the offset that was found."""
@@ -364,10 +364,10 @@ class Mapper:
 
     def _bundle_jobs(self) -> list[Job]:
         """One bundle at a time for each map, around the newest keyframe of a submap; submaps take turns."""
-        busy = {self.map.island_of(submap) for submap, _ in self._windows.values()}
+        busy = {self.map.map_id(submap) for submap, _ in self._windows.values()}
         jobs = []
         for submap in sorted(self._stale, key=lambda s: (self._served.get(s, 0), s)):
-            if self.map.island_of(submap) in busy:
+            if self.map.map_id(submap) in busy:
                 continue
             # Around the newest keyframe; where many came at once, from the oldest on, half a window at a time.
             waiting, size = self._stale.pop(submap), self.config.window.free
@@ -383,7 +383,7 @@ class Mapper:
                 jobs.append(job)
                 self._windows[job.id] = (submap, part)
                 self._served[submap] = job.id
-                busy.add(self.map.island_of(submap))
+                busy.add(self.map.map_id(submap))
         return jobs
 
     def _grid_jobs(self) -> list[Job]:

@@ -14,7 +14,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store import keeper as keeper_module
 from kiteline_basestation.store.keeper import KEEP_NS, Keeper
-from kiteline_basestation.store.kept import Kept
+from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.store import Batch, Store, StoreError, read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.coding import messages
@@ -31,7 +31,7 @@ class Flown:
         self.flight = flight
         self.station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 1))
         self.keeper = Keeper(folder)
-        self.keeper.begin(self.station, Kept(), Kept())
+        self.keeper.begin(self.station, SavedMap(), SavedMap())
 
     def step(self, n: int) -> None:
         codes = tuple((messages.key(r), messages.encode(r)) for r in self.flight.records[n])

@@ -103,8 +103,8 @@ def test_windows_that_repeat_along_a_corridor_close_no_loop(
     flight = make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4)
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [flight])
-    assert mapper.atlas is not None
-    assert mapper.atlas.finder.proofs > 0  # they do look alike
+    assert mapper.merger is not None
+    assert mapper.merger.detector.proofs > 0  # they do look alike
     assert mapper.summary()["loops"] == 0
     assert np.max(errors_m(mapper, flight)) < 0.3
 
@@ -121,4 +121,4 @@ def test_who_shares_with_whom() -> None:
 
 def test_a_config_without_loops_has_none(make_flight: MakeFlight, words: Any) -> None:
     config = replace(BaseConfig(), refind=RefindConfig(), loops=replace(BaseConfig().loops, enabled=False))
-    assert Mapper(config, words).atlas is None
+    assert Mapper(config, words).merger is None

@@ -138,7 +138,7 @@ def test_maps_that_a_person_says_to_overlap_are_looked_at_again(make_flight: Mak
     base.fly([a, b])
     if len(ids(base.ask("list"))) == 1:
         base.ask("split", map="1.1.0")
-        base.mapper.atlas.finder.apart.clear()  # type: ignore[union-attr]
+        base.mapper.merger.detector.apart.clear()  # type: ignore[union-attr]
     assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 24}
     base.rest()
     assert ids(base.ask("list")) == ["0.1.0"]

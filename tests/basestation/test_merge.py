@@ -80,8 +80,8 @@ def test_two_rooms_with_one_wallpaper_stay_two(
     b = make_flight(keyframes=40, turns=1.0, scene=other, variant=1, agent=1)
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [a, b])
-    assert mapper.atlas is not None
-    assert mapper.atlas.finder.proofs > 0  # single walls do look alike
+    assert mapper.merger is not None
+    assert mapper.merger.detector.proofs > 0  # single walls do look alike
     assert mapper.summary()["merges"] == 0
     assert mapper.summary()["maps"] == 2
 
@@ -129,8 +129,8 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     feed(mapper, [a, b], [0, 30])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
-    assert mapper.atlas is not None
-    mapper.atlas.undo(mapper.atlas.merges[0])
+    assert mapper.merger is not None
+    mapper.merger.undo(mapper.merger.merges[0])
     table, sparse_map = mapper.map.keypoints, mapper.map
     slots = np.flatnonzero(table.root[: sparse_map.slots] >= 0)
     here = sparse_map.keyframes.id[table.row[slots]] >> 20
@@ -161,8 +161,8 @@ def test_an_agent_hears_that_its_map_has_no_place_any_more(make_flight: MakeFlig
                 theirs[flight.agent].put(record)
         done = tuple(run_job(job) for job in station.step({a.agent: (), b.agent: ()}, done, n * STEP_NS).jobs)
     assert any(isinstance(r, SubmapPlacement) and r.submap == young for r in theirs[b.agent].receive((), 0))
-    assert station.mapper.atlas is not None
-    assert station.mapper.atlas.split(young)
+    assert station.mapper.merger is not None
+    assert station.mapper.merger.split(young)
     station.step({}, (), 100 * STEP_NS)
     assert theirs[b.agent].take_removed() == [Key(int(Kind.SUBMAP_PLACEMENT), young, 0)]
     assert not any(isinstance(r, SubmapPlacement) for r in theirs[b.agent].receive((), 0))

@@ -67,9 +67,9 @@ def test_agents_merges_and_the_state_are_told_once_each(make_flight: MakeFlight,
         r"1 agent here; \d+ keyframes and \d+ points in 1 map; 0 loops, 1 merge; \d+\.\d kB/s up", status[0]
     )
     assert status[0].endswith("230 MiB at most; all in the store")
-    atlas = station.mapper.atlas
-    assert atlas is not None
-    atlas.undo(atlas.merges[0])
+    merger = station.mapper.merger
+    assert merger is not None
+    merger.undo(merger.merges[0])
     assert [w.split("s  ", 1)[1] for w in narrator.lines((), 0, 0.0, None)][-1] == (
         "map 1.1.0 is taken out of the map that it was laid into"
     )

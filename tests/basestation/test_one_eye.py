@@ -16,7 +16,7 @@ from kiteline_basestation.management import _list
 from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_edges import similarity
-from kiteline_basestation.merging.loop_verification import Overlap, depth_scale
+from kiteline_basestation.merging.loop_verification import LoopMatch, depth_scale
 from kiteline_basestation.runtime.jobs import BundleInputs, Job, JobDone, run_job
 from kiteline_basestation.runtime.outputs import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
@@ -181,8 +181,8 @@ def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: Ma
     assert world_view(mapper.map, mapper.placements).rays.size == 0  # no metre, no grid
     young = submap_of_keyframe(b.keyframes[0])
     assert abs(mapper.map.unit(young) * 0.37 / 2.0 - 1.0) < 0.1
-    assert mapper.atlas is not None
-    mapper.atlas.undo(mapper.atlas.merges[0])
+    assert mapper.merger is not None
+    mapper.merger.undo(mapper.merger.merges[0])
     mapper.step(MapperInput(((a.agent, ()),)), 10**12)
     assert abs(mapper.map.unit(young) - 1.0) < 0.01  # as long as it was when it was laid into the other
     assert young not in mapper.placements
@@ -248,7 +248,7 @@ def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight,
     flight = make_flight(keyframes=40, turns=0.5, scene=ring, drift_m=0.002, seed=4, memory=3, stereo=False)
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [flight])
-    assert mapper.atlas is not None
+    assert mapper.merger is not None
     old, new = flight.keyframes[0], flight.keyframes[-1]
 
     def explained(shift_m: float, scale: float) -> bool:
@@ -256,9 +256,9 @@ def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight,
         X = sim3.of(scale, se3.from_rt(np.eye(3), at - scale * at + [shift_m, 0.0, 0.0]))  # about where the camera is
         S = sim3.inverse(similarity(mapper.map, old)) @ X @ similarity(mapper.map, new)
         none = np.zeros(0, np.int32)
-        vote = Overlap(new, old, sim3.rigid(S), 90, none, none, 3.0, sim3.scale_of(S))
-        assert mapper.atlas is not None
-        return mapper.atlas.finder._drift_explains(vote)
+        vote = LoopMatch(new, old, sim3.rigid(S), 90, none, none, 3.0, sim3.scale_of(S))
+        assert mapper.merger is not None
+        return mapper.merger.detector._drift_explains(vote)
 
     # 50 m on, a place that looks the same stands 6 m aside: no drift of the unit, and so no drift of the way either.
     assert not explained(6.0, 1.0)
@@ -296,9 +296,9 @@ def test_what_a_base_remembers_of_units_is_known_to_the_next(make_flight: MakeFl
     points = mapper.map.point_ids(mapper.map.roots())
     here, there = mapper.map.find_points(points), again.map.find_points(points)
     assert np.allclose(mapper.map.positions(here)[0], again.map.positions(there)[0], atol=1e-6)
-    assert again.atlas is not None and mapper.atlas is not None
-    assert [v.scale for v in again.atlas._edges] == [v.scale for v in mapper.atlas._edges]
-    assert sorted(again.atlas.merges[0].moved) == sorted(mapper.atlas.merges[0].moved)
+    assert again.merger is not None and mapper.merger is not None
+    assert [v.scale for v in again.merger._edges] == [v.scale for v in mapper.merger._edges]
+    assert sorted(again.merger.merges[0].moved) == sorted(mapper.merger.merges[0].moved)
 
 
 def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched(make_flight: MakeFlight) -> None:

@@ -17,8 +17,8 @@ from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.integrity import contradictions, sound
 from kiteline_basestation.store.keeper import Keeper, snapshot
-from kiteline_basestation.store.kept import Codes, Kept
 from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.coding import messages
@@ -96,10 +96,10 @@ def whole(station: Station) -> dict[str, Any]:
             int(sparse_map.keyframes.culled[sparse_map.rows[keyframe]]),
         )  # fmt: skip
     out["placements"] = [(int(s), T.tobytes()) for s, T in station.mapper.placements.items()]
-    out["islands"] = sorted(sparse_map.islands.items())
+    out["islands"] = sorted(sparse_map.root_submaps.items())
     out["offsets"] = sorted((int(a), offset.tolist()) for a, offset in sparse_map.disparity_offset_px.items())
     out["memory"] = {
-        n: t for n, t in snapshot(station, Kept()).memory.items() if n.partition("/")[0] in ("edge", "merge")
+        n: t for n, t in snapshot(station, SavedMap()).memory.items() if n.partition("/")[0] in ("edge", "merge")
     }
     return out
 
@@ -119,7 +119,7 @@ def joined(make_flight: MakeFlight, words: Any) -> tuple[Agents, Station]:
 def test_a_restored_map_is_the_map_to_the_last_bit(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     assert contradictions(first.mapper) == []
-    kept = snapshot(first, Kept())
+    kept = snapshot(first, SavedMap())
     second = new_station(words, session=2)
     restored = restore(second, kept, 0)
     assert (restored.faults, restored.awaited, restored.keyframes) == ((), 0, 68)
@@ -158,15 +158,17 @@ def test_each_base_goes_on_from_what_the_last_one_kept(make_flight: MakeFlight, 
     assert error_m(refined) < 0.5 * error_m(flight.agent_T_m_k)  # six deaths, and still worth having
 
 
-def spoilt(kept: Kept, agent: int, received: Mapping[Key, bytes], own: Mapping[Key, bytes], drop: Key | None) -> Kept:
+def spoilt(
+    kept: SavedMap, agent: int, received: Mapping[Key, bytes], own: Mapping[Key, bytes], drop: Key | None
+) -> SavedMap:
     codes = kept.agents[AgentId(agent)]
     mine = {key: code for key, code in codes.received.items() if key != drop}
-    return Kept({**kept.agents, AgentId(agent): Codes({**mine, **received}, {**codes.own, **own})}, kept.memory)
+    return SavedMap({**kept.agents, AgentId(agent): Codes({**mine, **received}, {**codes.own, **own})}, kept.memory)
 
 
 def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, Station], words: Any) -> None:
     agents, first = joined
-    kept = snapshot(first, Kept())
+    kept = snapshot(first, SavedMap())
     keyframe = agents.flights[0].keyframes[10]
     nowhere = keyframe_id(submap_of_keyframe(keyframe), 999)
     nowhere_map = replace(
@@ -199,9 +201,9 @@ def _coded(record: Any) -> dict[Key, bytes]:
 
 def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
-    kept = snapshot(first, Kept())
+    kept = snapshot(first, SavedMap())
     alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == Kind.KEYFRAME_HEADER)[3]
-    bare = Kept({AgentId(2): Codes(kept.agents[AgentId(2)].received, {})})
+    bare = SavedMap({AgentId(2): Codes(kept.agents[AgentId(2)].received, {})})
     checked = sound(spoilt(bare, 2, {}, {}, alone))
     assert checked.faults == ()
     assert checked.awaited > 1  # its child, and its own sections
@@ -211,10 +213,10 @@ def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station
 
 def test_a_joined_map_whose_other_half_is_gone_stands_alone(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
-    kept = snapshot(first, Kept())
+    kept = snapshot(first, SavedMap())
     (joined_to,) = {json.loads(t)["island"] for n, t in kept.memory.items() if n.startswith("submap/")} - {None}
     eldest = 0 if joined_to >> 26 == 0 else 1
-    half = Kept({a: c for a, c in kept.agents.items() if a != eldest}, kept.memory)
+    half = SavedMap({a: c for a, c in kept.agents.items() if a != eldest}, kept.memory)
     station = new_station(words, session=2)
     restored = restore(station, half, 0)
     assert any("is joined to" in fault for fault in restored.faults)
@@ -224,10 +226,10 @@ def test_a_joined_map_whose_other_half_is_gone_stands_alone(joined: tuple[Agents
 
 def test_memory_that_is_no_memory_is_told(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
-    kept = snapshot(first, Kept())
+    kept = snapshot(first, SavedMap())
     for name, text in (("base", "{}"), ("base", "nonsense"), ("submap/5", "[]")):
         with pytest.raises(WireError, match="memory"):
-            restore(new_station(words, session=2), Kept(kept.agents, {**kept.memory, name: text}), 0)
+            restore(new_station(words, session=2), SavedMap(kept.agents, {**kept.memory, name: text}), 0)
 
 
 def test_contradictions_in_the_tables_are_seen(make_flight: MakeFlight, words: Any) -> None:
@@ -251,7 +253,7 @@ def test_yesterdays_map_is_found_again_in_todays(make_flight: MakeFlight, words:
     yesterday.fly(old, 0, 40)
     today = Agents([make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)])
     station = new_station(words, session=2)
-    restore(station, snapshot(old, Kept()), 0)
+    restore(station, snapshot(old, SavedMap()), 0)
     today.fly(station, 0, 60)
     assert station.mapper.summary()["merges"] == 1
     assert next(iter(station.mapper.placements)) == submap_of_keyframe(yesterday.flights[0].keyframes[0])
@@ -263,7 +265,7 @@ def test_two_finished_maps_are_joined_by_their_places(make_flight: MakeFlight, w
         agents = Agents([make_flight(keyframes=30, turns=0.6, start=start, variant=agent, agent=agent)])
         station = new_station(words)
         agents.fly(station, 0, 40)
-        kept.append(snapshot(station, Kept()))
+        kept.append(snapshot(station, SavedMap()))
     both = combine(*kept)
     station = new_station(words, session=2)
     assert restore(station, both, 0).faults == ()
@@ -281,7 +283,7 @@ def test_maps_of_two_agents_with_one_number_are_refused(make_flight: MakeFlight,
         agents = Agents([make_flight(keyframes=4, turns=0.1, seed=seed)])
         station = new_station(words)
         agents.fly(station, 0, 8)
-        kept.append(snapshot(station, Kept()))
+        kept.append(snapshot(station, SavedMap()))
     with pytest.raises(WireError, match="another agent with this number"):
         combine(*kept)
 
@@ -309,7 +311,7 @@ def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFli
 
 def test_heads_are_what_they_were(joined: tuple[Agents, Station]) -> None:
     agents, first = joined
-    kept = snapshot(first, Kept())
+    kept = snapshot(first, SavedMap())
     for flight in agents.flights:
         heads = [k for k in kept.agents[flight.agent].received if k.kind == Kind.KEYFRAME_HEADER]
         assert sorted(k.id for k in heads) == flight.keyframes

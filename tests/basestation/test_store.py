@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_basestation.store.kept import Codes, Kept, pack, unpack
+from kiteline_basestation.store.saved_map import Codes, SavedMap, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read
 from kiteline_codec.schema import Key, Kind, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
@@ -22,16 +22,16 @@ keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0,
 values = st.dictionaries(keys, st.binary(max_size=30), max_size=4)
 codes = st.builds(Codes, values, values)
 memory = st.dictionaries(st.text("abc/01", min_size=1, max_size=5), st.text(max_size=20), max_size=3)
-maps = st.builds(Kept, st.dictionaries(st.integers(0, 63).map(AgentId), codes, max_size=3), memory)
+maps = st.builds(SavedMap, st.dictionaries(st.integers(0, 63).map(AgentId), codes, max_size=3), memory)
 
 
-def without_nothing(kept: Kept) -> Kept:
+def without_nothing(kept: SavedMap) -> SavedMap:
     """A store does not know agents of which it holds no value."""
-    return Kept({a: c for a, c in kept.agents.items() if c.received or c.own}, kept.memory)
+    return SavedMap({a: c for a, c in kept.agents.items() if c.received or c.own}, kept.memory)
 
 
 @given(maps)
-def test_packing_gives_back_what_it_was_given(kept: Kept) -> None:
+def test_packing_gives_back_what_it_was_given(kept: SavedMap) -> None:
     assert unpack(pack(kept)) == kept
 
 
@@ -42,7 +42,7 @@ def test_any_other_bytes_are_refused(noise: bytes) -> None:
 
 
 def test_a_flipped_bit_is_found() -> None:
-    content = bytearray(pack(Kept({AgentId(1): Codes({Key(3, 5): b"head"}, {})})))
+    content = bytearray(pack(SavedMap({AgentId(1): Codes({Key(3, 5): b"head"}, {})})))
     content[12] ^= 1
     with pytest.raises(WireError, match="damaged"):
         unpack(bytes(content))
@@ -50,7 +50,9 @@ def test_a_flipped_bit_is_found() -> None:
 
 @settings(max_examples=25)
 @given(maps, maps)
-def test_a_batch_leads_from_one_map_to_the_other(tmp_path_factory: pytest.TempPathFactory, a: Kept, b: Kept) -> None:
+def test_a_batch_leads_from_one_map_to_the_other(
+    tmp_path_factory: pytest.TempPathFactory, a: SavedMap, b: SavedMap
+) -> None:
     folder = tmp_path_factory.mktemp("store")
     store = Store(folder)
     store.write(batch_of(a, store.load()))
@@ -67,7 +69,7 @@ def test_nothing_is_left_of_a_deleted_submap(tmp_path: Path) -> None:
     received |= {Key(Kind.GRAVITY_ALIGNMENT, s): b"level" for s in (doomed, other)}
     own = {Key(Kind.REFINED_LANDMARKS, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
     store = Store(tmp_path)
-    store.write(batch_of(Kept({AgentId(3): Codes(received, own)}), Kept()))
+    store.write(batch_of(SavedMap({AgentId(3): Codes(received, own)}), SavedMap()))
     store.write(Batch(deleted=[doomed]))
     left = store.load().agents[AgentId(3)]
     store.close()

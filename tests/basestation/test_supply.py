@@ -13,8 +13,8 @@ from kiteline_basestation.config import BaseConfig, SupplyConfig
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.station import Station
-from kiteline_basestation.store.kept import Codes, Kept
 from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, plain_pair
 from kiteline_codec.coding import messages
@@ -118,7 +118,7 @@ def test_only_who_shares_lends(make_flight: MakeFlight, share: str, expected: bo
     base = Base(mine, theirs, share=share)
     a, b = (submap_of_keyframe(f.keyframes[0]) for f in (mine, theirs))
     assert not base.serve(mine.keyframes[-1]), "two maps, of which nobody knows how they lie"
-    base.map.islands[b] = a
+    base.map.root_submaps[b] = a
     lent = base.serve(mine.keyframes[-1])
     assert bool(lent) == expected
     assert all(agent_of_keyframe(k) == 1 for k in lent)
@@ -129,7 +129,7 @@ def test_a_copy_moves_with_the_map_and_leaves_with_it(make_flight: MakeFlight) -
     theirs = make_flight(keyframes=12, turns=0.2, agent=1, variant=1, points=1500)
     base = Base(mine, theirs)
     a, b = (submap_of_keyframe(f.keyframes[0]) for f in (mine, theirs))
-    base.map.islands[b] = a
+    base.map.root_submaps[b] = a
     lent = base.serve(mine.keyframes[-1], turns=2)
     base.heard.clear()
     base.serve(mine.keyframes[-1])
@@ -139,7 +139,7 @@ def test_a_copy_moves_with_the_map_and_leaves_with_it(make_flight: MakeFlight) -
     moved = {r.keyframe for r in base.heard if isinstance(r, CachedKeyframe)}
     assert moved == set(lent)
     assert not any(isinstance(r, CachedLandmarks) for r in base.heard if r.keyframe in lent)  # type: ignore[union-attr]
-    del base.map.islands[b]  # the merge is taken back
+    del base.map.root_submaps[b]  # the merge is taken back
     assert not base.serve(mine.keyframes[-1])
     assert {key.id for key in base.taken_back} == set(lent)
 
@@ -171,7 +171,7 @@ def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: M
     own = {messages.key(r): messages.encode(r) for r in [SubmapPlacement(submap, np.eye(4)), *lent]}
     station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 2))
     received = {messages.key(r): messages.encode(r) for r in flight.records[0]}
-    restore(station, Kept({flight.agent: Codes(received, own)}), 0)
+    restore(station, SavedMap({flight.agent: Codes(received, own)}), 0)
     channel = station.channels[flight.agent]
     assert isinstance(channel, CodedChannel)
     assert list(channel.endpoint.own_values()) == [messages.key(SubmapPlacement(submap, np.eye(4)))]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_basestation.store.store import FILE, Store, batch_of
 from kiteline_codec.coding import messages
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement
@@ -107,7 +107,7 @@ def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.Ca
         ),
     }
     store = Store(tmp_path)
-    store.write(batch_of(Kept({AgentId(0): Codes(codes, own)}, memory), Kept()))
+    store.write(batch_of(SavedMap({AgentId(0): Codes(codes, own)}, memory), SavedMap()))
     store.close()
     assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")

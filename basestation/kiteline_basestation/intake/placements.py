@@ -65,7 +65,7 @@ class World:
         """
         first = self.first
         metres = None if first is None else self._intake.units.get(first)
-        if first is None or metres is None or not self._map.own_unit(self._map.island_of(first)):
+        if first is None or metres is None or not self._map.own_unit(self._map.map_id(first)):
             return False
         if sim3.scale_of(self.placements[first]) != 1.0 or metres == 1.0:
             return False
@@ -117,12 +117,12 @@ class World:
                 self._publisher.forget_place(submap)
                 self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.SUBMAP_PLACEMENT), int(submap), 0)))
 
-    def lay_out(self, island: SubmapId) -> None:
+    def lay_out(self, map_id: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place. A map in
         metres keeps them: where the world had another unit, it takes on this one.
         """
-        submaps = self._map.island(island)
-        eldest = self._map.island_of(island)
+        submaps = self._map.submaps_of_map(map_id)
+        eldest = self._map.map_id(map_id)
         first = self.first
         anchor = next((s for s in [first, eldest, *submaps] if s in self.placements and s in submaps), None)
         if first is None or anchor is None:
@@ -132,7 +132,7 @@ class World:
         if unit != 1.0 and not self._map.own_unit(eldest):
             at = self.placements[anchor][:3, 3]
             stretch = sim3.of(1.0 / unit, se3.from_rt(np.eye(3), at - at / unit))
-            if anchor == first or self._map.own_unit(self._map.island_of(first)):
+            if anchor == first or self._map.own_unit(self._map.map_id(first)):
                 self._move_world(stretch, submaps)
             S_w_i = sim3.normalise(stretch @ S_w_i)
         for submap in submaps:

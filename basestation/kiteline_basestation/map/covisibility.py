@@ -61,7 +61,7 @@ def window(
     of each submap unless it is said.
     """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
-    submaps = sparse_map.island(submap_of_keyframe(free[0]))
+    submaps = sparse_map.submaps_of_map(submap_of_keyframe(free[0]))
     held = {sparse_map.submaps[s][0] for s in submaps} if held is None else held
     points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in free]))
     _, known = sparse_map.positions(points)

@@ -39,7 +39,7 @@ class MapView:
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes of each submap in order of id
         self.frames: dict[SubmapId, F64] = {}  # S_w_m of each submap that does not lie as it was begun: a similarity
         self._units: dict[SubmapId, float] = {}  # the scales of these
-        self.islands: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
+        self.root_submaps: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.metric: set[SubmapId] = set()  # of one eye, whose agent knows the metre
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
@@ -193,14 +193,14 @@ class MapView:
         deep = camera is None or camera.stereo or agent in self.measures_depth
         return not (deep or submap in self.metric)
 
-    def island_of(self, submap: SubmapId) -> SubmapId:
+    def map_id(self, submap: SubmapId) -> SubmapId:
         """The eldest of the submaps that are one map with this one."""
-        return self.islands.get(submap, submap)
+        return self.root_submaps.get(submap, submap)
 
-    def island(self, submap: SubmapId) -> list[SubmapId]:
+    def submaps_of_map(self, submap: SubmapId) -> list[SubmapId]:
         """All submaps that are one map with this one, in order of id."""
-        eldest = self.island_of(submap)
-        return sorted({eldest} | {s for s, root in self.islands.items() if root == eldest})
+        eldest = self.map_id(submap)
+        return sorted({eldest} | {s for s, root in self.root_submaps.items() if root == eldest})
 
     def complete(self, keyframe: KeyframeId) -> bool:
         """Whether all keypoints that the header announced have arrived."""

@@ -41,7 +41,7 @@ def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Gri
     """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
     rows, positions, metric = [], [], []
     for submap in sorted(placements):
-        S_w_m, metres = placements[submap], not sparse_map.own_unit(sparse_map.island_of(submap))
+        S_w_m, metres = placements[submap], not sparse_map.own_unit(sparse_map.map_id(submap))
         for keyframe in sparse_map.submaps.get(submap, []):
             pose = sparse_map.pose(keyframe)
             if pose is not None:

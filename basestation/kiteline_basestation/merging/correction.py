@@ -15,7 +15,7 @@ from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
 from kiteline_basestation.merging.loop_edges import depth_of, edge_of
-from kiteline_basestation.merging.loop_verification import Overlap
+from kiteline_basestation.merging.loop_verification import LoopMatch
 from kiteline_codec.schema import Kind
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
@@ -25,17 +25,17 @@ F64 = NDArray[np.float64]
 _SAME = 1e-4  # relative: what lengths may grow by before it is worth saying, a fifth of an inverse depth's code
 
 
-def keyframes_of(sparse_map: SparseMap, island: SubmapId) -> list[KeyframeId]:
+def keyframes_of(sparse_map: SparseMap, map_id: SubmapId) -> list[KeyframeId]:
     """All keyframes of a map that have a pose, in order of id."""
-    keyframes = [k for s in sparse_map.island(island) for k in sparse_map.submaps.get(s, [])]
+    keyframes = [k for s in sparse_map.submaps_of_map(map_id) for k in sparse_map.submaps.get(s, [])]
     return [k for k in keyframes if sparse_map.pose(k) is not None]
 
 
 def graph_of(
-    sparse_map: SparseMap, island: SubmapId, loops: tuple[Overlap, ...], config: GraphConfig
+    sparse_map: SparseMap, map_id: SubmapId, loops: tuple[LoopMatch, ...], config: GraphConfig
 ) -> GraphInputs | None:  # fmt: skip
     """The essential graph of a map. Its eldest submap's first keyframe holds it in place."""
-    keyframes = keyframes_of(sparse_map, island)
+    keyframes = keyframes_of(sparse_map, map_id)
     if len(keyframes) < 2:
         return None
     number = {k: i for i, k in enumerate(keyframes)}
@@ -60,8 +60,8 @@ def graph_of(
         [[config.sigma_m + config.loop_sigma_depth * depth_of(sparse_map, v), config.loop_sigma_rad] for v in inside]
     ).reshape(-1, 2)  # fmt: skip
     held = np.zeros(len(keyframes), np.bool_)
-    held[number[KeyframeId(sparse_map.submaps[sparse_map.island_of(island)][0])]] = True
-    own = {s for s in sparse_map.island(island) if sparse_map.own_unit(s)}
+    held[number[KeyframeId(sparse_map.submaps[sparse_map.map_id(map_id)][0])]] = True
+    own = {s for s in sparse_map.submaps_of_map(map_id) if sparse_map.own_unit(s)}
     scaled = None
     if own:
         free = np.array([submap_of_keyframe(k) in own for k in keyframes])
@@ -77,14 +77,14 @@ def graph_of(
 
 
 def move_keyframes(
-    sparse_map: SparseMap, island: SubmapId, targets: Mapping[KeyframeId, F64], publisher: Publisher,
+    sparse_map: SparseMap, map_id: SubmapId, targets: Mapping[KeyframeId, F64], publisher: Publisher,
     publish: PublishConfig,
 ) -> float:  # fmt: skip
     """Bring keyframes to T_w_k (4,4); those that came after the work began follow the nearest one before them.
 
     A submap's first keyframe stays in its own m: the submap moves instead. Returns the largest motion in m.
     """
-    keyframes = keyframes_of(sparse_map, island)
+    keyframes = keyframes_of(sparse_map, map_id)
     goal: dict[KeyframeId, F64] = {}
     largest = 0.0
     for keyframe in keyframes:  # in order of id: parents first
@@ -100,14 +100,14 @@ def move_keyframes(
             else:
                 goal[keyframe] = se3.orthonormalise(goal[parent] @ se3.inverse(above) @ old)
         largest = max(largest, float(np.linalg.norm(goal[keyframe][:3, 3] - old[:3, 3])))
-    for submap in sparse_map.island(island):
+    for submap in sparse_map.submaps_of_map(map_id):
         first = sparse_map.submaps[submap][0]
         T_m_k = sparse_map.pose(first)
-        stays = submap == sparse_map.island_of(island) and not sparse_map.own_unit(submap)
+        stays = submap == sparse_map.map_id(map_id) and not sparse_map.own_unit(submap)
         if T_m_k is not None and not stays:
             unit = sparse_map.unit(submap)
             sparse_map.move_submap(submap, sim3.normalise(sim3.of(unit, goal[first]) @ se3.inverse(T_m_k)))
-    firsts = {sparse_map.submaps[s][0] for s in sparse_map.island(island)}
+    firsts = {sparse_map.submaps[s][0] for s in sparse_map.submaps_of_map(map_id)}
     for keyframe in keyframes:
         if keyframe in firsts:
             continue
@@ -123,7 +123,7 @@ def move_keyframes(
 
 
 def rescale(
-    sparse_map: SparseMap, island: SubmapId, growth: Mapping[KeyframeId, float], publisher: Publisher
+    sparse_map: SparseMap, map_id: SubmapId, growth: Mapping[KeyframeId, float], publisher: Publisher
 ) -> tuple[dict[SubmapId, float], dict[KeyframeId, float]]:  # fmt: skip
     """Lengths before keyframes grow in w by `growth`; where one eye flew, its submap's unit grows as they do before the
     newest keyframe, so that nothing changes where the agent is. Points hang on their keyframes: those of older ones
@@ -132,7 +132,7 @@ def rescale(
     """
     units: dict[SubmapId, float] = {}
     left: dict[KeyframeId, float] = {}
-    for submap in sparse_map.island(island):
+    for submap in sparse_map.submaps_of_map(map_id):
         if not sparse_map.own_unit(submap):
             continue
         known = [k for k in sparse_map.submaps[submap] if k in growth]
@@ -160,12 +160,12 @@ def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher:
 
 
 def whole_window(
-    sparse_map: SparseMap, island: SubmapId, loops: Sequence[Overlap], base: BaseConfig
+    sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopMatch], base: BaseConfig
 ) -> Window | None:  # fmt: skip
     """The problem of a whole map, or of the part around its newest loop when it is too large."""
     config = base.graph
-    keyframes = [k for k in keyframes_of(sparse_map, island) if not sparse_map.keyframes.culled[sparse_map.rows[k]]]
-    first = sparse_map.submaps[sparse_map.island_of(island)][0]
+    keyframes = [k for k in keyframes_of(sparse_map, map_id) if not sparse_map.keyframes.culled[sparse_map.rows[k]]]
+    first = sparse_map.submaps[sparse_map.map_id(map_id)][0]
     if len(keyframes) > config.max_full:
         newest = next((v for v in reversed(loops) if v.new in keyframes), None)
         spots = [newest.new, newest.old] if newest is not None else keyframes[-1:]

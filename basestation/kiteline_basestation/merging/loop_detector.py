@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_edges import depth_of, motion_of, rescaled
-from kiteline_basestation.merging.loop_verification import Overlap, View, find_overlap, view_of
+from kiteline_basestation.merging.loop_verification import LoopMatch, View, verify_loop, view_of
 from kiteline_basestation.store.state import Memory, parsed, plain, votes_entry, votes_of
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
@@ -25,7 +25,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class LoopClosure:
     """Enough votes. newer, older: islands (the same one: a loop). S_older_newer: (4,4) how the newer has to move, in w:
     a rigid motion where both have one unit of length.
 
@@ -35,7 +35,7 @@ class Finding:
     newer: SubmapId
     older: SubmapId
     S_older_newer: F64
-    votes: tuple[Overlap, ...]
+    votes: tuple[LoopMatch, ...]
     against: tuple[SubmapId, SubmapId] | None = None
 
     @property
@@ -61,7 +61,7 @@ class Shares:
         return a == b or self._all or any(a in group and b in group for group in self._groups)
 
 
-class LoopFinder:
+class LoopDetector:
     """The place index over all keyframes, and the votes that are open."""
 
     def __init__(self, config: LoopConfig, sparse_map: SparseMap, words: Vocabulary) -> None:
@@ -69,7 +69,7 @@ class LoopFinder:
         self._map = sparse_map
         self._index = PlaceIndex(words)
         self._shares = Shares(config.share)
-        self._votes: dict[tuple[SubmapId, SubmapId], list[Overlap]] = {}  # by the submaps of old and new
+        self._votes: dict[tuple[SubmapId, SubmapId], list[LoopMatch]] = {}  # by the submaps of old and new
         self._doubts: dict[tuple[SubmapId, SubmapId], int] = {}  # how often a join of two submaps was taken back
         self._born: dict[SubmapId, int] = {}  # when the base first heard of a submap
         self.apart: list[tuple[frozenset[SubmapId], frozenset[SubmapId]]] = []  # what a person has split stays so
@@ -90,17 +90,17 @@ class LoopFinder:
         """The submap that the base heard of first."""
         return min(submaps, key=lambda s: (self._born.get(s, len(self._born)), s))
 
-    def consider(self, keyframe: KeyframeId) -> Finding | None:
+    def consider(self, keyframe: KeyframeId) -> LoopClosure | None:
         """Ask where else this place was seen. A finding is told once: its votes are used up."""
-        finding = self._said_by_agent(keyframe)
+        closure = self._said_by_agent(keyframe)
         view = view_of(self._map, keyframe)
         for old in self._candidates(keyframe, view):
-            overlap = find_overlap(self._map, keyframe, old, self._config, view)
-            if overlap is None:
+            match = verify_loop(self._map, keyframe, old, self._config, view)
+            if match is None:
                 continue
             self.proofs += 1
-            finding = finding or self._count(overlap) or self._ask_before(overlap)
-        return finding
+            closure = closure or self._count(match) or self._ask_before(match)
+        return closure
 
     def memory(self) -> Memory:
         """What a successor needs: evidence that is not enough yet, doubts, and which map is the elder."""
@@ -134,14 +134,12 @@ class LoopFinder:
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
-    def _said_by_agent(self, keyframe: KeyframeId) -> Finding | None:
+    def _said_by_agent(self, keyframe: KeyframeId) -> LoopClosure | None:
         """An agent that found its old map again makes two keyframes of one instant, one in each submap."""
         sparse_map = self._map
         new, t_ns = submap_of_keyframe(keyframe), sparse_map.keyframes.t_ns[sparse_map.rows[keyframe]]
         for submap in sorted(sparse_map.submaps):
-            if agent_of_submap(submap) != agent_of_submap(new) or sparse_map.island_of(submap) == sparse_map.island_of(
-                new
-            ):
+            if agent_of_submap(submap) != agent_of_submap(new) or sparse_map.map_id(submap) == sparse_map.map_id(new):
                 continue
             for other in sparse_map.submaps[submap]:
                 if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
@@ -151,8 +149,8 @@ class LoopFinder:
                 if self._doubts.get((min(new, submap), max(new, submap)), 0) or self._kept_apart(new, submap):
                     continue
                 nothing = np.empty(0, np.int32)
-                vote = Overlap(keyframe, other, np.eye(4), self._config.min_inliers_loop, nothing, nothing, 1.0)
-                return self._finding(vote, [vote])
+                vote = LoopMatch(keyframe, other, np.eye(4), self._config.min_inliers_loop, nothing, nothing, 1.0)
+                return self._closure(vote, [vote])
         return None
 
     def _candidates(self, keyframe: KeyframeId, view: View) -> list[KeyframeId]:
@@ -173,12 +171,12 @@ class LoopFinder:
         out: list[KeyframeId] = []
         taken: set[int] = set()
         left = {True: config.candidates_here, False: config.candidates}
-        island = sparse_map.island_of(submap_of_keyframe(keyframe))
+        map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
         for key, score in zip(places.keys.tolist(), places.score.tolist()):
             old = KeyframeId(key)
             if score < enough:
                 break
-            here = sparse_map.island_of(submap_of_keyframe(old)) == island
+            here = sparse_map.map_id(submap_of_keyframe(old)) == map_id
             if (
                 key in taken
                 or left[here] == 0
@@ -192,7 +190,7 @@ class LoopFinder:
             taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > config.max_shared)].tolist())
         return out
 
-    def _count(self, vote: Overlap) -> Finding | None:
+    def _count(self, vote: LoopMatch) -> LoopClosure | None:
         """Whether this vote and earlier ones are enough."""
         config = self._config
         new, old = submap_of_keyframe(vote.new), submap_of_keyframe(vote.old)
@@ -200,7 +198,7 @@ class LoopFinder:
         votes = [v for v in self._votes.get(key, []) if self._recent(v, vote)]
         votes.append(vote)
         self._votes[key] = votes
-        same_map = self._map.island_of(new) == self._map.island_of(old)
+        same_map = self._map.map_id(new) == self._map.map_id(old)
         chosen = [v for v in votes if self._agree(v, vote)]
         supporters = {v.new for v in chosen}
         best = max(chosen, key=lambda v: (v.inliers, v.new))
@@ -208,13 +206,13 @@ class LoopFinder:
             if new == old or len(supporters) < config.votes:
                 return None
             self._doubts[key] = self._doubts.get(key, 0) + 1
-            return replace(self._finding(best, chosen), against=key)
+            return replace(self._closure(best, chosen), against=key)
         if same_map and vote.inliers < config.min_inliers_loop:
             return None
         against = {v.new for v in votes} - supporters
         needed = config.votes * (1 + 2 * self._doubts.get(key, 0)) + config.against * len(against)
-        islands = (self._map.island_of(key[0]), self._map.island_of(key[1]))
-        if (min(islands), max(islands)) in self.asked:
+        root_submaps = (self._map.map_id(key[0]), self._map.map_id(key[1]))
+        if (min(root_submaps), max(root_submaps)) in self.asked:
             needed = 1
         if len(supporters) < needed or not (same_map or self._stands_out(chosen)):
             return None
@@ -223,28 +221,28 @@ class LoopFinder:
             return None
         if same_map:
             self._votes[key] = []  # those that joined maps stay, to be weighed against later ones
-        return self._finding(best, chosen)
+        return self._closure(best, chosen)
 
-    def _ask_before(self, vote: Overlap) -> Finding | None:
+    def _ask_before(self, vote: LoopMatch) -> LoopClosure | None:
         """Ask keyframes just before a proved one of the same place: where maps hardly overlap, few find it alone."""
         new, old = submap_of_keyframe(vote.new), submap_of_keyframe(vote.old)
-        if self._map.island_of(new) == self._map.island_of(old):
+        if self._map.map_id(new) == self._map.map_id(old):
             return None
         same = self._map.submaps[new]
         at = same.index(vote.new)
         for keyframe in reversed(same[max(0, at - self._config.ask_before) : at]):
             if any(v.new == keyframe for v in self._votes[(min(new, old), max(new, old))]):
                 continue
-            overlap = find_overlap(self._map, keyframe, vote.old, self._config)
-            if overlap is None:
+            match = verify_loop(self._map, keyframe, vote.old, self._config)
+            if match is None:
                 continue
             self.proofs += 1
-            finding = self._count(overlap)
-            if finding is not None:
-                return finding
+            closure = self._count(match)
+            if closure is not None:
+                return closure
         return None
 
-    def _stands_out(self, votes: list[Overlap]) -> bool:
+    def _stands_out(self, votes: list[LoopMatch]) -> bool:
         """Whether points lie off the plane that fits most of them: what is flat may hang in two places."""
         points = np.unique(np.concatenate([v.theirs for v in votes]))
         xyz, known = self._map.positions(points.astype(np.int32))
@@ -261,17 +259,17 @@ class LoopFinder:
             inside = distance <= max(limit, float(np.median(distance)))
         return float(np.mean(distance > limit)) >= self._config.min_off_plane
 
-    def _finding(self, best: Overlap, chosen: list[Overlap]) -> Finding:
-        islands = tuple(self._map.island_of(submap_of_keyframe(k)) for k in (best.new, best.old))
-        metric = [i for i in islands if not self._map.own_unit(i)]
-        older = metric[0] if len(metric) == 1 else self.eldest(islands)  # who knows the metre keeps it
-        newer = islands[1] if older == islands[0] else islands[0]
+    def _closure(self, best: LoopMatch, chosen: list[LoopMatch]) -> LoopClosure:
+        root_submaps = tuple(self._map.map_id(submap_of_keyframe(k)) for k in (best.new, best.old))
+        metric = [i for i in root_submaps if not self._map.own_unit(i)]
+        older = metric[0] if len(metric) == 1 else self.eldest(root_submaps)  # who knows the metre keeps it
+        newer = root_submaps[1] if older == root_submaps[0] else root_submaps[0]
         X = motion_of(self._map, best)  # island of old from island of new
-        if older != islands[1]:
+        if older != root_submaps[1]:
             X = sim3.inverse(X)
-        return Finding(newer, older, X, tuple(chosen))
+        return LoopClosure(newer, older, X, tuple(chosen))
 
-    def _recent(self, vote: Overlap, newest: Overlap) -> bool:
+    def _recent(self, vote: LoopMatch, newest: LoopMatch) -> bool:
         if vote.new not in self._map or vote.old not in self._map:
             return False
         if submap_of_keyframe(vote.new) != submap_of_keyframe(newest.new):
@@ -279,7 +277,7 @@ class LoopFinder:
         same = self._map.submaps[submap_of_keyframe(vote.new)]
         return abs(same.index(vote.new) - same.index(newest.new)) <= self._config.memory
 
-    def _agree(self, a: Overlap, b: Overlap) -> bool:
+    def _agree(self, a: LoopMatch, b: LoopMatch) -> bool:
         """Whether two votes say the same of how two maps lie, as far as drift between them allows."""
         config = self._config
         Xa, Xb = motion_of(self._map, a), motion_of(self._map, b)
@@ -297,7 +295,7 @@ class LoopFinder:
         limit = config.agree_m + config.agree_depth * deep + config.agree_path * way
         return apart <= limit and turned <= config.agree_rad
 
-    def _drift_explains(self, vote: Overlap) -> bool:
+    def _drift_explains(self, vote: LoopMatch) -> bool:
         """Whether a loop's correction is what flying that far may have added up to."""
         config = self._config
         X = motion_of(self._map, vote)
@@ -311,7 +309,7 @@ class LoopFinder:
         self.refused += not explained
         return explained
 
-    def _drift_m(self, vote: Overlap, way: float) -> float:
+    def _drift_m(self, vote: LoopMatch, way: float) -> float:
         """By how much the end of a way may be off: where the unit of length drifts, by as much as it did, too."""
         config, share = self._config, self._config.drift_path
         if any(self._map.own_unit(submap_of_keyframe(k)) for k in (vote.new, vote.old)):
@@ -331,7 +329,7 @@ class LoopFinder:
             total += float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
         return total
 
-    def _has_twin(self, vote: Overlap) -> bool:
+    def _has_twin(self, vote: LoopMatch) -> bool:
         """Whether one of the two maps shows the same place elsewhere too: then nobody knows which of them it is."""
         return any(self._twin_of(k) for k in (vote.old, vote.new))
 
@@ -340,12 +338,12 @@ class LoopFinder:
         T = sparse_map.world_pose(keyframe)
         assert T is not None
         view = view_of(sparse_map, keyframe)
-        island = sparse_map.island_of(submap_of_keyframe(keyframe))
+        map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
         looked = 0
         for key in self._index.query(view.descriptor, {keyframe}, 12 * config.candidates).keys.tolist():
             other = KeyframeId(key)
             T_other = sparse_map.world_pose(other)
-            if sparse_map.island_of(submap_of_keyframe(other)) != island or T_other is None:
+            if sparse_map.map_id(submap_of_keyframe(other)) != map_id or T_other is None:
                 continue
             own = sparse_map.own_unit(submap_of_keyframe(keyframe))
             way = self._way_m(other, keyframe)
@@ -355,10 +353,10 @@ class LoopFinder:
             looked += 1
             if looked > config.candidates:
                 return False
-            overlap = find_overlap(sparse_map, keyframe, other, config, view)
-            if overlap is None:
+            match = verify_loop(sparse_map, keyframe, other, config, view)
+            if match is None:
                 continue
-            X = motion_of(sparse_map, overlap)
+            X = motion_of(sparse_map, match)
             if float(np.linalg.norm(se3.transform(X, T[None, :3, 3])[0] - T[:3, 3])) > limit:
                 return True
         return False

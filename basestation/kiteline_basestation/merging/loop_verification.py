@@ -53,7 +53,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Overlap:
+class LoopMatch:
     """A keyframe `new` that proved to see what `old` saw. T_old_new: (4,4). inliers: points that agree.
 
     mine, theirs: (k,) slots of points of the new and of the old that are one. depth_m: median depth of them. Lengths
@@ -91,9 +91,9 @@ def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
     )  # fmt: skip
 
 
-def find_overlap(
+def verify_loop(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig, view: View | None = None
-) -> Overlap | None:  # fmt: skip
+) -> LoopMatch | None:  # fmt: skip
     """Whether `new` sees what `old` and its neighbours saw, and how the two then lie; None without proof.
 
     The poses of both are taken from their own maps; how these lie to each other is not used. view: of `new`, if known.
@@ -127,12 +127,12 @@ def find_overlap(
     if not free:
         if not _one_unit(sparse_map, new, mine, which, depth):
             return None
-        return Overlap(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
+        return LoopMatch(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
     scale = depth_scale(_own_depth(sparse_map, new, mine, which), depth[mine.known[which]], config)
     if scale is None:
         return None
     unit_new, unit_old = (float(sparse_map.keyframes.unit[sparse_map.rows[k]]) for k in (new, old))
-    return Overlap(
+    return LoopMatch(
         new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), mine.points[which], points,
         float(np.median(depth)) / unit_old, scale * unit_new / unit_old,
     )  # fmt: skip

@@ -20,16 +20,16 @@ from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.correction import graph_of, keyframes_of, move_keyframes, rescale, whole_window
 from kiteline_basestation.merging.essential_graph import GraphResult
-from kiteline_basestation.merging.loop_detector import Finding, LoopFinder
+from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
 from kiteline_basestation.merging.loop_edges import rescaled, similarity
-from kiteline_basestation.merging.loop_verification import Overlap
+from kiteline_basestation.merging.loop_verification import LoopMatch
 from kiteline_basestation.merging.merge import Merge
 from kiteline_basestation.refinement import disparity_calibration as disparity
 from kiteline_basestation.refinement import refind
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_units
 from kiteline_basestation.refinement.odometry_links import with_links, without_links
 from kiteline_basestation.runtime.jobs import BundleInputs, Job, JobDone
-from kiteline_basestation.store import merger_state as atlas_memory
+from kiteline_basestation.store import merger_state as merger_state
 from kiteline_basestation.store.state import Memory
 from kiteline_codec.schema import Kind
 from kiteline_core.geometry import se3, sim3
@@ -40,7 +40,7 @@ from kiteline_core.places.place_index import Vocabulary
 F64 = NDArray[np.float64]
 
 
-class Atlas:
+class MapMerger:
     """Findings and their consequences. The mapper calls; nothing here waits."""
 
     def __init__(
@@ -51,7 +51,7 @@ class Atlas:
         self._map = sparse_map
         self._publisher = publisher
         self._next_job = next_job
-        self.finder = LoopFinder(config.loops, sparse_map, words)
+        self.detector = LoopDetector(config.loops, sparse_map, words)
         self.loops = 0
         self.merges: list[Merge] = []
         self.undone = 0
@@ -59,8 +59,8 @@ class Atlas:
         self.grown: dict[SubmapId, float] = {}  # by what units grew in their maps since the mapper last asked
         self.parted: set[SubmapId] = set()  # submaps that were taken out of a map since the mapper last asked
         self._returned: dict[SubmapId, int] = {}  # where in each submap the way last was where it had been before
-        self._edges: list[Overlap] = []  # proved loops, edges of the pose graph
-        self._fresh: dict[SubmapId, list[Overlap]] = {}  # of each map, those whose points are not fused yet
+        self._edges: list[LoopMatch] = []  # proved loops, edges of the pose graph
+        self._fresh: dict[SubmapId, list[LoopMatch]] = {}  # of each map, those whose points are not fused yet
         self._graph_due: set[SubmapId] = set()
         self._full_due: set[SubmapId] = set()
         self._plain: set[SubmapId] = set()  # of those, the ones whose disparities are to be taken as they are
@@ -75,7 +75,7 @@ class Atlas:
         return not (self._graph_due or self._full_due or self._graphs or self._fulls or self._revisit)
 
     @property
-    def proved(self) -> Sequence[Overlap]:
+    def proved(self) -> Sequence[LoopMatch]:
         """Loops that were proved, oldest first."""
         return self._edges
 
@@ -84,27 +84,27 @@ class Atlas:
         """How many jobs are under way."""
         return len(self._graphs) + len(self._fulls)
 
-    def busy_with(self, island: SubmapId) -> bool:
+    def busy_with(self, map_id: SubmapId) -> bool:
         """Whether a correction of a map is under way."""
-        due = island in self._graph_due or island in self._full_due or island in self._graphs.values()
-        return due or any(i == island for i, _, _ in self._fulls.values())
+        due = map_id in self._graph_due or map_id in self._full_due or map_id in self._graphs.values()
+        return due or any(i == map_id for i, _, _ in self._fulls.values())
 
-    def fits(self, island: SubmapId) -> bool:
+    def fits(self, map_id: SubmapId) -> bool:
         """Whether one bundle can hold a whole map."""
-        return len(keyframes_of(self._map, island)) <= self._config.graph.max_full
+        return len(keyframes_of(self._map, map_id)) <= self._config.graph.max_full
 
-    def _keeps_disparities(self, island: SubmapId) -> bool:
+    def _keeps_disparities(self, map_id: SubmapId) -> bool:
         """Whether offsets were looked for in vain just now, or in a map that was hardly smaller."""
-        enough = self._config.disparity.again * self._doubted.get(island, 0)
-        return island in self._plain or len(keyframes_of(self._map, island)) < enough
+        enough = self._config.disparity.again * self._doubted.get(map_id, 0)
+        return map_id in self._plain or len(keyframes_of(self._map, map_id)) < enough
 
-    def bundle_all(self, island: SubmapId) -> None:
+    def bundle_all(self, map_id: SubmapId) -> None:
         """Bundle a whole map anew."""
-        self._full_due.add(island)
+        self._full_due.add(map_id)
 
     def consider(self, keyframe: KeyframeId) -> None:
         """Ask whether a new keyframe's place is known, and remember it."""
-        self.finder.add(keyframe)
+        self.detector.add(keyframe)
         if self._old_company(keyframe) and self._is_return(keyframe):
             self.loops += 1  # so little drift that its points were found where they were foreseen
         self._ask(keyframe)
@@ -132,100 +132,100 @@ class Atlas:
             refind.refind(self._map, keyframe, self._config.refind, self._publisher)
             self._ask(keyframe)
         if now and not self._revisit:
-            self._full_due.add(self._map.island_of(submap_of_keyframe(now[-1])))  # with all that they have in common
+            self._full_due.add(self._map.map_id(submap_of_keyframe(now[-1])))  # with all that they have in common
         return now
 
     def jobs(self) -> list[Job]:
         """Pose graphs first, then full bundles of maps whose graph is settled."""
         out: list[Job] = []
-        for island in sorted(self._graph_due):
-            inputs = graph_of(self._map, island, tuple(self._edges), self._config.graph)
+        for map_id in sorted(self._graph_due):
+            inputs = graph_of(self._map, map_id, tuple(self._edges), self._config.graph)
             if inputs is not None:
                 job = Job(self._next_job(), "graph", inputs)
-                self._graphs[job.id] = island
+                self._graphs[job.id] = map_id
                 out.append(job)
         self._graph_due.clear()
-        for island in sorted(self._full_due - set(self._graphs.values())):
-            part = whole_window(self._map, island, self._edges, self._config)
+        for map_id in sorted(self._full_due - set(self._graphs.values())):
+            part = whole_window(self._map, map_id, self._edges, self._config)
             if part is not None:
                 agents: tuple[AgentId, ...] = ()
-                if self.fits(island) and not self._keeps_disparities(island):
+                if self.fits(map_id) and not self._keeps_disparities(map_id):
                     problem, agents = disparity.with_border(
                         self._map, part.slots, part.problem, self._config.disparity
                     )  # fmt: skip
                     part = replace(part, problem=problem)
                 linked = with_links(self._map, part, self._config.links)
                 job = Job(self._next_job(), "full", BundleInputs(linked, self._full_config()))
-                self._fulls[job.id] = (island, part, agents)
+                self._fulls[job.id] = (map_id, part, agents)
                 out.append(job)
-            self._full_due.discard(island)
-            self._plain.discard(island)
+            self._full_due.discard(map_id)
+            self._plain.discard(map_id)
         return out
 
     def finish(self, done: JobDone) -> bool:
         """Take in a finished job; False when it is none of ours. One that was made void changes nothing."""
         if isinstance(done.result, GraphResult):
-            island = self._graphs.pop(done.id, None)
-            if island is not None:
-                self._bend(island, done.result)
+            map_id = self._graphs.pop(done.id, None)
+            if map_id is not None:
+                self._bend(map_id, done.result)
             return True
         if isinstance(done.result, BundleResult) and done.id in self._fulls:
-            island, part, agents = self._fulls.pop(done.id)
+            map_id, part, agents = self._fulls.pop(done.id)
             result = without_links(part, done.result)
             if agents and not disparity.stands_out(result, self._config.disparity):
                 disparity.forget(self._map, agents)
-                self._doubted[island] = len(keyframes_of(self._map, island))
-                self._plain.add(island)  # nothing is known to be off: the same again, with disparities as they are
-                self._full_due.add(island)
-            elif self._settle(island, part, result) and agents:
-                self._doubted.pop(island, None)
+                self._doubted[map_id] = len(keyframes_of(self._map, map_id))
+                self._plain.add(map_id)  # nothing is known to be off: the same again, with disparities as they are
+                self._full_due.add(map_id)
+            elif self._settle(map_id, part, result) and agents:
+                self._doubted.pop(map_id, None)
                 disparity.take(self._map, agents, part.problem, result, self._config.disparity)
             return True
         return False
 
     def memory(self) -> Memory:
         """What a successor needs to go on from here; corrections under way are due again."""
-        return atlas_memory.memory(self)
+        return merger_state.memory(self)
 
     def recall(self, texts: Mapping[str, str]) -> None:
         """Go on from what a forerunner remembered; every keyframe is a known place."""
-        atlas_memory.recall(self, texts)
+        merger_state.recall(self, texts)
 
     # -- findings ----------------------------------------------------------------------------------------------------
 
     def _ask(self, keyframe: KeyframeId) -> None:
-        finding = self.finder.consider(keyframe)
-        if finding is None:
+        closure = self.detector.consider(keyframe)
+        if closure is None:
             return
-        if finding.against is not None:
-            a, b = finding.against
+        if closure.against is not None:
+            a, b = closure.against
             for merge in reversed(self.merges):
                 if (a in merge.moved) != (b in merge.moved):
                     self.undo(merge)
                     return
             return
-        if finding.loop:
+        if closure.loop:
             self.loops += self._is_return(keyframe)
         else:
-            self._join(finding)
-        self._edges.extend(finding.votes)
-        self._fresh.setdefault(finding.older, []).extend(finding.votes)
-        self._void(finding.older)
-        if self._needs_graph(finding):
-            self._graph_due.add(finding.older)
+            self._join(closure)
+        self._edges.extend(closure.votes)
+        self._fresh.setdefault(closure.older, []).extend(closure.votes)
+        self._void(closure.older)
+        if self._needs_graph(closure):
+            self._graph_due.add(closure.older)
         else:
-            self._fuse_fresh(finding.older)
-            self._full_due.add(finding.older)
+            self._fuse_fresh(closure.older)
+            self._full_due.add(closure.older)
 
-    def _void(self, island: SubmapId) -> None:
+    def _void(self, map_id: SubmapId) -> None:
         """What is under way in a map is out of date."""
-        self._graphs = {job: i for job, i in self._graphs.items() if i != island}
-        self._fulls = {job: full for job, full in self._fulls.items() if full[0] != island}
+        self._graphs = {job: i for job, i in self._graphs.items() if i != map_id}
+        self._fulls = {job: full for job, full in self._fulls.items() if full[0] != map_id}
 
-    def _needs_graph(self, finding: Finding) -> bool:
+    def _needs_graph(self, closure: LoopClosure) -> bool:
         """Whether fusing points and bundling would not do: the correction reaches further than they look."""
         limits = self._config.loops
-        for vote in finding.votes:
+        for vote in closure.votes:
             S_w_new = similarity(self._map, vote.new)
             error = sim3.inverse(S_w_new) @ similarity(self._map, vote.old) @ sim3.of(vote.scale, vote.T_old_new)
             if sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]) > limits.small_m:
@@ -236,34 +236,34 @@ class Atlas:
                 return True
         return False
 
-    def _join(self, finding: Finding) -> None:
+    def _join(self, closure: LoopClosure) -> None:
         """Lay the newer map into the older; where it is then bent, its submaps keep their own m."""
         sparse_map = self._map
-        submaps = sparse_map.island(finding.newer)
-        self._void(finding.newer)
+        submaps = sparse_map.submaps_of_map(closure.newer)
+        self._void(closure.newer)
         for waiting in (self._graph_due, self._full_due):
-            waiting.discard(finding.newer)
-        self._fresh.setdefault(finding.older, []).extend(self._fresh.pop(finding.newer, []))
-        merge = Merge(finding.newer, finding.older, {s: sparse_map.frame(s) for s in submaps})
+            waiting.discard(closure.newer)
+        self._fresh.setdefault(closure.older, []).extend(self._fresh.pop(closure.newer, []))
+        merge = Merge(closure.newer, closure.older, {s: sparse_map.frame(s) for s in submaps})
         for submap in submaps:
-            sparse_map.move_submap(submap, sim3.normalise(finding.S_older_newer @ merge.moved[submap]))
-            sparse_map.islands[submap] = finding.older
+            sparse_map.move_submap(submap, sim3.normalise(closure.S_older_newer @ merge.moved[submap]))
+            sparse_map.root_submaps[submap] = closure.older
         self.merges.append(merge)
-        self.moved |= {finding.older, finding.newer}
+        self.moved |= {closure.older, closure.newer}
         self._revisit.extend(k for s in submaps for k in sparse_map.submaps[s] if k not in self._revisit)
 
     # -- corrections -------------------------------------------------------------------------------------------------
 
-    def _bend(self, island: SubmapId, result: GraphResult) -> None:
+    def _bend(self, map_id: SubmapId, result: GraphResult) -> None:
         targets = {KeyframeId(k): T for k, T in zip(result.keyframes.tolist(), result.T_w_k)}
         growth = {KeyframeId(k): s for k, s in zip(result.keyframes.tolist(), result.scale.tolist())}
-        units, lengths = rescale(self._map, island, growth, self._publisher)
+        units, lengths = rescale(self._map, map_id, growth, self._publisher)
         self._note_growth(units)
         self._stretch(lengths)
-        move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
-        self.moved.add(island)
-        self._fuse_fresh(island)
-        self._full_due.add(island)
+        move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
+        self.moved.add(map_id)
+        self._fuse_fresh(map_id)
+        self._full_due.add(map_id)
 
     def _note_growth(self, units: Mapping[SubmapId, float]) -> None:
         for submap, more in units.items():
@@ -274,13 +274,13 @@ class Atlas:
         if grown:
             self._edges = [rescaled(v, grown) for v in self._edges]
             self._fresh = {s: [rescaled(v, grown) for v in votes] for s, votes in self._fresh.items()}
-            self.finder.rescale(grown)
+            self.detector.rescale(grown)
 
-    def _fuse_fresh(self, island: SubmapId) -> None:
+    def _fuse_fresh(self, map_id: SubmapId) -> None:
         """Points that votes proved to be one, then what the neighbours on both sides see of each other."""
         table = self._map.keypoints
-        votes = self._fresh.pop(island, [])
-        merge = self.merges[-1] if self.merges and self.merges[-1].into == island else None
+        votes = self._fresh.pop(map_id, [])
+        merge = self.merges[-1] if self.merges and self.merges[-1].into == map_id else None
         for vote in votes:
             for a, b in zip(vote.mine.tolist(), vote.theirs.tolist()):
                 a, b = int(table.root[a]), int(table.root[b])
@@ -298,14 +298,14 @@ class Atlas:
         config = self._config.graph
         return replace(self._config.bundle, robust_trials=config.robust_trials, final_trials=config.final_trials)
 
-    def _settle(self, island: SubmapId, part: Window, result: BundleResult) -> bool:
+    def _settle(self, map_id: SubmapId, part: Window, result: BundleResult) -> bool:
         """Take a full bundle in; what came meanwhile moves along the spanning tree. Returns whether it was taken."""
         if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
             return False
-        if self._contradicted(island, part, result):
+        if self._contradicted(map_id, part, result):
             return False
-        if self.fits(island):
-            result, units = keep_units(self._map, island, part, result)
+        if self.fits(map_id):
+            result, units = keep_units(self._map, map_id, part, result)
             self._note_growth(units)
         rows = part.rows[part.problem.free]
         poses = np.linalg.inv(result.T_c_m[part.problem.free])
@@ -316,21 +316,21 @@ class Atlas:
             pose = self._map.world_pose(keyframe)
             assert pose is not None
             targets[keyframe] = pose
-        move_keyframes(self._map, island, targets, self._publisher, self._config.publish)
+        move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
         apply_bundle(self._map, part, result, self._publisher, self._config.cull, self._config.publish)
-        self.moved.add(island)
+        self.moved.add(map_id)
         return True
 
     # -- orders ------------------------------------------------------------------------------------------------------
 
     def look_for(self, newer: SubmapId, older: SubmapId) -> None:
         """A person says that two maps overlap: every keyframe of the newer looks for it, and one proof is enough."""
-        self.finder.asked.add((min(newer, older), max(newer, older)))
+        self.detector.asked.add((min(newer, older), max(newer, older)))
         self._revisit.extend(k for k in keyframes_of(self._map, newer) if k not in self._revisit)
 
     def join(self, newer: SubmapId, older: SubmapId, S_older_newer: F64) -> None:
         """A person says how two maps lie to each other: (4,4) moves the newer, in w, onto the older."""
-        self._join(Finding(newer, older, S_older_newer, ()))
+        self._join(LoopClosure(newer, older, S_older_newer, ()))
         self._void(older)
         self._full_due.add(older)
 
@@ -339,8 +339,8 @@ class Atlas:
         merge = next((m for m in reversed(self.merges) if submap in m.moved), None)
         if merge is None:
             return False
-        rest = frozenset(self._map.island(merge.into)) - merge.moved.keys()
-        self.finder.apart.append((frozenset(merge.moved), rest))
+        rest = frozenset(self._map.submaps_of_map(merge.into)) - merge.moved.keys()
+        self.detector.apart.append((frozenset(merge.moved), rest))
         self.undo(merge)
         return True
 
@@ -348,7 +348,7 @@ class Atlas:
         """Maps are deleted: nothing is looked for in them, or made of them, any more."""
         for submap in submaps:
             for keyframe in self._map.submaps.get(submap, []):
-                self.finder.forget(keyframe)
+                self.detector.forget(keyframe)
             self._void(submap)
         self._graph_due.difference_update(submaps)
         self._full_due.difference_update(submaps)
@@ -357,9 +357,9 @@ class Atlas:
 
     # -- second thoughts ---------------------------------------------------------------------------------------------
 
-    def _contradicted(self, island: SubmapId, part: Window, result: BundleResult) -> bool:
+    def _contradicted(self, map_id: SubmapId, part: Window, result: BundleResult) -> bool:
         """Undo the last merge into a map when the bundle rejects most of what it fused. Returns whether it did."""
-        merge = next((m for m in reversed(self.merges) if m.into == island), None)
+        merge = next((m for m in reversed(self.merges) if m.into == map_id), None)
         if merge is None or not merge.fused:
             return False
         table = self._map.keypoints
@@ -392,9 +392,9 @@ class Atlas:
         sparse_map.part(crossing[table.kind[crossing] == LANDMARK])
         self._publisher.touch_slots(Kind.FUSED_LANDMARKS, crossing[table.kind[crossing] == LANDMARK])
         for submap, frame in merge.moved.items():
-            sparse_map.islands.pop(submap, None)
+            sparse_map.root_submaps.pop(submap, None)
             if submap != merge.eldest:
-                sparse_map.islands[submap] = merge.eldest
+                sparse_map.root_submaps[submap] = merge.eldest
             sparse_map.move_submap(submap, frame)
         self.parted |= mine
         self.moved |= {merge.into, merge.eldest}

@@ -112,15 +112,15 @@ def _points(
 
 
 def keep_units(
-    sparse_map: SparseMap, island: SubmapId, window: Window, result: BundleResult
+    sparse_map: SparseMap, map_id: SubmapId, window: Window, result: BundleResult
 ) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
     """What a bundle of a whole map did to the units of one eye's submaps is said by their scale, as far as it did it
     before the newest keyframes: lengths there stay as the agent has them. In a map without a metre, lengths before the
     oldest keyframes stay as they were in w. Returns the result so, and by what units grew.
     """
-    own = [submap for submap in sparse_map.island(island) if sparse_map.own_unit(submap)]
+    own = [submap for submap in sparse_map.submaps_of_map(map_id) if sparse_map.own_unit(submap)]
     growth = {s: _growth(sparse_map, sparse_map.submaps[s][-_AROUND:], window, result) for s in own}
-    eldest = sparse_map.island_of(island)
+    eldest = sparse_map.map_id(map_id)
     if eldest in growth:
         whole = _growth(sparse_map, sparse_map.submaps[eldest][:_AROUND], window, result)
         centre = sim3.place(sparse_map.frame(eldest), sparse_map.beginning(eldest))[:3, 3]

@@ -51,7 +51,7 @@ def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig
     if len(inverse) == 0:
         return covisible
     reach = config.near_ratio / float(np.median(inverse))
-    same = [k for s in sparse_map.island(submap_of_keyframe(keyframe)) for k in sparse_map.submaps[s]]
+    same = [k for s in sparse_map.submaps_of_map(submap_of_keyframe(keyframe)) for k in sparse_map.submaps[s]]
     rows = np.array([sparse_map.rows[k] for k in same], np.int32)
     poses = table.T_w_k[rows]
     distance = np.linalg.norm(poses[:, :3, 3] - table.T_w_k[row, :3, 3], axis=1)

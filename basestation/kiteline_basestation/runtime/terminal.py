@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from kiteline_basestation.management import called
-from kiteline_basestation.merging.loop_verification import Overlap
+from kiteline_basestation.merging.loop_verification import LoopMatch
 from kiteline_basestation.merging.merge import Merge
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
@@ -27,11 +27,11 @@ class Narrator:
         self._sessions: dict[AgentId, int] = {}
         self._submaps = set(station.mapper.map.submaps)
         self._deleted = set(station.mapper.deleted)
-        atlas = station.mapper.atlas
-        self._loops = 0 if atlas is None else atlas.loops
-        self._undone = 0 if atlas is None else atlas.undone
-        self._proofs = 0 if atlas is None else len(atlas.proved)
-        self._merges = [] if atlas is None else list(atlas.merges)
+        merger = station.mapper.merger
+        self._loops = 0 if merger is None else merger.loops
+        self._undone = 0 if merger is None else merger.undone
+        self._proofs = 0 if merger is None else len(merger.proved)
+        self._merges = [] if merger is None else list(merger.merges)
         self._summary_ns = _EVERY_NS
         self._bytes_down = self._bytes_up = 0
 
@@ -74,24 +74,24 @@ class Narrator:
         for submap in sorted(mapper.deleted - self._deleted):
             self._deleted.add(submap)
             out.append(f"map {_name(submap, mapper.names)} is deleted")
-        atlas = mapper.atlas
-        if atlas is None:
+        merger = mapper.merger
+        if merger is None:
             return out
-        proved, self._proofs = atlas.proved[self._proofs :], len(atlas.proved)
-        if atlas.loops > self._loops:
-            self._loops = atlas.loops
+        proved, self._proofs = merger.proved[self._proofs :], len(merger.proved)
+        if merger.loops > self._loops:
+            self._loops = merger.loops
             out.append(f"loop closed, the {_nth(self._loops)}: {self._loop(proved)}")
-        for merge in [m for m in atlas.merges if not any(m is known for known in self._merges)]:
+        for merge in [m for m in merger.merges if not any(m is known for known in self._merges)]:
             out.append(self._joined(merge))
-        if atlas.undone > self._undone:
-            self._undone = atlas.undone
-            gone = [m for m in self._merges if not any(m is kept for kept in atlas.merges)]
+        if merger.undone > self._undone:
+            self._undone = merger.undone
+            gone = [m for m in self._merges if not any(m is kept for kept in merger.merges)]
             names = ", ".join(_name(m.eldest, mapper.names) for m in gone)
             out.append(f"map {names} is taken out of the map that it was laid into")
-        self._merges = list(atlas.merges)
+        self._merges = list(merger.merges)
         return out
 
-    def _loop(self, proved: Sequence[Overlap]) -> str:
+    def _loop(self, proved: Sequence[LoopMatch]) -> str:
         """How long a loop is, and how far its ends were apart."""
         sparse_map = self._station.mapper.map
         vote = max(proved, key=lambda v: v.inliers, default=None)

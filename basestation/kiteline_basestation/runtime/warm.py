@@ -8,7 +8,7 @@ import numpy as np
 
 from kiteline_basestation.config import BaseConfig, GraphConfig
 from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
-from kiteline_basestation.merging.loop_verification import find_overlap
+from kiteline_basestation.merging.loop_verification import verify_loop
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
@@ -40,10 +40,10 @@ def warm(config: BaseConfig | None = None, words: Vocabulary | None = None) -> N
         submap = submap_id(0, 0, 0)
         easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_share=0.0)
         sparse_map, last, first = station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
-        find_overlap(sparse_map, last, first, easy)
+        verify_loop(sparse_map, last, first, easy)
         sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))
         sparse_map.measures_depth.clear()
-        find_overlap(sparse_map, last, first, easy)  # as one eye's, with a scale
+        verify_loop(sparse_map, last, first, easy)  # as one eye's, with a scale
 
 
 def warm_graphs() -> None:

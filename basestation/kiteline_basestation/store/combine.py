@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
-from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_codec.schema import Key, Kind, WireError
 from kiteline_core.ids import AgentId
 
 _NUMBERED = ("edge", "merge")
 
 
-def combine(first: Kept, second: Kept) -> Kept:
+def combine(first: SavedMap, second: SavedMap) -> SavedMap:
     """Both maps; the first one's world. What the second has of the same keyframes as the first is passed over.
 
     Raises WireError where both have other keyframes under the same ids.
@@ -36,7 +36,7 @@ def combine(first: Kept, second: Kept) -> Kept:
             {**codes.received, **here.received},
             {**{key: code for key, code in codes.own.items() if _is_news(key, known)}, **here.own},
         )
-    return Kept(agents, _combined(first.memory, second.memory, new))
+    return SavedMap(agents, _combined(first.memory, second.memory, new))
 
 
 def _is_news(key: Key, known: set[int]) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
 from kiteline_basestation.mapper import Mapper
-from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_codec.coding import messages
 from kiteline_codec.schema import (
     CulledLandmarks,
@@ -53,12 +53,12 @@ class Checked:
     parent, and sections whose keyframe, have not arrived: their agent sends them again.
     """
 
-    kept: Kept
+    kept: SavedMap
     faults: tuple[str, ...]
     awaited: int
 
 
-def sound(kept: Kept) -> Checked:
+def sound(kept: SavedMap) -> Checked:
     """Check every value, and take out what cannot be."""
     faults: list[str] = []
     decoded = {
@@ -93,7 +93,7 @@ def sound(kept: Kept) -> Checked:
     for agent, codes in kept.agents.items():
         received, own = decoded[agent]
         agents[agent] = Codes({key: codes.received[key] for key in received}, {key: codes.own[key] for key in own})
-    return Checked(Kept(agents, _sound_memory(kept.memory, submaps, faults)), tuple(faults), awaited)
+    return Checked(SavedMap(agents, _sound_memory(kept.memory, submaps, faults)), tuple(faults), awaited)
 
 
 def _name(key: Key) -> str:
@@ -212,13 +212,13 @@ def contradictions(mapper: Mapper) -> list[str]:
     if np.any(met[hangs] != 1) or met.sum() != len(hangs):
         out.append("the lists of observations do not hold every observation once")
     submap = frames.id[table.row[:n]] >> 20
-    island = {s: int(sparse_map.island_of(SubmapId(s))) for s in np.unique(submap).tolist()}
+    map_id = {s: int(sparse_map.map_id(SubmapId(s))) for s in np.unique(submap).tolist()}
     across = hangs[submap[hangs] != submap[on]]
-    apart = sum(island[a] != island[b] for a, b in zip(submap[across].tolist(), submap[root[across]].tolist()))
+    apart = sum(map_id[a] != map_id[b] for a, b in zip(submap[across].tolist(), submap[root[across]].tolist()))
     if apart:
         out.append(f"{apart} keypoints show points of a map that is not theirs")
-    for joined, eldest in sparse_map.islands.items():
-        if eldest not in sparse_map.submaps or eldest in sparse_map.islands or joined not in sparse_map.submaps:
+    for joined, eldest in sparse_map.root_submaps.items():
+        if eldest not in sparse_map.submaps or eldest in sparse_map.root_submaps or joined not in sparse_map.submaps:
             out.append(f"submap {joined} is joined to {eldest}, which is no map")
     for placed, T_w_m in mapper.placements.items():
         if placed not in sparse_map.submaps or not np.isfinite(T_w_m).all():

@@ -15,8 +15,8 @@ from pathlib import Path
 from kiteline_basestation.runtime import flight_log
 from kiteline_basestation.runtime.jobs import Job, run_job
 from kiteline_basestation.station import Import, Station
-from kiteline_basestation.store.kept import Codes, Kept, unpack
 from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.saved_map import Codes, SavedMap, unpack
 from kiteline_basestation.store.state import Scribe
 from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read, submap_of
 from kiteline_basestation.supply.supply import is_copy
@@ -52,11 +52,11 @@ class Keeper:
         """Whether all that was handed to the thread is written."""
         return self._writing == 0
 
-    def load(self) -> Kept:
+    def load(self) -> SavedMap:
         """What earlier bases kept."""
         return self._store.load()
 
-    def begin(self, station: Station, kept: Kept, held: Kept) -> None:
+    def begin(self, station: Station, kept: SavedMap, held: SavedMap) -> None:
         """From here on keep a station that began with `kept`, in a store that holds `held`."""
         self._put(batch_of(kept, held))
         self._deleted = set(station.mapper.deleted)
@@ -118,7 +118,7 @@ class Keeper:
             self._store.close()
 
 
-def snapshot(station: Station, before: Kept) -> Kept:
+def snapshot(station: Station, before: SavedMap) -> SavedMap:
     """A station's whole map at rest. before: what it was restored from. What was imported since must be noted."""
     agents = {}
     for agent, channel in sorted(station.channels.items()):
@@ -130,13 +130,13 @@ def snapshot(station: Station, before: Kept) -> Kept:
             imported = {key: code for (a, _, key), code in noted if a == agent and code is not None}
             agents[agent] = Codes({**old.received, **imported, **end.legacy_values(), **end.peer_values()}, own)
     texts = Scribe().changes(station.mapper.memory())
-    return Kept(agents, {name: text for name, text in texts.items() if text is not None})
+    return SavedMap(agents, {name: text for name, text in texts.items() if text is not None})
 
 
 # -- imports -----------------------------------------------------------------------------------------------------------
 
 
-def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> Kept | list[Import]:
+def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | list[Import]:
     """A finished map (a store, a base's log), or what an agent's log holds, in pieces for several steps.
 
     make_station: makes a station as that of a base's log was, from the log's metadata. Raises StoreError, SourceError.
@@ -166,11 +166,11 @@ def _of_agent(log: LogReader, path: Path) -> list[Import]:
     return out
 
 
-def _of_base(log: LogReader, path: Path, station: Station) -> Kept:
+def _of_base(log: LogReader, path: Path, station: Station) -> SavedMap:
     """Run the base again, to its end."""
     if log.metadata.get("channel") != "CodedChannel":
         raise StoreError(f"{path}: the log of a monolith holds no packets: expected that of a base with a link")
-    before = Kept()
+    before = SavedMap()
     for blob in log.messages((flight_log.RESTORED,)):
         before = unpack(blob.blob())
         restore(station, before, blob.t_ns)
@@ -201,13 +201,13 @@ def _steps(log: LogReader) -> Iterator[Sequence[LogMessage]]:
 
 def read_imports(
     paths: Sequence[str], make_station: Callable[[Mapping[str, str]], Station]
-) -> tuple[list[Kept], list[Import]]:
+) -> tuple[list[SavedMap], list[Import]]:
     """What --import names: finished maps, and pieces of agents' logs. Raises StoreError, SourceError."""
-    maps: list[Kept] = []
+    maps: list[SavedMap] = []
     pieces: list[Import] = []
     for text in paths:
         found = import_map(Path(text), make_station)
-        if isinstance(found, Kept):
+        if isinstance(found, SavedMap):
             maps.append(found)
         else:
             pieces += found

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import Checked, contradictions, sound
-from kiteline_basestation.store.kept import Kept
+from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.supply.supply import is_copy
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.coding import messages
@@ -19,13 +19,13 @@ class Restored:
     are to send again.
     """
 
-    kept: Kept
+    kept: SavedMap
     keyframes: int
     faults: tuple[str, ...]
     awaited: int
 
 
-def restore(station: Station, kept: Kept, now_ns: int) -> Restored:
+def restore(station: Station, kept: SavedMap, now_ns: int) -> Restored:
     """Put a map into a station that begins, and share with the agents again what is ours. What an agent still holds
     comes again and replaces what it told the earlier base. Raises WireError where what is left contradicts itself.
     """

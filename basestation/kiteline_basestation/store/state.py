@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.loop_verification import Overlap
+from kiteline_basestation.merging.loop_verification import LoopMatch
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import KeyframeId
 
@@ -88,13 +88,13 @@ def similarity_of(numbers: Sequence[float]) -> F64:
     return S
 
 
-def votes_entry(sparse_map: SparseMap, votes: Sequence[Overlap], points: bool) -> Entry:
+def votes_entry(sparse_map: SparseMap, votes: Sequence[LoopMatch], points: bool) -> Entry:
     """Evidence. points: with the points that are one; without them it only says how keyframes lie to each other."""
     mark = tuple((v.new, v.old, v.inliers, v.T_old_new.tobytes(), v.scale, len(v.mine)) for v in votes)
     return Entry(mark, lambda: [_vote(sparse_map, v, points) for v in votes])
 
 
-def _vote(sparse_map: SparseMap, vote: Overlap, points: bool) -> Json:
+def _vote(sparse_map: SparseMap, vote: LoopMatch, points: bool) -> Json:
     pairs = [vote.mine, vote.theirs] if points else [vote.mine[:0], vote.theirs[:0]]
     return {
         "new": int(vote.new), "old": int(vote.old), "T": matrix(vote.T_old_new), "inliers": int(vote.inliers),
@@ -103,7 +103,7 @@ def _vote(sparse_map: SparseMap, vote: Overlap, points: bool) -> Json:
     }  # fmt: skip
 
 
-def votes_of(sparse_map: SparseMap, value: Json) -> list[Overlap]:
+def votes_of(sparse_map: SparseMap, value: Json) -> list[LoopMatch]:
     """The opposite of `votes_entry`; what names unknown keyframes is left out, and so are unknown points."""
     out = []
     for vote in value:
@@ -112,7 +112,7 @@ def votes_of(sparse_map: SparseMap, value: Json) -> list[Overlap]:
             continue
         mine, theirs = slots_of(sparse_map, *vote["points"])
         T, scale = pose_of(vote["T"]), vote.get("scale", 1.0)  # stores of protocol 2 knew no scale
-        out.append(Overlap(new, old, T, vote["inliers"], mine, theirs, vote["depth_m"], scale))
+        out.append(LoopMatch(new, old, T, vote["inliers"], mine, theirs, vote["depth_m"], scale))
     return out
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from kiteline_basestation.store.kept import Codes, Kept
+from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_codec.schema import Key, Kind
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
 
@@ -67,7 +67,7 @@ class Batch:
         return bool(self.rows or self.gone or self.memory or self.deleted)
 
 
-def batch_of(kept: Kept, held: Kept) -> Batch:
+def batch_of(kept: SavedMap, held: SavedMap) -> Batch:
     """What has to be written so that a store that holds `held` holds `kept`, and nothing else."""
     out = Batch()
     for agent in sorted(kept.agents.keys() | held.agents.keys()):
@@ -96,7 +96,7 @@ class Store:
             self._lock.close()
             raise
 
-    def load(self) -> Kept:
+    def load(self) -> SavedMap:
         """All that is kept."""
         with _told(self.path):
             return _read(self._db)
@@ -137,7 +137,7 @@ class Store:
         self._lock.close()
 
 
-def read(path: Path) -> Kept:
+def read(path: Path) -> SavedMap:
     """The content of a store, also while its base runs. path: its folder, or the file in it. Raises StoreError."""
     file = path / FILE if path.is_dir() else path
     if not file.is_file():
@@ -195,7 +195,7 @@ def _open(path: Path, make: bool) -> sqlite3.Connection:
     return db
 
 
-def _read(db: sqlite3.Connection) -> Kept:
+def _read(db: sqlite3.Connection) -> SavedMap:
     agents: dict[AgentId, tuple[dict[Key, bytes], dict[Key, bytes]]] = {}
     db.execute("BEGIN")  # both tables as they stand at one moment
     try:
@@ -204,7 +204,7 @@ def _read(db: sqlite3.Connection) -> Kept:
         memory: Mapping[str, str] = dict(db.execute("SELECT name, text FROM memory"))
     finally:
         db.execute("COMMIT")
-    return Kept({agent: Codes(*agents[agent]) for agent in sorted(agents)}, memory)
+    return SavedMap({agent: Codes(*agents[agent]) for agent in sorted(agents)}, memory)
 
 
 @contextlib.contextmanager

@@ -131,7 +131,7 @@ class Supply:
             for k in self._map.submaps[s][-self._config.remembered :]
         )
         remembered = {k for _, k in newest[-self._config.remembered :]}
-        for other in self._map.island(submap):
+        for other in self._map.submaps_of_map(submap):
             if self._shares.together(agent, agent_of_submap(other)):
                 rows += [self._map.rows[k] for k in self._map.submaps.get(other, []) if k not in remembered]
         return np.array([r for r in rows if self._map.keyframes.pose_source[r]], np.int64)
@@ -164,11 +164,11 @@ class Supply:
         """What is no longer of one map with the submap in which it was lent, or no longer wanted before it arrived;
         then, for want of room, what is not wanted, the oldest first.
         """
-        island = self._map.island_of
+        map_id = self._map.map_id
         gone = [
             k
             for k, lent in reader.lent.items()
-            if island(submap_of_keyframe(k)) != island(lent.copy.submap)
+            if map_id(submap_of_keyframe(k)) != map_id(lent.copy.submap)
             or abs(self._length(k, submap) / lent.length - 1.0) > self._config.length
             or (k not in wanted and not _arrived(lent, channel))
         ]
@@ -183,7 +183,7 @@ class Supply:
     def _tell_moves(self, reader: _Reader, submap: SubmapId, channel: RecordChannel) -> None:
         """Copies stand where the map has them now, said in the submap in which the agent flies now."""
         for keyframe, lent in reader.lent.items():
-            if self._map.island_of(submap_of_keyframe(keyframe)) != self._map.island_of(submap):
+            if self._map.map_id(submap_of_keyframe(keyframe)) != self._map.map_id(submap):
                 continue
             now = self._copy(keyframe, submap)
             if lent.copy.submap == submap:

@@ -132,8 +132,8 @@ class Judged:
     @property
     def merges(self) -> int:
         """How many maps were joined."""
-        atlas = self.flight.station.mapper.atlas
-        return 0 if atlas is None else len(atlas.merges)
+        merger = self.flight.station.mapper.merger
+        return 0 if merger is None else len(merger.merges)
 
     def live_m(self, sortie: int, first: int = 0) -> float:
         """Root mean square error of the live positions in w, of the frames from one on that have one."""

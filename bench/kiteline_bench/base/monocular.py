@@ -56,8 +56,8 @@ class Judged:
     @property
     def merges(self) -> int:
         """How many maps were joined."""
-        atlas = self.mapper.atlas
-        return 0 if atlas is None else len(atlas.merges)
+        merger = self.mapper.merger
+        return 0 if merger is None else len(merger.merges)
 
     def length_error(self, sortie: int) -> float:
         """By what share lengths of a sortie's way are off, in the world."""

@@ -28,8 +28,8 @@ from kiteline_basestation.runtime.jobs import Job, run_job
 from kiteline_basestation.runtime.options import BaseSpec
 from kiteline_basestation.runtime.warm import warm as base_warm
 from kiteline_basestation.station import Station
-from kiteline_basestation.store.kept import unpack
 from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.saved_map import unpack
 from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration

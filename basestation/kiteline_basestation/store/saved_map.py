@@ -32,7 +32,7 @@ class Codes:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class SavedMap:
     """A map at rest. memory: JSON texts by name, see `memory`."""
 
     agents: Mapping[AgentId, Codes] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class Kept:
         return not any(codes.received or codes.own for codes in self.agents.values())
 
 
-def pack(kept: Kept) -> bytes:
+def pack(kept: SavedMap) -> bytes:
     """As bytes."""
     out = [_MAGIC, _AGENTS.pack(len(kept.agents))]
     for agent in sorted(kept.agents):
@@ -61,7 +61,7 @@ def pack(kept: Kept) -> bytes:
     return body + hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest()
 
 
-def unpack(content: bytes) -> Kept:
+def unpack(content: bytes) -> SavedMap:
     """What `pack` was given. Raises WireError on anything else."""
     body, digest = content[:-_DIGEST_BYTES], content[-_DIGEST_BYTES:]
     if not body.startswith(_MAGIC) or hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest() != digest:
@@ -86,4 +86,4 @@ def unpack(content: bytes) -> Kept:
         at += _TEXT.size
         memory[body[at : at + name].decode()] = body[at + name : at + name + text].decode()
         at += name + text
-    return Kept(agents, memory)
+    return SavedMap(agents, memory)
