@@ -15,7 +15,7 @@ from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.submaps.map_growth import MapGrowth
 from kiteline_agent.tracking.image_pair import RightEye, rectified
 from kiteline_agent.tracking.image_shift import Glimpse
-from kiteline_agent.tracking.tracker import Track, Tracker, View
+from kiteline_agent.tracking.tracker import Track, View
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
@@ -38,12 +38,9 @@ class Agent:
         identity: Identity,
         channel: RecordChannel,
         words: Vocabulary | None = None,
-        tracker: type[Tracker] = Tracker,
     ) -> None:
-        """words: those by which places are recognised; without them only the reference keyframe is found again.
-        tracker: what finds the map's points in a frame.
-        """
-        self._s = s = Stages(rig, imu, config, identity, channel, words, tracker)  # shared with the growth of the map
+        """words: those by which places are recognised; without them only the reference keyframe is found again."""
+        self._s = s = Stages(rig, imu, config, identity, channel, words)  # shared with the growth of the map
         self.map = s.map
         self.window = s.window
         self.work = s.work  # of the last step

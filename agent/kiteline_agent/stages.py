@@ -50,7 +50,6 @@ class Stages:
         identity: Identity,
         channel: RecordChannel,
         words: Vocabulary | None,
-        tracker: type[Tracker],
     ) -> None:
         self.config = config
         self.channel = channel
@@ -65,7 +64,7 @@ class Stages:
             camera, self.inertia.tracker, config.inertial.askew_rad, config.inertial.level_patience_s
         )
         self.map = LocalMap(camera, config.local_map, config.depth_filter)
-        self.tracker = tracker(self.map, config, self.work)
+        self.tracker = Tracker(self.map, config, self.work)
         self.maker = KeyframeMaker(self.map, camera, config, channel, self.work)
         self.reference = Reference(self.map, camera, self.maker)
         self.submaps = Submaps(identity, self.map, self.pose, self.reference, self.maker)

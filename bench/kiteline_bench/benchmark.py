@@ -21,7 +21,6 @@ from kiteline_hw.ports import SourceError
 
 BENCHMARKS = {
     "first-flight": "kiteline_bench.system.first_flight",
-    "front-end": "kiteline_bench.agent.front_end",
     "agent": "kiteline_bench.agent.flights",
     "governor": "kiteline_bench.agent.knobs",
     "honest": "kiteline_bench.agent.honest",
