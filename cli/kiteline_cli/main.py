@@ -1,6 +1,6 @@
-"""The `kiteline` command: finds the subcommand, hands it the rest of the line, turns known errors into one line.
+"""The `kiteline` command: finds the subcommand and hands it the rest of the command line.
 
-Only argparse is loaded here, so `kiteline --help` answers at once. Each subcommand parses its arguments in its room.
+Only argparse is loaded here, so that `kiteline --help` answers at once. Each subcommand parses its own arguments.
 """
 
 from __future__ import annotations
@@ -9,51 +9,17 @@ import argparse
 import difflib
 import importlib
 import os
+import pkgutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 
-from kiteline_cli.examples import EXAMPLES
+from kiteline_cli import commands
+from kiteline_core.errors import KitelineError
 
 EXIT_ERROR = 2  # as argparse uses for a wrong command line
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """One subcommand. `name` is also the module kiteline_cli.commands.<name>, which has `run(argv) -> int`."""
-
-    name: str
-    summary: str
-
-
-COMMANDS = (
-    Command("fly", "fly recordings or a simulation: agents and a base as processes of this machine"),
-    Command("eval", "judge a trajectory against ground truth: ATE, RPE, KITTI drift, coverage"),
-    Command("grid", "judge an occupancy grid: precision and recall of the roads drawn on it"),
-    Command("sim", "record a simulated flight"),
-    Command("agent", "the onboard half: camera in, pose out, thin diffs to the base"),
-    Command("base", "the base station: maps for any number of agents"),
-    Command("replay", "run an agent or a base again from its log, and compare"),
-    Command("convert", "turn a data set or a ROS 2 bag into a kiteline log"),
-    Command("log", "look into logs and mend them: info, recover, cut, merge"),
-    Command("export", "a base's map in the formats of other tools: TUM, PLY, PGM, g2o"),
-    Command("maps", "the maps of a running base: list, get, name, merge, split, delete"),
-    Command("keys", "make and show the keys with which agents and base seal their packets"),
-    Command("doctor", "check this machine, and warm the compiled kernels"),
-    Command("bench", "measure, and write docs/results.md"),
-)
-
-# Raised on purpose, with a text for the user. Looked up among loaded modules: what was raised has been imported.
-KNOWN_ERRORS = (
-    ("kiteline_core.geometry.cameras", "CalibrationError"),
-    ("kiteline_core.config", "ConfigError"),
-    ("kiteline_codec.schema", "WireError"),
-    ("kiteline_basestation.store.store", "StoreError"),
-    ("kiteline_hw.ports", "SourceError"),
-    ("kiteline_hw.ports", "LinkError"),
-    ("kiteline_lab.evaluation.trajectories", "TrajectoryError"),
-)
 
 # Which extra brings a package that the plain install leaves out.
 EXTRAS = {"gtsam": "base", "websockets": "base", "matplotlib": "lab"}
@@ -62,7 +28,7 @@ _EXAMPLES = """\
 examples:
   kiteline sim room --out room.mcap            record a simulated flight through a room
   kiteline fly room.mcap --out out             fly it: an agent and a base, linked over loopback
-  kiteline eval out/base/agent0.tum room.mcap  how far from the truth?
+  kiteline eval out/base/agent0.tum room.mcap  compare the trajectory with the truth
   kiteline fly euroc:V1_01_easy --out out --profile radio
                                                a EuRoC folder over the budget of a telemetry radio
   kiteline base --link zenoh:tcp/0.0.0.0:7447 --web 0.0.0.0:8080
@@ -71,22 +37,48 @@ examples:
 
 SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path, recognised by its layout.
 LINK   is zenoh:ENDPOINT serial:DEV:BAUD mavlink:URL none.
-`kiteline COMMAND --help` says more about each."""
+`kiteline COMMAND --help` says more about each command."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A subcommand: its name and the module in `kiteline_cli.commands` that holds it."""
+
+    name: str
+    module: str
+
+    def load(self) -> ModuleType:
+        """The module, with SUMMARY, EXAMPLES and run(argv)."""
+        return importlib.import_module(self.module)
+
+
+def find_commands() -> dict[str, list[Command]]:
+    """All subcommands by group title, in the order of `kiteline --help`."""
+    found: dict[str, list[Command]] = {}
+    for group in commands.GROUPS:
+        package = importlib.import_module(f"{commands.__name__}.{group}")
+        names = [module.name for module in pkgutil.iter_modules(package.__path__)]
+        found[(package.__doc__ or group).strip(".")] = [Command(n, f"{package.__name__}.{n}") for n in names]
+    return found
 
 
 def parser() -> argparse.ArgumentParser:
     """The parser of everything before the subcommand."""
-    width = max(len(c.name) for c in COMMANDS)
-    table = "\n".join(f"  {c.name:{width}}  {c.summary}" for c in COMMANDS)
+    groups = find_commands()
+    width = max(len(c.name) for group in groups.values() for c in group)
+    table = "\n\n".join(
+        f"{title}:\n" + "\n".join(f"  {c.name:{width}}  {c.load().SUMMARY}" for c in group)
+        for title, group in groups.items()
+    )
     p = argparse.ArgumentParser(
         prog="kiteline",
         usage="kiteline COMMAND [arguments]",
         description="Visual SLAM for small drones: a light tracker on board, the map on a base station, "
-        f"a thin link between.\n\ncommands:\n{table}",
+        f"a thin link between.\n\n{table}",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--version", action="store_true", help="print the version and leave")
+    p.add_argument("--version", action="store_true", help="print the version and exit")
     p.add_argument("--debug", action="store_true", help="before COMMAND: show the traceback of an error")
     return p
 
@@ -97,20 +89,19 @@ def main(argv: Sequence[str]) -> int:
     debug = rest[:1] == ["--debug"]
     if debug:
         rest = rest[1:]
-    names = [c.name for c in COMMANDS]
-    if not rest or rest[0] not in names:
-        return _without_command(rest, names)
-    # Small matrices only: extra BLAS threads would spin, not help. Children inherit this.
+    known = {c.name: c for group in find_commands().values() for c in group}
+    if not rest or rest[0] not in known:
+        return _without_command(rest, sorted(known))
+    # Small matrices only: extra BLAS threads would spin, not help. Child processes inherit this.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    module = importlib.import_module(f"kiteline_cli.commands.{rest[0]}")
-    command: Callable[[list[str]], int | None] = module.run
+    command = known[rest[0]].load()
     try:
-        return command(rest[1:]) or 0
+        return command.run(rest[1:]) or 0
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again while it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at exit
         return EXIT_ERROR
     except Exception as error:
         text = explanation(error)
@@ -120,13 +111,12 @@ def main(argv: Sequence[str]) -> int:
         return EXIT_ERROR
     finally:
         if rest[1:2] in (["-h"], ["--help"]):
-            print("\nexamples:", *EXAMPLES[rest[0]], sep="\n  ")
+            print("\nexamples:", *command.EXAMPLES, sep="\n  ")
 
 
 def explanation(error: Exception) -> str | None:
     """One line for an error that the user can mend; None for a fault of the program."""
-    known = [getattr(sys.modules[m], n) for m, n in KNOWN_ERRORS if m in sys.modules and hasattr(sys.modules[m], n)]
-    if isinstance(error, tuple(known)):
+    if isinstance(error, KitelineError):
         return " ".join(str(error).split())
     if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in EXTRAS:
         extra = EXTRAS[(error.name or "").split(".")[0]]
@@ -137,17 +127,13 @@ def explanation(error: Exception) -> str | None:
 
 
 def _without_command(rest: list[str], names: list[str]) -> int:
-    p = parser()
-    if not rest:
-        p.print_help()
-        return EXIT_ERROR
-    if not rest[0].startswith("-"):
+    if rest and not rest[0].startswith("-"):
         near = difflib.get_close_matches(rest[0], names, 1)
         hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(names)}"
         print(f"kiteline: error: no command {rest[0]!r}; {hint}", file=sys.stderr)
         return EXIT_ERROR
-    options = p.parse_args(rest)
-    if options.version:
+    p = parser()
+    if rest and p.parse_args(rest).version:
         from importlib.metadata import version
 
         print(f"kiteline {version('kiteline')}")

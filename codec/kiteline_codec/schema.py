@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.errors import KitelineError
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 
@@ -24,7 +25,7 @@ U16 = NDArray[np.uint16]
 I64 = NDArray[np.int64]
 
 
-class WireError(Exception):
+class WireError(KitelineError):
     """Bytes that are no valid packet or code. The only exception that a decoder raises, on any bytes."""
 
 

@@ -1,20 +1,26 @@
-"""Frozen configuration: nested dataclasses, overridden by a parsed TOML table, described as TOML.
+"""Frozen configuration: nested dataclasses, overridden by a parsed TOML table, written as TOML.
 
-A value's unit and reason stand beside its default in the code; a table can only replace values that exist.
+The unit and the reason of a value are in the comment beside its default; a table only replaces values that exist.
 """
 
 from __future__ import annotations
 
+import math
+import tomllib
 import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from kiteline_core.errors import KitelineError
+
 T = TypeVar("T")
 
+ROOTS = frozenset({"agent", "base"})  # tables that a configuration file may have
 
-class ConfigError(ValueError):
+
+class ConfigError(KitelineError, ValueError):
     """An unknown key or a value of the wrong type; the text names the key, its section and what is known there."""
 
 
@@ -48,6 +54,41 @@ def apply(config: T, table: Mapping[str, object], path: str = "") -> T:
         raise ConfigError(f"{_section(path)}: {error}") from error
 
 
+def load(config: T, text: str, root: str, name: str) -> T:
+    """`config` with the values of the table [root] of a TOML text, as people write it.
+
+    The text may have the tables [agent] and [base]. name: of the file, for error texts. Raises ConfigError as `apply`
+    does, and for a number that is not finite, or negative where the default is not.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name}: no valid TOML: {error}") from error
+    if unknown := set(table) - ROOTS:
+        raise ConfigError(f"{name}: unknown table {sorted(unknown)}; known are: {', '.join(sorted(ROOTS))}")
+    section = table.get(root, {})
+    if not isinstance(section, dict):
+        raise ConfigError(f"{name}: [{root}] is a section: found {_shown(section)}")
+    try:
+        return in_range(apply(config, section, root), config, root)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from error
+
+
+def in_range(config: T, default: T, path: str) -> T:
+    """`config`, if all its numbers are finite and not negative where those of `default` are not; else ConfigError."""
+    for f in fields(config):  # type: ignore[arg-type]
+        value, normal, inner = getattr(config, f.name), getattr(default, f.name), f"{path}.{f.name}"
+        if is_dataclass(value):
+            in_range(value, normal, inner)
+        elif isinstance(value, int | float) and isinstance(normal, int | float):
+            if not math.isfinite(value):
+                raise ConfigError(f"{inner}: found {_shown(value)}, expected a finite number")
+            if value < 0 <= normal:
+                raise ConfigError(f"{inner}: found {_shown(value)}, expected a number that is not negative")
+    return config
+
+
 def describe(config: object) -> str:
     """The TOML text of a config with the values it has now; `apply` of its parse gives the same config."""
     lines: list[str] = []
@@ -63,24 +104,25 @@ def _describe(config: object, path: str, lines: list[str]) -> None:
     if path and plain:
         lines += ["", f"[{path}]"]
     for key, value in plain.items():
-        lines.append(f"# {key} is not set" if value is None else f"{key} = {_toml(value)}")
+        lines.append(f"# {key} is not set" if value is None else f"{key} = {toml_value(value)}")
     for key, value in values.items():
         if is_dataclass(value):
             _describe(value, f"{path}.{key}" if path else key, lines)
 
 
-def _toml(value: object) -> str:
+def toml_value(value: object) -> str:
+    """A value as TOML writes it. Raises TypeError for one that no option can have."""
     match value:
         case bool():
             return "true" if value else "false"
         case Enum():
-            return _toml(value.value)
+            return toml_value(value.value)
         case int() | float():
             return repr(value)
         case str():
             return _quoted(value)
         case tuple() | list():
-            return "[" + ", ".join(_toml(v) for v in value) + "]"
+            return "[" + ", ".join(toml_value(v) for v in value) + "]"
     raise TypeError(f"a config value is a bool, number, string, enum or tuple of them, not {type(value).__name__}")
 
 
@@ -119,20 +161,21 @@ def _convert(value: object, hint: Any, path: str) -> object:
             return value
     elif isinstance(hint, type) and isinstance(value, hint):
         return value
-    raise ConfigError(f"{path}: found {_shown(value)}, expected {_name(hint)}")
+    raise ConfigError(f"{path}: found {_shown(value)}, expected {type_name(hint)}")
 
 
-def _name(hint: Any) -> str:
+def type_name(hint: Any) -> str:
+    """What a value of the type `hint` is, in words for people: `a number`, `a list of 3: a text, …`."""
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
-        return " or ".join(_name(o) for o in get_args(hint) if o is not type(None))
+        return " or ".join(type_name(o) for o in get_args(hint) if o is not type(None))
     if origin is Literal:
         return "one of " + ", ".join(repr(a) for a in get_args(hint))
     if origin is tuple:
         args = get_args(hint)
         if len(args) == 2 and args[1] is Ellipsis:
-            return f"a list of {_name(args[0])}"
-        return f"a list of {len(args)}: " + ", ".join(_name(a) for a in args)
+            return f"a list of {type_name(args[0])}"
+        return f"a list of {len(args)}: " + ", ".join(type_name(a) for a in args)
     if isinstance(hint, type) and issubclass(hint, Enum):
         return "one of " + ", ".join(repr(member.value) for member in hint)
     return {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}.get(hint, str(hint))

@@ -9,15 +9,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 
 
-class SourceError(Exception):
+class SourceError(KitelineError):
     """A source that cannot be read. The text says what was found, what was expected and how to mend it."""
 
 
-class LinkError(Exception):
+class LinkError(KitelineError):
     """A link that cannot be opened. Loss and silence are no errors: they are what links do."""
 
 

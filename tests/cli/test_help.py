@@ -5,12 +5,14 @@ import re
 import pytest
 
 from kiteline_cli import main as cli
-from kiteline_cli.examples import EXAMPLES
 
 WITH_VERBS = ("grid", "log", "maps", "keys")  # a verb's own help explains its flags
 
 
-@pytest.mark.parametrize("name", [c.name for c in cli.COMMANDS])
+COMMANDS = {c.name: c for group in cli.find_commands().values() for c in group}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     try:
         status = cli.main([name, "--help"])
@@ -20,7 +22,7 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     text = capsys.readouterr().out
     assert text.startswith(f"usage: kiteline {name}")
     explained, _, examples = text.partition("\nexamples:\n")
-    assert len(examples.splitlines()) == len(EXAMPLES[name]) > 0
+    assert len(examples.splitlines()) == len(COMMANDS[name].load().EXAMPLES) > 0
     for line in examples.splitlines():
         assert line.startswith(f"  kiteline {name}")
         flags = {word for word in line.split() if word.startswith("--")}

@@ -7,21 +7,39 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_cli import commands
 from kiteline_cli import main as cli
+from kiteline_cli.commands import machine
 from kiteline_core.geometry.cameras import CalibrationError
 
 
 def _stand_in(monkeypatch: pytest.MonkeyPatch, run: object) -> None:
-    module = types.ModuleType("kiteline_cli.commands.fly")
-    module.run = run  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "kiteline_cli.commands.fly", module)
+    module = types.ModuleType("kiteline_cli.commands.flights.fly")
+    vars(module).update(run=run, EXAMPLES=())
+    monkeypatch.setitem(sys.modules, "kiteline_cli.commands.flights.fly", module)
 
 
-def test_every_command_has_a_file_and_a_line_of_help() -> None:
-    files = {p.stem for p in (Path(cli.__file__).parent / "commands").glob("*.py")} - {"__init__"}
-    assert {c.name for c in cli.COMMANDS} == files
+def test_every_group_has_a_heading_and_every_command_a_line_of_help() -> None:
+    folders = {p.name for p in Path(commands.__file__).parent.iterdir() if (p / "__init__.py").is_file()}
+    assert set(commands.GROUPS) == folders
+    groups = cli.find_commands()
+    names = [c.name for group in groups.values() for c in group]
+    assert len(names) == len(set(names)) == len(list(Path(commands.__file__).parent.glob("*/[!_]*.py"))) >= 15
     text = cli.parser().format_help()
-    assert all(f"  {c.name} " in text for c in cli.COMMANDS)
+    for title, group in groups.items():
+        block = text.partition(f"\n{title}:\n")[2].partition("\n\n")[0].splitlines()
+        assert [line.split()[0] for line in block] == [c.name for c in group]
+
+
+def test_a_new_command_is_one_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = 'SUMMARY = "a toy"\nEXAMPLES = ("kiteline toy",)\n\ndef run(argv):\n    print("ran", argv)\n'
+    (tmp_path / "toy.py").write_text(text)
+    monkeypatch.setattr(machine, "__path__", [*machine.__path__, str(tmp_path)])
+    assert "  toy      a toy\n" in cli.parser().format_help()
+    assert cli.main(["toy", "--fast"]) == 0
+    assert capsys.readouterr().out == "ran ['--fast']\n"
 
 
 def test_help_loads_nothing_heavy() -> None:

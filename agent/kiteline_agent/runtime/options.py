@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import tomllib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -73,24 +72,12 @@ def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
 
     cpu_percent: of one core, overrides the governor's budget; 0: what the file says.
     """
-    config = _config_of(path) if path else AgentConfig()
+    config = AgentConfig()
+    if path:
+        config = configuration.load(config, Path(path).read_text(encoding="utf-8"), "agent", path)
     if cpu_percent <= 0.0:
         return config
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
-
-
-def _config_of(path: str) -> AgentConfig:
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise configuration.ConfigError(f"{path}: {error}") from error
-    unknown = set(table) - {"agent", "base"}
-    if unknown:
-        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
-    section = table.get("agent", {})
-    if not isinstance(section, dict):
-        raise configuration.ConfigError(f"{path}: [agent] is a section")
-    return configuration.apply(AgentConfig(), section, "agent")
 
 
 def channel_for(spec: AgentSpec, spill: Spill | None = None) -> RecordChannel:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -59,16 +58,7 @@ def base_config(path: str) -> BaseConfig:
     """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
     if not path:
         return BaseConfig()
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise configuration.ConfigError(f"{path}: {error}") from error
-    if unknown := set(table) - {"agent", "base"}:
-        raise configuration.ConfigError(f"{path}: unknown table {sorted(unknown)}; known are: agent, base")
-    section = table.get("base", {})
-    if not isinstance(section, dict):
-        raise configuration.ConfigError(f"{path}: [base] is a section")
-    return configuration.apply(BaseConfig(), section, "base")
+    return configuration.load(BaseConfig(), Path(path).read_text(encoding="utf-8"), "base", path)
 
 
 def parser() -> argparse.ArgumentParser:

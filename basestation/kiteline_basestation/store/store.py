@@ -21,6 +21,7 @@ from typing import IO
 
 from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_codec.schema import Key, Kind
+from kiteline_core.errors import KitelineError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
@@ -50,7 +51,7 @@ def submap_of(key: Key) -> SubmapId | None:
 Row = tuple[int, int, int, int, int, bytes]
 
 
-class StoreError(Exception):
+class StoreError(KitelineError):
     """A store that cannot be used. The text says what was found, what was expected and how to mend it."""
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
 from kiteline_core.imaging.stereo_kernels import GRID_STEP
 
@@ -23,7 +24,7 @@ LEAST_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 d
 VIRTUAL_BASELINE_M = 0.1  # gives cameras without a right eye a scale for coded inverse depths
 
 
-class CalibrationError(ValueError):
+class CalibrationError(KitelineError, ValueError):
     """A calibration that cannot be used; the text says why and what was expected."""
 
 

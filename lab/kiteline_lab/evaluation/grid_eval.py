@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.errors import KitelineError
 from kiteline_lab.evaluation.grid_eval_kernels import roads_free
 
 F64 = NDArray[np.float64]
@@ -26,7 +27,7 @@ Bool = NDArray[np.bool_]
 U8 = NDArray[np.uint8]
 
 
-class GridFileError(Exception):
+class GridFileError(KitelineError):
     """A grid that cannot be read. The text says what was found and what was expected."""
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 
@@ -19,7 +20,7 @@ QUATERNION_TOLERANCE = 0.02  # a length further from 1 than this is no rotation 
 _PREFIXES = ("euroc:", "kitti:", "tum:", "mcap:", "sim:")
 
 
-class TrajectoryError(Exception):
+class TrajectoryError(KitelineError):
     """A file that is no trajectory; the text says where and what was expected."""
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.errors import KitelineError
 from kiteline_lab.evaluation import trajectories
 from kiteline_lab.evaluation.grid_eval import GridFile, GridFileError, read_grid
 from kiteline_lab.evaluation.trajectories import TrajectoryError
@@ -33,7 +34,7 @@ _MARGIN_M = 0.5  # m around what was mapped
 _TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "ushort": "<u2", "uint": "<u4", "int": "<i4", "short": "<i2"}
 
 
-class MapFileError(Exception):
+class MapFileError(KitelineError):
     """A map that cannot be read. The text says what was found and what was expected."""
 
 

@@ -21,6 +21,7 @@ from kiteline_basestation.store.store import StoreError, read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError
 from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
 
@@ -30,7 +31,7 @@ FORMATS = ("tum", "ply", "pgm", "g2o")
 ESSENTIAL_POINTS = 100  # points that two keyframes share for an edge of the essential graph (ORB-SLAM2)
 
 
-class ExportError(Exception):
+class ExportError(KitelineError):
     """A map that cannot be exported so. The text says what was found and what was expected."""
 
 

@@ -1,0 +1,16 @@
+"""`kiteline bench`."""
+
+from __future__ import annotations
+
+SUMMARY = "run measurements and write docs/results.md"
+EXAMPLES = (
+    "kiteline bench",
+    "kiteline bench agent",
+)
+
+
+def run(argv: list[str]) -> int | None:
+    """Run the command with the arguments after `kiteline bench`; the exit status."""
+    from kiteline_bench.benchmark import main
+
+    return main(argv)

@@ -1,0 +1,10 @@
+"""The base class of every error that a user can mend."""
+
+from __future__ import annotations
+
+
+class KitelineError(Exception):
+    """An error outside of the program. Its text says what was found, what was expected and how to mend it.
+
+    Each room derives its own from this class; the command line prints them as one line, without a traceback.
+    """
