@@ -24,10 +24,18 @@ from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.cpu_account import CpuAccount
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
-from kiteline_agent.runtime.frame_reader import Camera
-from kiteline_agent.runtime.options import AgentSpec, agent_config, channel_for, from_json, parser, settled, spec_of
-from kiteline_agent.runtime.tally import Tally
-from kiteline_agent.runtime.terminal import Narrator, summary
+from kiteline_agent.runtime.frame_counts import FrameCounts
+from kiteline_agent.runtime.frame_reader import FrameReader
+from kiteline_agent.runtime.options import (
+    AgentOptions,
+    agent_config,
+    channel_for,
+    from_json,
+    options_of,
+    parser,
+    settled,
+)
+from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
@@ -65,12 +73,12 @@ class Onboard:
     its own; otherwise only the time inside its steps is.
     """
 
-    def __init__(self, spec: AgentSpec, source: FrameSource, channel: RecordChannel, whole_process: bool) -> None:
+    def __init__(self, spec: AgentOptions, source: FrameSource, channel: RecordChannel, whole_process: bool) -> None:
         cv2.setNumThreads(1)
         self.spec = spec
         self.source = source
         self.channel = channel
-        self.tally = Tally()
+        self.tally = FrameCounts()
         self.flown: dict[str, int | float] | None = None  # the tally when the last frame had been flown
         self.rss_mib = 0.0
         config = agent_config(spec.config, spec.cpu_percent)
@@ -83,7 +91,7 @@ class Onboard:
             release_memory()
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = spec.start_ns + round(spec.seconds * 1e9) if spec.seconds > 0 else None
-        self.camera = Camera(source, until_ns, time.process_time_ns)
+        self.camera = FrameReader(source, until_ns, time.process_time_ns)
         self._files = ExitStack()
         self._log_shift_ns = spec.start_ns  # log time minus the time handed to the agent: logs stand in source time
         self._record = self._open_record(config) if spec.log_name else None
@@ -221,12 +229,12 @@ class Onboard:
         self._files.close()
 
 
-def _spill(spec: AgentSpec) -> SpillFile | None:
+def _spill(spec: AgentOptions) -> SpillFile | None:
     """Where shared values wait while the link is down: beside the log, where one is kept."""
     return SpillFile(Path(spec.folder)) if spec.log_name else None
 
 
-def fly_lockstep(spec: AgentSpec, parent: process.Parent) -> None:
+def fly_lockstep(spec: AgentOptions, parent: process.Parent) -> None:
     """Fly behind the base's barrier; where the base ends, go on alone."""
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
     onboard = Onboard(spec, source, channel_for(spec, _spill(spec)), whole_process=True)
@@ -259,7 +267,7 @@ def fly_lockstep(spec: AgentSpec, parent: process.Parent) -> None:
         source.close()
 
 
-def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopSignal) -> None:
+def fly_live(spec: AgentOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
     """Fly on real clocks: frames are paced by their stamps, the newest wins, and the tracker waits for nobody."""
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
     with ExitStack() as stack:
@@ -278,7 +286,7 @@ def fly_live(spec: AgentSpec, parent: process.Parent | None, stop: process.StopS
         if parent is not None:
             parent.tell("ready", frames=source.frame_count)
         process.notify("READY=1")
-        narrator = Narrator()
+        narrator = StatusMessages()
         if parent is None:
             _tell([f"flying {source.name}, {_link_words(spec)}"])
         begin_ns = clock.now_ns()
@@ -328,11 +336,11 @@ def _tell(lines: Sequence[str]) -> None:
         pass
 
 
-def _link_words(spec: AgentSpec) -> str:
+def _link_words(spec: AgentOptions) -> str:
     return "without a link" if spec.link == "none" else f"the base at {spec.link}"
 
 
-def _sealed(spec: AgentSpec, link: ByteLink) -> ByteLink:
+def _sealed(spec: AgentOptions, link: ByteLink) -> ByteLink:
     """The link with its packets sealed. Raises LinkError without a key for this agent."""
     keys = read_keys(Path(spec.key))
     if spec.agent not in keys:
@@ -361,7 +369,9 @@ def _drain_live(
         process.notify("WATCHDOG=1")
 
 
-def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stack: ExitStack) -> ControllerLink | None:
+def _pose_sink(
+    spec: AgentOptions, source: FrameSource, clock: MonotonicClock, stack: ExitStack
+) -> ControllerLink | None:
     """The flight controller that gets poses, if any. Raises LinkError."""
     if not spec.mavlink:
         if spec.odometry:
@@ -379,7 +389,7 @@ def _pose_sink(spec: AgentSpec, source: FrameSource, clock: MonotonicClock, stac
     )  # fmt: skip
 
 
-def _with_imu(spec: AgentSpec, source: FrameSource) -> FrameSource:
+def _with_imu(spec: AgentOptions, source: FrameSource) -> FrameSource:
     """The source, with the flight controller's IMU in place of its own where that is asked for. Raises LinkError."""
     if not spec.imu_of:
         return source
@@ -407,12 +417,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         p.error("a SOURCE is required")
     state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
     folder = (Path(a.log) if a.log else state) / f"agent{a.agent}"
-    spec = spec_of(a, folder, process.next_number(folder / "boot"))
+    spec = options_of(a, folder, process.next_number(folder / "boot"))
     fly_live(spec, None, process.StopSignal())
     process.leave(0)
 
 
-def run_child(spec: AgentSpec) -> int:
+def run_child(spec: AgentOptions) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
 
     def fly(parent: process.Parent) -> None:

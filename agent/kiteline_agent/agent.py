@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.governor import FULL, Extra, governed
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
-from kiteline_agent.relocalisation.relocaliser import Recovered
+from kiteline_agent.relocalisation.relocaliser import Relocalisation
 from kiteline_agent.runtime.frame_reader import joined
 from kiteline_agent.stages import Stages
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.submaps.map_growth import MapGrowth
-from kiteline_agent.tracking.image_pair import RightEye, rectified
-from kiteline_agent.tracking.image_shift import Glimpse
-from kiteline_agent.tracking.tracker import Track, View
+from kiteline_agent.tracking.frame_images import RightImage, rectified
+from kiteline_agent.tracking.image_shift import ImageShift
+from kiteline_agent.tracking.tracker import FrameImages, Track
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
@@ -57,7 +57,7 @@ class Agent:
         self._held_imu: list[ImuBatch] = []  # of frames that were skipped
         self._growth = MapGrowth(s)
         self._motion_depth = DepthFromMotion(s.map, config, s.work)
-        self._glimpse = Glimpse(s.camera)
+        self._glimpse = ImageShift(s.camera)
         self._bridged = False  # the last pose is that of IMU or odometer alone
         self._lost = False  # the last frame had no pose
         channel.put(CameraIntrinsics(identity.agent, s.camera))
@@ -143,20 +143,20 @@ class Agent:
             self._reference.fewer_points(points, self._s.config.align.points)
         return decision.track
 
-    def _view(self, frame: Frame) -> View:
+    def _view(self, frame: Frame) -> FrameImages:
         levels = self._s.config.pyramid.levels
         # Coarse images are for a track that holds: what is lost or begins needs all there is.
         first = self._s.config.pyramid.first if self._submaps.any and self._s.failures == 0 else 0
         left = rectified(frame.left, self._s.rectifier, 0, levels, first)
-        right = None if frame.right is None else RightEye(frame.right, self._s.rectifier, levels, self.map.offset_px)
+        right = None if frame.right is None else RightImage(frame.right, self._s.rectifier, levels, self.map.offset_px)
         depth = None if frame.depth_m is None else self._s.rectifier.depth(frame.depth_m)
         self.work.frames = 1
         share = 4 if first else 1
         self.work.rectified_px += frame.left.size // share if self._s.rectifier.bends else 0
         self.work.pyramid_px += frame.left.size * (1 if right is None or not self._s.config.stereo.points else 2)
-        return View(left, right, depth, first if self._s.rectifier.bends else 0)
+        return FrameImages(left, right, depth, first if self._s.rectifier.bends else 0)
 
-    def _second_look(self, view: View, track: Track) -> Track:
+    def _second_look(self, view: FrameImages, track: Track) -> Track:
         """The same track, or where it missed most points the best of others that begin elsewhere."""
         if self._holds(track):
             return track
@@ -222,7 +222,7 @@ class Agent:
 
     # the old map found again
 
-    def _recover(self, view: View, t_ns: int) -> Track | None:
+    def _recover(self, view: FrameImages, t_ns: int) -> Track | None:
         """Look for a lost frame in all that is remembered."""
         if not self._submaps.any:
             return None
@@ -244,7 +244,7 @@ class Agent:
             self._growth.keyframe_if_due(view, found.track, t_ns)
         return found.track
 
-    def _join_if_found(self, view: View, track: Track, t_ns: int) -> None:
+    def _join_if_found(self, view: FrameImages, track: Track, t_ns: int) -> None:
         """Beside a young submap, look for the old ones; where one is found, a keyframe in each says how they lie."""
         found = self._recovery.beside(view, self._s.frame, self._pose.T_m_c)
         if found is None:
@@ -257,7 +257,7 @@ class Agent:
         self._inertia.restart(t_ns)
         self._growth.add_keyframe(view, found.track, t_ns)
 
-    def _return_to(self, found: Recovered) -> None:
+    def _return_to(self, found: Relocalisation) -> None:
         self._s.carry_certainty()
         self._submaps.return_to(found, self._s.frame)
         if found.lent:

@@ -96,7 +96,7 @@ class DepthFilterConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class MonoStartConfig:
+class TwoViewStartConfig:
     """How one eye begins a map."""
 
     median_depth_m: float = 4.0  # of the first points: the convention that sets the scale; that of a room
@@ -112,7 +112,7 @@ class MonoStartConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class MotionDepthConfig:
+class DepthFromMotionConfig:
     """How bearings get their depth from motion."""
 
     per_frame: int = 150  # bearings looked for in a frame; each costs about 10 us
@@ -135,7 +135,7 @@ class MotionDepthConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class RecoveryConfig:
+class RelocalisationConfig:
     """Finding the old map again."""
 
     cell_px: int = 16  # one corner a cell; four times as many as a keyframe bears, so that its own are among them
@@ -159,7 +159,7 @@ class RecoveryConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class CertaintyConfig:
+class CovarianceConfig:
     """What is not known of the sensors, and when a pose counts as good."""
 
     calibration_px: float = 0.05  # px at the image's edge that a good calibration of one camera is off by
@@ -190,7 +190,7 @@ class CertaintyConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class WindowConfig:
+class MapCacheConfig:
     """Copies of keyframes that the base lends, and what is made of them."""
 
     copies: int = 32  # slots; the base lends fewer, an earlier base's may still be here
@@ -261,12 +261,12 @@ class AgentConfig:
     inertial: InertialConfig = field(default_factory=InertialConfig)
     controller_imu: ControllerImuConfig = field(default_factory=ControllerImuConfig)
     odometer: OdometerConfig = field(default_factory=OdometerConfig)
-    certainty: CertaintyConfig = field(default_factory=CertaintyConfig)
+    certainty: CovarianceConfig = field(default_factory=CovarianceConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)
-    motion: MotionDepthConfig = field(default_factory=MotionDepthConfig)
-    mono_start: MonoStartConfig = field(default_factory=MonoStartConfig)
-    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
+    motion: DepthFromMotionConfig = field(default_factory=DepthFromMotionConfig)
+    mono_start: TwoViewStartConfig = field(default_factory=TwoViewStartConfig)
+    recovery: RelocalisationConfig = field(default_factory=RelocalisationConfig)
+    window: MapCacheConfig = field(default_factory=MapCacheConfig)
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     matching: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)

@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.covariance.pose_covariance import Certainty
-from kiteline_agent.exchange.corrections import FromBase
+from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import Governor
 from kiteline_agent.inertial.gravity_alignment import Levelling
-from kiteline_agent.initialisation.two_view_start import MonoStart
+from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
-from kiteline_agent.keyframes.reference import Reference
+from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.motion.motion_model import Inertia
-from kiteline_agent.relocalisation.map_cache import Window
-from kiteline_agent.relocalisation.relocaliser import Recovery
+from kiteline_agent.relocalisation.map_cache import MapCache
+from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.step import Identity
 from kiteline_agent.submaps.submaps import Submaps
 from kiteline_agent.tracking.pose_state import PoseState
-from kiteline_agent.tracking.stuck_camera import FrozenEye
+from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_core.frame import ImuCalibration
@@ -66,17 +66,17 @@ class Stages:
         self.map = LocalMap(camera, config.local_map, config.depth_filter)
         self.tracker = Tracker(self.map, config, self.work)
         self.maker = KeyframeMaker(self.map, camera, config, channel, self.work)
-        self.reference = Reference(self.map, camera, self.maker)
+        self.reference = ReferenceKeyframe(self.map, camera, self.maker)
         self.submaps = Submaps(identity, self.map, self.pose, self.reference, self.maker)
         self.certainty = Certainty(
             self.map, camera.T_b_c, config.certainty, has_body=rig.has_body, has_depth=not one_eye
         )
         self.governor = Governor(config.governor, inertial=imu is not None)
-        self.mono = MonoStart(camera, config) if one_eye else None
-        self.window = Window(camera, config.window, config.matching, config.ransac, words)
-        self.base = FromBase(self.map, self.window, config.smoothing)
-        self.recovery = Recovery(self.map, self.tracker, config, words, self.window, self._believes_found)
-        self.frozen = FrozenEye(camera)
+        self.mono = TwoViewStart(camera, config) if one_eye else None
+        self.window = MapCache(camera, config.window, config.matching, config.ransac, words)
+        self.base = Corrections(self.map, self.window, config.smoothing)
+        self.recovery = Relocaliser(self.map, self.tracker, config, words, self.window, self._believes_found)
+        self.frozen = StuckCamera(camera)
         self.events: list[str] = []
         self.frame = 0
         self.last_t_ns: int | None = None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
@@ -23,7 +23,7 @@ from kiteline_hw.sources.open import open_source
 
 
 def fly(source: FrameSource, frames: Iterable[Frame | ImuBatch], config: AgentConfig | None = None) -> list[Estimate]:
-    agent = Agent(source.rig, source.imu, config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(source.rig, source.imu, config or AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out: list[Estimate] = []
     imu: ImuBatch | None = None
     for item in frames:
@@ -126,7 +126,7 @@ def test_where_the_imu_knows_the_place_the_map_goes_on(data_dir: Path) -> None:
             if 60 <= seen < 68:  # 0.4 s of black in a flight, and what was known of the place is gone with it
                 item = replace(item, left=np.zeros_like(item.left), right=np.zeros_like(item.left), encoded=())
         items.append(item)
-    agent = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     found: list[Estimate] = []
     imu: ImuBatch | None = None
     for item in items:
@@ -150,7 +150,7 @@ def test_nothing_to_see_is_no_error() -> None:
 
     camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
     rig = CameraRig(camera, camera, np.eye(4), se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
-    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     grey = np.full((240, 320), 100, np.uint8)
     for k in range(6):
         estimate = agent.step(StepInput(Frame(k * 50_000_000, grey, grey)), k * 50_000_000).estimate

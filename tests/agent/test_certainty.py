@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.config import AgentConfig, CertaintyConfig
+from kiteline_agent.config import AgentConfig, CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.covariance.pose_covariance import Certainty, adjoint, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
@@ -80,7 +80,7 @@ def test_what_an_error_of_calibration_does_to_a_pose_is_foreseen(shape: int) -> 
     error[shape] = 0.05
     local_map = map_of(seen_with(error, X, np.eye(4)))
     track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
-    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(), has_body=False, has_depth=True)
+    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
     certainty.measured(track)
     moved = se3.log(se3.inverse(track.T_c_m) @ T_c_m)  # on the left of T_m_c
     np.testing.assert_allclose(certainty._shift @ error, moved, atol=0.04 * np.abs(moved).max() + 2e-6)
@@ -93,7 +93,7 @@ def test_the_error_of_a_keyframe_is_that_of_what_is_measured_against_it() -> Non
     nothing = np.zeros(SHAPES)
     moved = se3.exp(np.array([0.01, -0.02, 0.015, 0.002, -0.003, 0.004]))
     local_map = map_of(seen_with(nothing, X, np.eye(4)), moved)
-    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(), has_body=False, has_depth=True)
+    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
     certainty._shift_k[0, :, 0] = se3.log(moved)
     certainty.measured(tracked(local_map, seen_with(nothing, X, T_c_m), T_c_m))
     # observations in the moved map put the camera at moved @ T_m_c: the same perturbation on the left
@@ -102,7 +102,7 @@ def test_the_error_of_a_keyframe_is_that_of_what_is_measured_against_it() -> Non
 
 def _alone(X: F64, T_c_m: F64) -> F64:
     local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(), has_body=False, has_depth=True)
+    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
     certainty.measured(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
     return certainty._shift
 
@@ -113,7 +113,7 @@ def test_noise_of_a_measured_pose_is_what_it_says() -> None:
     T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
-    config = CertaintyConfig(calibration_px=0.0, least_rms=0.0)
+    config = CovarianceConfig(calibration_px=0.0, least_rms=0.0)
     certainty = Certainty(local_map, np.eye(4), config, has_body=False, has_depth=True)
     certainty.begin(np.eye(4))
     nees = []
@@ -131,7 +131,7 @@ def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
     X = scene()
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
-    certainty = Certainty(local_map, np.eye(4), CertaintyConfig(calibration_px=0.0), has_body=False, has_depth=True)
+    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(calibration_px=0.0), has_body=False, has_depth=True)
     certainty.begin(np.eye(4))
     track = tracked(local_map, clean, np.eye(4))
     pull = np.array([0.0, 0.0, 0.004, 0.0, 0.001, 0.0])
@@ -155,7 +155,7 @@ def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
 
 
 def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
-    config = CertaintyConfig(calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
+    config = CovarianceConfig(calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
     certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config, has_body=True,
                           has_depth=True)  # fmt: skip
     certainty.begin(np.eye(4))
@@ -169,7 +169,7 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
     X = scene()
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
-    config = replace(CertaintyConfig(), calibration_px=0.0)
+    config = replace(CovarianceConfig(), calibration_px=0.0)
     certainty = Certainty(local_map, np.eye(4), config, has_body=True, has_depth=True)
     pose = PoseState()
     certainty.begin(np.eye(4))
@@ -191,7 +191,7 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
 
 
 def test_where_the_speed_was_not_known_blindness_is_worse() -> None:
-    config = replace(CertaintyConfig(), blind_speed_m_s=5.0, blind_speed_rad_s=1.0)
+    config = replace(CovarianceConfig(), blind_speed_m_s=5.0, blind_speed_rad_s=1.0)
     sigma = []
     for moves in (True, False):
         certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config,

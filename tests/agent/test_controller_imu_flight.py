@@ -7,7 +7,7 @@ import pytest
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame
@@ -38,7 +38,7 @@ def fly(room: tuple[SimSource, list[Frame]], latency_ns: int, jitter_ns: int) ->
     R_b_f = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     imu = ControllerImu(R_b_f, 200.0, SourceReport())
     noise = ControllerImuConfig().noise
-    agent = Agent(source.rig, noise, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(source.rig, noise, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out, done = [], 0
     for k, frame in enumerate(frames):
         now_ns = frame.t_ns + 2_000_000  # the camera is quicker than the controller

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import PRICES_NS, Work, cost_ns
 from kiteline_agent.governor.governor import CARRIED, governed
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
@@ -19,7 +19,7 @@ from kiteline_hw.sources.open import open_source
 
 def costs_of(path: Path, config: AgentConfig, frames: int = 12) -> tuple[list[int], list[Work], list[bool]]:
     source = open_source(str(path))
-    agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), NoBaseChannel())
     costs: list[int] = []
     works: list[Work] = []
     tracked: list[bool] = []

@@ -12,9 +12,9 @@ import pytest
 from kiteline_agent.governor.cpu_account import CpuAccount
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.flight_log import estimate_from_json, estimate_to_json
-from kiteline_agent.runtime.frame_reader import Camera, joined
-from kiteline_agent.runtime.options import AgentSpec, agent_config, from_json
-from kiteline_agent.runtime.tally import Tally, live_line, odometry_line
+from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
+from kiteline_agent.runtime.frame_reader import FrameReader, joined
+from kiteline_agent.runtime.options import AgentOptions, agent_config, from_json
 from kiteline_agent.step import Estimate
 from kiteline_core.config import ConfigError
 from kiteline_core.frame import Frame, ImuBatch
@@ -40,7 +40,7 @@ def no_clock() -> int:
 
 
 def test_frames_come_with_the_samples_before_them() -> None:
-    camera = Camera(source(), None, no_clock)
+    camera = FrameReader(source(), None, no_clock)
     assert camera.next_ns == 100
     frame, batch, _ = camera.take()
     assert frame.t_ns == 100
@@ -50,7 +50,7 @@ def test_frames_come_with_the_samples_before_them() -> None:
 
 
 def test_samples_of_a_dropped_frame_go_with_the_next() -> None:
-    camera = Camera(source(), None, no_clock)
+    camera = FrameReader(source(), None, no_clock)
     camera.drop()
     frame, batch, _ = camera.take()
     assert frame.t_ns == 200
@@ -60,14 +60,14 @@ def test_samples_of_a_dropped_frame_go_with_the_next() -> None:
 
 
 def test_frames_beyond_the_end_are_left_out() -> None:
-    camera = Camera(source(), 250, no_clock)
+    camera = FrameReader(source(), 250, no_clock)
     assert [camera.take()[0].t_ns, camera.take()[0].t_ns] == [100, 200]
     assert camera.next_ns is None
 
 
 def test_decoding_is_measured_apart() -> None:
     ticks = iter(range(0, 10**9, 3_000_000))
-    camera = Camera(source(), None, lambda: next(ticks))
+    camera = FrameReader(source(), None, lambda: next(ticks))
     camera.take()
     assert camera.decode_ms == [3.0, 3.0]
     assert camera.decode_ns == 6_000_000
@@ -76,7 +76,7 @@ def test_decoding_is_measured_apart() -> None:
 def accounted(whole: bool) -> list[float]:
     """Two steps without and three with a frame, at ticks of 1 ms: decoding takes one between two looks at the clock."""
     ticks = iter(range(0, 10**9, 1_000_000))
-    camera = Camera(source(), None, lambda: next(ticks))
+    camera = FrameReader(source(), None, lambda: next(ticks))
     account = CpuAccount(lambda: next(ticks), camera, whole)
     for with_frame in (True, False, True, False, True):
         if with_frame:
@@ -108,7 +108,7 @@ def estimate(tracked: bool = True, placed: bool = False, keyframe: int = 3) -> E
 
 
 def test_frames_are_tracked_lost_or_dropped() -> None:
-    tally = Tally(dropped=2, bytes_up=700)
+    tally = FrameCounts(dropped=2, bytes_up=700)
     for e in (estimate(), estimate(keyframe=4), replace(estimate(), bridged=True), estimate(tracked=False), None):
         tally.count(e)
     assert tally.as_report() == {
@@ -153,8 +153,8 @@ def test_a_limited_core_is_busy_for_longer_than_a_whole_one() -> None:
 
 
 def test_a_spec_travels_as_json() -> None:
-    spec = AgentSpec(source="a", folder="b", seconds=2.5)
-    assert from_json(json.dumps({name: getattr(spec, name) for name in AgentSpec.__slots__})) == spec
+    spec = AgentOptions(source="a", folder="b", seconds=2.5)
+    assert from_json(json.dumps({name: getattr(spec, name) for name in AgentOptions.__slots__})) == spec
     with pytest.raises(ValueError, match="speed"):
         from_json('{"source": "a", "folder": "b", "speed": 1}')
 

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.corrections import FromBase
+from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.relocalisation.map_cache import Window
+from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import Key, Kind, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -23,16 +23,16 @@ FOUND = se3.exp(np.array([1.3, -0.6, 0.1, 0.0, 0.0, 0.4]))
 
 
 @pytest.fixture
-def base() -> FromBase:
+def base() -> Corrections:
     camera, config = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4)), AgentConfig()
     local_map = LocalMap(camera, config.local_map, config.depth_filter)
-    window = Window(camera, config.window, config.matching, config.ransac, None)
-    known = FromBase(local_map, window, config.smoothing)
+    window = MapCache(camera, config.window, config.matching, config.ransac, None)
+    known = Corrections(local_map, window, config.smoothing)
     known.begins(YOUNG, ODOMETRY)
     return known
 
 
-def say(base: FromBase, T_w_first: NDArray[np.float64], T_first_young: NDArray[np.float64] | None) -> bool:
+def say(base: Corrections, T_w_first: NDArray[np.float64], T_first_young: NDArray[np.float64] | None) -> bool:
     """A base says where submaps lie; whether the young one counts as placed."""
     records = [SubmapPlacement(FIRST, T_w_first)]
     if T_first_young is not None:
@@ -41,7 +41,7 @@ def say(base: FromBase, T_w_first: NDArray[np.float64], T_first_young: NDArray[n
     return base.has_placed(YOUNG)
 
 
-def test_a_base_that_takes_the_odometrys_word_has_placed_nothing(base: FromBase) -> None:
+def test_a_base_that_takes_the_odometrys_word_has_placed_nothing(base: Corrections) -> None:
     assert not base.has_placed(YOUNG)
     assert not say(base, np.eye(4), None)
     assert not say(base, np.eye(4), CARRIED)
@@ -50,7 +50,7 @@ def test_a_base_that_takes_the_odometrys_word_has_placed_nothing(base: FromBase)
     assert not say(base, UPRIGHT, CARRIED)  # a merge is undone
 
 
-def test_a_submap_that_had_no_place_is_placed_where_it_is_recognised(base: FromBase) -> None:
+def test_a_submap_that_had_no_place_is_placed_where_it_is_recognised(base: Corrections) -> None:
     assert not say(base, np.eye(4), None)
     assert say(base, np.eye(4), FOUND)
     base.take([], [Key(int(Kind.SUBMAP_PLACEMENT), int(YOUNG), 0)], [])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kiteline_agent.config import AgentConfig, SmoothingConfig
-from kiteline_agent.exchange.corrections import FromBase
+from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.relocalisation.map_cache import Window
+from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import Key, Kind, SubmapPlacement
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -22,9 +22,9 @@ SUBMAP = submap_id(3, 1, 0)
 @pytest.mark.parametrize("pace", [0.0, 0.5])
 def test_a_place_with_a_scale_stretches_the_way_but_not_the_arm(pace: float) -> None:
     config = AgentConfig()
-    window = Window(CAMERA, config.window, config.matching, config.ransac, None)
+    window = MapCache(CAMERA, config.window, config.matching, config.ransac, None)
     local_map = LocalMap(CAMERA, config.local_map, config.depth_filter)
-    base = FromBase(local_map, window, SmoothingConfig(max_m_s=pace, max_rad_s=pace, snap_m=0.3))
+    base = Corrections(local_map, window, SmoothingConfig(max_m_s=pace, max_rad_s=pace, snap_m=0.3))
     T_m_c = se3.exp(np.array([2.0, 1.0, 0.3, 0.1, 0.4, -0.2]))
     T_m_b, T_o_m = T_m_c @ se3.inverse(T_B_C), se3.exp(np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.7]))
     assert base.in_world(SUBMAP, T_m_b, T_o_m, 0) is None

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
-from kiteline_agent.initialisation.two_view_start import MonoStart
+from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_agent.tracking.tracker import View
+from kiteline_agent.tracking.tracker import FrameImages
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import NewLandmarks
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
@@ -80,7 +80,7 @@ def frame(k: int) -> Frame:
 
 
 def agent() -> Agent:
-    return Agent(RIG, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    return Agent(RIG, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
 
 
 def step(one: Agent, f: Frame) -> Estimate:
@@ -164,20 +164,20 @@ def test_points_too_far_for_stereo_get_their_depth_from_motion() -> None:
 
 def test_standing_and_turning_begin_nothing() -> None:
     for turns in (False, True):
-        start = MonoStart(Rectifier(RIG).camera, AgentConfig())
+        start = TwoViewStart(Rectifier(RIG).camera, AgentConfig())
         for k in range(14):
             turn = se3.so3_exp(np.array([0.0, 0.015 * k if turns else 0.0, 0.0]))
-            view = View(build_pyramid(room(se3.from_rt(turn, np.zeros(3)))[0], 4), None, None)
+            view = FrameImages(build_pyramid(room(se3.from_rt(turn, np.zeros(3)))[0], 4), None, None)
             assert start.step(view, k) is None
 
 
 def test_a_second_start_takes_on_the_scale_of_the_first() -> None:
-    start = MonoStart(Rectifier(RIG).camera, AgentConfig())
+    start = TwoViewStart(Rectifier(RIG).camera, AgentConfig())
     start.tracked(np.array([6.0, 7.0, 9.0]))
     start.rescale(2.0)
     opening = None
     for k in range(3, 20):
-        opening = opening or start.step(View(build_pyramid(frame(k).left, 4), None, None), k)
+        opening = opening or start.step(FrameImages(build_pyramid(frame(k).left, 4), None, None), k)
     assert opening is not None and opening.median_depth_m == 14.0
     depths = Rectifier(RIG).camera.bf / opening.points.disparity
     assert np.median(depths) == pytest.approx(14.0, rel=0.1)
@@ -240,7 +240,7 @@ def test_deviation_of_a_meeting_is_that_of_moved_pixels() -> None:
 
 def test_a_street_is_followed_with_one_eye(data_dir: Path) -> None:
     source = open_source(str(data_dir / "kitti07_mono"))
-    one = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    one = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     estimates: list[Estimate] = []
     for item in source:
         if isinstance(item, Frame):

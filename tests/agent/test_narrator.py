@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_agent.runtime.tally import Tally
-from kiteline_agent.runtime.terminal import Narrator, summary
+from kiteline_agent.runtime.frame_counts import FrameCounts
+from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_agent.step import Estimate, StepOutput
 from kiteline_core.ids import KeyframeId, SubmapId
 
@@ -21,7 +21,7 @@ def output(tracked: bool, *events: str) -> StepOutput:
 
 
 def test_changes_are_told_once_and_a_summary_now_and_then() -> None:
-    narrator, tally, told = Narrator(), Tally(), []
+    narrator, tally, told = StatusMessages(), FrameCounts(), []
     tracked = [False] * 10 + [True] * 300 + [False] * 4 + [True] * 86  # at 20 Hz
     for k, yes in enumerate(tracked):
         step = output(yes, *(("submap: opened", "keyframe: heartbeat") if k == 10 else ()))

@@ -9,7 +9,7 @@ import pytest
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, OdometryBatch
@@ -44,7 +44,7 @@ def fly(
     flight: Flight, driven: OdometryBatch | None, dark: range = range(0), *, one_eye: bool = False
 ) -> tuple[Agent, list[Estimate], list[str]]:
     rig = replace(flight.rig, right=None, T_c_r=None) if one_eye else flight.rig
-    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out, events, done = [], [], 0
     for k, shown in enumerate(flight.frames):
         frame = replace(shown, right=None) if one_eye else shown

@@ -12,7 +12,7 @@ import pytest
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.schema import KeyframeHeader, Record
 from kiteline_core.frame import Frame
@@ -27,7 +27,7 @@ from kiteline_hw.system.vocabulary import shipped_words
 PERIOD_NS = 50_000_000
 
 
-class Listening(AloneChannel):
+class Listening(NoBaseChannel):
     """Keeps the heads of the keyframes that were shared."""
 
     def __init__(self) -> None:
@@ -230,7 +230,7 @@ def test_rooms_of_the_same_textures_are_kept_apart(words: Vocabulary) -> None:
 def test_a_place_that_the_map_shows_twice_is_not_believed(room: Recording, words: Vocabulary) -> None:
     frames = room.show([*BEFORE, *[None] * 20, *range(200, 206)], 120.0)
     for twice in (False, True):
-        agent = Agent(room.rig, None, AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+        agent = Agent(room.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), words)
         estimate = None
         for k, frame in enumerate(frames):
             if k == len(BEFORE) and twice:

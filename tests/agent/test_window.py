@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.relocalisation.map_cache import Seen, Window
+from kiteline_agent.relocalisation.map_cache import FrameFeatures, MapCache
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -28,14 +28,14 @@ class World:
     points: F64
     descriptor: NDArray[np.uint8]
 
-    def seen(self, T_m_c: F64, rng: np.random.Generator, share: float = 0.6, noise_px: float = 0.5) -> Seen:
+    def seen(self, T_m_c: F64, rng: np.random.Generator, share: float = 0.6, noise_px: float = 0.5) -> FrameFeatures:
         """Corners of a view: some of the points in it, and as many others."""
         rows, uv, z = self.in_view(T_m_c)
         keep = rng.random(len(rows)) < share
         rows, uv, z = rows[keep], uv[keep] + rng.normal(0, noise_px, (int(keep.sum()), 2)), z[keep]
         n = len(rows)
         flips = np.packbits(rng.random((n, 256)) < 0.08, axis=1)
-        return Seen(
+        return FrameFeatures(
             np.concatenate([uv, rng.uniform((8, 8), (744, 472), (n, 2))]),
             np.concatenate([CAMERA.bf / z, np.full(n, -1.0)]),
             np.zeros(2 * n, np.uint8),
@@ -85,12 +85,12 @@ def world() -> World:
     return World(points, rng.integers(0, 256, (n, 32), dtype=np.uint8))
 
 
-def window(**limits: float) -> Window:
+def window(**limits: float) -> MapCache:
     config = AgentConfig()
-    return Window(CAMERA, replace(config.window, **limits), config.matching, config.ransac, shipped_words())
+    return MapCache(CAMERA, replace(config.window, **limits), config.matching, config.ransac, shipped_words())
 
 
-def ring(world: World, box: Window, copies: int = 12, submap: SubmapId = HERE) -> None:
+def ring(world: World, box: MapCache, copies: int = 12, submap: SubmapId = HERE) -> None:
     """Copies of keyframes that look all around."""
     for k in range(copies):
         for record in world.copy(keyframe_id(THERE, k), submap, look(2 * np.pi * k / copies)):

@@ -12,7 +12,7 @@ import pytest
 
 from kiteline_agent.__main__ import fly_live
 from kiteline_agent.runtime.flight_log import estimate_from_json
-from kiteline_agent.runtime.options import AgentSpec, parser, spec_of
+from kiteline_agent.runtime.options import AgentOptions, options_of, parser
 from kiteline_core.config import ConfigError
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.mcap_log import LogReader
@@ -50,7 +50,7 @@ def fly(recording: Path, folder: Path) -> None:
             url = f"udp:127.0.0.1:{controller.port}"
             a = parser().parse_args([str(recording), "--mavlink", url, "--imu", "controller", "--config", str(config),
                                      "--log", str(folder)])  # fmt: skip
-            fly_live(spec_of(a, folder, 0), None, process.StopSignal())
+            fly_live(options_of(a, folder, 0), None, process.StopSignal())
         finally:
             over.set()
             unit.join()
@@ -92,7 +92,7 @@ def test_a_source_that_knows_its_body_needs_letters_only() -> None:
 
 def test_what_is_missing_is_said(recording: Path, tmp_path: Path) -> None:
     def refused(error: type[Exception], match: str, **options: object) -> None:
-        spec = AgentSpec(source=str(recording), folder=str(tmp_path), imu_of="controller", **options)  # type: ignore[arg-type]
+        spec = AgentOptions(source=str(recording), folder=str(tmp_path), imu_of="controller", **options)  # type: ignore[arg-type]
         with pytest.raises(error, match=match):
             fly_live(spec, None, process.StopSignal())
 

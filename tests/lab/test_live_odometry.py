@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_agent.__main__ import fly_live
-from kiteline_agent.runtime.options import AgentSpec
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.mavlink.messages import WheelDistance
 from kiteline_hw.ports import LinkError
@@ -36,7 +36,7 @@ def test_wheels_of_a_flight_controller_reach_the_agent(recording: Path, tmp_path
         wheels = threading.Thread(target=roll)
         wheels.start()
         try:
-            spec = AgentSpec(
+            spec = AgentOptions(
                 source=str(recording), folder=str(tmp_path), mavlink=f"udp:127.0.0.1:{controller.port}",
                 odometry="wheels", axes="frd",
             )  # fmt: skip
@@ -56,9 +56,9 @@ def test_wheels_of_a_flight_controller_reach_the_agent(recording: Path, tmp_path
 
 
 def test_odometry_needs_a_flight_controller(recording: Path, tmp_path: Path) -> None:
-    spec = AgentSpec(source=str(recording), folder=str(tmp_path), odometry="wheels")
+    spec = AgentOptions(source=str(recording), folder=str(tmp_path), odometry="wheels")
     with pytest.raises(LinkError, match="expected --mavlink URL"):
         fly_live(spec, None, process.StopSignal())
-    spec = AgentSpec(source=str(recording), folder=str(tmp_path), odometry="feet", mavlink="udp:127.0.0.1:14550")
+    spec = AgentOptions(source=str(recording), folder=str(tmp_path), odometry="feet", mavlink="udp:127.0.0.1:14550")
     with pytest.raises(LinkError, match="expected controller, wheels or wheels:TRACK_M"):
         fly_live(spec, None, process.StopSignal())

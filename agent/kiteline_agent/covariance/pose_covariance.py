@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import CertaintyConfig
+from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance.calibration_error_kernels import (
     CALIBRATION,
     DISPARITY_SHAPES,
@@ -45,7 +45,7 @@ class Certainty:
     Perturbations stand on the left of poses in m (or o), [translation, rotation].
     """
 
-    def __init__(self, local_map: LocalMap, T_b_c: F64, config: CertaintyConfig, *, has_body: bool, has_depth: bool):
+    def __init__(self, local_map: LocalMap, T_b_c: F64, config: CovarianceConfig, *, has_body: bool, has_depth: bool):
         """has_body: the camera's place in the body is a calibration. has_depth: stereo or a depth camera."""
         self._map = local_map
         self._T_b_c = T_b_c

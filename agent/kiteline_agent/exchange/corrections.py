@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.relocalisation.map_cache import Window
+from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import (
     CachedKeyframe,
     CachedLandmarks,
@@ -36,10 +36,10 @@ _MOVED_M = 5e-3  # a placement that differs by less is the same one, coded anew
 _GUESSED_M = 0.5  # by which a base that has only the odometry's word differs from it: a frame's motion
 
 
-class FromBase:
+class Corrections:
     """Takes records to where they belong, and knows the world as far as the base told of it."""
 
-    def __init__(self, local_map: LocalMap, window: Window, smoothing: SmoothingConfig) -> None:
+    def __init__(self, local_map: LocalMap, window: MapCache, smoothing: SmoothingConfig) -> None:
         self._map = local_map
         self._window = window
         self._smoothing = Smoothing(smoothing)

@@ -9,7 +9,7 @@ from kiteline_codec.pacing.profiles import EXACT
 from kiteline_codec.schema import Key, LivePose, Record
 
 
-class AloneChannel:
+class NoBaseChannel:
     """A RecordChannel with nobody at the other end."""
 
     profile = EXACT

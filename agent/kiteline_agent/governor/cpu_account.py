@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kiteline_agent.runtime.frame_reader import Camera
+from kiteline_agent.runtime.frame_reader import FrameReader
 
 
 class CpuAccount:
@@ -14,7 +14,7 @@ class CpuAccount:
     its own; otherwise only the time inside its steps is. ms: a frame each. last_ns: what the last one took.
     """
 
-    def __init__(self, clock: Callable[[], int], camera: Camera, whole: bool) -> None:
+    def __init__(self, clock: Callable[[], int], camera: FrameReader, whole: bool) -> None:
         self._clock = clock
         self._camera = camera
         self._whole = whole

@@ -15,9 +15,9 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
-from kiteline_agent.keyframes.keyframes import NewPoints
+from kiteline_agent.keyframes.policy import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import View
+from kiteline_agent.tracking.tracker import FrameImages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
@@ -26,14 +26,14 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Opening:
+class TwoViewMap:
     """The first keyframe of a map, seen from the second.
 
     view, t_ns: of the first frame. frames: from there to the second. T_a_b: (4,4) the second camera in the first.
     points: what is born in the first frame. median_depth_m: theirs. flat: the scene was taken for a plane.
     """
 
-    view: View
+    view: FrameImages
     t_ns: int
     frames: int
     T_a_b: F64
@@ -52,7 +52,7 @@ class Opening:
         )  # fmt: skip
 
 
-class MonoStart:
+class TwoViewStart:
     """Follows corners of a first frame through those that come after it."""
 
     def __init__(self, camera: RectifiedCamera, config: AgentConfig) -> None:
@@ -63,7 +63,7 @@ class MonoStart:
         )
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._median_depth_m = config.mono_start.median_depth_m
-        self._first: View | None = None
+        self._first: FrameImages | None = None
         self._first_t_ns = 0
         self._frames = 0
         self._last: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
@@ -83,7 +83,7 @@ class MonoStart:
         """Change the unit of length: all lengths grow by `factor`."""
         self._median_depth_m *= factor
 
-    def step(self, view: View, t_ns: int) -> Opening | None:
+    def step(self, view: FrameImages, t_ns: int) -> TwoViewMap | None:
         """Take in a frame. Returns the opening of a map when this frame and the first one give at least 100 points."""
         config = self._config.mono_start
         if self._first is None:
@@ -102,7 +102,7 @@ class MonoStart:
             self._begin(view, t_ns)
         return opening
 
-    def _begin(self, view: View, t_ns: int) -> None:
+    def _begin(self, view: FrameImages, t_ns: int) -> None:
         corners = features.detect(view.left, np.zeros((0, 2)), self._detector)
         self._first, self._first_t_ns, self._frames = replace(view, right=None), t_ns, 0
         self._last = view.left[0]
@@ -111,7 +111,7 @@ class MonoStart:
         self._index = np.arange(len(corners.uv))
         alignment_kernels.cut_templates(view.left, corners.uv, corners.octave, self._templates)
 
-    def _follow(self, view: View) -> None:
+    def _follow(self, view: FrameImages) -> None:
         """Pyramidal flow from the last frame, forth and back."""
         image, window = view.left[0], self._config.mono_start.window_px
         if len(self._uv):
@@ -126,7 +126,7 @@ class MonoStart:
             self._octave, self._index = self._octave[keep], self._index[keep]
         self._last = image
 
-    def _try(self, view: View) -> Opening | None:
+    def _try(self, view: FrameImages) -> TwoViewMap | None:
         """Sharpen the pixels on the first frame's templates, and ask the two views."""
         align, config = self._config.align, self._config.mono_start
         uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
@@ -147,7 +147,7 @@ class MonoStart:
         angle, descriptor = features.describe(self._first.left, place, octave)
         disparity = self._camera.bf / (seen.points[rows, 2] * factor)
         points = NewPoints(place, disparity, octave, angle, descriptor)
-        return Opening(
+        return TwoViewMap(
             self._first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m, seen.flat
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
-from kiteline_agent.tracking.tracker import Track, View
+from kiteline_agent.tracking.tracker import FrameImages, Track
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -32,7 +32,7 @@ class DepthFromMotion:
         self._config = config
         self._work = work
 
-    def update(self, view: View, track: Track) -> int:
+    def update(self, view: FrameImages, track: Track) -> int:
         """Look for bearings in a frame whose pose is known. Returns how many became points of the map."""
         config = self._config.motion
         near = 1.0 / track.depth_m[track.inlier]
@@ -85,7 +85,7 @@ class DepthFromMotion:
         f, c = self._map.intrinsics[:2], self._map.intrinsics[2:4]
         return np.asarray(p[:, :2] / z[:, None] * f + c)
 
-    def _look(self, view: View, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
+    def _look(self, view: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
         """Where the templates lie: correlation along the segment, then alignment in the plane."""
         config, align = self._config.motion, self._config.align
         octave = self._map.octave[rows]

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
-from kiteline_agent.keyframes.keyframes import NewPoints, new_points
+from kiteline_agent.keyframes.policy import NewPoints, new_points
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import Track, View
+from kiteline_agent.tracking.tracker import FrameImages, Track
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.geometry import se3
@@ -39,14 +39,14 @@ class KeyframeMaker:
         """From now on so much effort."""
         self._config = config
 
-    def enough(self, view: View, points: int) -> bool:
+    def enough(self, view: FrameImages, points: int) -> bool:
         """Whether a view by itself gives at least so many points with depth."""
         fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
         enough = int(np.count_nonzero(fresh.disparity > 0.0)) >= points
         self._fresh = fresh if enough else None
         return enough
 
-    def look(self, view: View, track: Track) -> NewPoints:
+    def look(self, view: FrameImages, track: Track) -> NewPoints:
         """What would be born in a keyframe of a tracked frame."""
         return new_points(view, self._seen(track)[1][:, :2], self._camera, self._config)
 
@@ -61,7 +61,7 @@ class KeyframeMaker:
         self._fresh = points
 
     def make(
-        self, view: View, track: Track | None, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
+        self, view: FrameImages, track: Track | None, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
         frame_number: int,
     ) -> F64:  # fmt: skip
         """Share and remember a keyframe; its pose T_m_k (4,4) as both sides hold it. Without a track, a map begins."""
@@ -140,7 +140,7 @@ class KeyframeMaker:
 
     def _remember(
         self,
-        view: View,
+        view: FrameImages,
         head: KeyframeHeader,
         T_m_k: F64,
         uv: F64,

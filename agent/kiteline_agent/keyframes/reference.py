@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.keyframes import keyframes
+from kiteline_agent.keyframes import policy
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import Track, View
+from kiteline_agent.tracking.tracker import FrameImages, Track
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id
@@ -17,7 +17,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id
 F64 = NDArray[np.float64]
 
 
-class Reference:
+class ReferenceKeyframe:
     """The newest keyframe, or the one where an old map was found again. T_k_c: (4,4) the camera in it."""
 
     def __init__(self, local_map: LocalMap, camera: RectifiedCamera, maker: KeyframeMaker) -> None:
@@ -43,23 +43,23 @@ class Reference:
         if T_m_k is not None:
             self.T_k_c = se3.inverse(T_m_k) @ T_m_c
 
-    def asks(self, track: Track, t_ns: int, frame: int, config: AgentConfig, gap_ns: int) -> keyframes.Wish | None:
+    def asks(self, track: Track, t_ns: int, frame: int, config: AgentConfig, gap_ns: int) -> policy.Wish | None:
         """Whether a tracked frame should become a keyframe. gap_ns: between keyframes, that the link can carry."""
         if frame - self._frame == 1:
             self._inliers = track.inliers
         T_m_k = self.T_m_k
         assert T_m_k is not None
-        what = keyframes.situation(
+        what = policy.situation(
             track, self._camera, T_m_k, frame - self._frame, (t_ns - self._t_ns) * 1e-9, self._inliers
         )
-        why = keyframes.why_keyframe(what, config.keyframe)
+        why = policy.why_keyframe(what, config.keyframe)
         if why is None:
             return None
-        waits = t_ns - self._t_ns < gap_ns and keyframes.may_wait(what, config.keyframe)
+        waits = t_ns - self._t_ns < gap_ns and policy.may_wait(what, config.keyframe)
         thin = track.inliers < config.keyframe.thin * config.pose.min_inliers
-        return keyframes.Wish(why, urgent=thin, waits=waits)
+        return policy.Wish(why, urgent=thin, waits=waits)
 
-    def add(self, view: View, track: Track | None, t_ns: int, frame: int, submap: SubmapId, T_m_c: F64) -> None:
+    def add(self, view: FrameImages, track: Track | None, t_ns: int, frame: int, submap: SubmapId, T_m_c: F64) -> None:
         """Make a keyframe of this frame. Without a track it sees nothing again; a submap's first one begins it."""
         begins = submap not in self._sequence
         parent, T_p_k = (NO_KEYFRAME, T_m_c) if begins else (self.keyframe, self.T_k_c)

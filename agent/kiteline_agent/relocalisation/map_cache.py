@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import WindowConfig
-from kiteline_agent.keyframes.keyframes import NewPoints
+from kiteline_agent.config import MapCacheConfig
+from kiteline_agent.keyframes.policy import NewPoints
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind
 from kiteline_core.geometry import se3
@@ -34,7 +34,7 @@ _MARGIN_PX = 4.0  # beyond the border: a point that is just out of view has no c
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class FrameFeatures:
     """Corners of a frame. uv: (n,2) px. disparity: (n,) px, < 0 none. octave, angle: (n,). descriptor: (n,32)."""
 
     uv: F64
@@ -45,7 +45,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Met:
+class CacheMatches:
     """Lent points that corners met. T_c_m: (4,4) by them alone. corner: (n,) indices of corners. depth_m: (n,) in the
     camera. xyz, ray, observed, sigma_px: (n,3), (n,3), (n,3), (n,) as in `optimise_pose`. foreseen: how many points
     should have been in view.
@@ -72,11 +72,11 @@ class _Around:
     ray: F64
 
 
-class Window:
+class MapCache:
     """The copies, bounded in number: slot k holds a keyframe, row k * points + i one of its points."""
 
     def __init__(
-        self, camera: RectifiedCamera, config: WindowConfig, matching: MatchConfig, ransac: RansacConfig,
+        self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig, ransac: RansacConfig,
         words: Vocabulary | None,
     ) -> None:  # fmt: skip
         k, p = config.copies, config.points
@@ -174,7 +174,7 @@ class Window:
 
     # meeting them
 
-    def meet(self, T_c_m: F64, submap: SubmapId, seen: Seen, radius_px: float) -> Met | None:
+    def meet(self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures, radius_px: float) -> CacheMatches | None:
         """Lent points of a submap that corners of a frame at about T_c_m (4,4) show; None where too few agree."""
         around = self._around(T_c_m, submap, _MARGIN_PX)
         if len(around.rows) < self._config.min_met or len(seen.uv) < self._config.min_met:
@@ -186,7 +186,7 @@ class Window:
         )  # fmt: skip
         return self._agreed(T_c_m, around, found, seen)
 
-    def _agreed(self, T_c_m: F64, around: _Around, found: Matches, seen: Seen) -> Met | None:
+    def _agreed(self, T_c_m: F64, around: _Around, found: Matches, seen: FrameFeatures) -> CacheMatches | None:
         """What of the matches one pose explains."""
         if len(found.a) < self._config.min_met:
             return None
@@ -202,12 +202,12 @@ class Window:
             return None
         T = se3.orthonormalise(T)
         depth = se3.transform(T, xyz[inlier])[:, 2]
-        return Met(
+        return CacheMatches(
             T, found.b[inlier].astype(np.int64), depth, xyz[inlier], ray[inlier], observed[inlier], sigma_px[inlier],
             len(around.rows),
         )  # fmt: skip
 
-    def yields(self, T_c_m: F64, met: Met) -> F64 | None:
+    def yields(self, T_c_m: F64, met: CacheMatches) -> F64 | None:
         """T_c_m (4,4) as far towards where the copies say that it is as they know better than the track does; None
         where they are few, or far from it.
         """
@@ -240,7 +240,7 @@ class Window:
 
     # a lost frame
 
-    def find(self, seen: Seen, submaps: set[int], frame_number: int) -> tuple[SubmapId, Met] | None:
+    def find(self, seen: FrameFeatures, submaps: set[int], frame_number: int) -> tuple[SubmapId, CacheMatches] | None:
         """Where a frame was taken, in one of some submaps, by the lent keyframes that look most alike."""
         if self._words is None or not np.isin(self._submap, sorted(submaps)).any():
             return None
@@ -258,7 +258,7 @@ class Window:
                 return submap, met
         return None
 
-    def _pose_by(self, slot: int, submap: SubmapId, seen: Seen, frame_number: int) -> F64 | None:
+    def _pose_by(self, slot: int, submap: SubmapId, seen: FrameFeatures, frame_number: int) -> F64 | None:
         """Match with all that a lent keyframe should see, and solve for the pose."""
         around = self._around(se3.inverse(self._T_m_k[slot]), submap, -self._config.beyond_px)
         wanted, offered = comparable(self._descriptor[around.rows], seen.descriptor)
@@ -291,12 +291,12 @@ class Window:
             self._indexed.discard(key)
 
 
-def corners_of(points: NewPoints) -> Seen:
+def corners_of(points: NewPoints) -> FrameFeatures:
     """The corners of a keyframe that is being made."""
-    return Seen(points.uv, points.disparity, points.octave, points.angle, points.descriptor)
+    return FrameFeatures(points.uv, points.disparity, points.octave, points.angle, points.descriptor)
 
 
-def with_depths(points: NewPoints, met: Met) -> NewPoints:
+def with_depths(points: NewPoints, met: CacheMatches) -> NewPoints:
     """The same points; those that met lent ones know their depths."""
     rho = np.zeros(len(points.uv))
     rho[met.corner] = 1.0 / met.depth_m

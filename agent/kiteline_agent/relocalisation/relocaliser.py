@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.relocalisation.map_cache import Seen, Window
-from kiteline_agent.tracking.tracker import Track, Tracker, View, without_points
+from kiteline_agent.relocalisation.map_cache import FrameFeatures, MapCache
+from kiteline_agent.tracking.tracker import FrameImages, Track, Tracker, without_points
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.imaging import matching
@@ -29,7 +29,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Recovered:
+class Relocalisation:
     """Where the old map was found. T_c_m: (4,4) in the submap of `keyframe`, from which to go on. track: its proof,
     without points where it is `lent`: corners met the base's copies. depth_m: of the points in view, median.
     """
@@ -46,11 +46,11 @@ class Recovered:
         return submap_of_keyframe(self.keyframe)
 
 
-class Recovery:
+class Relocaliser:
     """Knows the places of all remembered keyframes, and searches them for a frame: a few keyframes a call, no more."""
 
     def __init__(
-        self, local_map: LocalMap, tracker: Tracker, config: AgentConfig, words: Vocabulary | None, window: Window,
+        self, local_map: LocalMap, tracker: Tracker, config: AgentConfig, words: Vocabulary | None, window: MapCache,
         believes: Callable[[F64, SubmapId], bool],
     ) -> None:  # fmt: skip
         """believes: whether the vehicle can be at T_c_m (4,4) in a submap, by what else is known of its way."""
@@ -88,14 +88,14 @@ class Recovery:
         self._search_until = frame_number + self._config.recovery.beside_frames
         self._suspect = None
 
-    def attempt(self, view: View, frame_number: int, reference: KeyframeId) -> Recovered | None:
+    def attempt(self, view: FrameImages, frame_number: int, reference: KeyframeId) -> Relocalisation | None:
         """One try for a lost frame, over all submaps, the reference keyframe first."""
         seen = self._look(view)
         if seen is None:
             return None
         return self._search(view, seen, frame_number, reference, exclude=None)
 
-    def beside(self, view: View, frame_number: int, T_m_c: F64) -> Recovered | None:
+    def beside(self, view: FrameImages, frame_number: int, T_m_c: F64) -> Relocalisation | None:
         """One try for a frame that is tracked at T_m_c (4,4) in a young submap, over the other submaps.
 
         A pose that would leave the young submap has to be found twice, the same.
@@ -121,7 +121,7 @@ class Recovery:
         self._search_until = -1
         return found
 
-    def _look(self, view: View) -> Seen | None:
+    def _look(self, view: FrameImages) -> FrameFeatures | None:
         """Corners and descriptors; None where there is no texture."""
         detector = replace(self._detector, first=max(self._detector.first, view.first))
         corners = features.detect(view.left, np.zeros((0, 2)), detector)
@@ -129,11 +129,11 @@ class Recovery:
         if not self.textured:
             return None
         angle, descriptor = features.describe(view.left, corners.uv, corners.octave)
-        return Seen(corners.uv, np.full(len(corners.uv), -1.0), corners.octave, angle, descriptor)
+        return FrameFeatures(corners.uv, np.full(len(corners.uv), -1.0), corners.octave, angle, descriptor)
 
     def _search(
-        self, view: View, seen: Seen, frame_number: int, reference: KeyframeId, exclude: SubmapId | None
-    ) -> Recovered | None:
+        self, view: FrameImages, seen: FrameFeatures, frame_number: int, reference: KeyframeId, exclude: SubmapId | None
+    ) -> Relocalisation | None:
         """Try the reference keyframe and the most alike places, in this order."""
         tried = [reference] if self._map.slot_of(reference) >= 0 and reference != NO_KEYFRAME else []
         if self._index is not None:
@@ -148,13 +148,13 @@ class Recovery:
             if track is None or not self._believes(track.T_c_m, submap_of_keyframe(keyframe)):
                 continue
             depth_m = float(np.median(track.depth_m[track.inlier]))
-            found = Recovered(track.T_c_m, keyframe, track, depth_m)
+            found = Relocalisation(track.T_c_m, keyframe, track, depth_m)
             if self._has_twin(found, fit.inliers, seen, frame_number):
                 return None
             return found
         return self._search_window(seen, frame_number, exclude)
 
-    def _has_twin(self, found: Recovered, inliers: int, seen: Seen, frame_number: int) -> bool:
+    def _has_twin(self, found: Relocalisation, inliers: int, seen: FrameFeatures, frame_number: int) -> bool:
         """Whether the same submap shows all this at another place too: then nobody knows which of them it is."""
         if self._index is None:
             return False
@@ -171,7 +171,7 @@ class Recovery:
                 return True
         return False
 
-    def _search_window(self, seen: Seen, frame_number: int, exclude: SubmapId | None) -> Recovered | None:
+    def _search_window(self, seen: FrameFeatures, frame_number: int, exclude: SubmapId | None) -> Relocalisation | None:
         """Try the base's copies, in every submap of which a keyframe is remembered: from that one it goes on."""
         known = self._map.keyframe[self._map.keyframe != NO_KEYFRAME]
         submaps = {int(submap_of_keyframe(KeyframeId(k))) for k in known.tolist()} - {exclude}
@@ -181,9 +181,9 @@ class Recovery:
         submap, met = found
         newest = KeyframeId(max(k for k in known.tolist() if submap_of_keyframe(KeyframeId(k)) == submap))
         proof = without_points(met.T_c_m, len(met.corner))
-        return Recovered(met.T_c_m, newest, proof, float(np.median(met.depth_m)), lent=True)
+        return Relocalisation(met.T_c_m, newest, proof, float(np.median(met.depth_m)), lent=True)
 
-    def _pose_by(self, keyframe: KeyframeId, seen: Seen, frame_number: int) -> PoseFit | None:
+    def _pose_by(self, keyframe: KeyframeId, seen: FrameFeatures, frame_number: int) -> PoseFit | None:
         """Match with all that a keyframe should see, also a little beyond its border, and solve for the pose."""
         limits = self._config.recovery
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
@@ -208,7 +208,7 @@ class Recovery:
             return None
         return fit
 
-    def _confirm(self, view: View, T_c_m: F64, frame_number: int, submap: SubmapId) -> Track | None:
+    def _confirm(self, view: FrameImages, T_c_m: F64, frame_number: int, submap: SubmapId) -> Track | None:
         """The tracker's own templates must agree with a pose."""
         limits = self._config.recovery
         active = self._map.active

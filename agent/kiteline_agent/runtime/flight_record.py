@@ -7,10 +7,10 @@ from dataclasses import asdict
 from typing import TextIO
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.flight_log import StepLog, write_step
-from kiteline_agent.runtime.options import AgentSpec
-from kiteline_agent.runtime.tally import live_line, odometry_line
+from kiteline_agent.runtime.frame_counts import live_line, odometry_line
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.step import Estimate, StepInput, StepOutput
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.coding import record_log
@@ -31,7 +31,7 @@ class FlightRecord:
         self._agent = AgentId(agent)
         self._channel = channel
         self._link_due_ns = 0
-        if isinstance(channel, CodedChannel | AloneChannel):
+        if isinstance(channel, CodedChannel | NoBaseChannel):
             channel.noting = True
 
     def step(self, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int) -> None:
@@ -44,7 +44,7 @@ class FlightRecord:
 
     def _shared(self, log_ns: int) -> None:
         """What was shared, for a base that reads the log after landing: no link may have carried it."""
-        if isinstance(self._channel, CodedChannel | AloneChannel):
+        if isinstance(self._channel, CodedChannel | NoBaseChannel):
             for key, code in self._channel.take_noted().items():
                 self._log.blob(record_log.TOPIC, log_ns, record_log.write_record(self._agent, key, code))
 
@@ -54,7 +54,7 @@ class FlightRecord:
         self._odometry.write(odometry_line(estimate))
 
 
-def metadata(spec: AgentSpec, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
+def metadata(spec: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
     """What a log says of its flight at its head. source: its name."""
     plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
     plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not

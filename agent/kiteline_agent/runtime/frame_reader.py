@@ -10,7 +10,7 @@ from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
 
-class Camera:
+class FrameReader:
     """Frames of a source, each with the inertial samples, and what an odometer measured, since the one taken before it.
 
     until_ns: frames with a later stamp are left out; None: all. cpu_clock: process CPU time in ns, handed in.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.transport.seal import seal_bytes, suite_for
@@ -17,7 +17,7 @@ from kiteline_core import config as configuration
 
 
 @dataclass(frozen=True, slots=True)
-class AgentSpec:
+class AgentOptions:
     """All that one agent's flight is told. Plain values, so that it travels as JSON."""
 
     source: str
@@ -48,9 +48,9 @@ class AgentSpec:
     await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
 
 
-def spec_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentSpec:
+def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
     """What the command line says. folder: for the log. boot: number of this start."""
-    return AgentSpec(
+    return AgentOptions(
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
         key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
@@ -58,13 +58,13 @@ def spec_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentSpec:
     )  # fmt: skip
 
 
-def from_json(text: str) -> AgentSpec:
+def from_json(text: str) -> AgentOptions:
     """A spec from its JSON; unknown keys are an error."""
     values: dict[str, Any] = json.loads(text)
-    known = {f.name for f in fields(AgentSpec)}
+    known = {f.name for f in fields(AgentOptions)}
     if unknown := set(values) - known:
         raise ValueError(f"unknown key in spec: {sorted(unknown)}")
-    return AgentSpec(**values)
+    return AgentOptions(**values)
 
 
 def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
@@ -80,13 +80,13 @@ def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
 
 
-def channel_for(spec: AgentSpec, spill: Spill | None = None) -> RecordChannel:
+def channel_for(spec: AgentOptions, spill: Spill | None = None) -> RecordChannel:
     """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1.
 
     spill: keeps what would take too much memory while the link is down.
     """
     if spec.link == "none":
-        return AloneChannel()
+        return NoBaseChannel()
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
     return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
 

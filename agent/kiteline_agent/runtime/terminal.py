@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kiteline_agent.runtime.tally import Tally, live_pose
+from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import StepOutput
 
 _EVERY_NS = 10_000_000_000  # between two lines while nothing happens
@@ -17,7 +17,7 @@ _TOLD = (
 )  # beginnings of the events worth a line
 
 
-class Narrator:
+class StatusMessages:
     """Makes lines of text from steps."""
 
     def __init__(self) -> None:
@@ -26,7 +26,7 @@ class Narrator:
         self._summary_ns = _EVERY_NS
         self._bytes_up = 0
 
-    def lines(self, output: StepOutput, tally: Tally, flight_ns: int) -> list[str]:
+    def lines(self, output: StepOutput, tally: FrameCounts, flight_ns: int) -> list[str]:
         """What is to be said after a step at a time of the flight."""
         out = [event for event in output.events if event.startswith(_TOLD)]
         estimate = output.estimate
@@ -48,7 +48,7 @@ class Narrator:
         return [f"{flight_ns / 1e9:8.1f} s  {line}" for line in out]
 
 
-def summary(tally: Tally) -> str:
+def summary(tally: FrameCounts) -> str:
     """The flight so far in one line."""
     return (
         f"{tally.frames} frames: {tally.tracked} tracked, {tally.lost} lost, {tally.dropped} dropped; "

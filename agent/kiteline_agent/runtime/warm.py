@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
@@ -35,7 +35,7 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
     right = np.ascontiguousarray(np.roll(image, -8, axis=1))
     centres = pixels[: 32 * nodes(4, 2)].view(np.uint64).reshape(-1, 4)
     words = Vocabulary(4, 2, centres, np.ones(16, np.float32))
-    agent = Agent(small, ImuCalibration(), config or AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+    agent = Agent(small, ImuCalibration(), config or AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), words)
     for k in range(14):
         # At last the picture jumps by a quarter of its width: lost, and found again by its descriptors.
         shift = 0 if k < 13 else -80

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_agent.governor.governor import Extra
-from kiteline_agent.initialisation.metric_start import Reborn, reborn
-from kiteline_agent.initialisation.two_view_start import Opening
+from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
+from kiteline_agent.initialisation.two_view_start import TwoViewMap
 from kiteline_agent.relocalisation.map_cache import corners_of, with_depths
 from kiteline_agent.stages import Stages
-from kiteline_agent.tracking.tracker import Track, View
+from kiteline_agent.tracking.tracker import FrameImages, Track
 from kiteline_codec.schema import SubmapScale
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
@@ -42,7 +42,7 @@ class MapGrowth:
         )
         self._reference.refresh(self._pose.T_m_c)
 
-    def keyframe_if_due(self, view: View, track: Track, t_ns: int) -> None:
+    def keyframe_if_due(self, view: FrameImages, track: Track, t_ns: int) -> None:
         """A keyframe, where the policy asks for one, the link can carry it and there is time for it."""
         wish = self._reference.asks(track, t_ns, self._s.frame, self._s.config, self._s.channel.keyframe_gap_ns())
         if wish is None:
@@ -53,13 +53,13 @@ class MapGrowth:
             self._s.events.append(f"keyframe: {wish.why}")
             self.add_keyframe(view, track, t_ns)
 
-    def add_keyframe(self, view: View, track: Track, t_ns: int) -> None:
+    def add_keyframe(self, view: FrameImages, track: Track, t_ns: int) -> None:
         """A keyframe of this frame, with new points where the image has room."""
         self._yield_to_copies(view, track)
         self._reference.add(view, track, t_ns, self._s.frame, self._submaps.active, self._pose.T_m_c)
         self._note_keyframe(view, Extra.KEYFRAME)
 
-    def _yield_to_copies(self, view: View, track: Track) -> None:
+    def _yield_to_copies(self, view: FrameImages, track: Track) -> None:
         """A keyframe's corners meet the base's copies: it takes over their depths, and moves a little towards where
         they say that it is. The odometry frame stays still.
         """
@@ -76,7 +76,7 @@ class MapGrowth:
         if goal is not None:
             self._s.move_map(se3.inverse(goal))
 
-    def _note_keyframe(self, view: View, extra: Extra) -> None:
+    def _note_keyframe(self, view: FrameImages, extra: Extra) -> None:
         """What follows every keyframe: it is booked, and its place remembered."""
         self._s.governor.note(extra)
         if view.right is not None and self._s.rectifier.bends:
@@ -84,7 +84,7 @@ class MapGrowth:
         self._s.recovery.remember(self._reference.keyframe)
         self._certainty.remember(self._reference.keyframe)
 
-    def go_on(self, view: View, t_ns: int) -> bool:
+    def go_on(self, view: FrameImages, t_ns: int) -> bool:
         """No point of the map was found, but the IMU knows well where the camera is: the map goes on with a keyframe
         there. Returns whether that is so, even where the keyframe has to wait for CPU time.
         """
@@ -102,7 +102,7 @@ class MapGrowth:
         self._note_keyframe(view, Extra.KEYFRAME)
         return True
 
-    def begin_submap(self, view: View, t_ns: int, imu: ImuBatch | None) -> bool:
+    def begin_submap(self, view: FrameImages, t_ns: int, imu: ImuBatch | None) -> bool:
         """Open a submap when the old map was not found again. Returns whether there is a pose now."""
         first = not self._submaps.any
         if not first:
@@ -140,7 +140,7 @@ class MapGrowth:
         self._note_keyframe(view, Extra.SUBMAP)
         return True
 
-    def _open_from_two_views(self, view: View, t_ns: int, opening: Opening) -> bool:
+    def _open_from_two_views(self, view: FrameImages, t_ns: int, opening: TwoViewMap) -> bool:
         """The first two keyframes of one eye's map."""
         self._s.events.append(f"mono: scale by convention, median depth {opening.median_depth_m:.3g} m")
         self._inertia.forget_unit()
@@ -157,7 +157,7 @@ class MapGrowth:
         self.add_keyframe(view, track, t_ns)
         return True
 
-    def find_scale(self, view: View, track: Track, t_ns: int) -> None:
+    def find_scale(self, view: FrameImages, track: Track, t_ns: int) -> None:
         """One eye with an IMU: once acceleration tells how long the map's unit is, begin a map in metres."""
         limits = self._s.config.mono_start
         if self._s.frame % limits.scale_every or not self._submaps.room:
@@ -165,11 +165,11 @@ class MapGrowth:
         unit_m = self._inertia.unit_m(limits.scale_sigma)
         if unit_m is None:
             return
-        born = reborn(view, track, self._map, unit_m, self._s.config.detector.cell_px)
+        born = metric_points(view, track, self._map, unit_m, self._s.config.detector.cell_px)
         if len(born.sigma_rho) >= self._s.config.local_map.first_points:
             self._begin_in_metres(view, t_ns, unit_m, born)
 
-    def _begin_in_metres(self, view: View, t_ns: int, unit_m: float, born: Reborn) -> None:
+    def _begin_in_metres(self, view: FrameImages, t_ns: int, unit_m: float, born: MetricPoints) -> None:
         """Go on in a new submap whose unit is a metre."""
         assert self._mono is not None
         self._s.events += [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]

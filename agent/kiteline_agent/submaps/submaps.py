@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.initialisation.metric_start import Reborn
-from kiteline_agent.initialisation.two_view_start import Opening
+from kiteline_agent.initialisation.metric_restart import MetricPoints
+from kiteline_agent.initialisation.two_view_start import TwoViewMap
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
-from kiteline_agent.keyframes.reference import Reference
+from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.relocalisation.relocaliser import Recovered
+from kiteline_agent.relocalisation.relocaliser import Relocalisation
 from kiteline_agent.step import Identity
 from kiteline_agent.tracking.pose_state import PoseState
-from kiteline_agent.tracking.tracker import View
+from kiteline_agent.tracking.tracker import FrameImages
 from kiteline_core.geometry import se3
 from kiteline_core.ids import MAX_SUBMAPS, SubmapId, submap_id
 
@@ -24,7 +24,12 @@ class Submaps:
     """Opens submaps and returns to older ones; the odometry frame stays still through all of it."""
 
     def __init__(
-        self, identity: Identity, local_map: LocalMap, pose: PoseState, reference: Reference, maker: KeyframeMaker
+        self,
+        identity: Identity,
+        local_map: LocalMap,
+        pose: PoseState,
+        reference: ReferenceKeyframe,
+        maker: KeyframeMaker,
     ) -> None:
         self._identity = identity
         self._map = local_map
@@ -54,13 +59,13 @@ class Submaps:
         """The submap in which the flight begins."""
         return submap_id(self._identity.agent, self._identity.boot, 0)
 
-    def open_from_pair(self, view: View, t_ns: int, frame: int) -> None:
+    def open_from_pair(self, view: FrameImages, t_ns: int, frame: int) -> None:
         """The first keyframe gives depth by itself. Where the camera is has been set."""
         self._next()
         self._pose.stand()
         self._reference.add(view, None, t_ns, frame, self.active, self._pose.T_m_c)
 
-    def open_from_two_views(self, frame: int, opening: Opening, sigma_px: float) -> F64:
+    def open_from_two_views(self, frame: int, opening: TwoViewMap, sigma_px: float) -> F64:
         """The first keyframe of one eye's map. The second view stays where the camera was thought to be; T_m_a (4,4)
         says where that puts the first one.
         """
@@ -73,7 +78,7 @@ class Submaps:
         opening.sharpen(self._map, self._reference.keyframe, sigma_px)
         return T_m_a
 
-    def open_in_metres(self, view: View, t_ns: int, frame: int, unit_m: float, born: Reborn) -> F64:
+    def open_in_metres(self, view: FrameImages, t_ns: int, frame: int, unit_m: float, born: MetricPoints) -> F64:
         """Go on in a new submap whose unit is a metre, from points that are tracked now; the old one is left behind.
         T_new_old (4,4), of lengths in m.
         """
@@ -85,7 +90,7 @@ class Submaps:
         born.sharpen(self._map, self._reference.keyframe)
         return T_n_m
 
-    def return_to(self, found: Recovered, frame: int) -> None:
+    def return_to(self, found: Relocalisation, frame: int) -> None:
         """Go on in the submap and from the keyframe where the old map was found."""
         self._number = found.submap % MAX_SUBMAPS
         self._map.activate(found.submap)

@@ -20,7 +20,7 @@ _LEVEL = 3  # 94x60 px for 752x480: a shift of half the image is still found
 _LEAST_RESPONSE = 0.05  # of the correlation's peak: below it the two images have nothing in common
 
 
-class Glimpse:
+class ImageShift:
     """Keeps the small image of the last tracked frame, with its pose."""
 
     def __init__(self, camera: RectifiedCamera) -> None:

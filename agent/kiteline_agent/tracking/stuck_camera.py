@@ -16,7 +16,7 @@ _MOVED_PX = 2.0  # by which the view must have shifted meanwhile; a camera witho
 _DEPTH_M = 4.0  # of a view, to tell shifts from motion
 
 
-class FrozenEye:
+class StuckCamera:
     """Once a frame `repeats`."""
 
     def __init__(self, camera: RectifiedCamera) -> None:

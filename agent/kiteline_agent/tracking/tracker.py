@@ -13,7 +13,7 @@ from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.features import Pyramid
 from kiteline_agent.local_map import projection_kernels as local_map_kernels
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
-from kiteline_agent.tracking.image_pair import RightEye
+from kiteline_agent.tracking.frame_images import RightImage
 from kiteline_core.geometry import se3
 from kiteline_core.pose import pose_kernels
 
@@ -26,11 +26,11 @@ _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class FrameImages:
     """The pyramids of one instant. depth_m: (h,w) float32 aligned with left, or None. first: finest level not blank."""
 
     left: Pyramid
-    right: RightEye | None
+    right: RightImage | None
     depth_m: NDArray[np.float32] | None
     first: int = 0
 
@@ -79,7 +79,7 @@ class Tracker:
         """From now on so much effort."""
         self._config = config
 
-    def track(self, view: View, predicted_T_c_m: F64, frame_number: int) -> Track:
+    def track(self, view: FrameImages, predicted_T_c_m: F64, frame_number: int) -> Track:
         """One frame: a coarse pass over few points mends the prediction, a fine pass over many measures the pose."""
         T_c_m = predicted_T_c_m.copy()
         # Coarse pass: big steps on small images.
@@ -106,7 +106,9 @@ class Tracker:
         n = local_map_kernels.select(order, candidates.uv, float(cell), limit, per_cell, cells, chosen)
         return chosen[:n]
 
-    def _measure(self, view: View, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool) -> Track:
+    def _measure(
+        self, view: FrameImages, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool
+    ) -> Track:
         config = self._config
         rows = candidates.rows[chosen]
         uv = candidates.uv[chosen]
@@ -135,7 +137,7 @@ class Tracker:
         )
 
     def _solve(
-        self, view: View, candidates: Candidates, chosen: I64, uv: F64, octave: NDArray[np.uint8], sigma_px: F64,
+        self, view: FrameImages, candidates: Candidates, chosen: I64, uv: F64, octave: NDArray[np.uint8], sigma_px: F64,
         T_c_m: F64, *, tried: int, stereo: bool,
     ) -> Track:  # fmt: skip
         """The pose from candidates[chosen] (n,), seen at uv (n,2) px on octave (n,), each to sigma_px (n,); stereo:
@@ -160,7 +162,7 @@ class Tracker:
         )  # fmt: skip
 
     def _add_disparities(
-        self, view: View, rows: I64, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64
+        self, view: FrameImages, rows: I64, uv: F64, octave: NDArray[np.uint8], depth: F64, observed: F64
     ) -> None:
         """Fill observed[:, 2] from the right image or from the depth image, where they agree to be measurable."""
         bf = self._map.camera.bf

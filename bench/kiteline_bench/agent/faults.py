@@ -12,7 +12,7 @@ import numpy as np
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
 from kiteline_bench.harness import faults
@@ -30,7 +30,7 @@ _SOON = 3  # frames after texture returned
 
 def estimates(clip: Clip, words: Vocabulary | None = None) -> list[Estimate]:
     """What an agent without a base makes of a clip."""
-    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), words)
     found = (agent.step(StepInput(frame, imu), frame.t_ns).estimate for frame, imu in clip.items)
     return [e for e in found if e is not None]
 

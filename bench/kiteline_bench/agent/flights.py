@@ -13,7 +13,7 @@ import numpy as np
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_bench.agent import governor as bench_governor
 from kiteline_bench.agent import odometry as bench_agent_odometry
@@ -133,7 +133,7 @@ def _begun(found: Sequence[Estimate]) -> tuple[int, int]:
 
 
 def _with_imu(clip: Clip) -> tuple[Agent, list[Estimate]]:
-    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     found = (agent.step(StepInput(frame, imu), frame.t_ns).estimate for frame, imu in clip.items)
     return agent, [e for e in found if e is not None]
 

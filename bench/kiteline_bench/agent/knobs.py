@@ -15,7 +15,7 @@ import numpy as np
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import PRICES_NS, cost_ns
 from kiteline_agent.governor.governor import FULL, governed
 from kiteline_agent.runtime.frame_reader import joined
@@ -77,7 +77,7 @@ class Flown:
 
 def fly_at(clip: Clip, config: AgentConfig, every: int) -> Flown:
     """Fly a clip at one effort, on a core that is never busy."""
-    agent = Agent(clip.rig, clip.imu, config, Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(clip.rig, clip.imu, config, Identity(AgentId(0), 0), NoBaseChannel())
     agent.map.searched = config.local_map.searched
     found: list[Estimate] = []
     spent_ns, held = 0, list[ImuBatch]()

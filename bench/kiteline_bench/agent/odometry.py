@@ -10,7 +10,7 @@ import numpy as np
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_bench.benchmark import Bar, Bench, at_most
 from kiteline_bench.harness import faults
@@ -61,7 +61,7 @@ def bars(bench: Bench, flights: Mapping[str, Simulated]) -> list[Bar]:
 
 def fly(clip: Clip, driven: OdometryBatch | None) -> tuple[Agent, list[Estimate]]:
     """An agent without a base; the odometry reaches it with the frames that follow."""
-    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), shipped_words())
+    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), shipped_words())
     out, done = [], 0
     for frame, imu in clip.items:
         part = None

@@ -20,8 +20,7 @@ from kiteline_agent.relocalisation import relocaliser as recovery
 from kiteline_agent.runtime import flight_log
 from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput
-from kiteline_agent.tracking import image_pair as right_eye
-from kiteline_agent.tracking import tracker
+from kiteline_agent.tracking import frame_images, tracker
 from kiteline_bench.benchmark import Bar, Bench, at_most
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, coded_channel
@@ -41,7 +40,7 @@ TITLE = "Stages"
 STAGES: tuple[tuple[Any, str, str], ...] = (
     (Agent, "step", "all else"),
     (Agent, "_view", "rectification"),
-    (right_eye, "build_pyramid", "pyramids"),
+    (frame_images, "build_pyramid", "pyramids"),
     (tracker.Tracker, "track", "tracking, but for:"),
     (alignment_kernels, "align", "alignment"),
     (stereo_kernels, "refine_rows", "stereo, sub-pixel"),
@@ -51,9 +50,9 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (features, "detect", "corners"),
     (features, "describe", "descriptors"),
     (stereo_kernels, "search_rows", "stereo, search"),
-    (right_eye.RightEye, "coarse", "right image, half"),
+    (frame_images.RightImage, "coarse", "right image, half"),
     (alignment_kernels, "cut_templates", "templates"),
-    (recovery.Recovery, "remember", "place words"),
+    (recovery.Relocaliser, "remember", "place words"),
     (CodedChannel, "receive", "codec, in"),
     (CodedChannel, "put", "codec, records"),
     (CodedChannel, "poll", "codec, packets"),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.frame_reader import joined
@@ -53,7 +53,7 @@ def fly_clip(clip: Clip, percent: float, *, governor: bool, real: bool) -> Gover
     config = AgentConfig()
     if governor and percent > 0.0:
         config = replace(config, governor=replace(config.governor, cpu_percent=percent))
-    agent = Agent(clip.rig, clip.imu, config, Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(clip.rig, clip.imu, config, Identity(AgentId(0), 0), NoBaseChannel())
     estimates: list[Estimate | None] = []
     spent: list[tuple[int, int]] = []
     core = VirtualCpu(percent)

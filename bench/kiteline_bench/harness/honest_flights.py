@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.frame_reader import joined
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
@@ -212,7 +212,7 @@ def fly(
     rig: CameraRig, imu: ImuCalibration | None, items: list[Shown], words: Vocabulary | None = None
 ) -> Iterator[Judged]:
     """Fly and judge each frame."""
-    agent = Agent(rig, imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel(), words)
+    agent = Agent(rig, imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), words)
     begin: tuple[F64, F64] | None = None
     for item in items:
         step = StepInput(item.frame, item.imu if imu is not None else None)

@@ -23,7 +23,7 @@ import cv2
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput
 from kiteline_bench.harness.clip import Clip, load
@@ -161,7 +161,7 @@ def _first_pose_s(source: str) -> float:
     """Seconds from the start of this process to its first pose."""
     opened = open_source(source)
     warm(opened.rig)
-    agent = Agent(opened.rig, opened.imu, AgentConfig(), Identity(AgentId(0), 0), AloneChannel())
+    agent = Agent(opened.rig, opened.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     imu = None
     for item in opened:
         if isinstance(item, ImuBatch):

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.__main__ import Onboard
-from kiteline_agent.exchange.no_base import AloneChannel
-from kiteline_agent.runtime.options import AgentSpec
+from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.__main__ import Ground
 from kiteline_basestation.runtime.options import BaseSpec, coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
@@ -38,7 +38,7 @@ class Flight:
     deaths: when each base in turn is killed (flight time, and real time after it, in s); a new one follows each.
     """
 
-    agents: Sequence[AgentSpec]
+    agents: Sequence[AgentOptions]
     base: BaseSpec | None
     frames: int | None
     quiet: bool = False
@@ -80,7 +80,7 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
                 spec.boot + 1, spec.up_bytes_s, spec.profile, spill=SpillFile(Path(spec.folder)), bounded=True
             )
         else:
-            ours[spec.agent] = AloneChannel()
+            ours[spec.agent] = NoBaseChannel()
     with contextlib.ExitStack() as stack:
         onboards = {}
         for spec, source in zip(flight.agents, sources, strict=True):
@@ -174,7 +174,7 @@ class _Supervisor:
         self,
         crew: Crew,
         base: BaseSpec,
-        agents: Sequence[AgentSpec],
+        agents: Sequence[AgentOptions],
         progress: Progress | None,
         deaths: Sequence[tuple[float, float]],
     ) -> None:

@@ -10,7 +10,7 @@ import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from kiteline_agent.runtime.options import AgentSpec
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.options import BaseSpec
 from kiteline_core.frame import Frame
 from kiteline_hw.logs.mcap_mend import mend
@@ -58,7 +58,7 @@ class Plan:
     """A flight about to begin: the opened sources and what each process is told."""
 
     sources: list[FrameSource] = field(default_factory=list)
-    agents: list[AgentSpec] = field(default_factory=list)
+    agents: list[AgentOptions] = field(default_factory=list)
     base: BaseSpec | None = None
     frames: int | None = None
 
@@ -145,7 +145,7 @@ def plan(o: Options) -> Plan:
     made.frames = None if o.seconds > 0 or None in counts else sum(count or 0 for count in counts)
     for k, text in enumerate(o.sources):
         made.agents.append(
-            AgentSpec(
+            AgentOptions(
                 source=text, folder=str(o.out / f"agent{k}"), agent=k, boot=boot, mono=o.mono, imu=o.imu,
                 config=o.config,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.runtime.flight_log import ESTIMATE, estimate_from_json
-from kiteline_agent.runtime.options import AgentSpec
-from kiteline_agent.runtime.tally import Tally, live_pose
+from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.step import Estimate
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry.cameras import Rectifier
@@ -28,7 +28,11 @@ _SAMPLES = ("cpu_ms_per_frame", "decode_ms", "bundle_ms", "grid_ms", "step_ms") 
 
 
 def judge(
-    out: Path, sources: Sequence[FrameSource], agents: Sequence[AgentSpec], outcome: Outcome, align_scale: bool = False
+    out: Path,
+    sources: Sequence[FrameSource],
+    agents: Sequence[AgentOptions],
+    outcome: Outcome,
+    align_scale: bool = False,
 ) -> Report:
     """Write what the processes themselves did not, and report.json; the report."""
     alignment = Alignment.SIM3 if align_scale else Alignment.SE3
@@ -87,7 +91,7 @@ def _with_statistics(part: Report) -> Report:
 
 def _from_log(source: FrameSource, estimates: Sequence[Estimate]) -> Report:
     """The report of an agent that ended without one: what its log says."""
-    tally = Tally()
+    tally = FrameCounts()
     for estimate in estimates:
         tally.count(estimate)
     timing = {"cpu_ms_per_frame": statistic([]), "decode_ms": statistic([]), "rss_mib": 0.0}

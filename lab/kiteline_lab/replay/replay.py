@@ -15,10 +15,10 @@ import cv2
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.exchange.no_base import AloneChannel
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime import flight_log as agent_log
-from kiteline_agent.runtime.options import AgentSpec
-from kiteline_agent.runtime.tally import Tally, live_line, odometry_line
+from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.runtime.warm import warm as agent_warm
 from kiteline_agent.step import Identity, StepInput
 from kiteline_basestation.__main__ import place_words
@@ -67,7 +67,7 @@ class Replayed:
 
     steps: int = 0
     difference: str | None = None
-    tally: Tally = field(default_factory=Tally)
+    tally: FrameCounts = field(default_factory=FrameCounts)
     live: list[str] = field(default_factory=list)
     odometry: list[str] = field(default_factory=list)
 
@@ -104,7 +104,7 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
     kind = log.metadata.get("channel", "")
     if kind == "PlainChannel":
         raise SourceError("this is a monolith's log: what its base handed over was no packet, and is not in it")
-    channel: RecordChannel = AloneChannel()
+    channel: RecordChannel = NoBaseChannel()
     if kind == "CodedChannel":
         spill = SpillFile(Path(tempfile.gettempdir())) if spec["log_name"] else None
         channel = channel_of_log(spec, spec["boot"] + 1, spec["up_bytes_s"], spill, bounded=True)
@@ -212,7 +212,7 @@ def _compare_packets(out: Replayed, step: Step, topic: str, made: tuple[bytes, .
 def spec_of_log(log: LogReader) -> dict[str, Any]:
     known: dict[str, Any] = {}
     if log.metadata.get("role") == "agent":
-        fields = AgentSpec.__dataclass_fields__
+        fields = AgentOptions.__dataclass_fields__
         known = {name: fields[name].default for name in ("up_bytes_s", "log_name")}
     elif log.metadata.get("role") == "base":
         known = {"down_bytes_s": BaseSpec.__dataclass_fields__["down_bytes_s"].default}

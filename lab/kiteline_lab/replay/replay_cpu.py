@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from kiteline_agent.runtime.options import AgentSpec
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
@@ -42,14 +42,14 @@ def _modelled(log: Path, percent: float, folder: Path) -> dict[str, Any]:
     source = open_source(f"mcap:{log}")
     with contextlib.closing(source):
         start_ns = flight_starts([source])[0]
-        spec = AgentSpec(source=f"mcap:{log}", folder=str(folder), start_ns=start_ns, cpu_percent=percent)
+        spec = AgentOptions(source=f"mcap:{log}", folder=str(folder), start_ns=start_ns, cpu_percent=percent)
         report = fly_here(Flight([spec], None, source.frame_count), [source], "tracker").agents[0]
     assert report is not None
     return report
 
 
 def _limited(log: Path, percent: float, folder: Path) -> dict[str, Any]:
-    spec = AgentSpec(source=f"mcap:{log}", folder=str(folder), cpu_percent=percent)
+    spec = AgentOptions(source=f"mcap:{log}", folder=str(folder), cpu_percent=percent)
     with Crew() as crew, Progress("flying", None, "frames") as progress:
         child = crew.start("agent0", "kiteline_agent", asdict(spec), folder)
         report: dict[str, Any] | None = None

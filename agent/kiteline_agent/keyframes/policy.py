@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, KeyframeConfig
 from kiteline_agent.imaging import features
-from kiteline_agent.tracking.tracker import Track, View, depth_at
+from kiteline_agent.tracking.tracker import FrameImages, Track, depth_at
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.imaging import stereo_kernels
@@ -112,7 +112,7 @@ class NewPoints:
     lent_rho: F64 | None = None
 
 
-def new_points(view: View, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:
+def new_points(view: FrameImages, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:
     """Corners where no point is tracked, with depth where the row or the depth image gives one."""
     detector = config.detector
     if view.first > detector.first:

@@ -28,7 +28,7 @@ def rectified(image: U8, rectifier: Rectifier, eye: int, levels: int, first: int
     return (rectifier.blank, *build_pyramid(rectifier.half(eye, image), levels - 1))
 
 
-class RightEye:
+class RightImage:
     """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's.
 
     offset_px: what disparities at pixels (n,2) are measured too large by (n,), as far as is known; it is taken off.

@@ -15,7 +15,7 @@ F64 = NDArray[float64]
 
 
 @dataclass(slots=True)
-class Tally:
+class FrameCounts:
     """frames = tracked + lost + dropped. bridged: those of the tracked that the IMU carried."""
 
     tracked: int = 0

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.feature_kernels import BORDER
-from kiteline_agent.keyframes.keyframes import NewPoints
+from kiteline_agent.keyframes.policy import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import Track, View
+from kiteline_agent.tracking.tracker import FrameImages, Track
 from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[np.float64]
@@ -23,7 +23,7 @@ _LEAST_SIGMA_PX = 0.06  # virtual disparity error, of depths that many frames ha
 
 
 @dataclass(frozen=True, slots=True)
-class Reborn:
+class MetricPoints:
     """Births of the first keyframe in metres, in the order in which they are shared. sigma_rho: (n,) 1/m."""
 
     points: NewPoints
@@ -36,7 +36,7 @@ class Reborn:
         local_map.sigma_rho[slot, :n] = self.sigma_rho[:n]
 
 
-def reborn(view: View, track: Track, local_map: LocalMap, metres: float, cell_px: int) -> Reborn:
+def metric_points(view: FrameImages, track: Track, local_map: LocalMap, metres: float, cell_px: int) -> MetricPoints:
     """The points of a track as births of its frame. metres: in one unit of the map. cell_px: of the detector."""
     camera = local_map.camera
     octave = local_map.octave[track.rows]
@@ -51,4 +51,4 @@ def reborn(view: View, track: Track, local_map: LocalMap, metres: float, cell_px
     blur = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]
     angle, descriptor = features.describe(view.left, uv[keep], octave[keep])
     points = NewPoints(uv[keep], camera.bf * rho, octave[keep], angle, descriptor)
-    return Reborn(points, np.maximum(blur * rho, _LEAST_SIGMA_PX / camera.bf))
+    return MetricPoints(points, np.maximum(blur * rho, _LEAST_SIGMA_PX / camera.bf))
