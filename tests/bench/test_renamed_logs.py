@@ -50,7 +50,7 @@ def test_names_are_mapped_and_all_else_stays(log: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr(renamed_logs, "FIELDS", {"/job": {"cost_ops": "cost"}})
     monkeypatch.setattr(renamed_logs, "TOPICS", {"/packets/in": "/received"})
     monkeypatch.setattr(renamed_logs, "JOB_KINDS", {"old": "new"})
-    log.with_name("log.jobs.json").write_text(json.dumps([f"result {n}" for n in range(200)]))
+    log.with_name("log.job_values.json").write_text(json.dumps([f"result {n}" for n in range(200)]))
     copy_renamed(log, tmp_path / "new.mcap")
     with LogReader(log) as a, LogReader(tmp_path / "new.mcap") as b:
         old, new = list(a.messages()), list(b.messages())

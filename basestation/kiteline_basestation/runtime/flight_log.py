@@ -129,10 +129,9 @@ def fingerprint(done: JobDone) -> str:
 
 
 def _feed(digest: hashlib.blake2b, value: object) -> None:
-    """Every field by name, type, shape and content."""
+    """Feed type, shape and content of every field, in order; names may change between versions."""
     if is_dataclass(value):
         for field in fields(value):
-            digest.update(field.name.encode())
             _feed(digest, getattr(value, field.name))
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str}{value.shape}".encode())

@@ -43,7 +43,7 @@ _AGENT_PREFIX = re.compile(r"^(/agent\d+)?(.*)$")
 def copy_renamed(old: Path, new: Path) -> None:
     """Copy a log under new names. Raises SourceError when `old` is no MCAP file.
 
-    Where OLD.jobs.json lies beside `old`, its list replaces the logged fingerprints of the jobs' results, in order.
+    Where OLD.job_values.json lies beside `old`, its list replaces the logged fingerprints of the jobs' results, in order.
     """
     log = McapFile(old)
     role = next((r.metadata.get("role", "") for r in log.metadata if r.name == "kiteline"), "")
@@ -117,7 +117,7 @@ def renamed_message(topic: str, data: bytes, results: list[str]) -> bytes:
 
 
 def _job_results(log: Path) -> list[str]:
-    path = log.with_name(log.stem + ".jobs.json")
+    path = log.with_name(log.stem + ".job_values.json")
     return list(json.loads(path.read_text())) if path.exists() else []
 
 
