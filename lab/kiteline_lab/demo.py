@@ -1,4 +1,4 @@
-"""`make demo`: simulate a short flight, fly it in two processes over a real link, and judge it against the truth."""
+"""`make demo`: simulate a short flight, run agent and base on it over a real link, and evaluate the result."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from pathlib import Path
 from kiteline_lab.evaluation.evaluate import evaluate_files
 from kiteline_lab.evaluation.metrics import Evaluation
 
-SCENE = "room"  # four walls, furniture, a window: what EuRoC's Vicon room is like
+SCENE = "room"  # four walls, furniture, a window: similar to EuRoC's Vicon room
 SECONDS = 8.0  # long enough to see the room, short enough to wait for
 SEED = 7
-# A sixth of the time to compile would go to looking for garbage; without, it takes 700 MiB in place of 500.
+# Without garbage collection compiling takes a sixth less time, and 700 MiB instead of 500.
 _WARM_ALL = "import gc; gc.disable(); from kiteline_lab.tools.doctor import warm; warm()"
 _WARM_BASE = (
     "import gc; gc.disable(); from kiteline_basestation.runtime.warm import warm; "
@@ -27,7 +27,7 @@ _WARM_BASE = (
 
 
 def demo(folder: Path, seconds: float = SECONDS) -> str:
-    """Make the recording, fly it, evaluate it; the table that sums it up. Leaves everything in `folder`."""
+    """Record, fly and evaluate in `folder`; returns the table of results."""
     from kiteline_lab.flights import fly, simulate
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def demo(folder: Path, seconds: float = SECONDS) -> str:
         _must(simulate.main([f"{SCENE}?seed={SEED}&seconds={seconds:g}", "--out", str(recording)]), "simulation")
     _step(f"2/3  the recording is flown again: an agent and a base, two processes with a link between: {out}")
     _must(fly.main([f"mcap:{recording}", "--out", str(out), "--mode", "distributed"]), "flight")
-    _step("3/3  what came out, against the truth")
+    _step("3/3  the estimated trajectories against ground truth")
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     truth = f"mcap:{recording}"
     live = evaluate_files(str(out / "agent0" / "live.tum"), truth)
@@ -46,14 +46,14 @@ def demo(folder: Path, seconds: float = SECONDS) -> str:
 
 
 def summary(agent: dict[str, object], live: Evaluation, base: Evaluation) -> str:
-    """A table of two rows and the line of what it took. agent: the agent's part of report.json."""
+    """Table of the errors, frames and bytes. agent: the agent's part of report.json."""
     rows = [f"{'':22}{'ATE rmse':>10}{'max':>9}{'per frame':>11}{'':>10}"]
     for name, e in (("live, on the drone", live), ("refined, on the base", base)):
         step = e.rpe_frame
         relative = f"{1e3 * step.translation_m.rmse:7.1f} mm{step.rotation_deg.rmse:8.3f}°" if step else ""
         rows.append(f"{name:22}{1e3 * e.ate_m.rmse:7.1f} mm{1e3 * e.ate_m.max:6.0f} mm {relative}")
     kilobytes = float(str(agent["bytes_per_keyframe"])) / 1e3
-    rows.append(f"{agent['tracked']} of {agent['frames']} frames tracked over {base.path_m:.1f} m of way")
+    rows.append(f"{agent['tracked']} of {agent['frames']} frames tracked over {base.path_m:.1f} m of path")
     rows.append(f"{agent['keyframes']} keyframes went up the link, {kilobytes:.1f} kB each")
     return "\n".join(rows)
 
@@ -61,7 +61,7 @@ def summary(agent: dict[str, object], live: Evaluation, base: Evaluation) -> str
 def main(argv: list[str]) -> int:
     """Run the demo; the exit status."""
     p = argparse.ArgumentParser(prog="make demo", description=(__doc__ or "").strip())
-    p.add_argument("--out", type=Path, default=Path("demo"), help="folder for all that it makes (default %(default)s)")
+    p.add_argument("--out", type=Path, default=Path("demo"), help="output folder (default %(default)s)")
     p.add_argument("--seconds", type=float, default=SECONDS, help="length of the flight (default %(default)s)")
     a = p.parse_args(argv)
     start_s = time.monotonic()
@@ -73,12 +73,12 @@ def main(argv: list[str]) -> int:
 
 @contextlib.contextmanager
 def _compiling() -> Iterator[None]:
-    """Compile the kernels of the flight beside what is done meanwhile, and wait for it at the end.
+    """Compile the kernels in two processes during the block, and wait for them at its end.
 
-    Two processes: one takes all in turn, and finds those of the base done by the other. Should that fail, the flight
-    compiles for itself.
+    One process compiles everything in turn and finds the base's kernels done by the other. If one fails, the flight
+    compiles them itself.
     """
-    compilers = [subprocess.Popen([sys.executable, "-c", words]) for words in (_WARM_ALL, _WARM_BASE)]
+    compilers = [subprocess.Popen([sys.executable, "-c", code]) for code in (_WARM_ALL, _WARM_BASE)]
     try:
         yield
         for compiler in compilers:
@@ -95,7 +95,7 @@ def _step(text: str) -> None:
 
 def _must(status: int | None, what: str) -> None:
     if status:
-        raise SystemExit(f"kiteline: error: the {what} ended with status {status}; its words stand above")
+        raise SystemExit(f"kiteline: error: the {what} ended with status {status}; see its messages above")
 
 
 if __name__ == "__main__":

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from kiteline_lab.tools import doctor
-from kiteline_lab.tools.doctor import Finding, Level
+from kiteline_lab.tools.doctor import DoctorCheck, Severity
 
 
-def test_every_plain_dependency_is_looked_at() -> None:
+def test_every_plain_dependency_is_checked() -> None:
     """The list in the code and the one that pip reads must not drift apart."""
     import re
     import tomllib
@@ -24,44 +24,44 @@ def test_every_plain_dependency_is_looked_at() -> None:
 
 
 def test_this_machine_can_run_the_tests_so_python_and_packages_are_fine() -> None:
-    assert [f.level for f in doctor.check_python()] == [Level.OK]
-    assert next(iter(doctor.check_packages())).level is Level.OK
+    assert [f.severity for f in doctor.check_python()] == [Severity.OK]
+    assert next(iter(doctor.check_packages())).severity is Severity.OK
 
 
 def test_a_package_that_does_not_load_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(doctor.PLAIN, "numpy", "no_such_module_here")
     found = next(iter(doctor.check_packages()))
-    assert found.level is Level.FAIL
+    assert found.severity is Severity.FAIL
     assert "numpy (No module named 'no_such_module_here')" in found.text
 
 
 def test_the_cache_folder_must_be_writable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert [f.level for f in doctor.check_kernel_cache()] == [Level.OK]
+    assert [f.severity for f in doctor.check_kernel_cache()] == [Severity.OK]
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))  # nobody may write there, root included
     found = next(iter(doctor.check_kernel_cache()))
-    assert found.level is Level.FAIL
-    assert "NUMBA_CACHE_DIR" in found.mend
+    assert found.severity is Severity.FAIL
+    assert "NUMBA_CACHE_DIR" in found.remedy
 
 
 def test_serial_ports_are_found_by_pattern(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(doctor, "SERIAL_PORTS", (str(tmp_path / "ttyUSB*"),))
-    assert [f.level for f in doctor.check_serial()] == [Level.NOTE]
+    assert [f.severity for f in doctor.check_serial()] == [Severity.NOTE]
     (tmp_path / "ttyUSB0").touch()
     found = list(doctor.check_serial())
-    assert found[0] == Finding(Level.OK, "serial", str(tmp_path / "ttyUSB0"))
-    assert "SERIALx_OPTIONS" in found[1].mend
+    assert found[0] == DoctorCheck(Severity.OK, "serial", str(tmp_path / "ttyUSB0"))
+    assert "SERIALx_OPTIONS" in found[1].remedy
 
 
-def test_exit_status_tells_of_a_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def good() -> list[Finding]:
-        return [Finding(Level.OK, "one", "fine")]
+def test_exit_status_is_1_if_a_check_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def good() -> list[DoctorCheck]:
+        return [DoctorCheck(Severity.OK, "one", "fine")]
 
-    def bad() -> list[Finding]:
-        return [Finding(Level.FAIL, "two", "broken", "mend it so")]
+    def bad() -> list[DoctorCheck]:
+        return [DoctorCheck(Severity.FAIL, "two", "broken", "mend it so")]
 
-    def breaks() -> list[Finding]:
+    def breaks() -> list[DoctorCheck]:
         raise RuntimeError("odd machine")
 
     monkeypatch.setattr(doctor, "CHECKS", (good, breaks))
@@ -73,4 +73,4 @@ def test_exit_status_tells_of_a_failure(monkeypatch: pytest.MonkeyPatch, capsys:
 
 
 def test_zenoh_opens_on_this_machine() -> None:
-    assert [f.level for f in doctor.check_zenoh()] == [Level.OK]
+    assert [f.severity for f in doctor.check_zenoh()] == [Severity.OK]

@@ -140,7 +140,7 @@ def test_reads_both_kinds_of_pgm(tmp_path: Path) -> None:
         assert found.origin == (1.0, 2.0, 0.0) and found.cell_m == 0.1
 
 
-def test_bad_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_files_are_named(tmp_path: Path) -> None:
     cut = write(tmp_path, "cut", b"P5\n30 20\n255\nabc")
     with pytest.raises(GridFileError, match=r"cut\.pgm: no complete PGM"):
         read_grid(cut)
@@ -151,8 +151,8 @@ def test_bad_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     (tmp_path / "none.yaml").write_text("hello")
     with pytest.raises(GridFileError, match="no image, resolution, origin"):
         read_grid(tmp_path / "none.yaml")
-    assert main([str(tmp_path / "missing.yaml"), str(cut)]) == 2
-    assert "missing.yaml" in capsys.readouterr().err
+    with pytest.raises(GridFileError, match=r"missing\.yaml"):
+        main([str(tmp_path / "missing.yaml"), str(cut)])
 
 
 def test_command_prints_json_that_repeats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

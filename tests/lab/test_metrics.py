@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics
-from kiteline_lab.evaluation.metrics import Alignment, associate, evaluate, match, truth_at, umeyama
+from kiteline_lab.evaluation.metrics import TrajectoryAlignment, associate, evaluate, match, truth_at, umeyama
 
 F64 = NDArray[np.float64]
 PERIOD_NS = 50_000_000
@@ -83,7 +83,7 @@ def test_known_answers() -> None:
     est = truth.copy()
     est[:, 1, 3] = 0.03 * (-1.0) ** np.arange(n)
     t_ns = 100_000_000 * np.arange(n, dtype=np.int64)
-    e = evaluate(Trajectory(t_ns, est), Trajectory(t_ns, truth), Alignment.ORIGIN)
+    e = evaluate(Trajectory(t_ns, est), Trajectory(t_ns, truth), TrajectoryAlignment.ORIGIN)
     assert e.ate_m.max == pytest.approx(0.06)  # the first pose lies on the truth, each second one 6 cm beside
     assert e.ate_m.mean == pytest.approx(0.06 * 20 / 41)
     assert e.rpe_frame is not None
@@ -114,7 +114,7 @@ def test_a_steady_turn_is_the_rotation_error() -> None:
 def test_scale_is_found_only_when_asked_for() -> None:
     truth = flight()
     half = moved(truth, se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])), 0.5)
-    with_scale = evaluate(half, truth, Alignment.SIM3)
+    with_scale = evaluate(half, truth, TrajectoryAlignment.SIM3)
     assert with_scale.scale == pytest.approx(2.0)
     assert with_scale.ate_m.rmse == pytest.approx(0.0, abs=1e-9)
     assert with_scale.rpe_frame is not None
@@ -182,7 +182,7 @@ def test_too_few_common_poses_say_when_each_runs() -> None:
     truth = flight()
     late = Trajectory(truth.t_ns + 10**12, truth.T_w_b)
     with pytest.raises(ValueError, match=r"only 0 of 120 .* the truth from 1403715273"):
-        match(late, truth, Alignment.SE3)
+        match(late, truth, TrajectoryAlignment.SE3)
 
 
 def test_a_standing_estimate_has_no_scale() -> None:
@@ -190,7 +190,7 @@ def test_a_standing_estimate_has_no_scale() -> None:
     still = Trajectory(truth.t_ns, np.tile(np.eye(4), (120, 1, 1)))
     assert evaluate(still, truth).ate_m.rmse > 1.0
     with pytest.raises(ValueError, match="no scale"):
-        evaluate(still, truth, Alignment.SIM3)
+        evaluate(still, truth, TrajectoryAlignment.SIM3)
 
 
 def test_dense_truth_is_met_between_its_stamps() -> None:
@@ -202,7 +202,7 @@ def test_dense_truth_is_met_between_its_stamps() -> None:
         return Trajectory(t_ns, poses)
 
     truth, est = at(20_000_000 * np.arange(101, dtype=np.int64)), at(50_000_000 * np.arange(41, dtype=np.int64))
-    e = evaluate(est, truth, Alignment.ORIGIN)
+    e = evaluate(est, truth, TrajectoryAlignment.ORIGIN)
     assert e.matched == 41
     assert e.ate_m.max == pytest.approx(0.0, abs=1e-9)
     assert e.rpe_frame is not None

@@ -1,4 +1,4 @@
-"""`kiteline eval EST GT`: how far a trajectory is from the truth."""
+"""`kiteline eval EST GT`: compare a trajectory with ground truth."""
 
 from __future__ import annotations
 
@@ -8,23 +8,34 @@ from dataclasses import replace
 
 from kiteline_core.frame import Trajectory
 from kiteline_lab.evaluation import metrics
-from kiteline_lab.evaluation.metrics import Alignment, Evaluation, Relative
+from kiteline_lab.evaluation.metrics import Evaluation, Relative, TrajectoryAlignment
 from kiteline_lab.evaluation.trajectories import TrajectoryError, TrajectoryFile, read
 
 
 def evaluate_files(
-    estimate: str, truth: str, alignment: Alignment = Alignment.SE3, max_difference_ns: int = metrics.MAX_DIFFERENCE_NS
+    estimate: str,
+    truth: str,
+    alignment: TrajectoryAlignment = TrajectoryAlignment.SE3,
+    max_difference_ns: int = metrics.MAX_DIFFERENCE_NS,
+    plot: str = "",
 ) -> Evaluation:
-    """Read both and compare. Raises TrajectoryError."""
+    """Compare two trajectory files. plot: a PNG to draw, empty for none. Raises TrajectoryError."""
     est, true = load(estimate, truth)
     try:
-        return metrics.evaluate(est, true, alignment, max_difference_ns)
+        result = metrics.evaluate(est, true, alignment, max_difference_ns)
     except ValueError as error:
         raise TrajectoryError(f"{estimate} against {truth}: {error}") from error
+    if plot:
+        from kiteline_lab.plots.plot import Line, plot_trajectories
+
+        matched = metrics.match(est, true, alignment, max_difference_ns)
+        line = Line("estimate", Trajectory(matched.t_ns, matched.estimate))
+        plot_trajectories(plot, [line], true, f"ATE {result.ate_m.rmse:.3f} m rmse over {result.path_m:.0f} m")
+    return result
 
 
 def load(estimate: str, truth: str) -> tuple[Trajectory, Trajectory]:
-    """Both trajectories on one clock. KITTI poses without times take those of the other one, pose for pose."""
+    """Read both trajectories. KITTI poses without times take the times of the other one, pose by pose."""
     est, true = read(estimate), read(truth)
     if not true.timed and est.timed:
         true = _timed_by(true, est.trajectory)
@@ -34,14 +45,14 @@ def load(estimate: str, truth: str) -> tuple[Trajectory, Trajectory]:
 
 
 def _timed_by(poses: TrajectoryFile, clock: Trajectory) -> TrajectoryFile:
-    """In order where both have as many poses; else the poses stay at 10 Hz from 0, as KITTI's sources stamp them."""
+    """`poses` with the times of `clock` if both have as many; else at 10 Hz from 0, as KITTI's sources stamp them."""
     if len(poses.trajectory.t_ns) != len(clock.t_ns):
         return poses
     return TrajectoryFile(replace(poses.trajectory, t_ns=clock.t_ns))
 
 
 def table(e: Evaluation) -> str:
-    """The figures as text of a few lines."""
+    """The errors as a few lines of text."""
     fitted = {
         "se3": "rotation and translation fitted",
         "sim3": f"scale {e.scale:.4f} fitted too",
@@ -55,7 +66,7 @@ def table(e: Evaluation) -> str:
         _relative_line("RPE/s", e.rpe_second),
     ]
     if e.kitti is None:
-        lines.append(f"KITTI      needs at least {metrics.KITTI_LENGTHS_M[0]:.0f} m of way")
+        lines.append(f"KITTI      needs at least {metrics.KITTI_LENGTHS_M[0]:.0f} m of path")
     else:
         k = e.kitti
         lines.append(
@@ -79,45 +90,34 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline eval`."""
     p = argparse.ArgumentParser(
         prog="kiteline eval",
-        description="Compare a trajectory with the truth. Either may be a TUM file (t x y z qx qy qz qw), KITTI poses "
+        description="Compare a trajectory with ground truth. Either may be a TUM file (t x y z qx qy qz qw), KITTI poses "
         "(12 columns) or EuRoC's data.csv; the truth may also be a recording that holds it (mcap:FILE, euroc:DIR, "
         "a folder). KITTI poses take their times from times.txt beside them; without it, from the other trajectory "
         "in order when both have as many poses, else they stand for 10 Hz from 0.",
     )
-    p.add_argument("estimate", metavar="EST", help="the trajectory to judge")
-    p.add_argument("truth", metavar="GT", help="the truth")
+    p.add_argument("estimate", metavar="EST", help="the estimated trajectory")
+    p.add_argument("truth", metavar="GT", help="ground truth")
     how = p.add_mutually_exclusive_group()
-    how.add_argument("--scale", action="store_true", help="fit scale as well (Sim3): for a mono camera")
-    how.add_argument(
-        "--origin", action="store_true", help="lay the first pose on the first pose instead of the best fit"
-    )
+    how.add_argument("--scale", action="store_true", help="fit scale as well (Sim3): for a monocular camera")
+    how.add_argument("--origin", action="store_true", help="align the first poses instead of the best fit")
     p.add_argument(
         "--max-difference",
         type=float,
         default=metrics.MAX_DIFFERENCE_NS / 1e9,
         metavar="S",
-        help="truth sparser than 20 Hz: poses further apart in time are not compared (default %(default)s s)",
+        help="ground truth below 20 Hz: largest difference in time of two poses that are compared (default %(default)s s)",
     )
     p.add_argument("--json", action="store_true", help="print JSON instead of the table")
-    p.add_argument("--plot", metavar="F.png", help="draw both: from above, height and error over time")
+    p.add_argument("--plot", metavar="F.png", help="draw both from above, and height and error over time")
     return p
 
 
 def main(argv: list[str]) -> int:
     """Run `kiteline eval`; the exit status."""
     a = parser().parse_args(argv)
-    alignment = Alignment.SIM3 if a.scale else Alignment.ORIGIN if a.origin else Alignment.SE3
-    est, true = load(a.estimate, a.truth)
-    limit_ns = round(a.max_difference * 1e9)
-    try:
-        result = metrics.evaluate(est, true, alignment, limit_ns)
-    except ValueError as error:
-        raise TrajectoryError(f"{a.estimate} against {a.truth}: {error}") from error
-    if a.plot:
-        from kiteline_lab.plots.plot import Line, plot_trajectories
-
-        matched = metrics.match(est, true, alignment, limit_ns)
-        line = Line("estimate", Trajectory(matched.t_ns, matched.estimate))
-        plot_trajectories(a.plot, [line], true, f"ATE {result.ate_m.rmse:.3f} m rmse over {result.path_m:.0f} m")
+    alignment = (
+        TrajectoryAlignment.SIM3 if a.scale else TrajectoryAlignment.ORIGIN if a.origin else TrajectoryAlignment.SE3
+    )
+    result = evaluate_files(a.estimate, a.truth, alignment, round(a.max_difference * 1e9), a.plot or "")
     print(json.dumps(result.as_dict(), indent=2) if a.json else table(result))
     return 0

@@ -1,16 +1,15 @@
-"""`kiteline grid eval EST.yaml TRUE.yaml`: is an occupancy grid fit to plan on? Precision and recall of road maps.
+"""`kiteline grid eval EST.yaml TRUE.yaml`: precision and recall of an occupancy grid for path planning.
 
-"Segfloor" section 6.1.1: a probabilistic road map (PRM) is drawn on one grid (nodes at random free places, a minimum
-distance apart; every straight line between two of them over free cells is a road) and laid over the other. Precision is
-the share of the estimate's roads that are free in the truth, recall the share of the truth's roads that are free in the
-estimate. Mean over draws; seeded, so the same two grids always give the same figures.
+After "Segfloor", section 6.1.1: a probabilistic road map (PRM) is drawn on one grid (nodes at random free places, a
+minimum distance apart; every straight line over free cells between two nodes is a road) and checked on the other.
+Precision is the share of the estimate's roads that are free in the truth, recall the share of the truth's roads that
+are free in the estimate; means over draws. Seeded: two grids always give the same numbers.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +27,7 @@ U8 = NDArray[np.uint8]
 
 
 class GridFileError(KitelineError):
-    """A grid that cannot be read. The text says what was found and what was expected."""
+    """A grid that cannot be read; the text says what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,9 @@ class GridEvalConfig:
     nodes: int = 100  # nodes of each, as in the paper's large scene
     spacing: float = 0.5  # of the distance that nodes had on a square lattice over the free area
     opening_cells: int = 1  # radius of the opening of the free area before scoring; the paper opens all maps
-    robot_radius_m: float = 0.0  # m by which obstacles and unknown grow first; the paper's roads have no width
+    robot_radius_m: float = (
+        0.0  # m by which occupied and unknown cells are dilated first; the paper's roads have no width
+    )
     seed: int = 0
 
 
@@ -56,7 +57,7 @@ class GridFile:
 
 @dataclass(frozen=True, slots=True)
 class GridScore:
-    """Percent, as means over the draws (NaN: no roads). roads: how many there were in all."""
+    """Means over the draws in percent (NaN: no roads), and the total numbers of roads."""
 
     precision: float
     recall: float
@@ -102,7 +103,7 @@ def read_pgm(path: Path) -> F64:
         raise GridFileError(f"{path}: {e.strerror or e}") from None
     words: list[bytes] = []
     at = 0
-    while len(words) < 4 and at < len(data):  # the header is four words, among them comments to the end of a line
+    while len(words) < 4 and at < len(data):  # the header: four words, with comments between them
         end = at
         while end < len(data) and not data[end : end + 1].isspace() and data[end : end + 1] != b"#":
             end += 1
@@ -126,7 +127,7 @@ def read_pgm(path: Path) -> F64:
 
 
 def free_cells(grid: GridFile, config: GridEvalConfig) -> Bool:
-    """Which cells a robot's centre may enter (rows, columns): free, opened, and away from all that is not free."""
+    """Cells that a robot's centre may enter (rows, columns): free, opened, and a radius away from all others."""
     free = (grid.state == 0).astype(np.uint8)
     if config.opening_cells > 0:
         free = np.asarray(cv2.morphologyEx(free, cv2.MORPH_OPEN, _disc(config.opening_cells)), np.uint8)
@@ -146,11 +147,11 @@ def _disc(radius: int) -> U8:
 def score(
     est: GridFile, true: GridFile, T_true_est: F64 | None = None, config: GridEvalConfig | None = None
 ) -> GridScore:
-    """Precision and recall of two grids. T_true_est: (3,3) planar motion that maps points of est into true."""
+    """Precision and recall of a grid. T_true_est: (3,3) planar motion that maps points of est into true."""
     config = config or GridEvalConfig()
     T_true_est = np.eye(3) if T_true_est is None else T_true_est
     free_est, free_true = free_cells(est, config), free_cells(true, config)
-    # Planar affine maps of fractional cells (column, row) of one grid onto those of the other.
+    # Affine map from fractional cells (column, row) of the estimate to those of the truth.
     est_to_true: F64 = np.linalg.inv(_T_map_cell(true)) @ T_true_est @ _T_map_cell(est)
     precision, precision_roads = _share(free_est, free_true, est_to_true, config, 0)
     recall, recall_roads = _share(free_true, free_est, np.asarray(np.linalg.inv(est_to_true), np.float64), config, 1)
@@ -185,7 +186,7 @@ def _share(mine: Bool, other: Bool, A_other_mine: F64, config: GridEvalConfig, s
 
 
 def draw_nodes(free: Bool, config: GridEvalConfig, rng: np.random.Generator) -> F64:
-    """Places (n,2), column and row in cells, at random in free cells and no nearer to each other than the spacing."""
+    """Draw nodes (n,2), column and row in cells, at random in free cells and at least the spacing apart."""
     row, column = np.nonzero(free)
     apart = config.spacing * np.sqrt(len(row) / config.nodes)
     chosen = np.zeros((0, 2))
@@ -205,7 +206,7 @@ def planar(x_m: float, y_m: float, yaw_deg: float) -> F64:
 
 
 def main(argv: list[str]) -> int:
-    """The command; prints one JSON object. Returns the exit status."""
+    """Run `kiteline grid eval`, which prints one JSON object; the exit status. Raises GridFileError."""
     parser = argparse.ArgumentParser(prog="kiteline grid eval", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("est", type=Path, metavar="EST.yaml")
     parser.add_argument("true", type=Path, metavar="TRUE.yaml")
@@ -223,14 +224,10 @@ def main(argv: list[str]) -> int:
     if args.draws < 1 or args.nodes < 2 or args.opening < 0 or args.robot_radius < 0:
         parser.error("expected at least 1 draw, 2 nodes, and no negative opening or radius")
     config = GridEvalConfig(args.draws, args.nodes, default.spacing, args.opening, args.robot_radius, args.seed)
-    try:
-        found = score(read_grid(args.est), read_grid(args.true), planar(*args.transform), config)
-    except GridFileError as e:
-        print(f"kiteline grid eval: {e}", file=sys.stderr)
-        return 2
+    found = score(read_grid(args.est), read_grid(args.true), planar(*args.transform), config)
     result = {
-        "precision_percent": _number(found.precision),
-        "recall_percent": _number(found.recall),
+        "precision_percent": _rounded(found.precision),
+        "recall_percent": _rounded(found.recall),
         "roads": {"estimate": found.precision_roads, "truth": found.recall_roads},
         "free_m2": {"estimate": round(found.free_est_m2, 3), "truth": round(found.free_true_m2, 3)},
         "draws": config.draws,
@@ -243,5 +240,5 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _number(value: float) -> float | None:
+def _rounded(value: float) -> float | None:
     return None if np.isnan(value) else round(value, 3)

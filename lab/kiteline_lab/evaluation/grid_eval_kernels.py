@@ -1,4 +1,4 @@
-"""Is a straight road over a grid free? Arrays in, caller's arrays out."""
+"""Kernel that checks straight roads on a grid. Arrays in, caller's arrays out."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Bool = NDArray[np.bool_]
 
 @njit
 def roads_free(free: Bool, nodes: F64, pairs: I64, out: Bool) -> None:
-    """Whether each straight road runs over free cells only.
+    """Check whether each straight road crosses free cells only.
 
     free: (rows, columns). nodes: (n,2) column, row in cells, fractions included. pairs: (p,2) rows of nodes. out: (p,).
-    Every cell that the line enters counts (J. Amanatides and A. Woo, "A fast voxel traversal algorithm", 1987); outside
-    of the grid nothing is free.
+    Every cell that the line enters counts (J. Amanatides and A. Woo, "A fast voxel traversal algorithm", 1987); cells
+    outside of the grid are not free.
     """
     rows, columns = free.shape
     for i in range(pairs.shape[0]):

@@ -1,4 +1,4 @@
-"""Errors of a trajectory against the truth. Pure: arrays in, numbers out.
+"""Errors of a trajectory against ground truth. Pure: arrays in, numbers out.
 
 ATE and RPE after J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012); alignment after
 S. Umeyama (PAMI 1991); t_rel and r_rel after A. Geiger et al., the KITTI odometry benchmark (CVPR 2012).
@@ -18,26 +18,26 @@ from kiteline_core.geometry import se3
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-MAX_DIFFERENCE_NS = 10_000_000  # two poses further apart in time are not of the same instant (as evo and TUM's tools)
-MAX_BRIDGE_NS = 50_000_000  # truth at 20 Hz or more is interpolated: a drone's own way in between is below 1 mm
-GAP_FACTOR = 1.5  # a step longer than this many usual ones is a gap: poses are missing there
+MAX_DIFFERENCE_NS = 10_000_000  # largest difference in time of two poses that are compared (as in evo and TUM's tools)
+MAX_BRIDGE_NS = 50_000_000  # ground truth at 20 Hz or more is interpolated; the error on a drone is below 1 mm
+GAP_FACTOR = 1.5  # a step longer than this many median steps is a gap: poses are missing there
 SECOND_TOLERANCE = 0.1  # an RPE pair "one second apart" may be 10 % off
 END_SLACK_NS = 5_000_000  # stamps jitter: the last full second may end this much after the last pose
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)  # the benchmark's own
 KITTI_STEP_S = 1.0  # one segment start a second: the benchmark's ten frames
 
 
-class Alignment(Enum):
-    """How the estimate's frame is laid onto the truth's."""
+class TrajectoryAlignment(Enum):
+    """How the estimate's frame is aligned with that of the ground truth."""
 
-    SE3 = "se3"  # rotation and translation that fit best
-    SIM3 = "sim3"  # and scale: for a camera that cannot know it
+    SE3 = "se3"  # least squares over rotation and translation
+    SIM3 = "sim3"  # and scale: for a monocular camera
     ORIGIN = "origin"  # the first pose on the first pose
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Root mean square, mean and largest of n values."""
+    """Root mean square, mean and maximum of n values."""
 
     rmse: float
     mean: float
@@ -55,7 +55,7 @@ class Relative:
 
 @dataclass(frozen=True, slots=True)
 class KittiDrift:
-    """Mean over segments of 100 to 800 m: drift in percent of the way, and degrees per 100 m."""
+    """Mean over segments of 100 to 800 m: drift in percent of the path, and degrees per 100 m."""
 
     t_rel_percent: float
     r_rel_deg_per_100m: float
@@ -64,14 +64,14 @@ class KittiDrift:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """All that `kiteline eval` tells. A part that the data do not allow (too short) is None."""
+    """All errors that `kiteline eval` reports. None where the trajectories are too short for one."""
 
     alignment: str
     scale: float
     matched: int  # pairs of an estimated and a true pose
     estimated: int  # poses in the estimate
-    coverage: float  # part of the truth's time during which the estimate has poses
-    frames_covered: float  # matched poses over the frames that the truth's time would hold at the estimate's rate
+    coverage: float  # share of the ground truth's time during which the estimate has poses
+    frames_covered: float  # matched poses over the frames in the ground truth's time at the estimate's rate
     path_m: float  # length of the true path over the matched poses
     ate_m: Spread
     rpe_frame: Relative | None
@@ -85,7 +85,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """Poses of the same instants. t_ns: (n,) of the estimate. estimate: (n,4,4) aligned. truth: (n,4,4)."""
+    """Pairs of poses at equal times. t_ns: (n,) of the estimate. estimate: (n,4,4) aligned. truth: (n,4,4)."""
 
     t_ns: I64
     estimate: F64
@@ -94,9 +94,9 @@ class Matched:
 
 
 def associate(est_ns: I64, truth_ns: I64, max_difference_ns: int = MAX_DIFFERENCE_NS) -> tuple[I64, I64]:
-    """Indices (k,), (k,) of poses of the same instant: for each estimate the nearest truth, each truth used once.
+    """Match times: for each estimate the nearest truth, each used once. Returns indices (k,), (k,).
 
-    Both inputs increase strictly. Of two estimates that want the same truth the nearer gets it (the earlier on a tie).
+    Both inputs increase strictly. Of two estimates nearest to the same truth, the nearer is matched (the earlier on a tie).
     """
     if len(truth_ns) == 0 or len(est_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -117,7 +117,7 @@ def truth_at(est_ns: I64, truth: Trajectory, max_difference_ns: int = MAX_DIFFER
     """The truth at the times of an estimate: indices (k,) of the estimated poses that have one, and poses (k,4,4).
 
     Between two true poses at most MAX_BRIDGE_NS apart it is interpolated (straight line, steady turn): taking the
-    nearest instead would charge the estimate with the way flown in half a period, 10 mm at 1 m/s and 50 Hz. Sparser
+    nearest instead would charge the estimate with the path flown in half a period, 10 mm at 1 m/s and 50 Hz. Sparser
     truth is associated with the nearest pose within max_difference_ns, each used once.
     """
     n = len(truth.t_ns)
@@ -145,14 +145,14 @@ def truth_at(est_ns: I64, truth: Trajectory, max_difference_ns: int = MAX_DIFFER
 
 
 def _between_poses(a: F64, b: F64, part: float) -> F64:
-    turn = se3.so3_exp(part * se3.so3_log(a[:3, :3].T @ b[:3, :3]))
-    return se3.from_rt(a[:3, :3] @ turn, (1.0 - part) * a[:3, 3] + part * b[:3, 3])
+    rotation = se3.so3_exp(part * se3.so3_log(a[:3, :3].T @ b[:3, :3]))
+    return se3.from_rt(a[:3, :3] @ rotation, (1.0 - part) * a[:3, 3] + part * b[:3, 3])
 
 
 def umeyama(source: F64, target: F64, with_scale: bool = False) -> tuple[F64, float]:
-    """The T (4,4) and scale that minimise sum |target - (scale * R source + t)|^2 over points (n,3), n >= 1.
+    """Align points: the T (4,4) and scale that minimise sum |target - (scale * R source + t)|^2 over points (n,3), n >= 1.
 
-    Raises ValueError when scale is asked for and all source points coincide.
+    Raises ValueError if `with_scale` and all source points coincide.
     """
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t
@@ -171,9 +171,9 @@ def umeyama(source: F64, target: F64, with_scale: bool = False) -> tuple[F64, fl
 
 
 def match(
-    estimate: Trajectory, truth: Trajectory, alignment: Alignment, max_difference_ns: int = MAX_DIFFERENCE_NS
+    estimate: Trajectory, truth: Trajectory, alignment: TrajectoryAlignment, max_difference_ns: int = MAX_DIFFERENCE_NS
 ) -> Matched:
-    """Associate and align. Raises ValueError when fewer than three poses meet."""
+    """Match in time and align. Raises ValueError if fewer than three poses match."""
     i, true = truth_at(estimate.t_ns, truth, max_difference_ns)
     if len(i) < 3:
         raise ValueError(
@@ -181,10 +181,10 @@ def match(
         )
     est = estimate.T_w_b[i]
     scale = 1.0
-    if alignment is Alignment.ORIGIN:
+    if alignment is TrajectoryAlignment.ORIGIN:
         t = true[0] @ se3.inverse(est[0])
     else:
-        t, scale = umeyama(est[:, :3, 3], true[:, :3, 3], alignment is Alignment.SIM3)
+        t, scale = umeyama(est[:, :3, 3], true[:, :3, 3], alignment is TrajectoryAlignment.SIM3)
     aligned = est.copy()
     aligned[:, :3, :3] = t[:3, :3] @ est[:, :3, :3]
     aligned[:, :3, 3] = scale * est[:, :3, 3] @ t[:3, :3].T + t[:3, 3]
@@ -203,15 +203,15 @@ def relative_errors(matched: Matched, i: I64, j: I64) -> tuple[F64, F64]:
 
 
 def kitti_drift(matched: Matched, lengths_m: tuple[float, ...] = KITTI_LENGTHS_M) -> KittiDrift | None:
-    """Drift over segments of the given true lengths; None when the way is shorter than the shortest."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1))])
+    """Drift over segments of the given lengths; None if the path is shorter than the shortest of them."""
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1))])
     step_ns = float(np.median(np.diff(matched.t_ns)))
     stride = max(1, round(KITTI_STEP_S * 1e9 / step_ns))
     translation, rotation = [], []
     for length in lengths_m:
-        start = np.arange(0, len(way), stride)
-        end = np.searchsorted(way, way[start] + length, side="right")
-        start, end = start[end < len(way)], end[end < len(way)]
+        start = np.arange(0, len(path), stride)
+        end = np.searchsorted(path, path[start] + length, side="right")
+        start, end = start[end < len(path)], end[end < len(path)]
         if len(start):
             t, r = relative_errors(matched, start, end)
             translation.append(t / length)
@@ -225,10 +225,10 @@ def kitti_drift(matched: Matched, lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
 def evaluate(
     estimate: Trajectory,
     truth: Trajectory,
-    alignment: Alignment = Alignment.SE3,
+    alignment: TrajectoryAlignment = TrajectoryAlignment.SE3,
     max_difference_ns: int = MAX_DIFFERENCE_NS,
 ) -> Evaluation:
-    """Every figure of `kiteline eval`. Raises ValueError when fewer than three poses meet in time."""
+    """All errors of `kiteline eval`. Raises ValueError if fewer than three poses match in time."""
     matched = match(estimate, truth, alignment, max_difference_ns)
     n = len(matched.t_ns)
     frame = _relative(matched, np.arange(n - 1), np.arange(1, n))
@@ -289,7 +289,7 @@ def _inverse(poses: F64) -> F64:
 
 
 def _angles(rotations: F64) -> F64:
-    """Angles (n,) in rad; from sine and cosine, so that small ones keep their digits."""
+    """Angles (n,) in rad; from sine and cosine, so that small angles keep their precision."""
     r = rotations
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
     return np.asarray(np.arctan2(np.linalg.norm(axis, axis=1), np.trace(r, axis1=1, axis2=2) - 1.0))

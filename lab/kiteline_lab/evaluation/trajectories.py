@@ -1,4 +1,4 @@
-"""Read trajectories: TUM lines, KITTI poses, EuRoC's ground truth table, or the truth inside a recording."""
+"""Read trajectories: TUM files, KITTI poses, EuRoC's data.csv, or the ground truth of a recording."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from kiteline_core.geometry import se3
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-KITTI_PERIOD_NS = 100_000_000  # 10 Hz: KITTI poses carry no time; used where no times.txt lies beside them
-QUATERNION_TOLERANCE = 0.02  # a length further from 1 than this is no rotation but a wrong column
+KITTI_PERIOD_NS = 100_000_000  # 10 Hz: for KITTI poses without a times.txt
+QUATERNION_TOLERANCE = 0.02  # a length further from 1 than this is a wrong column
 _PREFIXES = ("euroc:", "kitti:", "tum:", "mcap:", "sim:")
 
 
 class TrajectoryError(KitelineError):
-    """A file that is no trajectory; the text says where and what was expected."""
+    """A file that is no trajectory; the text says where, and what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFile:
-    """What was read. timed: False for KITTI poses without a times.txt; then t_ns counts at 10 Hz from 0."""
+    """A trajectory. timed: False for KITTI poses without a times.txt, whose t_ns counts at 10 Hz from 0."""
 
     trajectory: Trajectory
     timed: bool = True
@@ -35,7 +35,7 @@ class TrajectoryFile:
 def read(spec: str) -> TrajectoryFile:
     """Read a trajectory file, or the ground truth of a source (`mcap:FILE`, `euroc:DIR`, a folder, …).
 
-    Raises TrajectoryError, or SourceError where the source itself is at fault.
+    Raises TrajectoryError; SourceError if the source cannot be read.
     """
     path = Path(spec)
     if spec.startswith(_PREFIXES) or path.is_dir() or path.suffix == ".mcap":
@@ -87,7 +87,7 @@ def _floats(spec: str, number: int, fields: list[str]) -> list[float]:
 
 
 def _seconds_to_ns(spec: str, number: int, text: str) -> int:
-    """Exact where the text is plain decimal: a float64 of today's Unix time knows only 240 ns."""
+    """Nanoseconds of decimal seconds; exact for plain decimals, since float64 resolves Unix time to 240 ns only."""
     whole, _, fraction = text.partition(".")
     if whole.lstrip("-").isdigit() and (fraction.isdigit() or not fraction):
         magnitude = int(whole.lstrip("-")) * 10**9 + int(fraction[:9].ljust(9, "0"))

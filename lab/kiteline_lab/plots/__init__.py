@@ -1,1 +1,1 @@
-"""TODO."""
+"""Plots: trajectories and maps go in, PNG files come out."""

@@ -1,4 +1,4 @@
-"""Draw trajectories: from above, height over time, and the error over time where the truth is known."""
+"""Draw trajectories: from above, height over time, and the error over time if ground truth is known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import Trajectory
-from kiteline_lab.evaluation.metrics import Alignment, match, position_errors, truth_at
+from kiteline_lab.evaluation.metrics import TrajectoryAlignment, match, position_errors, truth_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-COLOURS = ("#1f6fb2", "#d1495b", "#2a9d5c", "#8e5ea2", "#e08e20", "#3bb0bf")  # told apart by colour-blind eyes too
+COLOURS = ("#1f6fb2", "#d1495b", "#2a9d5c", "#8e5ea2", "#e08e20", "#3bb0bf")  # distinct for colour-blind readers too
 TRUTH_COLOUR = "#9a9a9a"
 INK = "#333333"
 
@@ -35,10 +35,9 @@ class Line:
 def plot_trajectories(
     path: str | Path, lines: Sequence[Line], truth: Trajectory | None = None, title: str = "", align: bool = False
 ) -> None:
-    """Write a PNG. truth: grey below the lines; with it comes a panel of errors.
+    """Write a PNG. truth: drawn in grey, and adds a panel of errors.
 
-    align: lay each line onto the truth by rotation and translation first (as ATE does); a line that has too few poses
-    in common with it is drawn as it is.
+    align: first align each line with the truth by rotation and translation (as ATE does), if enough poses match.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -63,14 +62,14 @@ def plot_trajectories(
         p = line.trajectory.T_w_b[:, :3, 3]
         if len(p) == 0:
             continue
-        _, way = _with_gaps(t_s, p[:, [across, along]])
-        top.plot(way[:, 0], way[:, 1], color=colour, lw=1.3, label=line.name, zorder=2)
+        _, path_xy = _with_gaps(t_s, p[:, [across, along]])
+        top.plot(path_xy[:, 0], path_xy[:, 1], color=colour, lw=1.3, label=line.name, zorder=2)
         top.plot(p[:1, across], p[:1, along], "o", color=colour, ms=5, zorder=3)
         height.plot(*_with_gaps(t_s, sign * p[:, up]), color=colour, lw=1.2, zorder=2)
         if error is not None and truth is not None:
             i_est, true = truth_at(line.trajectory.t_ns, truth)
-            off = np.linalg.norm(p[i_est] - true[:, :3, 3], axis=1)
-            errors.append((t_s[i_est], off, colour))
+            distance = np.linalg.norm(p[i_est] - true[:, :3, 3], axis=1)
+            errors.append((t_s[i_est], distance, colour))
     if error is not None:
         _draw_errors(error, errors)
     if title:
@@ -95,12 +94,12 @@ def _panels(figure: Figure, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
 
 
 def _draw_errors(axes: Axes, errors: Sequence[tuple[F64, F64, str]]) -> None:
-    """Distances in the unit in which the largest reads well."""
+    """Draw distances in mm, cm or m, by the largest of them."""
     largest_m = max((float(off.max()) for _, off, _ in errors if len(off)), default=0.0)
     per_m, unit = (1e3, "mm") if largest_m < 0.1 else (1e2, "cm") if largest_m < 1.0 else (1.0, "m")
     for t_s, off, colour in errors:
         axes.plot(*_with_gaps(t_s, per_m * off), color=colour, lw=1.2)
-    axes.set_title(f"distance from the truth, {unit}", loc="left", fontsize=10, color=INK)
+    axes.set_title(f"error, {unit}", loc="left", fontsize=10, color=INK)
     axes.set_ylim(bottom=0.0)
 
 
@@ -119,7 +118,7 @@ def _style(axes: Axes, title: str, x: str, y: str) -> None:
 
 def _aligned(line: Line, truth: Trajectory) -> Line:
     try:
-        matched = match(line.trajectory, truth, Alignment.SE3)
+        matched = match(line.trajectory, truth, TrajectoryAlignment.SE3)
     except ValueError:
         return line
     return Line(f"{line.name}  ({_length(position_errors(matched))})", Trajectory(matched.t_ns, matched.estimate))
@@ -133,7 +132,7 @@ def _length(errors: F64) -> str:
 
 
 def _axes(reference: Trajectory | None) -> tuple[int, int, int, float]:
-    """Columns drawn across, along and up, and the sign of up: z is up, but y down for camera poses as KITTI's."""
+    """Columns drawn across, along and up, and the sign of up: z up, or y down for camera poses such as KITTI's."""
     if reference is not None and len(reference.t_ns):
         extent = np.ptp(reference.T_w_b[:, :3, 3], axis=0)
         if float(np.mean(reference.T_w_b[:, 1, 1])) > 0.8 and extent[1] < 0.5 * extent[2]:
@@ -142,7 +141,7 @@ def _axes(reference: Trajectory | None) -> tuple[int, int, int, float]:
 
 
 def _during(truth: Trajectory, lines: Sequence[Line]) -> Trajectory:
-    """The part of the truth within the time of the lines: a long flight judged by its start is not dwarfed."""
+    """The part of the truth within the time of the lines, so that a short estimate is not drawn tiny."""
     times = [line.trajectory.t_ns for line in lines if len(line.trajectory.t_ns)]
     if not times:
         return truth
@@ -151,7 +150,7 @@ def _during(truth: Trajectory, lines: Sequence[Line]) -> Trajectory:
 
 
 def _with_gaps(t_s: F64, values: F64) -> tuple[F64, F64]:
-    """Put a NaN into each long gap, so that no line is drawn across missing poses."""
+    """Insert a NaN into each long gap, so that no line is drawn across missing poses."""
     steps = np.diff(t_s)
     if len(steps) == 0:
         return t_s, values

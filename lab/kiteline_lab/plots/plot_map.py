@@ -1,4 +1,4 @@
-"""Draw the map that a flight left, from above: occupancy grid, labelled points and every agent's path.
+"""Draw the map of a flight from above: occupancy grid, labelled points and the path of each agent.
 
 python -m kiteline_lab.plots.plot_map OUT [--png F.png], where OUT is a folder of `kiteline fly`.
 """
@@ -35,7 +35,7 @@ _TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "ushort": "<u2", "uint
 
 
 class MapFileError(KitelineError):
-    """A map that cannot be read. The text says what was found and what was expected."""
+    """A map that cannot be read; the text says what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +67,14 @@ def read_map_ply(path: Path) -> MapPoints:
 
 
 def plot_map(out: Path, png: Path, title: str = "") -> None:
-    """Draw the folder `out` of a flight into a PNG. Raises MapFileError, GridFileError, TrajectoryError."""
+    """Draw the folder `out` of a flight to a PNG. Raises MapFileError, GridFileError, TrajectoryError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     points = read_map_ply(out / "base" / "map.ply")
     grid = read_grid(out / "base" / "grid.yaml")
-    tracks = [trajectories.read(str(path)).trajectory for path in _tracks(out)]
-    ways = [track.T_w_b[:, :3, 3] for track in tracks]
-    x0, y0, x1, y1 = _extent(points, grid, ways)
+    paths = [trajectories.read(str(file)).trajectory.T_w_b[:, :3, 3] for file in _tracks(out)]
+    x0, y0, x1, y1 = _extent(points, grid, paths)
     wide, tall = x1 - x0, y1 - y0
     inch = 8.6 / max(wide, tall)
     figure = Figure(figsize=(max(wide * inch, 3.6) + 0.9, max(tall * inch, 2.6) + 1.2), dpi=140, layout="constrained")
@@ -89,18 +88,18 @@ def plot_map(out: Path, png: Path, title: str = "") -> None:
             axes.plot(
                 p[:, 0], p[:, 1], "o", ms=1.9, mew=0, color=colour, alpha=0.65, label=name, zorder=2, rasterized=True
             )
-    for i, way in enumerate(ways):
+    for i, path in enumerate(paths):
         colour = COLOURS[i % len(COLOURS)]
-        axes.plot(way[:, 0], way[:, 1], color="white", lw=3.2, zorder=3, solid_capstyle="round")
-        axes.plot(way[:, 0], way[:, 1], color=colour, lw=1.6, label=f"agent {i}", zorder=4, solid_capstyle="round")
-        axes.plot(*way[0, :2], "o", ms=6, color="white", mec=colour, mew=1.6, zorder=5)
-        axes.plot(*way[-1, :2], "o", ms=6, color=colour, mec="white", mew=1.2, zorder=5)
+        axes.plot(path[:, 0], path[:, 1], color="white", lw=3.2, zorder=3, solid_capstyle="round")
+        axes.plot(path[:, 0], path[:, 1], color=colour, lw=1.6, label=f"agent {i}", zorder=4, solid_capstyle="round")
+        axes.plot(*path[0, :2], "o", ms=6, color="white", mec=colour, mew=1.6, zorder=5)
+        axes.plot(*path[-1, :2], "o", ms=6, color=colour, mec="white", mew=1.2, zorder=5)
     axes.set_xlim(x0, x1)
     axes.set_ylim(y0, y1)
     if title:
         axes.set_title(title, loc="left", fontsize=11, color=INK, fontweight="bold")
-    look = {"frameon": False, "fontsize": 9, "labelcolor": INK, "handlelength": 1.4, "columnspacing": 1.6}
-    legend = figure.legend(loc="outside lower center", ncols=5, **look)
+    style = {"frameon": False, "fontsize": 9, "labelcolor": INK, "handlelength": 1.4, "columnspacing": 1.6}
+    legend = figure.legend(loc="outside lower center", ncols=5, **style)
     for handle in legend.legend_handles:
         if handle is not None and hasattr(handle, "set_markersize") and handle.get_label() in dict(LABELS):
             handle.set_markersize(5)
@@ -110,14 +109,14 @@ def plot_map(out: Path, png: Path, title: str = "") -> None:
 
 
 def _tracks(out: Path) -> list[Path]:
-    """The agents' refined trajectories, in order of their numbers; empty files (no frame tracked) left out."""
+    """The agents' refined trajectories by number; without empty files (no frame tracked)."""
     found = [p for p in (out / "base").glob("agent*.tum") if p.stem[5:].isdecimal() and p.stat().st_size]
     return sorted(found, key=lambda p: int(p.stem[5:]))
 
 
-def _extent(points: MapPoints, grid: GridFile, ways: Sequence[F64]) -> tuple[float, float, float, float]:
-    """What is drawn: all that the grid knows and where agents were; without either, where most points lie."""
-    corners = [way[:, :2] for way in ways]
+def _extent(points: MapPoints, grid: GridFile, paths: Sequence[F64]) -> tuple[float, float, float, float]:
+    """Bounds of known cells and paths, or of 96 % of the points if there are neither."""
+    corners = [path[:, :2] for path in paths]
     rows, columns = np.nonzero(grid.state >= 0)
     if len(rows):
         corners.append(np.stack([columns, rows], axis=1) * grid.cell_m + grid.origin[:2])
@@ -153,11 +152,9 @@ def _style(axes: Axes) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command; the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m kiteline_lab.plots.plot_map", description=(__doc__ or "").split("\n\n")[0]
-    )
-    parser.add_argument("out", type=Path, metavar="OUT", help="a folder that `kiteline fly --out` left")
+    """Run the command; the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m kiteline_lab.plots.plot_map", description=_ABOUT)
+    parser.add_argument("out", type=Path, metavar="OUT", help="a folder written by `kiteline fly --out`")
     parser.add_argument("--png", type=Path, help="default: OUT/map.png")
     parser.add_argument("--title", default="")
     args = parser.parse_args(argv)

@@ -1,4 +1,4 @@
-"""`kiteline convert SOURCE OUT.mcap`: any source as a log, images kept as they were coded."""
+"""`kiteline convert SOURCE OUT.mcap`: write any source as a log, without coding its images again."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from kiteline_lab.flights.progress import Progress
 
 
 def main(argv: list[str]) -> int:
-    """Run the command. Raises SourceError."""
+    """Run `kiteline convert`; the exit status. Raises SourceError."""
     p = argparse.ArgumentParser(prog="kiteline convert", description="Turn a data set or a ROS 2 bag into a log.")
     p.add_argument(
         "source", metavar="SOURCE", help="euroc:DIR kitti:DIR tum:DIR mcap:FILE images:GLOB sim:SCENE or a path"
     )
     p.add_argument("out", metavar="OUT.mcap", type=Path)
-    p.add_argument("--mono", action="store_true", help="left images alone")
-    p.add_argument("--no-imu", dest="imu", action="store_false", help="leave inertial samples out")
+    p.add_argument("--mono", action="store_true", help="left images only")
+    p.add_argument("--no-imu", dest="imu", action="store_false", help="without inertial samples")
     p.add_argument("--force", action="store_true", help="overwrite OUT.mcap")
     o = p.parse_args(argv)
     with whole_file(o.out, o.force) as part:
@@ -32,14 +32,14 @@ def main(argv: list[str]) -> int:
             source.close()
     print(f"{o.out}: {frames} frames, {samples} imu samples, {o.out.stat().st_size / 1e6:.1f} MB")
     for reason, count in sorted(source.report.skipped.items()):
-        print(f"  passed over: {count} x {reason}")
+        print(f"  skipped: {count} x {reason}")
     for note in source.report.notes:
         print(f"  {note}")
     return 0
 
 
 def record(source: FrameSource, path: Path) -> tuple[int, int]:
-    """Write all that a source delivers; how many frames and inertial samples. Raises SourceError."""
+    """Write everything that a source delivers; the numbers of frames and inertial samples. Raises SourceError."""
     frames, samples, begun = 0, 0, False
     truth = _Truth(source.ground_truth)
     with (
@@ -68,7 +68,7 @@ def record(source: FrameSource, path: Path) -> tuple[int, int]:
 
 
 class _Truth:
-    """Known poses, written as the recording passes them."""
+    """Writes ground-truth poses in between the frames, in order of time."""
 
     def __init__(self, truth: Trajectory | None) -> None:
         self._truth = truth

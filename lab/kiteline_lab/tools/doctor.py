@@ -1,4 +1,4 @@
-"""`kiteline doctor`: is this machine fit to fly, and what would mend it?"""
+"""`kiteline doctor`: check whether this machine can run kiteline, and say how to mend what is missing."""
 
 from __future__ import annotations
 
@@ -45,37 +45,37 @@ WARMING = (
     "kiteline_agent.runtime.warm",
     "kiteline_basestation.runtime.warm",
 )
-MIN_MEMORY_MIB = 400  # an agent takes 250 MiB, and compiling its kernels half as much again
-OLDEST_CLOCK_S = 1_735_689_600  # 2025-01-01: a Pi without a network starts in the past
+MIN_MEMORY_MIB = 400  # an agent takes 250 MiB; compiling its kernels takes half as much again
+OLDEST_CLOCK_S = 1_735_689_600  # 2025-01-01: without a network, a Raspberry Pi starts in the past
 SERIAL_PORTS = ("/dev/serial0", "/dev/ttyAMA*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyS0", "/dev/ttyTHS*")
 
 
-class Level(Enum):
-    """How bad a finding is."""
+class Severity(Enum):
+    """How bad the result of a check is."""
 
     OK = "ok"
     NOTE = "note"  # good to know
-    FAIL = "FAIL"  # kiteline, or that part of it, will not work
+    FAIL = "FAIL"  # kiteline, or a part of it, will not work
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """What one check saw. mend: what to do about it, or empty."""
+class DoctorCheck:
+    """Result of one check. remedy: what to do about it, empty if nothing."""
 
-    level: Level
+    severity: Severity
     name: str
     text: str
-    mend: str = ""
+    remedy: str = ""
 
 
-def check_python() -> Iterable[Finding]:
-    """The interpreter."""
+def check_python() -> Iterable[DoctorCheck]:
+    """Report version and platform of the interpreter."""
     text = f"{platform.python_version()} on {platform.machine()}, {platform.system()} {platform.release()}"
-    yield Finding(Level.OK, "python", text)  # an older one could not have installed or parsed this
+    yield DoctorCheck(Severity.OK, "python", text)  # an older one could not have installed or parsed this
 
 
-def check_packages() -> Iterable[Finding]:
-    """What is installed: the plain part must load, extras may be absent."""
+def check_packages() -> Iterable[DoctorCheck]:
+    """Import every plain dependency; extras may be absent."""
     versions, broken = [], []
     for distribution, module in PLAIN.items():
         try:
@@ -84,37 +84,39 @@ def check_packages() -> Iterable[Finding]:
         except Exception as error:  # a wheel for another processor fails in its own way
             broken.append(f"{distribution} ({error})")
     if broken:
-        yield Finding(Level.FAIL, "packages", "; ".join(broken), "pip install --force-reinstall kiteline")
+        yield DoctorCheck(Severity.FAIL, "packages", "; ".join(broken), "pip install --force-reinstall kiteline")
     else:
-        yield Finding(Level.OK, "packages", ", ".join(versions))
+        yield DoctorCheck(Severity.OK, "packages", ", ".join(versions))
     for extra, packages in EXTRAS.items():
         missing = [d for d, module in packages.items() if importlib.util.find_spec(module) is None]
         if missing:
-            yield Finding(Level.NOTE, extra, f"without {', '.join(missing)}", f"pip install 'kiteline[{extra}]'")
+            yield DoctorCheck(Severity.NOTE, extra, f"without {', '.join(missing)}", f"pip install 'kiteline[{extra}]'")
         else:
-            yield Finding(Level.OK, extra, "extra installed")
+            yield DoctorCheck(Severity.OK, extra, "extra installed")
 
 
-def check_kernel_cache() -> Iterable[Finding]:
-    """Where numba keeps compiled kernels: without a cache each start compiles for many seconds."""
+def check_kernel_cache() -> Iterable[DoctorCheck]:
+    """Check that numba can keep compiled kernels: without a cache each start compiles for many seconds."""
     spec = importlib.util.find_spec("kiteline_core")
     beside = Path(spec.submodule_search_locations[0] if spec and spec.submodule_search_locations else ".")
     named = os.environ.get("NUMBA_CACHE_DIR")
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
     for folder in [Path(named)] if named else [beside / "__pycache__", user]:
         if _writable(folder):
-            yield Finding(Level.OK, "kernel cache", f"{folder} can be written; fill it with: kiteline doctor --warm")
+            yield DoctorCheck(
+                Severity.OK, "kernel cache", f"{folder} can be written; fill it with: kiteline doctor --warm"
+            )
             return
-    yield Finding(
-        Level.FAIL,
+    yield DoctorCheck(
+        Severity.FAIL,
         "kernel cache",
         f"cannot write {named or beside}: each start would compile for many seconds",
         "set NUMBA_CACHE_DIR to a folder that this user may write",
     )
 
 
-def check_processor() -> Iterable[Finding]:
-    """Cores, clock governor, OpenCV's threads."""
+def check_processor() -> Iterable[DoctorCheck]:
+    """Report cores, OpenCV's threads and a power-saving clock governor."""
     cores = len(os.sched_getaffinity(0))
     try:
         import cv2
@@ -122,31 +124,31 @@ def check_processor() -> Iterable[Finding]:
         cv = f"; OpenCV {cv2.__version__} would take {cv2.getNumThreads()} threads, an agent sets 1"
     except ImportError:
         cv = ""
-    yield Finding(Level.OK, "processor", f"{cores} of {os.cpu_count()} cores{cv}")
+    yield DoctorCheck(Severity.OK, "processor", f"{cores} of {os.cpu_count()} cores{cv}")
     governor = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     if governor.exists() and (name := governor.read_text().strip()) == "powersave":
-        yield Finding(
-            Level.NOTE, "governor", f"{name}: frames may take longer", "sudo cpupower frequency-set -g performance"
+        yield DoctorCheck(
+            Severity.NOTE, "governor", f"{name}: frames may take longer", "sudo cpupower frequency-set -g performance"
         )
 
 
-def check_memory() -> Iterable[Finding]:
-    """Room for an agent."""
+def check_memory() -> Iterable[DoctorCheck]:
+    """Check that there is memory for an agent."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         free_mib = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) // 1024
     except (OSError, StopIteration, ValueError):
         return
     if free_mib >= MIN_MEMORY_MIB:
-        yield Finding(Level.OK, "memory", f"{free_mib} MiB available")
+        yield DoctorCheck(Severity.OK, "memory", f"{free_mib} MiB available")
     else:
-        yield Finding(
-            Level.FAIL, "memory", f"{free_mib} MiB available, {MIN_MEMORY_MIB} are needed", "end other programs"
+        yield DoctorCheck(
+            Severity.FAIL, "memory", f"{free_mib} MiB available, {MIN_MEMORY_MIB} are needed", "end other programs"
         )
 
 
-def check_zenoh() -> Iterable[Finding]:
-    """A real session on loopback, in a process of its own: a broken one may hang."""
+def check_zenoh() -> Iterable[DoctorCheck]:
+    """Open a Zenoh session on loopback, in a process of its own, since a broken one may hang."""
     code = (
         "from kiteline_hw.links.zenoh_session import open_session, close_session\n"
         "close_session(open_session('tcp/127.0.0.1:0', 'base'))"
@@ -154,41 +156,43 @@ def check_zenoh() -> Iterable[Finding]:
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20, check=False)
     except subprocess.TimeoutExpired:
-        yield Finding(Level.FAIL, "zenoh", "a session on loopback hangs", "is the lo interface up?")
+        yield DoctorCheck(Severity.FAIL, "zenoh", "a session on loopback hangs", "is the lo interface up?")
         return
     if done.returncode == 0:
-        yield Finding(Level.OK, "zenoh", "opens and closes a session on loopback")
+        yield DoctorCheck(Severity.OK, "zenoh", "opens and closes a session on loopback")
     else:
-        last = (done.stderr.strip().splitlines() or ["no word"])[-1]
-        yield Finding(Level.FAIL, "zenoh", last[:160], "is the lo interface up, and may this user open TCP ports?")
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        yield DoctorCheck(
+            Severity.FAIL, "zenoh", last[:160], "is the lo interface up, and may this user open TCP ports?"
+        )
 
 
-def check_serial() -> Iterable[Finding]:
-    """Serial ports, and whether this user may open them."""
+def check_serial() -> Iterable[DoctorCheck]:
+    """List serial ports, and whether this user may open them."""
     ports = sorted({p for pattern in SERIAL_PORTS for p in glob.glob(pattern)})
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]
     if not ports:
-        yield Finding(Level.NOTE, "serial", "no port found: fine unless a flight controller or radio is to be attached")
+        yield DoctorCheck(Severity.NOTE, "serial", "no port found: needed only for a flight controller or a radio")
         return
     if closed:
-        yield Finding(
-            Level.NOTE,
+        yield DoctorCheck(
+            Severity.NOTE,
             "serial",
             f"may not open {', '.join(closed)}",
             "sudo usermod -aG dialout $USER, then log in again",
         )
     if usable := [p for p in ports if p not in closed]:
-        yield Finding(Level.OK, "serial", ", ".join(usable))
-    yield Finding(
-        Level.NOTE,
+        yield DoctorCheck(Severity.OK, "serial", ", ".join(usable))
+    yield DoctorCheck(
+        Severity.NOTE,
         "flight controller",
-        "one that forwards ODOMETRY to its telemetry radio drowns it",
+        "one that forwards ODOMETRY to its telemetry radio overloads the radio",
         "ArduPilot: set bit 1024 of SERIALx_OPTIONS of the port to this computer; PX4: MAV_x_FORWARD = 0",
     )
 
 
-def check_cgroup() -> Iterable[Finding]:
-    """Whether `--cpu` can be enforced by the kernel."""
+def check_cgroup() -> Iterable[DoctorCheck]:
+    """Check whether the kernel can enforce `--cpu`."""
     root = Path("/sys/fs/cgroup")
     two, one = (root / "cgroup.controllers"), (root / "cpu")
     if two.exists():
@@ -199,36 +203,36 @@ def check_cgroup() -> Iterable[Finding]:
     else:
         usable, kind = False, "none"
     how = "may be set" if usable else "may not be set by this user: replay --cpu uses the virtual CPU"
-    yield Finding(Level.OK if usable else Level.NOTE, "cgroup", f"{kind}; a CPU limit {how}")
+    yield DoctorCheck(Severity.OK if usable else Severity.NOTE, "cgroup", f"{kind}; a CPU limit {how}")
 
 
-def check_clock() -> Iterable[Finding]:
-    """The wall clock names logs and, on the base, certificates; flight time is monotonic and needs no date."""
+def check_clock() -> Iterable[DoctorCheck]:
+    """Check the clocks. The wall clock dates logs and checks certificates; flight time is monotonic."""
     resolution_ns = time.clock_getres(time.CLOCK_MONOTONIC) * 1e9
     today = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     if resolution_ns > 1e6:
-        yield Finding(
-            Level.FAIL, "clock", f"monotonic clock steps by {resolution_ns / 1e6:.0f} ms", "use another kernel"
+        yield DoctorCheck(
+            Severity.FAIL, "clock", f"monotonic clock steps by {resolution_ns / 1e6:.0f} ms", "use another kernel"
         )
     elif time.time() < OLDEST_CLOCK_S:
-        yield Finding(
-            Level.NOTE, "clock", f"says {today}: logs will bear a wrong date", "sudo timedatectl set-ntp true"
+        yield DoctorCheck(
+            Severity.NOTE, "clock", f"says {today}: logs will bear a wrong date", "sudo timedatectl set-ntp true"
         )
     else:
-        yield Finding(Level.OK, "clock", f"{today}, monotonic to {resolution_ns:.0f} ns")
+        yield DoctorCheck(Severity.OK, "clock", f"{today}, monotonic to {resolution_ns:.0f} ns")
 
 
-def check_systemd() -> Iterable[Finding]:
-    """Whether the units could run, and whether they do."""
+def check_systemd() -> Iterable[DoctorCheck]:
+    """Check whether systemd runs here, and which units are installed."""
     if not Path("/run/systemd/system").is_dir():
-        yield Finding(Level.NOTE, "systemd", "does not run here: start kiteline by hand or by another supervisor")
+        yield DoctorCheck(Severity.NOTE, "systemd", "not running: start kiteline by hand or by another supervisor")
         return
     folders = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
     units = [u for u in ("kiteline-agent", "kiteline-base") if any(Path(f, f"{u}.service").exists() for f in folders)]
-    yield Finding(Level.OK, "systemd", f"runs; units installed: {', '.join(units) or 'none'}")
+    yield DoctorCheck(Severity.OK, "systemd", f"runs; units installed: {', '.join(units) or 'none'}")
 
 
-CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
+CHECKS: tuple[Callable[[], Iterable[DoctorCheck]], ...] = (
     check_python,
     check_packages,
     check_kernel_cache,
@@ -242,47 +246,51 @@ CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
 )
 
 
-def examine() -> list[Finding]:
-    """All checks; one that itself breaks is a finding, not a traceback."""
-    findings: list[Finding] = []
+def run_checks() -> list[DoctorCheck]:
+    """Run all checks; one that raises becomes a note."""
+    results: list[DoctorCheck] = []
     for check in CHECKS:
         try:
-            findings.extend(check())
+            results.extend(check())
         except Exception as error:
-            findings.append(
-                Finding(Level.NOTE, check.__name__.removeprefix("check_"), f"could not be checked: {error}")
+            results.append(
+                DoctorCheck(Severity.NOTE, check.__name__.removeprefix("check_"), f"could not be checked: {error}")
             )
-    return findings
+    return results
 
 
-def warm() -> list[Finding]:
-    """Compile and cache the kernels of every room that is installed here."""
+def warm() -> list[DoctorCheck]:
+    """Compile and cache the kernels of every installed room."""
     from kiteline_hw.system import kernel_cache
 
-    findings = []
+    results = []
     for name in WARMING:
         room = name.split(".")[0]
         if importlib.util.find_spec(room) is None or importlib.util.find_spec(name) is None:
             continue
         start_s = time.perf_counter()
         importlib.import_module(name).warm()
-        findings.append(Finding(Level.OK, "warm", f"{room}: {time.perf_counter() - start_s:.1f} s"))
+        results.append(DoctorCheck(Severity.OK, "warm", f"{room}: {time.perf_counter() - start_s:.1f} s"))
     kernel_cache.mark()
-    return findings
+    return results
 
 
 def main(argv: list[str]) -> int:
-    """Run `kiteline doctor`; 1 when something will not work."""
-    p = argparse.ArgumentParser(prog="kiteline doctor", description="Check this machine, and say what would mend it.")
-    p.add_argument("--warm", action="store_true", help="compile all kernels and cache them, so that a start is quick")
+    """Run `kiteline doctor`; exit status 1 if a check fails."""
+    p = argparse.ArgumentParser(
+        prog="kiteline doctor", description="Check this machine, and say how to mend what fails."
+    )
+    p.add_argument(
+        "--warm", action="store_true", help="compile and cache all kernels, so that agent and base start quickly"
+    )
     a = p.parse_args(argv)
-    findings = examine() + (warm() if a.warm else [])
-    width = max(len(f.name) for f in findings)
-    for f in findings:
-        print(f"{f.level.value:>4}  {f.name:{width}}  {f.text}")
-        if f.mend:
-            print(f"{'':>4}  {'':{width}}  -> {f.mend}")
-    return 1 if any(f.level is Level.FAIL for f in findings) else 0
+    results = run_checks() + (warm() if a.warm else [])
+    width = max(len(f.name) for f in results)
+    for f in results:
+        print(f"{f.severity.value:>4}  {f.name:{width}}  {f.text}")
+        if f.remedy:
+            print(f"{'':>4}  {'':{width}}  -> {f.remedy}")
+    return 1 if any(f.severity is Severity.FAIL for f in results) else 0
 
 
 def _writable(folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""`kiteline export STORE --format tum|ply|pgm|g2o --out F`: a base's map in the formats of other tools."""
+"""`kiteline export STORE --format tum|ply|pgm|g2o --out F`: write a base's map in the formats of other tools."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from kiteline_basestation.runtime.export import g2o, tum
 from kiteline_basestation.runtime.outputs import keyframe_poses, map_files
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
-from kiteline_basestation.store.store import StoreError, read
+from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.schema import WireError
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
@@ -28,29 +27,26 @@ from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyfram
 I64 = NDArray[np.int64]
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
-ESSENTIAL_POINTS = 100  # points that two keyframes share for an edge of the essential graph (ORB-SLAM2)
+ESSENTIAL_LANDMARKS = 100  # shared by two keyframes of an edge of the essential graph (ORB-SLAM2)
 
 
 class ExportError(KitelineError):
-    """A map that cannot be exported so. The text says what was found and what was expected."""
+    """A map that cannot be exported in this way."""
 
 
 def load(store: Path) -> Mapper:
-    """The map that a base kept. store: the folder of `--store`, or the file in it. Raises ExportError."""
+    """Restore a saved map. store: the folder given to `--store`, or the file in it. Raises StoreError, WireError."""
     station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
-    try:
-        for fault in restore(station, read(store), 0).faults:
-            print(f"{store}: {fault}", file=sys.stderr)
-    except (StoreError, WireError) as e:
-        raise ExportError(str(e)) from None
+    for fault in restore(station, read(store), 0).faults:
+        print(f"{store}: {fault}", file=sys.stderr)
     return station.mapper
 
 
 def files(mapper: Mapper, kind: str, name: str, agent: int | None = None) -> dict[str, bytes]:
-    """The files of one format by name. name: of the main file. agent: whose trajectory, or None where there is one.
+    """Contents of the files of one format, by file name. name: of the main file. agent: tum: whose trajectory.
 
-    tum: camera poses of keyframes in w. g2o: keyframes with edges to parents, and to covisible ones. pgm brings a YAML
-    file beside it. Raises ExportError.
+    tum: camera poses of keyframes in w. g2o: keyframes with edges to parents and covisible keyframes. pgm: with a
+    YAML file beside it. Raises ExportError.
     """
     if kind == "tum":
         return {name: _trajectory(mapper, agent)}
@@ -67,7 +63,7 @@ def _trajectory(mapper: Mapper, agent: int | None) -> bytes:
     poses = keyframe_poses(mapper)
     here = sorted({int(agent_of_keyframe(k)) for k in poses})
     if agent is None and len(here) > 1:
-        raise ExportError(f"the map holds agents {here}: a trajectory is of one of them, choose with --agent")
+        raise ExportError(f"the map holds agents {here}: choose one with --agent")
     if agent is not None and agent not in here:
         raise ExportError(f"the map holds agents {here}, none with number {agent}")
     mine = [k for k in poses if agent is None or agent_of_keyframe(k) == AgentId(agent)]
@@ -83,7 +79,7 @@ def _graph(mapper: Mapper) -> bytes:
     for k, i in number.items():
         parent = KeyframeId(int(mapper.map.keyframes.parent[mapper.map.rows[k]]))
         near = [parent] if parent != NO_KEYFRAME else []
-        near += covisible_keyframes(mapper.map, k, ESSENTIAL_POINTS)
+        near += covisible_keyframes(mapper.map, k, ESSENTIAL_LANDMARKS)
         pairs |= {(min(i, number[n]), max(i, number[n])) for n in near if n in number}
     edges: I64 = np.array(sorted(pairs), np.int64).reshape(-1, 2)
     scale = np.array([sim3.scale_of(S) for S in poses.values()])
@@ -92,20 +88,16 @@ def _graph(mapper: Mapper) -> bytes:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command; the exit status."""
+    """Run `kiteline export`; the exit status. Raises KitelineError."""
     parser = argparse.ArgumentParser(prog="kiteline export", description="A base's map in the formats of other tools.")
     parser.add_argument("store", type=Path, metavar="STORE", help="the folder given to `kiteline base --store`")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="F", help="file to write; pgm: a YAML file beside it"
     )
-    parser.add_argument("--agent", type=int, help="tum: whose trajectory, where there are several")
+    parser.add_argument("--agent", type=int, help="tum: whose trajectory; needed if there are several")
     args = parser.parse_args(argv)
-    try:
-        made = files(load(args.store), args.format, args.out.name, args.agent)
-    except ExportError as e:
-        print(f"kiteline export: {e}", file=sys.stderr)
-        return 2
+    made = files(load(args.store), args.format, args.out.name, args.agent)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     for name, content in made.items():
         (args.out.parent / name).write_bytes(content)

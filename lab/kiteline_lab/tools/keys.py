@@ -1,4 +1,4 @@
-"""`kiteline keys`: make and show the keys with which agents and base seal their packets."""
+"""`kiteline keys`: make and show the keys that seal packets between agents and base."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline keys`."""
     p = argparse.ArgumentParser(
         prog="kiteline keys",
-        description="Keys of agents. With --key FILE, agent and base take nothing from whoever does not hold them.",
+        description="Keys of agents. With --key FILE, agent and base accept only packets that are sealed with one of them.",
         epilog="Make keys on the base: `kiteline keys new 3`. Copy that agent's line to a file on the agent.",
     )
     p.add_argument("--file", metavar="F", type=Path, default=None, help=f"default: {default_path()}")
     commands = p.add_subparsers(dest="command", required=True)
     new = commands.add_parser("new", help="make a key for an agent")
     new.add_argument("agent", metavar="AGENT", type=int, help="number of the agent, 0 to 63")
-    new.add_argument("--replace", action="store_true", help="even if it has one: the old one is void then")
+    new.add_argument("--replace", action="store_true", help="replace the key it has; the old one is void then")
     show = commands.add_parser("show", help="list agents with the fingerprints of their keys")
     show.add_argument("--secret", metavar="AGENT", type=int, default=None, help="print this agent's line of the file")
     return p

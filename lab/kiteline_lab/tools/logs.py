@@ -1,6 +1,6 @@
-"""`kiteline log info|recover|cut|merge`: look into MCAP files and mend them; works on any MCAP file, not only our own.
+"""`kiteline log info|recover|cut|merge`: inspect and repair MCAP files, kiteline's and others.
 
-Messages, schemas, channels and metadata are carried over as they are; attachments are not.
+Messages, schemas, channels and metadata are copied unchanged; attachments are dropped.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 import heapq
 import json
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
@@ -18,25 +18,25 @@ from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.ports import SourceError
 from kiteline_lab.flights.out_file import whole_file
 
-_STICKY = ("kiteline.Rig", "sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
+_LASTING = ("kiteline.Rig", "sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
 
 
 def main(argv: list[str]) -> int:
-    """Run the command. Raises SourceError."""
-    p = argparse.ArgumentParser(prog="kiteline log", description="Look into logs and mend them.")
+    """Run `kiteline log`; the exit status. Raises SourceError."""
+    p = argparse.ArgumentParser(prog="kiteline log", description="Inspect and repair logs (MCAP files).")
     commands = p.add_subparsers(dest="command", required=True, metavar="info|recover|cut|merge")
-    info = commands.add_parser("info", help="what a file holds, and whether it is whole")
+    info = commands.add_parser("info", help="list topics and metadata, and say whether the file is complete")
     info.add_argument("file", metavar="FILE", type=Path)
     info.add_argument("--json", action="store_true", help="as JSON")
-    recover = commands.add_parser("recover", help="all that a cut or damaged file still holds, as a whole file")
+    recover = commands.add_parser("recover", help="copy everything readable in a cut or damaged file to a complete one")
     recover.add_argument("file", metavar="FILE", type=Path)
     recover.add_argument("out", metavar="OUT", type=Path)
-    cut = commands.add_parser("cut", help="a stretch of time, calibration included")
+    cut = commands.add_parser("cut", help="copy an interval of time, with the calibration that applies to it")
     cut.add_argument("file", metavar="FILE", type=Path)
     cut.add_argument("out", metavar="OUT", type=Path)
     cut.add_argument("--from", dest="begin_s", metavar="S", type=float, default=0.0, help="seconds from the start")
     cut.add_argument("--to", dest="end_s", metavar="S", type=float, default=float("inf"), help="seconds from the start")
-    merge = commands.add_parser("merge", help="one file of several, in order of time")
+    merge = commands.add_parser("merge", help="merge several files into one, in order of time")
     merge.add_argument("out", metavar="OUT", type=Path)
     merge.add_argument("files", metavar="FILE", type=Path, nargs="+")
     for command in (recover, cut, merge):
@@ -53,18 +53,19 @@ def main(argv: list[str]) -> int:
 
 def _info(path: Path, as_json: bool) -> int:
     file = McapFile(path)
-    for _ in () if not file.indexed else file.messages(ordered=False):
-        pass  # reading is the check: damaged chunks are noted on the way
+    if file.indexed:
+        for _ in file.messages(ordered=False):
+            pass  # reading is the check: damaged chunks are added to file.notes
     topics = []
     span_s = (file.last_ns - file.first_ns) * 1e-9
     for number, channel in sorted(file.channels.items(), key=lambda item: item[1].topic):
-        schema, count = file.schema_of(number), file.counts.get(number, 0)
-        hz = round(count / span_s, 1) if span_s > 0 and count > 1 else None
+        schema, messages = file.schema_of(number), file.counts.get(number, 0)
+        hz = round(messages / span_s, 1) if span_s > 0 and messages > 1 else None
         name = schema.name if schema is not None else ""
         topics.append(
             {
                 "topic": channel.topic,
-                "messages": count,
+                "messages": messages,
                 "hz": hz,
                 "schema": name,
                 "encoding": channel.message_encoding,
@@ -109,8 +110,8 @@ def _print(facts: dict[str, object], topics: list[dict[str, object]], file: Mcap
 def _recover(path: Path, out: Path, force: bool) -> int:
     file = McapFile(path)
     with whole_file(out, force) as part:
-        count = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
-    print(f"{out}: {count} messages; {path} was {file.cut or 'whole'}")
+        written = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
+    print(f"{out}: {written} messages; {path} was {file.cut or 'whole'}")
     for note in file.notes:
         print(f"  {note}")
     return 0
@@ -127,16 +128,16 @@ def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> in
             f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"
         )
     with whole_file(out, force) as part:
-        count = _write(part, [file], ((0, m) for m in _stretch(file, begin_ns, end_ns)), [""])
-    print(f"{out}: {count} messages")
+        written = _write(part, [file], ((0, m) for m in _interval(file, begin_ns, end_ns)), [""])
+    print(f"{out}: {written} messages")
     return 0
 
 
-def _stretch(file: McapFile, begin_ns: int, end_ns: int) -> Iterator[RawMessage]:
-    """Messages of a stretch; before them calibration and static transforms said earlier, moved to its start."""
-    sticky = [c for c in file.channels if _is_sticky(file, c)]
+def _interval(file: McapFile, begin_ns: int, end_ns: int) -> Iterator[RawMessage]:
+    """Messages of an interval; first the latest calibration and static transforms from before it, at its start."""
+    lasting = [c for c in file.channels if _is_lasting(file, c)]
     latest: dict[int, list[RawMessage]] = {}
-    for m in file.messages(sticky):
+    for m in file.messages(lasting):
         if m.log_ns < begin_ns:
             kept = latest.setdefault(m.channel, [])
             if "static" not in file.channels[m.channel].topic:
@@ -150,20 +151,17 @@ def _stretch(file: McapFile, begin_ns: int, end_ns: int) -> Iterator[RawMessage]
             yield m
 
 
-def _is_sticky(file: McapFile, channel: int) -> bool:
+def _is_lasting(file: McapFile, channel: int) -> bool:
     schema = file.schema_of(channel)
-    return "static" in file.channels[channel].topic or (schema is not None and schema.name in _STICKY)
+    return "static" in file.channels[channel].topic or (schema is not None and schema.name in _LASTING)
 
 
 def _merge(out: Path, paths: list[Path], force: bool) -> int:
-    files: list[McapFile] = []
-    for path in paths:
-        files.append(McapFile(path))
-    numbered = [_numbered(i, file) for i, file in enumerate(files)]
-    merged = heapq.merge(*numbered, key=lambda item: (item[1].log_ns, item[0]))
+    files = [McapFile(path) for path in paths]
+    merged = heapq.merge(*map(_numbered, count(), files), key=lambda item: (item[1].log_ns, item[0]))
     with whole_file(out, force) as part:
-        count = _write(part, files, merged, _prefixes(files))
-    print(f"{out}: {count} messages of {len(paths)} files")
+        written = _write(part, files, merged, _prefixes(files))
+    print(f"{out}: {written} messages of {len(paths)} files")
     return 0
 
 
@@ -173,7 +171,7 @@ def _numbered(number: int, file: McapFile) -> Iterator[tuple[int, RawMessage]]:
 
 
 def _prefixes(files: list[McapFile]) -> list[str]:
-    """Nothing for the parts of one recording; a name before each topic where files speak of the same time."""
+    """Prefix of the topics of each file: empty for parts of one recording, its name where files overlap in time."""
     spans = sorted((f.first_ns, f.last_ns) for f in files if f.counts)
     topics = [c.topic for f in files for c in f.channels.values()]
     overlap = any(a[1] > b[0] for a, b in pairwise(spans))
@@ -184,8 +182,8 @@ def _prefixes(files: list[McapFile]) -> list[str]:
 
 
 def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawMessage]], prefixes: list[str]) -> int:
-    """Write messages (number of file, message); how many. Channels that agree in all but their file become one."""
-    count = 0
+    """Write messages (number of file, message); returns the count. Equal channels of several files become one."""
+    written = 0
     schemas: dict[tuple[str, str, bytes], int] = {}
     channels: dict[tuple[str, str, int, str], int] = {}
     known: dict[tuple[int, int], int] = {}
@@ -213,8 +211,8 @@ def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawM
                         channels[name] = writer.register_channel(*name[:3], channel.metadata)
                     target = known[(number, m.channel)] = channels[name]
                 writer.add_message(target, m.log_ns, m.data, m.publish_ns, m.sequence)
-                count += 1
+                written += 1
             writer.finish()
     except OSError as error:
         raise SourceError(f"{path}: cannot be written: {error.strerror}") from error
-    return count
+    return written

@@ -1,4 +1,4 @@
-"""`kiteline maps list|get|name|merge|split|delete`: the maps of a running base, asked for and changed by hand."""
+"""`kiteline maps list|get|name|merge|split|delete`: query and change the maps of a running base."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline maps`."""
     p = argparse.ArgumentParser(
         prog="kiteline maps",
-        description="The maps of a running base. A map is called by its id (AGENT.BOOT.NUMBER) or its name.",
-        epilog="Other programs ask the same over Zenoh: docs/map-management.md.",
+        description="Manage the maps of a running base. MAP is an id (AGENT.BOOT.NUMBER) or a name.",
+        epilog="Other programs send the same queries over Zenoh: docs/how-to/manage-maps.md.",
     )
     p.add_argument("--base", metavar="ENDPOINT", default=_DEFAULT, help="where the base listens (default: %(default)s)")
-    p.add_argument("--json", action="store_true", help="print the answer as it came")
+    p.add_argument("--json", action="store_true", help="print the reply as JSON")
     verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="all maps")
     one = {
         "get": "one map, with the poses of its keyframes",
-        "split": "take a map out of the one into which it was merged, for good",
-        "delete": "forget a map",
+        "split": "take a submap out of the map into which it was merged, for good",
+        "delete": "delete a map",
     }
     for verb, what in one.items():
         verbs.add_parser(verb, help=what).add_argument("map", metavar="MAP")
-    name = verbs.add_parser("name", help="call a map by a name")
+    name = verbs.add_parser("name", help="give a map a name")
     name.add_argument("map", metavar="MAP")
-    name.add_argument("name", metavar="NAME", help='"" takes the name back')
-    merge = verbs.add_parser("merge", help="lay a map into another: they overlap, or lie as --at says")
+    name.add_argument("name", metavar="NAME", help='"" removes the name')
+    merge = verbs.add_parser("merge", help="merge a map into another, where they overlap or at --at")
     merge.add_argument("map", metavar="MAP")
     merge.add_argument("into", metavar="INTO")
     merge.add_argument("--at", metavar="N", type=float, nargs=16, help="T_into_map, 16 numbers in rows")
     return p
 
 
-def question(a: argparse.Namespace) -> dict[str, Any]:
-    """What is asked of the base."""
+def query(a: argparse.Namespace) -> dict[str, Any]:
+    """The query's parameters."""
     given = {key: getattr(a, key) for key in ("map", "name", "into") if hasattr(a, key)}
     if getattr(a, "at", None) is not None:
         given["T_into_map"] = a.at
@@ -50,7 +50,7 @@ def question(a: argparse.Namespace) -> dict[str, Any]:
 
 
 def table(answer: Mapping[str, Any]) -> str:
-    """An answer for people."""
+    """A reply as a table of text."""
     if "maps" not in answer and "id" not in answer:
         return json.dumps(answer)
     lines = [f"{'map':10} {'name':16} {'agents':8} {'keyframes':>9} {'points':>8}  placed  unit   submaps"]
@@ -64,15 +64,15 @@ def table(answer: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _submap(told: Mapping[str, Any]) -> str:
-    """A submap's id, and its scale where that is not 1."""
-    return str(told["id"]) if told["scale"] == 1.0 else f"{told['id']} (x{told['scale']:.4g})"
+def _submap(submap: Mapping[str, Any]) -> str:
+    """A submap's id, with its scale if that is not 1."""
+    return str(submap["id"]) if submap["scale"] == 1.0 else f"{submap['id']} (x{submap['scale']:.4g})"
 
 
 def main(argv: list[str]) -> int:
-    """Run `kiteline maps`; 1 when the base refused."""
+    """Run `kiteline maps`; exit status 1 if the base refused."""
     a = parser().parse_args(argv)
-    ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, json.dumps(question(a)))
+    ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, json.dumps(query(a)))
     if a.json:
         print(text)
     elif ok:

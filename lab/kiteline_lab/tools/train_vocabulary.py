@@ -1,8 +1,8 @@
-"""`python -m kiteline_lab.tools.train_words SOURCE… --out FILE`: train the vocabulary of the place index.
+"""`python -m kiteline_lab.tools.train_vocabulary SOURCE… --out FILE`: train the visual vocabulary of the place index.
 
-The words that ship with kiteline were trained on its own simulated scenes, so that they may be given to anybody:
+The vocabulary that ships with kiteline is trained on its own simulated scenes (no licence of a data set applies):
 
-    python -m kiteline_lab.tools.train_words --out core/kiteline_core/places/words.bin
+    python -m kiteline_lab.tools.train_vocabulary --out core/kiteline_core/places/words.bin
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from kiteline_core.places.place_index import Vocabulary, nodes, pack
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.tools import train_words_kernels as kernels
+from kiteline_lab.tools import train_vocabulary_kernels as kernels
 
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
@@ -31,15 +31,17 @@ U64 = NDArray[np.uint64]
 
 SCENES = ("room", "hall", "street", "corridor")
 DEFAULT_SOURCES = tuple(f"sim:{scene}?seed={seed}&mono=1" for seed in range(101, 105) for scene in SCENES)
-_ROUNDS = 12  # of assigning and voting; clusters hardly move after eight
+_ROUNDS = 12  # k-majority iterations; clusters hardly move after eight
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command. Raises SourceError."""
     p = argparse.ArgumentParser(
-        prog="python -m kiteline_lab.tools.train_words", description="Train the words by which places are recognised."
+        prog="python -m kiteline_lab.tools.train_vocabulary", description="Train the vocabulary of the place index."
     )
-    p.add_argument("sources", nargs="*", metavar="SOURCE", default=list(DEFAULT_SOURCES), help="default: own scenes")
+    p.add_argument(
+        "sources", nargs="*", metavar="SOURCE", default=list(DEFAULT_SOURCES), help="default: simulated scenes"
+    )
     p.add_argument("--out", type=Path, required=True, metavar="FILE")
     p.add_argument("--every", type=int, default=24, metavar="N", help="take each N-th frame (default 24)")
     p.add_argument("--branching", type=int, default=10, metavar="K")
@@ -50,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     for spec in o.sources:
         source = open_source(spec, mono=True, imu=False)
         try:
-            images.extend(described(source, o.every))
+            images.extend(descriptors(source, o.every))
         finally:
             source.close()
         print(f"{spec}: {sum(map(len, images))} descriptors of {len(images)} images so far", file=sys.stderr)
@@ -60,8 +62,8 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def described(source: FrameSource, every: int) -> Iterator[U8]:
-    """Descriptors (n,32) of each N-th frame of a source."""
+def descriptors(source: FrameSource, every: int) -> Iterator[U8]:
+    """ORB descriptors (n,32) of every N-th frame of a source."""
     rectifier = Rectifier(source.rig)
     config = features.DetectorConfig(max_corners=600, cell_px=20)
     for frame in _frames(source, every):
@@ -71,10 +73,10 @@ def described(source: FrameSource, every: int) -> Iterator[U8]:
 
 
 def _frames(source: FrameSource, every: int) -> Iterator[Frame]:
-    if isinstance(source, SimSource):  # renders only what is wanted
-        eyes = source.eyes()
+    if isinstance(source, SimSource):  # renders only the frames that are used
+        cameras = source.eyes()
         for k in range(0, source.frame_count or 0, every):
-            yield source.render(k, eyes)
+            yield source.render(k, cameras)
         return
     number = 0
     for item in source:
@@ -85,9 +87,9 @@ def _frames(source: FrameSource, every: int) -> Iterator[Frame]:
 
 
 def train(images: list[U8], branching: int, levels: int, seed: int) -> Vocabulary:
-    """A tree over all descriptors, cluster by cluster, with weights log(images / images that have the word).
+    """Train a vocabulary tree by hierarchical k-majority; weights are log(images / images that have the word).
 
-    images: descriptors (n,32) of each image. Raises SourceError when there are fewer descriptors than words.
+    images: descriptors (n,32) of each image. Raises SourceError if there are fewer descriptors than words.
     """
     descriptor = words(np.concatenate(images)) if images else np.zeros((0, 4), np.uint64)
     if len(descriptor) < branching**levels:
@@ -109,21 +111,23 @@ def train(images: list[U8], branching: int, levels: int, seed: int) -> Vocabular
     having = np.zeros(branching**levels)
     for image in images:
         having[np.unique(bare.words_of(image))] += 1.0
-    weight = np.log((len(images) + 1.0) / np.maximum(having, 1.0))  # a word that none has is as telling as one's own
+    weight = np.log(
+        (len(images) + 1.0) / np.maximum(having, 1.0)
+    )  # a word that no image has weighs as much as one in a single image
     return Vocabulary(branching, levels, centres, weight.astype(np.float32))
 
 
 def _split(descriptor: U64, member: I64, centre: U64, rng: np.random.Generator) -> list[I64]:
-    """Cluster members around the centres (k,4), which are written. The members of each."""
+    """Cluster `member` rows into k groups; writes their centres (k,4). Returns the rows of each group."""
     if len(member) == 0:
         return [member] * len(centre)
     kernels.spread_centres(descriptor, member, int(rng.integers(len(member))), centre)
     label = np.full(len(member), -1, np.int32)
     for _ in range(_ROUNDS):
-        if kernels.assign(descriptor, member, centre, label) == 0:
+        if kernels.assign_to_nearest(descriptor, member, centre, label) == 0:
             break
-        kernels.majority(descriptor, member, label, centre)
-    kernels.assign(descriptor, member, centre, label)
+        kernels.update_centres(descriptor, member, label, centre)
+    kernels.assign_to_nearest(descriptor, member, centre, label)
     return [member[label == c] for c in range(len(centre))]
 
 

@@ -1,4 +1,4 @@
-"""Kernels that train a tree of binary words."""
+"""Kernels of k-majority clustering of binary descriptors."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ U64 = NDArray[np.uint64]
 
 @njit
 def spread_centres(descriptor: U64, member: I64, start: int, centre: U64) -> int:
-    """First centres of a cluster: member `start`, then always the member farthest from those chosen.
+    """Choose initial centres: member `start`, then always the member farthest from those chosen.
 
-    descriptor: (n,4). member: (m,) rows of the cluster. centre: (k,4) out. Returns how many differ.
+    descriptor: (n,4). member: (m,) rows of the cluster. centre: (k,4) out. Returns the number of distinct centres.
     """
     m, k = member.shape[0], centre.shape[0]
     nearest = np.full(m, 1 << 20, np.int64)
@@ -38,8 +38,8 @@ def spread_centres(descriptor: U64, member: I64, start: int, centre: U64) -> int
 
 
 @njit
-def assign(descriptor: U64, member: I64, centre: U64, label: I32) -> int:
-    """The nearest centre of each member, the first of equals. label: (m,) in and out. Returns how many changed."""
+def assign_to_nearest(descriptor: U64, member: I64, centre: U64, label: I32) -> int:
+    """Label each member with its nearest centre (the first of equals). label: (m,) in, out. Returns the changes."""
     changed = 0
     for i in range(member.shape[0]):
         first, chosen = 1 << 20, 0
@@ -54,8 +54,8 @@ def assign(descriptor: U64, member: I64, centre: U64, label: I32) -> int:
 
 
 @njit
-def majority(descriptor: U64, member: I64, label: I32, centre: U64) -> None:
-    """Each centre becomes the majority of its members, bit by bit; an empty one stays as it is."""
+def update_centres(descriptor: U64, member: I64, label: I32, centre: U64) -> None:
+    """Set each bit of a centre to the majority of its members; a centre without members stays."""
     k = centre.shape[0]
     ones = np.zeros((k, 256), np.int64)
     size = np.zeros(k, np.int64)

@@ -1,4 +1,4 @@
-"""Training of words: kernels against plain references, clusters found, and the tree that ships."""
+"""Training of the vocabulary: kernels against plain references, clusters found, and the tree that ships."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from kiteline_core.imaging.matching import words
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system.vocabulary import shipped_words
-from kiteline_lab.tools import train_words_kernels as kernels
-from kiteline_lab.tools.train_words import train
+from kiteline_lab.tools import train_vocabulary_kernels as kernels
+from kiteline_lab.tools.train_vocabulary import train
 
 
 def clusters(rng: np.random.Generator, count: int, each: int, flips: int) -> tuple[np.ndarray, np.ndarray]:
@@ -27,13 +27,13 @@ def test_assignment_and_majority_are_the_reference() -> None:
     rng = np.random.default_rng(0)
     d, c = rng.integers(0, 256, (80, 32), np.uint8), rng.integers(0, 256, (5, 32), np.uint8)
     member, label = np.arange(0, 80, 2), np.full(40, -1, np.int32)
-    assert kernels.assign(words(d), member, words(c), label) == 40
+    assert kernels.assign_to_nearest(words(d), member, words(c), label) == 40
     distance = np.unpackbits(d[member][:, None] ^ c[None], axis=2).sum(axis=2)
     assert np.array_equal(label, distance.argmin(axis=1))
-    assert kernels.assign(words(d), member, words(c), label) == 0
+    assert kernels.assign_to_nearest(words(d), member, words(c), label) == 0
     label[label == 3] = 2  # one cluster without members
     voted = words(c).copy()
-    kernels.majority(words(d), member, label, voted)
+    kernels.update_centres(words(d), member, label, voted)
     for k in range(5):
         mine = np.unpackbits(d[member][label == k], axis=1)
         expected = np.packbits(2 * mine.sum(axis=0) > len(mine)) if len(mine) else c[k]
