@@ -144,7 +144,7 @@ def _similar(found: Sequence[Estimate], clip: Clip) -> metrics.Evaluation | None
     if clip.truth is None or len(good) < 20 or len({e.submap for e in good}) > 1:
         return None
     flown = Trajectory(np.array([e.t_ns for e in good], np.int64), np.array([e.T_m_b for e in good]))
-    return metrics.evaluate(flown, clip.truth, metrics.Alignment.SIM3)
+    return metrics.evaluate(flown, clip.truth, metrics.TrajectoryAlignment.SIM3)
 
 
 def _ate_of(found: metrics.Evaluation | None) -> tuple[float, float]:

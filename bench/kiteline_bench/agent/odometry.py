@@ -129,7 +129,7 @@ def _scale(clip: Clip, found: list[Estimate]) -> float:
     if clip.truth is None or len(good) < 20:
         return 1e-9
     flown = Trajectory(np.array([e.t_ns for e in good], np.int64), np.array([e.T_m_b for e in good]))
-    return float(metrics.evaluate(flown, clip.truth, metrics.Alignment.SIM3).scale)
+    return float(metrics.evaluate(flown, clip.truth, metrics.TrajectoryAlignment.SIM3).scale)
 
 
 # bad odometry

@@ -82,7 +82,7 @@ def _street(bench: Bench) -> list[Bar]:
     start = _fly(bench, [str(bench_ratios.cut(bench, source, "street_start", 0.0, 30.0))], "street_start")
     truth = trajectories.read(f"mcap:{source}").trajectory
     estimate = trajectories.read(str(bench.folder / "street" / "base" / "agent0.tum")).trajectory
-    drift = metrics.kitti_drift(metrics.match(estimate, truth, metrics.Alignment.SE3))
+    drift = metrics.kitti_drift(metrics.match(estimate, truth, metrics.TrajectoryAlignment.SE3))
     assert drift is not None
     bench.say("weighing the base's parts")
     weighed = base_memory.measured(bench.folder / "street" / "base" / "log.mcap")

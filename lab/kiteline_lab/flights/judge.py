@@ -17,7 +17,7 @@ from kiteline_core.geometry.cameras import Rectifier
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_lab.evaluation import metrics
-from kiteline_lab.evaluation.metrics import Alignment
+from kiteline_lab.evaluation.metrics import TrajectoryAlignment
 from kiteline_lab.flights.flight import Outcome
 from kiteline_lab.flights.flight_report import Report, compose, statistic, write_report, write_tum
 from kiteline_lab.plots.plot import Line, plot_trajectories
@@ -35,7 +35,7 @@ def judge(
     align_scale: bool = False,
 ) -> Report:
     """Write what the processes themselves did not, and report.json; the report."""
-    alignment = Alignment.SIM3 if align_scale else Alignment.SE3
+    alignment = TrajectoryAlignment.SIM3 if align_scale else TrajectoryAlignment.SE3
     report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": sorted(outcome.notes)}
     lines: list[Line] = []
     for k, (source, spec) in enumerate(zip(sources, agents, strict=True)):
@@ -104,7 +104,7 @@ def _trajectory(poses: Sequence[tuple[int, F64]]) -> Trajectory:
 
 
 def _accuracy(
-    poses: Sequence[tuple[int, F64]], truth: Trajectory | None, alignment: Alignment
+    poses: Sequence[tuple[int, F64]], truth: Trajectory | None, alignment: TrajectoryAlignment
 ) -> dict[str, float] | None:
     """Errors against the truth; None where there is none to compare with."""
     if truth is None or not poses:
