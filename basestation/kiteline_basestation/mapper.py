@@ -30,7 +30,7 @@ from kiteline_basestation.refinement.odometry_links import with_links, without_l
 from kiteline_basestation.refinement.whole_maps import WholeMaps
 from kiteline_basestation.runtime.jobs import BundleInputs, GridInputs, Job, JobDone
 from kiteline_basestation.store.state import Json, Memory, matrix, parsed, plain, similarity_of
-from kiteline_codec.schema import DisparityCalibration, Key, Kind, LivePose, Record
+from kiteline_codec.schema import CulledLandmarks, DisparityCalibration, Key, LivePose, Record
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
@@ -224,7 +224,7 @@ class Mapper:
                 slots = self.map.slots_of(keyframe)
                 self.map.set_flags(slots[self.map.keypoints.kind[slots] == LANDMARK], CULLED)
                 self.map.cull_keyframe(keyframe)
-                self._publisher.touch(Kind.CULLED_LANDMARKS, keyframe)
+                self._publisher.touch(CulledLandmarks.KIND, keyframe)
             self._stale.pop(submap, None)
             self.placements.pop(submap, None)
             self.names.pop(submap, None)

@@ -11,8 +11,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import Job, JobDone
 from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import Key, Record, WireError
+from kiteline_codec.schema import Key, Record, WireError, messages
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from kiteline_codec.coding import messages
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, PROFILES, RADIO, Profile
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Record, WireError
+from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Record, WireError, messages
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig, SyncStats
 

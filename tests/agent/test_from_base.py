@@ -10,7 +10,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
-from kiteline_codec.schema import Key, Kind, SubmapPlacement
+from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, submap_id
@@ -53,5 +53,5 @@ def test_a_base_that_takes_the_odometrys_word_has_placed_nothing(base: Correctio
 def test_a_submap_that_had_no_place_is_placed_where_it_is_recognised(base: Corrections) -> None:
     assert not say(base, np.eye(4), None)
     assert say(base, np.eye(4), FOUND)
-    base.take([], [Key(int(Kind.SUBMAP_PLACEMENT), int(YOUNG), 0)], [])
+    base.take([], [Key(SubmapPlacement.KIND, int(YOUNG), 0)], [])
     assert not base.has_placed(YOUNG)

@@ -9,7 +9,7 @@ from kiteline_agent.config import AgentConfig, SmoothingConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
-from kiteline_codec.schema import Key, Kind, SubmapPlacement
+from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import submap_id
@@ -36,5 +36,5 @@ def test_a_place_with_a_scale_stretches_the_way_but_not_the_arm(pace: float) -> 
     assert np.allclose(told, sim3.place(S_w_m, T_m_c) @ se3.inverse(T_B_C), atol=1e-9)
     eye, body = (told @ T_B_C)[:3, 3], told[:3, 3]
     assert np.isclose(np.linalg.norm(eye - body), np.linalg.norm(T_B_C[:3, 3]))
-    base.take([], [Key(int(Kind.SUBMAP_PLACEMENT), int(SUBMAP), 0)], events)
+    base.take([], [Key(SubmapPlacement.KIND, int(SUBMAP), 0)], events)
     assert base.in_world(SUBMAP, T_m_b, T_o_m, 100_000_000) is None

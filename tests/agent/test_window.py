@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.relocalisation.map_cache import FrameFeatures, MapCache
-from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind
+from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
@@ -163,7 +163,7 @@ def test_what_is_taken_back_is_gone_and_the_number_is_bounded(world: World) -> N
     assert set(box.keyframe.tolist()) == {keyframe_id(THERE, k) for k in range(4, 12)}, "the oldest make room"
     true = look(2 * np.pi * 8 / 12)
     assert box.find(world.seen(true, rng), {HERE}, 0) is not None
-    box.take_back([Key(int(Kind.CACHED_KEYFRAME), int(keyframe_id(THERE, k))) for k in range(4, 12)])
+    box.take_back([Key(CachedKeyframe.KIND, int(keyframe_id(THERE, k))) for k in range(4, 12)])
     assert len(box) == 0
     assert not box.lies_in(HERE)
     assert box.find(world.seen(true, rng), {HERE}, 0) is None

@@ -17,8 +17,7 @@ from kiteline_basestation.store.keeper import KEEP_NS, Keeper
 from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.store import Batch, Store, StoreError, read
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import KeyframeHeader, messages
 from kiteline_codec.sync.endpoint import SyncConfig
 
 MakeFlight = Callable[..., Any]
@@ -40,7 +39,7 @@ class Flown:
 
 
 def kept_heads(folder: Path) -> int:
-    return sum(key.kind == Kind.KEYFRAME_HEADER for codes in read(folder).agents.values() for key in codes.received)
+    return sum(key.kind == KeyframeHeader.KIND for codes in read(folder).agents.values() for key in codes.received)
 
 
 def test_a_disk_that_refuses_for_a_while_loses_nothing(

@@ -17,7 +17,6 @@ from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.store.state import Scribe
-from kiteline_codec.coding import messages
 from kiteline_codec.schema import (
     CameraIntrinsics,
     CulledLandmarks,
@@ -30,6 +29,7 @@ from kiteline_codec.schema import (
     RefinedLandmarks,
     RemovedObservations,
     SubmapPlacement,
+    messages,
 )
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe

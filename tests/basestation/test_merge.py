@@ -15,7 +15,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import CameraIntrinsics, Key, Kind, Record, SubmapPlacement
+from kiteline_codec.schema import CameraIntrinsics, Key, Record, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import submap_of_keyframe
 
@@ -139,7 +139,7 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     assert mapper.summary()["maps"] == 2
     young = submap_of_keyframe(b.keyframes[0])
     output = mapper.step(MapperInput(((a.agent, ()),)), 10**12)
-    assert output.withdrawn == ((a.agent, Key(int(Kind.SUBMAP_PLACEMENT), young, 0)),)  # its place was the merge's
+    assert output.withdrawn == ((a.agent, Key(SubmapPlacement.KIND, young, 0)),)  # its place was the merge's
     assert young not in mapper.placements and submap_of_keyframe(a.keyframes[0]) in mapper.placements
     assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
 
@@ -164,5 +164,5 @@ def test_an_agent_hears_that_its_map_has_no_place_any_more(make_flight: MakeFlig
     assert station.mapper.merger is not None
     assert station.mapper.merger.split(young)
     station.step({}, (), 100 * STEP_NS)
-    assert theirs[b.agent].take_removed() == [Key(int(Kind.SUBMAP_PLACEMENT), young, 0)]
+    assert theirs[b.agent].take_removed() == [Key(SubmapPlacement.KIND, young, 0)]
     assert not any(isinstance(r, SubmapPlacement) for r in theirs[b.agent].receive((), 0))

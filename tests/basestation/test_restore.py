@@ -21,16 +21,15 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.coding import messages
 from kiteline_codec.schema import (
     CameraIntrinsics,
     FusedLandmarks,
     Key,
     KeyframeHeader,
     KeyframePose,
-    Kind,
     SubmapPlacement,
     WireError,
+    messages,
 )
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3
@@ -176,9 +175,9 @@ def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, St
     )
     index, ids = np.array([5], np.uint16), np.array([nowhere << 11], np.int64)
     far = np.array([2000], np.uint16)
-    head = kept.agents[AgentId(0)].received[Key(Kind.KEYFRAME_HEADER, keyframe)]
+    head = kept.agents[AgentId(0)].received[Key(KeyframeHeader.KIND, keyframe)]
     cases = {
-        "cannot be read": ({Key(Kind.KEYFRAME_HEADER, keyframe): head + b"!"}, {}),
+        "cannot be read": ({Key(KeyframeHeader.KIND, keyframe): head + b"!"}, {}),
         "tells of a keyframe that is not there": ({}, _coded(KeyframePose(nowhere, np.eye(4)))),
         "names points of a keyframe that is not there": ({}, _coded(FusedLandmarks(keyframe, index, ids))),
         "tells of keypoint 2000": ({}, _coded(FusedLandmarks(keyframe, far, ids))),
@@ -202,7 +201,7 @@ def _coded(record: Any) -> dict[Key, bytes]:
 def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     kept = snapshot(first, SavedMap())
-    alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == Kind.KEYFRAME_HEADER)[3]
+    alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == KeyframeHeader.KIND)[3]
     bare = SavedMap({AgentId(2): Codes(kept.agents[AgentId(2)].received, {})})
     checked = sound(spoilt(bare, 2, {}, {}, alone))
     assert checked.faults == ()
@@ -305,7 +304,7 @@ def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFli
     assert all(station.mapper.map.pose(k) is not None for k in flight.keyframes)
     assert contradictions(station.mapper) == []
     assert station.touched is not None
-    heads = {KeyframeId(key.id) for _, ours, key in station.touched if not ours and key.kind == Kind.KEYFRAME_HEADER}
+    heads = {KeyframeId(key.id) for _, ours, key in station.touched if not ours and key.kind == KeyframeHeader.KIND}
     assert heads == set(flight.keyframes[5:12])  # the others were here
 
 
@@ -313,7 +312,7 @@ def test_heads_are_what_they_were(joined: tuple[Agents, Station]) -> None:
     agents, first = joined
     kept = snapshot(first, SavedMap())
     for flight in agents.flights:
-        heads = [k for k in kept.agents[flight.agent].received if k.kind == Kind.KEYFRAME_HEADER]
+        heads = [k for k in kept.agents[flight.agent].received if k.kind == KeyframeHeader.KIND]
         assert sorted(k.id for k in heads) == flight.keyframes
         decoded = messages.decode(heads[0], kept.agents[flight.agent].received[heads[0]])
         assert isinstance(decoded, KeyframeHeader)

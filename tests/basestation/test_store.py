@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from kiteline_basestation.store.saved_map import Codes, SavedMap, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read
-from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
 
 keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
@@ -65,19 +65,19 @@ def test_a_batch_leads_from_one_map_to_the_other(
 
 def test_nothing_is_left_of_a_deleted_submap(tmp_path: Path) -> None:
     doomed, other = submap_id(3, 1, 0), submap_id(3, 1, 1)
-    received = {Key(Kind.KEYFRAME_HEADER, s << SEQUENCE_BITS | 5): b"head" for s in (doomed, other)}
-    received |= {Key(Kind.GRAVITY_ALIGNMENT, s): b"level" for s in (doomed, other)}
-    own = {Key(Kind.REFINED_LANDMARKS, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
+    received = {Key(KeyframeHeader.KIND, s << SEQUENCE_BITS | 5): b"head" for s in (doomed, other)}
+    received |= {Key(GravityAlignment.KIND, s): b"level" for s in (doomed, other)}
+    own = {Key(RefinedLandmarks.KIND, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
     store = Store(tmp_path)
     store.write(batch_of(SavedMap({AgentId(3): Codes(received, own)}), SavedMap()))
     store.write(Batch(deleted=[doomed]))
     left = store.load().agents[AgentId(3)]
     store.close()
     assert set(left.received) == {
-        Key(Kind.KEYFRAME_HEADER, other << SEQUENCE_BITS | 5),
-        Key(Kind.GRAVITY_ALIGNMENT, other),
+        Key(KeyframeHeader.KIND, other << SEQUENCE_BITS | 5),
+        Key(GravityAlignment.KIND, other),
     }
-    assert set(left.own) == {Key(Kind.REFINED_LANDMARKS, other << SEQUENCE_BITS | 5)}
+    assert set(left.own) == {Key(RefinedLandmarks.KIND, other << SEQUENCE_BITS | 5)}
 
 
 def test_a_store_serves_one_base_and_any_number_of_readers(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, plain_pair
-from kiteline_codec.coding import messages
 from kiteline_codec.pacing.profiles import RADIO
 from kiteline_codec.schema import (
     CachedKeyframe,
@@ -27,6 +26,7 @@ from kiteline_codec.schema import (
     LivePose,
     Record,
     SubmapPlacement,
+    messages,
 )
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3

@@ -27,8 +27,8 @@ from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_codec.sync.flights import Flight
 from kiteline_codec.sync.inbox import Inbox, Update
 from kiteline_codec.sync.outbox import Outbox
-from kiteline_codec.sync.packet import Item
 from kiteline_codec.sync.round_trip import RoundTrip
+from kiteline_codec.transport.packet import Item
 
 MS = 1_000_000
 CONFIG = SyncConfig(packet_bytes=160, overhead_bytes=10, budget_bytes=1500, window_packets=16, ack_packets=4)

@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
-from kiteline_codec.coding import messages
 from kiteline_codec.schema import (
     CachedKeyframe,
     CachedLandmarks,
     GridTile,
     Key,
     KeyframePose,
-    Kind,
     Record,
     RemovedObservations,
     SubmapPlacement,
+    messages,
 )
 from kiteline_codec.sync.endpoint import SyncConfig
 from kiteline_core.geometry import se3
@@ -56,7 +55,7 @@ def test_coded_records_arrive_as_the_writer_was_told() -> None:
 def test_values_of_another_schema_are_counted() -> None:
     a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
     a.endpoint.put(Key(50, 1), b"of the future")
-    a.endpoint.put(Key(Kind.KEYFRAME_POSE, 1), b"damaged")
+    a.endpoint.put(Key(KeyframePose.KIND, 1), b"damaged")
     a.put(POSE)
     records, _ = cross(a, b)
     assert len(records) == 1
@@ -100,10 +99,13 @@ def test_a_thin_link_carries_corrections_first_then_copies_then_tiles() -> None:
         now_ns = tick * 50_000_000
         order += [type(r).__name__ for r in b.receive(a.poll(now_ns), now_ns)]
         a.receive(b.poll(now_ns), now_ns)
-    last = {name: max(i for i, n in enumerate(order) if n == name) for name in ("Pose", "Placement", "Copied", "Tile")}
+    last = {
+        name: max(i for i, n in enumerate(order) if n == name)
+        for name in ("KeyframePose", "SubmapPlacement", "CachedLandmarks", "GridTile")
+    }
     first = {name: order.index(name) for name in last}
-    assert max(last["Pose"], last["Placement"]) < first["Copied"]
-    assert last["Copied"] < first["Tile"]
+    assert max(last["KeyframePose"], last["SubmapPlacement"]) < first["CachedLandmarks"]
+    assert last["CachedLandmarks"] < first["GridTile"]
     assert a.arrived(messages.key(CachedKeyframe(KeyframeId(0), SubmapId(0), POSE.T_m_k)))
     a.put(CachedKeyframe(KeyframeId(0), SubmapId(3), POSE.T_m_k))
-    assert not a.arrived(Key(Kind.CACHED_KEYFRAME, 0)), "a newer version is not there yet"
+    assert not a.arrived(Key(CachedKeyframe.KIND, 0)), "a newer version is not there yet"

@@ -12,9 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.schema import (
+    GridTile,
+    Key,
+    KeyframeHeader,
+    KeyframePose,
+    LivePose,
+    NewLandmarks,
+    Observations,
+    RefinedLandmarks,
+    WireError,
+)
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
-from kiteline_codec.sync.packet import parse
+from kiteline_codec.transport.packet import parse
 
 MS = 1_000_000
 PLAIN = SyncConfig(overhead_bytes=0)
@@ -71,7 +81,7 @@ class Pair:
         assert self.a.digests == self.b.digests[::-1]
 
 
-def fill(end: Endpoint, seed: int, n: int, kind: Kind, longest: int = 900) -> dict[Key, bytes]:
+def fill(end: Endpoint, seed: int, n: int, kind: int, longest: int = 900) -> dict[Key, bytes]:
     rng = random.Random(seed)
     values = {Key(kind, 1000 + i): rng.randbytes(rng.randrange(longest)) for i in range(n)}
     for key, code in values.items():
@@ -83,13 +93,13 @@ def fill(end: Endpoint, seed: int, n: int, kind: Kind, longest: int = 900) -> di
 @pytest.mark.parametrize("packet_bytes", [128, 1200, 65536])
 def test_both_sides_agree_whatever_the_link_does(loss: float, packet_bytes: int) -> None:
     pair = Pair(replace(PLAIN, packet_bytes=packet_bytes), loss, (1, 90))
-    ours = fill(pair.a, 1, 40, Kind.NEW_LANDMARKS, 3000)
-    theirs = fill(pair.b, 2, 60, Kind.KEYFRAME_POSE, 20)
+    ours = fill(pair.a, 1, 40, NewLandmarks.KIND, 3000)
+    theirs = fill(pair.b, 2, 60, KeyframePose.KIND, 20)
     pair.run(200)
     for key in list(ours)[::3]:
         pair.a.remove(key)
         del ours[key]
-    ours |= fill(pair.a, 3, 10, Kind.NEW_LANDMARKS)
+    ours |= fill(pair.a, 3, 10, NewLandmarks.KIND)
     pair.settle()
     assert pair.b.peer_values() == ours
     assert pair.a.peer_values() == theirs
@@ -108,7 +118,7 @@ def test_both_sides_agree_whatever_the_link_does(loss: float, packet_bytes: int)
 
 def test_without_loss_little_is_sent_twice() -> None:
     pair = Pair(delay_ms=(5, 30))
-    total = sum(map(len, fill(pair.a, 1, 300, Kind.NEW_LANDMARKS).values()))
+    total = sum(map(len, fill(pair.a, 1, 300, NewLandmarks.KIND).values()))
     pair.settle()
     assert pair.a.stats.bytes_sent < 1.2 * total
 
@@ -117,17 +127,17 @@ def test_the_newest_version_is_what_is_sent() -> None:
     pair = Pair()
     pair.run(50)
     for i in range(100):
-        pair.a.put(Key(Kind.LIVE_POSE, 1), bytes([i]) * 30)
+        pair.a.put(Key(LivePose.KIND, 1), bytes([i]) * 30)
     pair.settle()
-    assert pair.updates[1] == [(Key(Kind.LIVE_POSE, 1), bytes([99]) * 30)]
+    assert pair.updates[1] == [(Key(LivePose.KIND, 1), bytes([99]) * 30)]
 
 
 def test_the_same_code_again_costs_nothing() -> None:
     pair = Pair()
-    pair.a.put(Key(Kind.KEYFRAME_POSE, 1), b"x")
+    pair.a.put(Key(KeyframePose.KIND, 1), b"x")
     pair.settle()
     before = pair.a.stats.bytes_sent
-    pair.a.put(Key(Kind.KEYFRAME_POSE, 1), b"x")
+    pair.a.put(Key(KeyframePose.KIND, 1), b"x")
     assert pair.a.digest_equal
     assert pair.a.poll(pair.now_ns) is None
     assert pair.a.stats.bytes_sent == before
@@ -137,28 +147,28 @@ def test_order_of_sending() -> None:
     pair = Pair()
     pair.run(50)
     for kind, id_, part in (
-        (Kind.GRID_TILE, 9, 0), (Kind.NEW_LANDMARKS, 1, 1), (Kind.NEW_LANDMARKS, 1, 0), (Kind.NEW_LANDMARKS, 2, 0),
-        (Kind.OBSERVATIONS, 2, 0), (Kind.KEYFRAME_HEADER, 1, 0), (Kind.KEYFRAME_POSE, 1, 0), (Kind.LIVE_POSE, 0, 0),
+        (GridTile.KIND, 9, 0), (NewLandmarks.KIND, 1, 1), (NewLandmarks.KIND, 1, 0), (NewLandmarks.KIND, 2, 0),
+        (Observations.KIND, 2, 0), (KeyframeHeader.KIND, 1, 0), (KeyframePose.KIND, 1, 0), (LivePose.KIND, 0, 0),
     ):  # fmt: skip
         pair.a.put(Key(kind, id_, part), b"x" * 100)
     pair.settle()
     got = [(key.kind, key.id, key.part) for key, _ in pair.updates[1]]
     assert got == [
-        (Kind.LIVE_POSE, 0, 0), (Kind.KEYFRAME_POSE, 1, 0), (Kind.KEYFRAME_HEADER, 1, 0), (Kind.NEW_LANDMARKS, 2, 0), (Kind.NEW_LANDMARKS, 1, 0),
-        (Kind.NEW_LANDMARKS, 1, 1), (Kind.OBSERVATIONS, 2, 0), (Kind.GRID_TILE, 9, 0),
+        (LivePose.KIND, 0, 0), (KeyframePose.KIND, 1, 0), (KeyframeHeader.KIND, 1, 0), (NewLandmarks.KIND, 2, 0), (NewLandmarks.KIND, 1, 0),
+        (NewLandmarks.KIND, 1, 1), (Observations.KIND, 2, 0), (GridTile.KIND, 9, 0),
     ]  # fmt: skip
 
 
 def test_nothing_starves() -> None:
     pair = Pair(replace(PLAIN, budget_bytes=4000))
-    pair.a.put(Key(Kind.GRID_TILE, 1), b"t" * 100)
+    pair.a.put(Key(GridTile.KIND, 1), b"t" * 100)
     pair.run(100)
     for i in range(1500):
         for part in range(3):
-            pair.a.put(Key(Kind.NEW_LANDMARKS, i, part), b"b" * 300)
+            pair.a.put(Key(NewLandmarks.KIND, i, part), b"b" * 300)
         pair.step()
-    assert Key(Kind.GRID_TILE, 1) in pair.b.peer_values()
-    assert Key(Kind.NEW_LANDMARKS, 0, 2) in pair.b.peer_values()
+    assert Key(GridTile.KIND, 1) in pair.b.peer_values()
+    assert Key(NewLandmarks.KIND, 0, 2) in pair.b.peer_values()
 
 
 @pytest.mark.parametrize(("budget", "overhead"), [(500, 28), (1000, 28), (8000, 17), (300, 0)])
@@ -166,8 +176,8 @@ def test_the_budget_holds_in_every_window(budget: int, overhead: int) -> None:
     pair = Pair(SyncConfig(budget_bytes=budget, overhead_bytes=overhead), 0.2, (1, 300))
     for i in range(1500):
         if i % 7 == 0:
-            pair.a.put(Key(Kind.LIVE_POSE, 1), i.to_bytes(40, "big"))
-            pair.a.put(Key(Kind.NEW_LANDMARKS, i), random.Random(i).randbytes(700))
+            pair.a.put(Key(LivePose.KIND, 1), i.to_bytes(40, "big"))
+            pair.a.put(Key(NewLandmarks.KIND, i), random.Random(i).randbytes(700))
         pair.step()
     window: deque[tuple[int, int]] = deque()
     total = used = 0
@@ -187,10 +197,10 @@ def test_a_thin_link_carries_the_live_pose_first() -> None:
     pair.run(500)
     ages = []
     for i in range(600):
-        pair.a.put(Key(Kind.NEW_LANDMARKS, i // 20, i % 8), random.Random(i).randbytes(900))
-        pair.a.put(Key(Kind.LIVE_POSE, 1), i.to_bytes(40, "big"))
+        pair.a.put(Key(NewLandmarks.KIND, i // 20, i % 8), random.Random(i).randbytes(900))
+        pair.a.put(Key(LivePose.KIND, 1), i.to_bytes(40, "big"))
         pair.step()
-        live = pair.b.peer_values().get(Key(Kind.LIVE_POSE, 1))
+        live = pair.b.peer_values().get(Key(LivePose.KIND, 1))
         if live is not None:
             ages.append(i - int.from_bytes(live, "big"))
     assert sum(ages) / len(ages) * 10 < 400  # ms
@@ -199,21 +209,21 @@ def test_a_thin_link_carries_the_live_pose_first() -> None:
 def test_long_values_cross_in_fragments() -> None:
     pair = Pair(replace(PLAIN, packet_bytes=128, budget_bytes=20_000), 0.1)
     long = random.Random(0).randbytes(20_000)
-    pair.a.put(Key(Kind.GRID_TILE, 1), long)
+    pair.a.put(Key(GridTile.KIND, 1), long)
     pair.run(300)
     assert pair.b.peer_values() == {}
     assert not pair.b.quiet
     long = long[::-1]
-    pair.a.put(Key(Kind.GRID_TILE, 1), long)
+    pair.a.put(Key(GridTile.KIND, 1), long)
     pair.settle()
-    assert pair.b.peer_values() == {Key(Kind.GRID_TILE, 1): long}
-    assert pair.updates[1] == [(Key(Kind.GRID_TILE, 1), long)]
+    assert pair.b.peer_values() == {Key(GridTile.KIND, 1): long}
+    assert pair.updates[1] == [(Key(GridTile.KIND, 1), long)]
     assert pair.b._in.assembly_bytes == 0
 
 
 def test_removals_are_forgotten_once_they_have_arrived_and_old_packets_do_not_undo_them() -> None:
     pair = Pair()
-    keys = list(fill(pair.a, 1, 30, Kind.KEYFRAME_POSE, 40))
+    keys = list(fill(pair.a, 1, 30, KeyframePose.KIND, 40))
     pair.settle()
     for key in keys:
         pair.a.remove(key)
@@ -229,25 +239,25 @@ def test_removals_are_forgotten_once_they_have_arrived_and_old_packets_do_not_un
 
 def test_what_was_never_sent_is_removed_without_a_word() -> None:
     pair = Pair()
-    pair.a.put(Key(Kind.KEYFRAME_POSE, 1), b"x")
-    pair.a.remove(Key(Kind.KEYFRAME_POSE, 1))
-    pair.a.remove(Key(Kind.KEYFRAME_POSE, 2))
+    pair.a.put(Key(KeyframePose.KIND, 1), b"x")
+    pair.a.remove(Key(KeyframePose.KIND, 1))
+    pair.a.remove(Key(KeyframePose.KIND, 2))
     pair.settle()
     assert pair.updates[1] == []
 
 
 def test_a_base_that_starts_again_gets_everything_again() -> None:
     pair = Pair(loss=0.2)
-    ours = fill(pair.a, 1, 30, Kind.NEW_LANDMARKS)
-    theirs = fill(pair.b, 2, 30, Kind.KEYFRAME_POSE, 20)
+    ours = fill(pair.a, 1, 30, NewLandmarks.KIND)
+    theirs = fill(pair.b, 2, 30, KeyframePose.KIND, 20)
     pair.settle()
     pair.restart(1)
     pair.run(1000)
-    pair.b.put(Key(Kind.KEYFRAME_POSE, 1000), b"new")
+    pair.b.put(Key(KeyframePose.KIND, 1000), b"new")
     pair.settle()
     assert pair.b.peer_values() == ours
     assert pair.a.stats.restarts == 1
-    assert pair.a.peer_values() == {Key(Kind.KEYFRAME_POSE, 1000): b"new"}
+    assert pair.a.peer_values() == {Key(KeyframePose.KIND, 1000): b"new"}
     assert pair.a.legacy_values() == {k: v for k, v in theirs.items() if k.id != 1000}
     pair.a.forget_legacy()
     assert pair.a.stats.legacy == 0
@@ -255,19 +265,19 @@ def test_a_base_that_starts_again_gets_everything_again() -> None:
 
 def test_an_agent_that_starts_again_leaves_its_old_values_readable() -> None:
     pair = Pair(loss=0.2)
-    old = fill(pair.a, 1, 30, Kind.NEW_LANDMARKS)
+    old = fill(pair.a, 1, 30, NewLandmarks.KIND)
     pair.settle()
     pair.restart(0)
-    pair.a.put(Key(Kind.NEW_LANDMARKS, 5), b"new")
+    pair.a.put(Key(NewLandmarks.KIND, 5), b"new")
     pair.settle()
-    assert pair.b.peer_values() == {Key(Kind.NEW_LANDMARKS, 5): b"new"}
+    assert pair.b.peer_values() == {Key(NewLandmarks.KIND, 5): b"new"}
     assert pair.b.legacy_values() == old
     assert pair.b.peer_session == 2
 
 
 def test_packets_of_dead_sessions_change_nothing() -> None:
     pair = Pair()
-    fill(pair.a, 1, 10, Kind.NEW_LANDMARKS)
+    fill(pair.a, 1, 10, NewLandmarks.KIND)
     pair.settle()
     old = [packet for _, packet in pair.sent[0]]
     pair.restart(0)
@@ -310,14 +320,14 @@ def test_another_protocol_version_is_refused_by_name() -> None:
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_states_that_differ_are_found_and_mended(end: int, loss: float) -> None:
     pair = Pair(loss=loss)
-    values = [fill(pair.a, 1, 20, Kind.NEW_LANDMARKS), fill(pair.b, 2, 20, Kind.KEYFRAME_POSE, 30)]
+    values = [fill(pair.a, 1, 20, NewLandmarks.KIND), fill(pair.b, 2, 20, KeyframePose.KIND, 30)]
     pair.settle()
     inbox = pair.ends[end]._in
     first = min(inbox._values)
     inbox._drop_value(first)  # as if memory had been damaged
     inbox._values[Key(60, 1)] = (3, b"never sent")
-    pair.ends[1 - end].put(Key(Kind.LIVE_POSE, 2), b"anything new makes them compare")
-    values[1 - end][Key(Kind.LIVE_POSE, 2)] = b"anything new makes them compare"
+    pair.ends[1 - end].put(Key(LivePose.KIND, 2), b"anything new makes them compare")
+    values[1 - end][Key(LivePose.KIND, 2)] = b"anything new makes them compare"
     inbox.digest.add(Key(60, 1), 3, b"never sent")
     pair.settle()
     assert pair.ends[end].stats.mismatches >= 1
@@ -327,7 +337,7 @@ def test_states_that_differ_are_found_and_mended(end: int, loss: float) -> None:
 
 def test_an_idle_link_carries_only_heartbeats() -> None:
     pair = Pair(SyncConfig())
-    fill(pair.a, 1, 5, Kind.KEYFRAME_POSE, 20)
+    fill(pair.a, 1, 5, KeyframePose.KIND, 20)
     pair.settle()
     pair.run(500)
     before, sent = pair.a.stats.bytes_sent, len(pair.sent[0])
@@ -340,7 +350,7 @@ def test_a_silent_peer_costs_little_and_is_found_again() -> None:
     pair = Pair()
     pair.settle()
     pair.loss = 1.0
-    fill(pair.a, 1, 200, Kind.NEW_LANDMARKS)
+    fill(pair.a, 1, 200, NewLandmarks.KIND)
     pair.run(10_000)
     sent = len(pair.sent[0])
     pair.run(10_000)
@@ -353,9 +363,9 @@ def test_a_silent_peer_costs_little_and_is_found_again() -> None:
 def test_memory_is_bounded_while_there_is_no_peer() -> None:
     a = Endpoint(PLAIN, 1)
     for i in range(5000):
-        a.put(Key(Kind.LIVE_POSE, 1), i.to_bytes(4, "big"), (i % 7,))
-        a.put(Key(Kind.KEYFRAME_POSE, i), b"x")
-        a.remove(Key(Kind.KEYFRAME_POSE, i))
+        a.put(Key(LivePose.KIND, 1), i.to_bytes(4, "big"), (i % 7,))
+        a.put(Key(KeyframePose.KIND, i), b"x")
+        a.remove(Key(KeyframePose.KIND, i))
         a.poll(i * MS)
     out = a._out
     assert len(out) == 1
@@ -365,7 +375,7 @@ def test_memory_is_bounded_while_there_is_no_peer() -> None:
 def test_a_peer_that_sends_too_much_is_refused() -> None:
     pair = Pair()
     pair.ends[1] = Endpoint(replace(PLAIN, max_inbox_bytes=5000), 1)
-    fill(pair.a, 1, 100, Kind.NEW_LANDMARKS)
+    fill(pair.a, 1, 100, NewLandmarks.KIND)
     pair.run(3000)
     assert sum(map(len, pair.b.peer_values().values())) <= 5000
     assert dict(pair.b.stats.reasons)["no memory left for it"] > 0
@@ -386,7 +396,7 @@ def test_any_bytes_are_harmless(packet: bytes) -> None:
 @given(st.integers(0, 1000), st.data())
 def test_damaged_packets_with_a_good_checksum_are_harmless(seed: int, data: st.DataObject) -> None:
     pair = Pair()
-    fill(pair.a, seed, 5, Kind.NEW_LANDMARKS, 2000)
+    fill(pair.a, seed, 5, NewLandmarks.KIND, 2000)
     pair.run(60)
     body = bytearray(data.draw(st.sampled_from([p for _, p in pair.sent[0]]))[:-4])
     for _ in range(data.draw(st.integers(1, 3))):
@@ -400,8 +410,8 @@ def test_the_same_inputs_give_the_same_packets() -> None:
     runs = []
     for _ in range(2):
         pair = Pair(loss=0.3, delay_ms=(1, 50))
-        fill(pair.a, 1, 50, Kind.NEW_LANDMARKS)
-        fill(pair.b, 2, 50, Kind.REFINED_LANDMARKS)
+        fill(pair.a, 1, 50, NewLandmarks.KIND)
+        fill(pair.b, 2, 50, RefinedLandmarks.KIND)
         pair.settle()
         runs.append(pair.sent)
     assert runs[0] == runs[1]
@@ -434,7 +444,7 @@ def test_a_packet_takes_little_time() -> None:
     best = 1e9
     for _ in range(3):
         pair = Pair(delay_ms=(1, 1))
-        fill(pair.a, 1, 1500, Kind.NEW_LANDMARKS, 100)
+        fill(pair.a, 1, 1500, NewLandmarks.KIND, 100)
         start = time.process_time()
         pair.settle()
         best = min(best, (time.process_time() - start) / sum(map(len, pair.sent)))

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_bench.link import fuzz
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import Key
+from kiteline_codec.schema import Key, messages
 
 HERE = Path(__file__).parent
 

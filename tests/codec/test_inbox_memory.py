@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import random
 
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import (
+    CulledLandmarks,
+    FusedLandmarks,
+    Key,
+    KeyframePose,
+    RefinedLandmarks,
+    RemovedObservations,
+)
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 100_000
 KINDS = (
-    Kind.KEYFRAME_POSE,
-    Kind.REFINED_LANDMARKS,
-    Kind.FUSED_LANDMARKS,
-    Kind.REMOVED_OBSERVATIONS,
-    Kind.CULLED_LANDMARKS,
+    KeyframePose.KIND,
+    RefinedLandmarks.KIND,
+    FusedLandmarks.KIND,
+    RemovedObservations.KIND,
+    CulledLandmarks.KIND,
 )
 
 
@@ -57,10 +64,8 @@ def test_memory_is_bounded_and_the_two_sides_agree() -> None:
     assert most <= LIMIT + pages
     assert line.b.stats.values == 1500
     line.say(3)  # an old one is corrected
-    assert line.b.peer_value(Key(int(Kind.REFINED_LANDMARKS), 3)) == line.a.own_value(
-        Key(int(Kind.REFINED_LANDMARKS), 3)
-    )
-    line.a.remove(Key(int(Kind.FUSED_LANDMARKS), 7))
+    assert line.b.peer_value(Key(RefinedLandmarks.KIND, 3)) == line.a.own_value(Key(RefinedLandmarks.KIND, 3))
+    line.a.remove(Key(FusedLandmarks.KIND, 7))
     line.settle()
     assert line.b.peer_values() == line.a.own_values()
     assert line.b._in.resident_bytes <= LIMIT + pages

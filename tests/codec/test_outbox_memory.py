@@ -6,14 +6,14 @@ import random
 
 import pytest
 
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import Key, KeyframeHeader, LivePose, NewLandmarks, Observations
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
-from kiteline_codec.sync.packet import parse
+from kiteline_codec.transport.packet import parse
 from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 200_000
-LIVE = Key(Kind.LIVE_POSE, 0)
+LIVE = Key(LivePose.KIND, 0)
 
 
 class Line:
@@ -48,10 +48,10 @@ class Line:
 
     def keyframe(self) -> None:
         k, self.keyframes = self.keyframes, self.keyframes + 1
-        self.a.put(Key(Kind.KEYFRAME_HEADER, k), self.draw.randbytes(26))
+        self.a.put(Key(KeyframeHeader.KIND, k), self.draw.randbytes(26))
         for part in range(7):
-            self.a.put(Key(Kind.NEW_LANDMARKS, k, part), self.draw.randbytes(300))
-        self.a.put(Key(Kind.OBSERVATIONS, k), self.draw.randbytes(150))
+            self.a.put(Key(NewLandmarks.KIND, k, part), self.draw.randbytes(300))
+        self.a.put(Key(Observations.KIND, k), self.draw.randbytes(150))
 
 
 def test_what_was_written_while_the_link_was_down_arrives() -> None:
@@ -62,7 +62,7 @@ def test_what_was_written_while_the_link_was_down_arrives() -> None:
     assert line.a.stats.archived > 2500
     line.now_ns += 2 * 10**9
     first = line.run(1, up=True, flying=False)[0]
-    assert parse(first, 1 << 20)[1][0].key.kind == Kind.LIVE_POSE  # the pose leaves before anything else
+    assert parse(first, 1 << 20)[1][0].key.kind == LivePose.KIND  # the pose leaves before anything else
     line.run(400, up=True, flying=False)
     assert line.a.digest_equal
     assert line.b.peer_values()[LIVE] != before
@@ -92,7 +92,7 @@ def test_on_a_thin_link_old_values_do_not_starve() -> None:
     for _ in range(4):
         line.run(100, up=True)
     assert (
-        min(k.id for k in line.a.own_values() if k not in line.b.peer_values() and k.kind == Kind.KEYFRAME_HEADER) > 32
+        min(k.id for k in line.a.own_values() if k not in line.b.peer_values() and k.kind == KeyframeHeader.KIND) > 32
     )  # 25 came before the gap
     line.run(4000, up=True, flying=False)
     assert line.b.peer_values() == line.a.own_values()
@@ -109,12 +109,12 @@ def test_without_a_place_for_them_old_values_are_given_up_by_worth() -> None:
     assert line.b.stats.mismatches == 0
     held = line.b.peer_values()
     late = range(line.keyframes - 5, line.keyframes)
-    assert all(Key(Kind.KEYFRAME_HEADER, k) in held for k in late)
-    whole = [k for k in range(line.keyframes) if Key(Kind.NEW_LANDMARKS, k, 6) in held]
+    assert all(Key(KeyframeHeader.KIND, k) in held for k in late)
+    whole = [k for k in range(line.keyframes) if Key(NewLandmarks.KIND, k, 6) in held]
     assert whole[-1] == line.keyframes - 1
-    described = sum(Key(Kind.NEW_LANDMARKS, k, 0) in held for k in range(line.keyframes))
+    described = sum(Key(NewLandmarks.KIND, k, 0) in held for k in range(line.keyframes))
     assert described > len(whole)
-    assert len([k for k in held if k.kind == Kind.KEYFRAME_HEADER]) > described
+    assert len([k for k in held if k.kind == KeyframeHeader.KIND]) > described
 
 
 def test_a_base_that_begins_anew_gets_what_is_left() -> None:
@@ -127,9 +127,9 @@ def test_a_base_that_begins_anew_gets_what_is_left() -> None:
     assert line.a.digest_equal
     assert line.a.stats.dropped > 0
     assert line.b.peer_values() == line.a.own_values()
-    line.a.put(Key(Kind.KEYFRAME_HEADER, 0), b"anew")
+    line.a.put(Key(KeyframeHeader.KIND, 0), b"anew")
     line.run(100, up=True, flying=False)
-    assert line.b.peer_values()[Key(Kind.KEYFRAME_HEADER, 0)] == b"anew"
+    assert line.b.peer_values()[Key(KeyframeHeader.KIND, 0)] == b"anew"
 
 
 @pytest.mark.parametrize("spill", [Memory(forgets=5), Memory(room=100_000), Memory(room=0)])

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.coding import packing_kernels, ranges
+from kiteline_codec.coding import packing_kernels
 from kiteline_codec.coding.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
 from kiteline_codec.schema import WireError
+from kiteline_codec.sync import ranges
 
 
 @given(st.integers(0, (1 << 63) - 1), st.integers(-(1 << 62), 1 << 62))

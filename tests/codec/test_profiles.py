@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.coding import messages
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, RADIO, WIFI, Profile
 from kiteline_codec.pacing.throughput import Throughput
-from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations
+from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations, messages
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_core.imaging import descriptors
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.coding.record_log import read_record, write_record
 from kiteline_codec.schema import Key, WireError
+from kiteline_codec.schema.record_log import read_record, write_record
 from kiteline_core.ids import AgentId
 
 keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))

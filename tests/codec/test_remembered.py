@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.schema import Key, NewLandmarks, RefinedLandmarks, WireError
 from kiteline_codec.sync import remembered
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_core.ids import keyframe_id, submap_id
@@ -24,7 +24,7 @@ def values(boot: int, seed: int = 0) -> dict[Key, bytes]:
     random = np.random.default_rng(seed)
     submap = submap_id(1, boot, 0)
     ids = [keyframe_id(submap, i) for i in range(30)]
-    return {Key(Kind.NEW_LANDMARKS, k, part): random.bytes(400) for k in ids for part in range(3)}
+    return {Key(NewLandmarks.KIND, k, part): random.bytes(400) for k in ids for part in range(3)}
 
 
 def talk(a: Endpoint, b: Endpoint, begin_ns: int, steps: int = 60, lose: float = 0.0, seed: int = 0) -> int:
@@ -77,7 +77,7 @@ def test_only_what_is_missing_or_new_goes_whole() -> None:
 
 def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> None:
     agent, base, again = end(5), end(1), end(2)
-    own = {Key(Kind.REFINED_LANDMARKS, keyframe_id(submap_id(1, 4, 0), i)): bytes([i]) * 300 for i in range(40)}
+    own = {Key(RefinedLandmarks.KIND, keyframe_id(submap_id(1, 4, 0), i)): bytes([i]) * 300 for i in range(40)}
     for side in (base, again):
         for key, code in own.items():
             side.put(key, code)

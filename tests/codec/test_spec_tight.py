@@ -14,9 +14,8 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from kiteline_codec.coding import messages
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, Kind, Observations
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, Observations, messages
 
 
 def load(name: str) -> ModuleType:
@@ -160,7 +159,7 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
         on_way |= {k: heads[k][0] for k in above + down[:-1]}
     if ways:
         used += [on_way[k] for k in sorted(on_way)]
-        used.append(next(v for k, (v, _) in values.items() if k.kind == Kind.CAMERA_INTRINSICS))
+        used.append(next(v for k, (v, _) in values.items() if k.kind == CameraIntrinsics.KIND))
     camera = next(r.camera for r in records.values() if isinstance(r, CameraIntrinsics))
     seen = [foresee(b, ways[a], camera) if b else None for a, b in births]
     steps = s.u8()
@@ -187,12 +186,12 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
     return columns, used, s
 
 
-@pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != Kind.KEYFRAME_HEADER or key.id % 64 < 5])
+@pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != KeyframeHeader.KIND or key.id % 64 < 5])
 def test_sightings(held: Callable[[Key], bool]) -> None:
     values = TIGHT.coded(TIGHT.flight(7, keyframes=6, births=40))
     compared = 0
     for key, (_, code) in values.items():
-        if key.kind != Kind.OBSERVATIONS:
+        if key.kind != Observations.KIND:
             continue
         known = {k: v for k, v in values.items() if held(k)}
         form = Tightener().shrink(key, code, known.get, values.get)
@@ -215,7 +214,7 @@ def test_sightings(held: Callable[[Key], bool]) -> None:
 def test_births() -> None:
     values = TIGHT.coded(TIGHT.flight(7, keyframes=1, births=40))
     for key, (_, code) in values.items():
-        if key.kind != Kind.NEW_LANDMARKS:
+        if key.kind != NewLandmarks.KIND:
             continue
         form = Tightener().shrink(key, code, {}.get, {}.get)
         assert form is not None

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import messages, quantise
+from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.residuals import prediction_kernels as foresee_kernels
 from kiteline_codec.residuals import predictors as references
@@ -21,12 +21,12 @@ from kiteline_codec.schema import (
     CameraIntrinsics,
     Key,
     KeyframeHeader,
-    Kind,
     NewLandmarks,
     Observations,
     Record,
     RefinedLandmarks,
     WireError,
+    messages,
 )
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_core.geometry import se3
@@ -151,7 +151,7 @@ def test_another_version_of_what_a_form_builds_upon_is_refused() -> None:
     code = values[key][1]
     form = Tightener().shrink(key, code, values.get, values.get)
     assert form is not None
-    for other in [k for k in values if k.kind in (Kind.KEYFRAME_HEADER, Kind.NEW_LANDMARKS, Kind.CAMERA_INTRINSICS)]:
+    for other in [k for k in values if k.kind in (KeyframeHeader.KIND, NewLandmarks.KIND, CameraIntrinsics.KIND)]:
         changed = {**values, other: (99, values[other][1])}
         missing = {k: v for k, v in values.items() if k != other}
         refused = 0
@@ -296,7 +296,7 @@ def test_a_refused_form_is_followed_by_the_code_itself() -> None:
     for record in records[:-1]:
         a.put(messages.key(record), messages.encode(record))
     run(2000)
-    for key in [k for k in b._in._values if k.kind == Kind.NEW_LANDMARKS]:
+    for key in [k for k in b._in._values if k.kind == NewLandmarks.KIND]:
         version, code = b._in._values[key]
         b._in._values[key] = (version + 1000, code)  # as if they were other versions
     a.put(messages.key(records[-1]), messages.encode(records[-1]))

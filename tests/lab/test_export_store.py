@@ -12,8 +12,7 @@ import pytest
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.saved_map import Codes, SavedMap
 from kiteline_basestation.store.store import FILE, Store, StoreError, batch_of
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement, messages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id

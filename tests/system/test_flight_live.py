@@ -20,8 +20,7 @@ import pytest
 
 from kiteline_basestation.store.integrity import sound
 from kiteline_basestation.store.store import FILE, StoreError, read
-from kiteline_codec.coding import record_log
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import KeyframeHeader, record_log
 from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, read_frame
@@ -128,7 +127,7 @@ def test_agent_and_base_meet_and_a_killed_base_resumes(recording: Path, tmp_path
 def heads(store: Path) -> int:
     """How many keyframes a store holds; none before it has its tables."""
     try:
-        return sum(key.kind == Kind.KEYFRAME_HEADER for codes in read(store).agents.values() for key in codes.received)
+        return sum(key.kind == KeyframeHeader.KIND for codes in read(store).agents.values() for key in codes.received)
     except StoreError:
         return 0
 
@@ -225,7 +224,7 @@ def test_a_second_base_takes_over_with_a_copy_of_the_store_or_with_none(
         assert agent.wait(40.0) == 0
         with LogReader(tmp_path / how / "log" / "agent0" / "boot00001.mcap") as log:
             said = {record_log.read_record(m.blob())[1] for m in log.messages((record_log.TOPIC,))}
-        made = sum(key.kind == Kind.KEYFRAME_HEADER for key in said)
+        made = sum(key.kind == KeyframeHeader.KIND for key in said)
         wait_for("all keyframes", lambda second=second, made=made: heads(second / FILE) == made)  # type: ignore[misc]
         stop(again)
         assert made > held >= 2

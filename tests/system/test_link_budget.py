@@ -8,7 +8,7 @@ from collections import deque
 import pytest
 
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import Key, LivePose, NewLandmarks, RefinedLandmarks
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, seal_bytes, suite_for
 from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
@@ -43,9 +43,9 @@ def test_no_second_exceeds_the_budget(link: str, budget: int) -> None:
         now_ns = tick * 37_000_000
         if tick % 40 == 0:
             for part in range(6):
-                ends[0].endpoint.put(Key(Kind.NEW_LANDMARKS, tick, part), draw.randbytes(draw.randrange(20, 400)))
-            ends[1].endpoint.put(Key(Kind.REFINED_LANDMARKS, tick), draw.randbytes(300))
-        ends[0].endpoint.put(Key(Kind.LIVE_POSE, 0), draw.randbytes(29))
+                ends[0].endpoint.put(Key(NewLandmarks.KIND, tick, part), draw.randbytes(draw.randrange(20, 400)))
+            ends[1].endpoint.put(Key(RefinedLandmarks.KIND, tick), draw.randbytes(300))
+        ends[0].endpoint.put(Key(LivePose.KIND, 0), draw.randbytes(29))
         for i, end in enumerate(ends):
             for packet in end.poll(now_ns):
                 sealed = sealers[i].seal(packet)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import time
 
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import Key, KeyframePose, NewLandmarks
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_codec.transport.framing import Deframer, frame
 from kiteline_hw.links.open import Framing, open_link
@@ -35,8 +35,8 @@ def test_endpoints_agree_over_a_noisy_serial_line() -> None:
         down = hub.links()[1]
         try:
             for i in range(60):
-                agent.put(Key(Kind.NEW_LANDMARKS, i), draw.randbytes(draw.randrange(1, 900)))
-                base.put(Key(Kind.KEYFRAME_POSE, i), draw.randbytes(20))
+                agent.put(Key(NewLandmarks.KIND, i), draw.randbytes(draw.randrange(1, 900)))
+                base.put(Key(KeyframePose.KIND, i), draw.randbytes(20))
             end_s = time.monotonic() + 20.0
             while not (agent.quiet and base.quiet and agent.digest_equal and base.digest_equal):
                 assert time.monotonic() < end_s, (agent.stats, base.stats)

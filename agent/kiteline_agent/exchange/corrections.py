@@ -21,7 +21,6 @@ from kiteline_codec.schema import (
     GridTile,
     Key,
     KeyframePose,
-    Kind,
     Record,
     RefinedLandmarks,
     RemovedObservations,
@@ -72,7 +71,7 @@ class Corrections:
             self._compare()
         self._window.take_back(removed)
         for key in removed:
-            if key.kind == Kind.SUBMAP_PLACEMENT:  # the map was taken out of a larger one, and has no place any more
+            if key.kind == SubmapPlacement.KIND:  # the map was taken out of a larger one, and has no place any more
                 self._S_w_m.pop(SubmapId(key.id), None)
                 self._placed.discard(SubmapId(key.id))
         if touched:

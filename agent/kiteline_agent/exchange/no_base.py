@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kiteline_codec.coding import messages
 from kiteline_codec.pacing.profiles import EXACT
-from kiteline_codec.schema import Key, LivePose, Record
+from kiteline_codec.schema import Key, LivePose, Record, messages
 
 
 class NoBaseChannel:

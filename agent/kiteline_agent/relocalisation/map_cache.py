@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import MapCacheConfig
 from kiteline_agent.keyframes.policy import NewPoints
 from kiteline_agent.local_map import projection_kernels as kernels
-from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind
+from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
@@ -133,7 +133,7 @@ class MapCache:
     def take_back(self, keys: Sequence[Key]) -> None:
         """Copies that the base wants back."""
         for key in keys:
-            if key.kind == Kind.CACHED_KEYFRAME:
+            if key.kind == CachedKeyframe.KIND:
                 for slot in np.flatnonzero(self.keyframe == key.id).tolist():
                     self._clear(slot)
 

@@ -13,7 +13,7 @@ from kiteline_agent.runtime.frame_counts import live_line, odometry_line
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.step import Estimate, StepInput, StepOutput
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.coding import record_log
+from kiteline_codec.schema import record_log
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 

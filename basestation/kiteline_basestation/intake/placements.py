@@ -15,7 +15,7 @@ from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
@@ -115,7 +115,7 @@ class World:
             else:
                 del self.placements[submap]
                 self._publisher.forget_place(submap)
-                self._withdrawn.append((agent_of_submap(submap), Key(int(Kind.SUBMAP_PLACEMENT), int(submap), 0)))
+                self._withdrawn.append((agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0)))
 
     def lay_out(self, map_id: SubmapId) -> None:
         """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place. A map in

@@ -11,7 +11,6 @@ from kiteline_codec.schema import (
     CulledLandmarks,
     FusedLandmarks,
     KeyframePose,
-    Kind,
     Record,
     RefinedLandmarks,
     RemovedObservations,
@@ -33,11 +32,11 @@ class Publisher:
         self._dirty: set[tuple[int, KeyframeId]] = set()
         self._records: list[tuple[AgentId, Record]] = []
 
-    def touch(self, kind: Kind, keyframe: KeyframeId) -> None:
+    def touch(self, kind: int, keyframe: KeyframeId) -> None:
         """A value of a keyframe has changed."""
         self._dirty.add((int(kind), keyframe))
 
-    def touch_slots(self, kind: Kind, slots: I32) -> None:
+    def touch_slots(self, kind: int, slots: I32) -> None:
         """Values of the keyframes that own these slots have changed."""
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
             self.touch(kind, KeyframeId(keyframe))
@@ -62,34 +61,34 @@ class Publisher:
         for agent, record in self._records:
             out.setdefault(agent, []).append(record)
         for kind, keyframe in sorted(self._dirty):
-            made = self._record(Kind(kind), keyframe)
+            made = self._record(kind, keyframe)
             if made is not None:
                 out.setdefault(agent_of_keyframe(keyframe), []).append(made)
         self._records.clear()
         self._dirty.clear()
         return tuple((agent, tuple(records)) for agent, records in sorted(out.items()))
 
-    def _record(self, kind: Kind, keyframe: KeyframeId) -> Record | None:
+    def _record(self, kind: int, keyframe: KeyframeId) -> Record | None:
         sparse_map, table = self._map, self._map.keypoints
         slots = sparse_map.slots_of(keyframe)
         row = sparse_map.rows[keyframe]
         born = table.kind[slots] == LANDMARK
-        if kind is Kind.KEYFRAME_POSE:
+        if kind == KeyframePose.KIND:
             if sparse_map.keyframes.pose_source[row] != REFINED_POSE:
                 return None
             return KeyframePose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
-        if kind is Kind.REFINED_LANDMARKS:
+        if kind == RefinedLandmarks.KIND:
             here = slots[born & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)]
             return RefinedLandmarks(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
-        if kind is Kind.FUSED_LANDMARKS:
+        if kind == FusedLandmarks.KIND:
             here = slots[born & (table.root[slots] != slots)]
             return FusedLandmarks(keyframe, self._index(here), sparse_map.point_ids(table.root[here]))
-        if kind is Kind.REMOVED_OBSERVATIONS:
+        if kind == RemovedObservations.KIND:
             return RemovedObservations(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
-        if kind is Kind.CULLED_LANDMARKS:
+        if kind == CulledLandmarks.KIND:
             here = slots[born & (table.flags[slots] & CULLED != 0)]
             return CulledLandmarks(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
-        raise ValueError(f"the base writes no {kind.name} of a keyframe")
+        raise ValueError(f"the base writes record of kind {kind} for a keyframe")
 
     def _index(self, slots: I32) -> NDArray[np.uint16]:
         return self._map.keypoint_of(slots).astype(np.uint16)

@@ -16,7 +16,7 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
 from kiteline_basestation.merging.loop_edges import depth_of, edge_of
 from kiteline_basestation.merging.loop_verification import LoopMatch
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
 
@@ -118,7 +118,7 @@ def move_keyframes(
         turned = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)
         if moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, goal[keyframe])
-            publisher.touch(Kind.KEYFRAME_POSE, keyframe)
+            publisher.touch(KeyframePose.KIND, keyframe)
     return largest
 
 
@@ -156,7 +156,7 @@ def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher:
     known = (table.kind[slots] == LANDMARK) & (inverse > 0.0)
     if known.any():
         sparse_map.set_depths(slots[known], (inverse[known] / factor).astype(np.float32), offset[known])
-        publisher.touch(Kind.REFINED_LANDMARKS, keyframe)
+        publisher.touch(RefinedLandmarks.KIND, keyframe)
 
 
 def whole_window(

@@ -31,7 +31,7 @@ from kiteline_basestation.refinement.odometry_links import with_links, without_l
 from kiteline_basestation.runtime.jobs import BundleInputs, Job, JobDone
 from kiteline_basestation.store import merger_state as merger_state
 from kiteline_basestation.store.state import Memory
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import FusedLandmarks
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleConfig, BundleResult
@@ -390,7 +390,7 @@ class MapMerger:
         roots = table.root[: sparse_map.slots]
         crossing = np.flatnonzero((roots >= 0) & (inside != inside[np.maximum(roots, 0)])).astype(np.int32)
         sparse_map.part(crossing[table.kind[crossing] == LANDMARK])
-        self._publisher.touch_slots(Kind.FUSED_LANDMARKS, crossing[table.kind[crossing] == LANDMARK])
+        self._publisher.touch_slots(FusedLandmarks.KIND, crossing[table.kind[crossing] == LANDMARK])
         for submap, frame in merge.moved.items():
             sparse_map.root_submaps.pop(submap, None)
             if submap != merge.eldest:

@@ -12,7 +12,7 @@ from kiteline_basestation.map.covisibility import Window
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import CulledLandmarks, KeyframePose, RefinedLandmarks, RemovedObservations
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
@@ -51,7 +51,7 @@ def _poses(
         first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # said once, so that an older base's value goes
         if first or moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, new)
-            publisher.touch(Kind.KEYFRAME_POSE, keyframe)
+            publisher.touch(KeyframePose.KIND, keyframe)
 
 
 def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher: Publisher) -> None:
@@ -68,7 +68,7 @@ def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher
         keyframe = KeyframeId(int(table.id[row]))
         moved = table.T_w_k[window.rows[i]] @ np.linalg.inv(before[i]) @ table.T_w_k[row]
         sparse_map.set_world_pose(keyframe, se3.orthonormalise(moved))
-        publisher.touch(Kind.KEYFRAME_POSE, keyframe)
+        publisher.touch(KeyframePose.KIND, keyframe)
 
 
 def _observations(
@@ -82,7 +82,7 @@ def _observations(
     bad = window.slots[~result.inlier & current]
     if len(bad):
         sparse_map.set_flags(bad, REMOVED)
-        publisher.touch_slots(Kind.REMOVED_OBSERVATIONS, bad)
+        publisher.touch_slots(RemovedObservations.KIND, bad)
     left = np.diff(sparse_map.observations(window.points)[0])
     dropped = np.asarray((left < cull.min_observations) & (table.root[window.points] == window.points))
     drop_points(sparse_map, window.points[dropped], publisher)
@@ -108,7 +108,7 @@ def _points(
     moved = points[change > publish.depth_px]
     if len(moved):
         sparse_map.set_depths(moved, inv[change > publish.depth_px], offset[change > publish.depth_px])
-        publisher.touch_slots(Kind.REFINED_LANDMARKS, moved)
+        publisher.touch_slots(RefinedLandmarks.KIND, moved)
 
 
 def keep_units(
@@ -155,4 +155,4 @@ def drop_points(sparse_map: SparseMap, points: I32, publisher: Publisher) -> Non
     points = points[sparse_map.keypoints.kind[points] == LANDMARK]
     if len(points):
         sparse_map.set_flags(points, CULLED)
-        publisher.touch_slots(Kind.CULLED_LANDMARKS, points)
+        publisher.touch_slots(CulledLandmarks.KIND, points)

@@ -11,7 +11,7 @@ from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.apply_bundle import drop_points
 from kiteline_basestation.refinement.refind import foresee
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import CulledLandmarks
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 
 
@@ -50,7 +50,7 @@ def cull_redundant(
             sparse_map, other, config
         ):
             sparse_map.cull_keyframe(other)
-            publisher.touch(Kind.CULLED_LANDMARKS, other)
+            publisher.touch(CulledLandmarks.KIND, other)
             out.append(other)
     return out
 

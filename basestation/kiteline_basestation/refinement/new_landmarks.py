@@ -16,7 +16,7 @@ from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import refind_kernels as kernels
 from kiteline_basestation.refinement.refind import descriptors, fuse
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import RefinedLandmarks
 from kiteline_core.geometry.se3 import skew
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
 from kiteline_core.ids import KeyframeId
@@ -117,7 +117,7 @@ def _make(
 def _set(sparse_map: SparseMap, points: I32, position: F64, publisher: Publisher) -> int:
     inverse, offset, ahead = sparse_map.bearing_of(points, position)
     sparse_map.set_depths(points[ahead], inverse[ahead], offset[ahead])
-    publisher.touch_slots(Kind.REFINED_LANDMARKS, points[ahead])
+    publisher.touch_slots(RefinedLandmarks.KIND, points[ahead])
     return int(np.count_nonzero(ahead))
 
 

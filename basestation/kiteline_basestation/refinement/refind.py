@@ -16,7 +16,7 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE, REFIN
 from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import refind_kernels as kernels
-from kiteline_codec.schema import Kind
+from kiteline_codec.schema import FusedLandmarks, RefinedLandmarks
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.imaging.descriptors import comparable
 
@@ -144,9 +144,9 @@ def fuse(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
         if not ahead[0]:
             return False
         sparse_map.set_depths(one, inverse, offset)
-        publisher.touch_slots(Kind.REFINED_LANDMARKS, one)
+        publisher.touch_slots(RefinedLandmarks.KIND, one)
     if sparse_map.keypoints.flags[child] & REFINED:
-        publisher.touch_slots(Kind.REFINED_LANDMARKS, np.array([child], np.int32))  # it leaves its keyframe's table
+        publisher.touch_slots(RefinedLandmarks.KIND, np.array([child], np.int32))  # it leaves its keyframe's table
     for keyframe in sparse_map.fuse(int(child), int(parent)):
-        publisher.touch(Kind.FUSED_LANDMARKS, keyframe)
+        publisher.touch(FusedLandmarks.KIND, keyframe)
     return True

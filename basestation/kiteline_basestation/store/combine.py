@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 
 from kiteline_basestation.store.saved_map import Codes, SavedMap
-from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.schema import WORLD_KINDS, Key, KeyframeHeader, WireError
 from kiteline_core.ids import AgentId
 
 _NUMBERED = ("edge", "merge")
@@ -23,7 +23,7 @@ def combine(first: SavedMap, second: SavedMap) -> SavedMap:
     new: list[int] = []
     for agent, codes in sorted(second.agents.items()):
         here = agents.get(agent, Codes({}, {}))
-        heads = {key for key in codes.received if key.kind == Kind.KEYFRAME_HEADER}
+        heads = {key for key in codes.received if key.kind == KeyframeHeader.KIND}
         for key in heads:
             if here.received.get(key, codes.received[key]) != codes.received[key]:
                 raise WireError(
@@ -40,7 +40,7 @@ def combine(first: SavedMap, second: SavedMap) -> SavedMap:
 
 
 def _is_news(key: Key, known: set[int]) -> bool:
-    return key.kind not in (Kind.SUBMAP_PLACEMENT, Kind.GRID_TILE) and key.id not in known
+    return key.kind not in WORLD_KINDS and key.id not in known
 
 
 def _combined(first: Mapping[str, str], second: Mapping[str, str], new: list[int]) -> dict[str, str]:

@@ -14,15 +14,14 @@ import numpy as np
 from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.store.saved_map import Codes, SavedMap
-from kiteline_codec.coding import messages
 from kiteline_codec.schema import (
+    RECORD_TYPES,
     CulledLandmarks,
     FusedLandmarks,
     GravityAlignment,
     Key,
     KeyframeHeader,
     KeyframePose,
-    Kind,
     NewLandmarks,
     Observations,
     Record,
@@ -31,6 +30,7 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     SubmapScale,
     WireError,
+    messages,
 )
 from kiteline_core.ids import (
     KEYPOINT_BITS,
@@ -97,10 +97,8 @@ def sound(kept: SavedMap) -> Checked:
 
 
 def _name(key: Key) -> str:
-    try:
-        kind = Kind(key.kind).name.lower()
-    except ValueError:
-        kind = f"kind {key.kind}"
+    record_type = RECORD_TYPES.get(key.kind)
+    kind = f"kind {key.kind}" if record_type is None else record_type.__name__
     return f"{kind} {key.id}" + (f" part {key.part}" if key.part else "")
 
 

@@ -21,8 +21,7 @@ from kiteline_basestation.store.state import Scribe
 from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read, submap_of
 from kiteline_basestation.supply.supply import is_copy
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.coding import record_log
-from kiteline_codec.schema import Key
+from kiteline_codec.schema import Key, record_log
 from kiteline_core.ids import AgentId, SubmapId
 from kiteline_hw.logs.mcap_log import LogMessage, LogReader
 

@@ -9,8 +9,7 @@ from kiteline_basestation.store.integrity import Checked, contradictions, sound
 from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.supply.supply import is_copy
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import WireError
+from kiteline_codec.schema import WireError, messages
 
 
 @dataclass(frozen=True, slots=True)

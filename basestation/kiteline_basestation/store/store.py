@@ -20,17 +20,13 @@ from pathlib import Path
 from typing import IO
 
 from kiteline_basestation.store.saved_map import Codes, SavedMap
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import KEYFRAME_KINDS, SUBMAP_KINDS, Key
 from kiteline_core.errors import KitelineError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
 _APPLICATION = 0x6B6C6D70  # "klmp"
 _VERSION = 2  # of the tables; a store of another version is refused
-_OF_KEYFRAMES = (
-    Kind.KEYFRAME_HEADER, Kind.NEW_LANDMARKS, Kind.OBSERVATIONS, Kind.KEYFRAME_POSE, Kind.REFINED_LANDMARKS, Kind.FUSED_LANDMARKS, Kind.REMOVED_OBSERVATIONS, Kind.CULLED_LANDMARKS,
-)  # fmt: skip
-_OF_SUBMAPS = (Kind.GRAVITY_ALIGNMENT, Kind.SUBMAP_PLACEMENT)
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
 _TABLES = """
 CREATE TABLE code (
@@ -43,9 +39,9 @@ CREATE TABLE memory (name TEXT PRIMARY KEY, text TEXT NOT NULL) WITHOUT ROWID;
 
 def submap_of(key: Key) -> SubmapId | None:
     """The submap of which a value tells; None where it tells of none."""
-    if key.kind in _OF_KEYFRAMES:
+    if key.kind in KEYFRAME_KINDS:
         return SubmapId(key.id >> SEQUENCE_BITS)
-    return SubmapId(key.id) if key.kind in _OF_SUBMAPS else None
+    return SubmapId(key.id) if key.kind in SUBMAP_KINDS else None
 
 
 Row = tuple[int, int, int, int, int, bytes]
@@ -120,12 +116,12 @@ class Store:
     def _delete(self, submap: SubmapId) -> None:
         agent, first, end = agent_of_submap(submap), submap << SEQUENCE_BITS, (submap + 1) << SEQUENCE_BITS
         for own in (0, 1):
-            for kind in _OF_KEYFRAMES:
+            for kind in KEYFRAME_KINDS:
                 self._db.execute(
                     "DELETE FROM code WHERE agent = ? AND own = ? AND kind = ? AND id >= ? AND id < ?",
                     (int(agent), own, int(kind), first, end),
                 )
-            for kind in _OF_SUBMAPS:
+            for kind in SUBMAP_KINDS:
                 self._db.execute(
                     "DELETE FROM code WHERE agent = ? AND own = ? AND kind = ? AND id = ?",
                     (int(agent), own, int(kind), int(submap)),

@@ -16,8 +16,7 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_detector import Shares
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key, Kind, LivePose
+from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, Key, LivePose, messages
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
@@ -251,4 +250,4 @@ def _arrived(lent: _Lent, channel: RecordChannel) -> bool:
 
 def is_copy(key: Key) -> bool:
     """Whether a key is one of a copy: those are lent anew by each base."""
-    return key.kind in (Kind.CACHED_KEYFRAME, Kind.CACHED_LANDMARKS)
+    return key.kind in CACHED_KINDS

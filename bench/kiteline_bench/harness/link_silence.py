@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import Key, KeyframeHeader, LivePose, NewLandmarks, Observations
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
@@ -17,7 +17,7 @@ _MINUTE_NS = 60_000_000_000
 _TICK_NS = 50_000_000
 _UP_MINUTES = 10
 _GIVE_UP_MINUTES = 5
-_LIVE = Key(Kind.LIVE_POSE, 0)
+_LIVE = Key(LivePose.KIND, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def silence(folder: Path, minutes: int) -> Silence:
 
 def keyframe(agent: Endpoint, number: int, draw: random.Random) -> None:
     """Share a keyframe of 8 kB."""
-    agent.put(Key(Kind.KEYFRAME_HEADER, number), draw.randbytes(26))
+    agent.put(Key(KeyframeHeader.KIND, number), draw.randbytes(26))
     for part in range(7):
-        agent.put(Key(Kind.NEW_LANDMARKS, number, part), draw.randbytes(1000))
-    agent.put(Key(Kind.OBSERVATIONS, number), draw.randbytes(900))
+        agent.put(Key(NewLandmarks.KIND, number, part), draw.randbytes(1000))
+    agent.put(Key(Observations.KIND, number), draw.randbytes(900))

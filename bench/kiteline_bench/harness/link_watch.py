@@ -9,9 +9,8 @@ from pathlib import Path
 
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_basestation.runtime import flight_log as base_log
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import KeyframeHeader, Kind, LivePose, WireError
-from kiteline_codec.sync.packet import parse
+from kiteline_codec.schema import KeyframeHeader, LivePose, WireError, messages
+from kiteline_codec.transport.packet import parse
 from kiteline_hw.logs.mcap_log_read import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_lab.replay.replay import steps
@@ -66,7 +65,7 @@ def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float],
                 except WireError:
                     continue
                 for item in items:
-                    if item.key.kind not in (Kind.KEYFRAME_HEADER, Kind.LIVE_POSE) or not item.whole:
+                    if item.key.kind not in (KeyframeHeader.KIND, LivePose.KIND) or not item.whole:
                         continue
                     record = messages.decode(item.key, item.data)
                     if isinstance(record, KeyframeHeader):

@@ -7,10 +7,18 @@ import time
 
 import numpy as np
 
-from kiteline_codec.coding import messages
 from kiteline_codec.pacing.profiles import WIFI
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, Kind, NewLandmarks, Observations, Record
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    Key,
+    KeyframeHeader,
+    LivePose,
+    NewLandmarks,
+    Observations,
+    Record,
+    messages,
+)
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -83,9 +91,9 @@ def packet_ms() -> float:
     a, b = Endpoint(SyncConfig(), 1), Endpoint(SyncConfig(), 1)
     begin, now_ns = time.process_time(), 0
     for i in range(400):
-        a.put(Key(Kind.LIVE_POSE, 0), draw.randbytes(29))
+        a.put(Key(LivePose.KIND, 0), draw.randbytes(29))
         for part in range(4):
-            a.put(Key(Kind.NEW_LANDMARKS, i, part), draw.randbytes(900))
+            a.put(Key(NewLandmarks.KIND, i, part), draw.randbytes(900))
         for _ in range(3):
             now_ns += 20_000_000
             for end, other in ((a, b), (b, a)):

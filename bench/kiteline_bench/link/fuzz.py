@@ -10,18 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
-from kiteline_codec.coding import messages
 from kiteline_codec.residuals.residual_coding import Tightener
-from kiteline_codec.schema import Key, Kind, WireError
+from kiteline_codec.schema import RECORD_TYPES, Key, WireError, messages
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
-from kiteline_codec.sync.packet import parse
 from kiteline_codec.transport.framing import Deframer, frame
+from kiteline_codec.transport.packet import parse
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 
 _MAX_BYTES = 1400  # of an input
 _SLOW_S = 0.25  # s of CPU that one input may take; a hang would take more
 _KEY = bytes(32)
-_KINDS = tuple(int(k) for k in Kind)
+_KINDS = tuple(sorted(RECORD_TYPES))
 
 Target = Callable[[bytes, random.Random], None]
 

@@ -9,13 +9,17 @@ from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing_kernels import pack_columns, unpack_columns
 from kiteline_codec.coding.residual_column_kernels import LIMIT, pack_tight, unpack_tight
-from kiteline_codec.schema import WireError
+from kiteline_core.errors import KitelineError
 
 I64 = NDArray[np.int64]
 
 _F64 = struct.Struct("<d")
 _F32 = struct.Struct("<f")
 _MAX_VARINT_BYTES = 10  # 64 bits in groups of seven
+
+
+class WireError(KitelineError):
+    """Bytes that are no valid packet or code: the only exception that a decoder raises, on any bytes."""
 
 
 def zigzag(value: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
-from kiteline_codec.coding.sections import split_births, split_copied, split_sightings, take
+from kiteline_codec.pacing.sections import split_births, split_copied, split_sightings, take
 from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations
 from kiteline_core.imaging.descriptors import narrowed
 

@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import messages
 from kiteline_codec.coding.packing import Reader
-from kiteline_codec.coding.rows import read_codes
 from kiteline_codec.residuals import prediction_kernels as kernels
-from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, Kind, WireError
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, WireError, messages
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId, agent_of_keyframe
 
 I32 = NDArray[np.int32]
@@ -26,7 +24,7 @@ MAX_GENERATIONS = 64  # steps along parents to a keyframe of birth: farther, the
 MASK_PARTS = 16  # parts of births that can be named
 _REMEMBERED = 256  # keyframes whose values are kept decoded
 _NO_PART = -1
-_BIRTHS, _HEAD = int(Kind.NEW_LANDMARKS), int(Kind.KEYFRAME_HEADER)
+_BIRTHS, _HEAD = NewLandmarks.KIND, KeyframeHeader.KIND
 
 
 @dataclass(slots=True)
@@ -62,11 +60,11 @@ class References:
     def camera(self, keyframe: int, held: Held) -> tuple[int, F64] | None:
         """Version, and fx, fy, cx, cy of the camera that saw a keyframe."""
         agent = int(agent_of_keyframe(KeyframeId(keyframe)))
-        now = held(Key(Kind.CAMERA_INTRINSICS, agent))
+        now = held(Key(CameraIntrinsics.KIND, agent))
         if now is None:
             return None
         if agent not in self._cameras or self._cameras[agent][0] != now[0]:
-            record = messages.decode(Key(Kind.CAMERA_INTRINSICS, agent), now[1])
+            record = messages.decode(Key(CameraIntrinsics.KIND, agent), now[1])
             assert isinstance(record, CameraIntrinsics)
             c = record.camera
             self._cameras[agent] = now[0], np.array([c.fx, c.fy, c.cx, c.cy])
@@ -81,7 +79,7 @@ class References:
             return None
         entry = self._keyframe(keyframe)
         if entry.head is None or entry.head_version != now[0]:
-            record = messages.decode(Key(Kind.KEYFRAME_HEADER, keyframe), now[1])
+            record = messages.decode(Key(KeyframeHeader.KIND, keyframe), now[1])
             assert isinstance(record, KeyframeHeader)
             entry.head, entry.head_version = record, now[0]
         return entry.head_version, entry.head
@@ -103,7 +101,7 @@ class References:
             versions[part] = now[0]
             if entry.part_versions.get(part) != now[0]:
                 entry.births[4, entry.births[4] == part] = _NO_PART
-                values = read_codes(Reader(now[1]), Kind.NEW_LANDMARKS)
+                values = NewLandmarks.COLUMNS.read_codes(Reader(now[1]))
                 if values.shape[1]:
                     if values[0].min() < 0 or values[0].max() >= MAX_KEYPOINTS:
                         raise WireError("a keypoint is out of range")

@@ -16,22 +16,28 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import messages, quantise
+from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, Writer
-from kiteline_codec.coding.rows import MAX_KEYFRAME_ID, read_codes
 from kiteline_codec.residuals import prediction_kernels as kernels
 from kiteline_codec.residuals.predictors import Held, References, parts_at
-from kiteline_codec.schema import Key, KeyframeHeader, Kind, WireError
+from kiteline_codec.schema import (
+    Key,
+    KeyframeHeader,
+    NewLandmarks,
+    Observations,
+    RefinedLandmarks,
+    WireError,
+    messages,
+)
+from kiteline_codec.schema.columns import read_landmark_table, write_landmark_table
+from kiteline_codec.schema.record import MAX_KEYFRAME_ID
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
-TIGHT_KINDS = frozenset({int(Kind.NEW_LANDMARKS), int(Kind.OBSERVATIONS), int(Kind.REFINED_LANDMARKS)})
-BASIS_KINDS = frozenset(
-    {int(Kind.CAMERA_INTRINSICS), int(Kind.KEYFRAME_HEADER), int(Kind.NEW_LANDMARKS)}
-)  # what forms build upon
+TIGHT_KINDS = frozenset({NewLandmarks.KIND, Observations.KIND, RefinedLandmarks.KIND})
 _CRC_BYTES = 4
 _MAX_SHIFT = 8
 _DESCRIPTOR_SIZES = (0, 16, 32)
@@ -53,11 +59,11 @@ class Tightener:
         """
         if key.kind not in TIGHT_KINDS:
             return None
-        if key.kind == Kind.NEW_LANDMARKS:
+        if key.kind == NewLandmarks.KIND:
             return self._shrink_births(key, code)
         out = Writer()
         try:
-            if key.kind == Kind.OBSERVATIONS:
+            if key.kind == Observations.KIND:
                 versions = self._shrink_sightings(out, key, code, held, own)
             else:
                 versions = self._shrink_depths(out, key, code, held)
@@ -69,11 +75,11 @@ class Tightener:
     def grow(self, key: Key, data: bytes, held: Held) -> bytes:
         """The code of a tight form. Raises WireError, also when the values that it builds upon are not held."""
         source, out = Reader(data), Writer()
-        if key.kind == Kind.NEW_LANDMARKS:
+        if key.kind == NewLandmarks.KIND:
             versions = _grow_births(out, source)
-        elif key.kind == Kind.OBSERVATIONS:
+        elif key.kind == Observations.KIND:
             versions = self._grow_sightings(out, key, source, held)
-        elif key.kind == Kind.REFINED_LANDMARKS:
+        elif key.kind == RefinedLandmarks.KIND:
             versions = self._grow_depths(out, key, source, held)
         else:
             raise WireError(f"kind {key.kind} has no tight form")
@@ -104,9 +110,9 @@ class Tightener:
 
     def _shrink_sightings(self, out: Writer, key: Key, code: bytes, held: Held, own: Held) -> list[int]:
         source = Reader(code)
-        values = read_codes(source, Kind.OBSERVATIONS)
+        values = Observations.COLUMNS.read_codes(source)
         n = values.shape[1]
-        table, place, keypoint = _read_plain_points(source, n)
+        table, place, keypoint = read_landmark_table(source, n)
         source.end()
         if n == 0 or np.diff(place << KEYPOINT_BITS | keypoint).min(initial=1) <= 0 or table[-1] > key.id:
             raise ValueError("points must increase, and be born before they are seen again")
@@ -156,12 +162,12 @@ class Tightener:
         values[1:4, ~known] = source.tight(3, int((~known).sum()))
         out.varint(n)
         out.columns(values)
-        _write_plain_points(out, table, place, keypoint)
+        write_landmark_table(out, table, place, keypoint)
         return versions
 
     def _untold_head(self, key: Key, held: Held, own: Held) -> KeyframeHeader | None:
         """The keyframe's own header, when the peer is not known to hold it."""
-        head_key = Key(Kind.KEYFRAME_HEADER, key.id)
+        head_key = Key(KeyframeHeader.KIND, key.id)
         mine = own(head_key)
         if held(head_key) is not None or mine is None:
             return None
@@ -210,7 +216,7 @@ class Tightener:
 
     def _shrink_depths(self, out: Writer, key: Key, code: bytes, held: Held) -> list[int]:
         source = Reader(code)
-        values = read_codes(source, Kind.REFINED_LANDMARKS)
+        values = RefinedLandmarks.COLUMNS.read_codes(source)
         source.end()
         versions, births = self._references.births(key.id, held)
         out.varint(values.shape[1])
@@ -254,7 +260,7 @@ def _checksum(code: bytes, versions: Sequence[int]) -> bytes:
 
 def _shrink_births(out: Writer, code: bytes) -> list[int]:
     source = Reader(code)
-    values = read_codes(source, Kind.NEW_LANDMARKS)
+    values = NewLandmarks.COLUMNS.read_codes(source)
     n = values.shape[1]
     size = source.left // n if n else 0
     if size not in _DESCRIPTOR_SIZES:
@@ -293,37 +299,6 @@ def _seen_depths(births: I32, parts: Sequence[int] | dict[int, int], index: I64)
 
 
 # ---- points of sightings
-
-
-def _read_plain_points(source: Reader, n: int) -> tuple[list[int], I64, I64]:
-    """Keyframes of birth, and for each row the place in that table and the keypoint."""
-    if not n:
-        return [], np.zeros(0, np.int64), np.zeros(0, np.int64)
-    table, last = [], 0
-    for _ in range(source.varint(n)):
-        last += source.varint(MAX_KEYFRAME_ID)
-        table.append(last)
-    place, keypoint = source.columns(2, n)
-    if (
-        not table
-        or place.min() < 0
-        or place.max() >= len(table)
-        or keypoint.min() < 0
-        or keypoint.max() >= MAX_KEYPOINTS
-    ):
-        raise WireError("a point id is out of range")
-    return table, place, keypoint
-
-
-def _write_plain_points(out: Writer, table: Sequence[int], place: I64, keypoint: I64) -> None:
-    if not len(place):
-        return
-    out.varint(len(table))
-    last = 0
-    for keyframe in table:
-        out.varint(keyframe - last)
-        last = keyframe
-    out.columns(np.stack([place, keypoint]))
 
 
 def _write_table(out: Writer, id_: int, table: Sequence[int], masks: Sequence[int], place: I64, keypoint: I64) -> None:

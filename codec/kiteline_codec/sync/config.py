@@ -5,33 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import RECORD_TYPES, Key, Priority
 from kiteline_codec.sync.entries import Order
-from kiteline_codec.sync.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
 from kiteline_codec.sync.remembered import KIND as REMEMBERED
+from kiteline_codec.transport.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
 
-_RANKS = {
-    Kind.LIVE_POSE: 0,
-    Kind.CAMERA_INTRINSICS: 0,  # nothing can be made of keypoints without it
-    Kind.SUBMAP_PLACEMENT: 0,  # few bytes, and all that a pose in the world is wrong by
-    Kind.GRAVITY_ALIGNMENT: 0,
-    Kind.SUBMAP_SCALE: 0,
-    Kind.KEYFRAME_POSE: 1,
-    Kind.REFINED_LANDMARKS: 1,
-    Kind.FUSED_LANDMARKS: 1,
-    Kind.REMOVED_OBSERVATIONS: 1,
-    Kind.CULLED_LANDMARKS: 1,
-    Kind.DISPARITY_CALIBRATION: 1,
-    Kind.KEYFRAME_HEADER: 2,
-    Kind.NEW_LANDMARKS: 3,
-    Kind.OBSERVATIONS: 4,  # after the births, so that the next keyframe's sightings may build upon them
-    Kind.CACHED_KEYFRAME: 5,
-    Kind.CACHED_LANDMARKS: 5,
-    Kind.GRID_TILE: 6,
-}
-_FIRST_PARTS = 4  # births: what makes a keyframe useful where a thin link has them short
-_RANK_OTHER_PARTS = 5
-_RANK_UNKNOWN = 6
+_ORDERS = {kind: (int(t.PRIORITY), t.FIRST_PARTS) for kind, t in RECORD_TYPES.items()}
+_UNKNOWN = int(Priority.GRID), 1
 MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
 
 
@@ -39,9 +19,9 @@ def default_order(key: Key) -> Order:
     """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
     if key.kind == REMEMBERED:
         return (0, 0, key.part)  # it saves more than it costs
-    rank = _RANKS.get(key.kind, _RANK_UNKNOWN)  # type: ignore[call-overload]
-    if key.part >= (_FIRST_PARTS if key.kind == Kind.NEW_LANDMARKS else 1):
-        rank = max(rank, _RANK_OTHER_PARTS)
+    rank, first_parts = _ORDERS.get(key.kind, _UNKNOWN)
+    if key.part >= first_parts:
+        rank = max(rank, Priority.REST)
     return (rank, -key.id, key.part)
 
 

@@ -14,8 +14,8 @@ from kiteline_codec.coding.packing import Writer
 from kiteline_codec.pacing.budget import SlidingBudget
 from kiteline_codec.pacing.congestion_window import Window
 from kiteline_codec.pacing.throughput import Throughput
-from kiteline_codec.residuals.residual_coding import BASIS_KINDS, Tightener
-from kiteline_codec.schema import Key, WireError
+from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.schema import PREDICTOR_KINDS, Key, WireError
 from kiteline_codec.sync import remembered
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats, default_order
@@ -23,8 +23,8 @@ from kiteline_codec.sync.entries import Order
 from kiteline_codec.sync.expand import grown
 from kiteline_codec.sync.inbox import Inbox, Update
 from kiteline_codec.sync.outbox import Known, Outbox
-from kiteline_codec.sync.packet import CRC_BYTES, MAX_KIND, Header, Item, VersionError, parse, seal, write_header
 from kiteline_codec.sync.round_trip import RoundTrip
+from kiteline_codec.transport.packet import CRC_BYTES, MAX_KIND, Header, Item, VersionError, parse, seal, write_header
 
 __all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
 
@@ -52,7 +52,7 @@ class Endpoint:
         self.name = name
         self._tightener = tightener
         self._out = Outbox(
-            config.order, config.oldest_every, self._shrink if tightener else None, BASIS_KINDS, config.resident_bytes,
+            config.order, config.oldest_every, self._shrink if tightener else None, PREDICTOR_KINDS, config.resident_bytes,
             spill,
         )  # fmt: skip
         self._spill = spill
@@ -213,7 +213,7 @@ class Endpoint:
             for item in items:
                 update = self._in.apply(item)
                 if update is not None:
-                    if update.key.kind in BASIS_KINDS:
+                    if update.key.kind in PREDICTOR_KINDS:
                         self._out.basis_changed()
                     if update.key.kind == remembered.KIND:
                         self._hear(update)

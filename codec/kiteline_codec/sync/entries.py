@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from kiteline_codec.coding import ranges
 from kiteline_codec.coding.packing import varint_bytes, zigzag
 from kiteline_codec.schema import Key
-from kiteline_codec.sync.packet import Item
+from kiteline_codec.sync import ranges
+from kiteline_codec.transport.packet import Item
 
 Order = tuple[int, ...]
 

@@ -9,7 +9,7 @@ from kiteline_codec.residuals.predictors import Held
 from kiteline_codec.residuals.residual_coding import Tightener
 from kiteline_codec.schema import Key
 from kiteline_codec.sync import remembered
-from kiteline_codec.sync.packet import Item
+from kiteline_codec.transport.packet import Item
 
 
 def grown(items: Sequence[Item], tightener: Tightener, held: Held, legacy: Mapping[Key, bytes]) -> list[Item]:

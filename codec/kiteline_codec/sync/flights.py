@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from kiteline_codec.schema import Key
-from kiteline_codec.sync.packet import MASK_BITS
+from kiteline_codec.transport.packet import MASK_BITS
 
 Carried = tuple[Key, int, int, int]  # key, version, first byte, last byte + 1
 

@@ -9,26 +9,14 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass
 
-from kiteline_codec.coding import ranges
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import KEYFRAME_KINDS, Key
+from kiteline_codec.sync import ranges
 from kiteline_codec.sync.archive import Archive, Row, Spill
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
-from kiteline_codec.sync.packet import MASK_BITS, Item
 from kiteline_codec.sync.resident import Resident
+from kiteline_codec.transport.packet import MASK_BITS, Item
 
 _MASK = (1 << MASK_BITS) - 1
-_BULK_KINDS = frozenset(
-    {
-        int(k)
-        for k in (
-            Kind.KEYFRAME_POSE,
-            Kind.REFINED_LANDMARKS,
-            Kind.FUSED_LANDMARKS,
-            Kind.REMOVED_OBSERVATIONS,
-            Kind.CULLED_LANDMARKS,
-        )
-    }
-)
 _VALUE_BYTES = 350  # of memory that a value takes beside its code, about
 
 
@@ -54,7 +42,7 @@ class Inbox:
         """resident_bytes: of memory for what the peer says of keyframes, about; 0, or without a spill: any number."""
         self._values: dict[Key, tuple[int, bytes]] = {}
         self._archive = Archive(spill)
-        self._resident = Resident(0 if spill is None else resident_bytes, _BULK_KINDS, _VALUE_BYTES)
+        self._resident = Resident(0 if spill is None else resident_bytes, KEYFRAME_KINDS, _VALUE_BYTES)
         self.digest = Digest()
         self.value_bytes = 0
         self.assembly_bytes = 0
@@ -71,7 +59,7 @@ class Inbox:
 
     def held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value, None when there is none."""
-        if key.kind in _BULK_KINDS and key.id in self._archive:
+        if key.kind in KEYFRAME_KINDS and key.id in self._archive:
             self._fetch(key.id)
             self._make_room(key.id)
         return self._values.get(key)

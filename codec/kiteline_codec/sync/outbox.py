@@ -8,23 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kiteline_codec.coding import ranges
 from kiteline_codec.coding.packing import Writer
-from kiteline_codec.schema import Key, Kind
+from kiteline_codec.schema import KEYFRAME_KINDS, Key
+from kiteline_codec.sync import ranges
 from kiteline_codec.sync.archive import Archive, Row, Spill
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
 from kiteline_codec.sync.entries import Entry, Order, Waiting, item_of
 from kiteline_codec.sync.flights import Carried, Flight, Flights
-from kiteline_codec.sync.packet import write_item
 from kiteline_codec.sync.resident import Resident
+from kiteline_codec.transport.packet import write_item
 
 Known = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value of ours that the peer holds
 Shrink = Callable[[Key, bytes, Known], bytes | None]  # a shorter form of a code, None where there is none
 
 _MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
-_BULK_KINDS = frozenset(
-    {int(Kind.KEYFRAME_HEADER), int(Kind.NEW_LANDMARKS), int(Kind.OBSERVATIONS)}
-)  # of keyframes: what may be archived
 _ENTRY_BYTES = 700  # of memory that a value takes beside its code, about
 _FIRST = (1,)  # orders below it, poses and placements, go before what has waited longest
 _FETCHED = 16  # pages that are taken back at once when nothing else is left to be sent
@@ -59,7 +56,7 @@ class Outbox:
         self.dropped = 0  # values given up for want of memory
         self.flights = Flights()
         self.archive = Archive(spill)
-        self._resident = Resident(resident_bytes, _BULK_KINDS, _ENTRY_BYTES)
+        self._resident = Resident(resident_bytes, KEYFRAME_KINDS, _ENTRY_BYTES)
         self._entries: dict[Key, Entry] = {}
         self._waiting = Waiting(self._entries)
 
@@ -95,7 +92,7 @@ class Outbox:
     def _find(self, key: Key) -> Entry | None:
         """The entry of a key, out of the archive if need be."""
         entry = self._entries.get(key)
-        if entry is None and key.kind in _BULK_KINDS and self.archive.readable(key.id):
+        if entry is None and key.kind in KEYFRAME_KINDS and self.archive.readable(key.id):
             self._fetch(key.id)
             entry = self._entries.get(key)
         return entry
@@ -104,7 +101,7 @@ class Outbox:
 
     def put(self, key: Key, code: bytes, order: Order) -> None:
         """A new value, or a new version of one; the same code again changes nothing but its order."""
-        if key.kind in _BULK_KINDS and key.id in self.archive:
+        if key.kind in KEYFRAME_KINDS and key.id in self.archive:
             self._fetch(key.id)
         entry = self._entries.get(key)
         if entry is not None and entry.code == code:
@@ -117,7 +114,7 @@ class Outbox:
 
     def remove(self, key: Key) -> None:
         """Take a value back. One of which nothing was ever sent is forgotten without a word."""
-        if key.kind in _BULK_KINDS and key.id in self.archive:
+        if key.kind in KEYFRAME_KINDS and key.id in self.archive:
             self._fetch(key.id)
         entry = self._entries.get(key)
         if entry is None or entry.code is None:
@@ -215,7 +212,7 @@ class Outbox:
             refused |= not self._archive(id_)
         if not (self._resident.full and refused):
             return
-        idle = [k for k, e in self._entries.items() if k.kind in _BULK_KINDS and e.still and not e.clean]
+        idle = [k for k, e in self._entries.items() if k.kind in KEYFRAME_KINDS and e.still and not e.clean]
         for key in sorted(idle, key=lambda k: (-self._entries[k].order[0], k.id, -k.part)):
             if self._resident.roomy:
                 return

@@ -11,8 +11,8 @@ from struct import pack
 from zlib import crc32
 
 from kiteline_codec.coding.packing import Reader, Writer
-from kiteline_codec.schema import Key, Kind, WireError
-from kiteline_codec.sync.packet import MAX_KIND
+from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key, WireError
+from kiteline_codec.transport.packet import MAX_KIND
 from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS
 
 KIND = MAX_KIND  # of the values that tell; no record has it
@@ -21,7 +21,7 @@ _LEAST_BYTES = 16  # shorter codes are not worth a word
 _PART_VALUES = 60  # told in one value: it fits a packet of a thin link in a few pieces
 _MAX_PARTS = 1 << 16
 _HASH = 0xFFFFFF
-_SEEN = frozenset({int(Kind.KEYFRAME_HEADER), int(Kind.NEW_LANDMARKS), int(Kind.OBSERVATIONS)})
+_SEEN = KEYFRAME_KINDS & AGENT_KINDS
 
 
 def told(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:

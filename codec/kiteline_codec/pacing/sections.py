@@ -8,8 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import messages
-from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations
+from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations, messages
 
 F64 = NDArray[np.float64]
 

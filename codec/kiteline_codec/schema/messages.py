@@ -1,0 +1,31 @@
+"""Records to keys and codes, and back. A code holds everything of a record but its key."""
+
+from __future__ import annotations
+
+from kiteline_codec.coding.packing import Reader, WireError, Writer
+from kiteline_codec.schema.record import RECORD_TYPES, Key, Record
+
+
+def key(record: Record) -> Key:
+    """The name under which a record is shared."""
+    return record.key()
+
+
+def encode(record: Record) -> bytes:
+    """The code of a record: quantised, without its key. Raises ValueError for values that have no code."""
+    out = Writer()
+    record.write(out)
+    return out.bytes()
+
+
+def decode(key: Key, code: bytes) -> Record:
+    """The record of a key and a code; `encode` gives the same code again. Raises WireError, on any bytes."""
+    record_type = RECORD_TYPES.get(key.kind)
+    if record_type is None:
+        raise WireError(f"kind {key.kind} is unknown; known are {sorted(RECORD_TYPES)}")
+    if not 0 <= key.id <= record_type.ID.max_id or not 0 <= key.part < record_type.PARTS:
+        raise WireError(f"{key} is out of range")
+    source = Reader(code)
+    record = record_type.read(source, key)
+    source.end()
+    return record

@@ -1,0 +1,108 @@
+"""What all records have in common: a kind, a key and a code. Each record is one module beside this one.
+
+Arrays are structures of arrays, one row a keypoint. The keypoints of a keyframe share one index space [0, n); each is
+a new landmark, which has a descriptor and is named by its index, or the observation of a landmark of another keyframe.
+Pixels are those of the rectified left camera. Inverse depth is along the optical axis (z), in 1/m; 0 means unknown.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum
+from typing import ClassVar, NamedTuple, Self, TypeVar
+
+from kiteline_codec.coding.packing import Reader, Writer
+
+MAX_AGENT_ID = 63
+MAX_SUBMAP_ID = (1 << 32) - 1
+MAX_KEYFRAME_ID = (1 << 52) - 1  # as laid out in kiteline_core.ids
+MAX_TILE_ID = (1 << 48) - 1
+MAX_PARTS = 1 << 8
+FIRST_BASE_KIND = 16  # the agent writes the kinds below, the base the others
+
+
+class Key(NamedTuple):
+    """The name of a value. A tuple, because keys are hashed often."""
+
+    kind: int
+    id: int  # keyframe, submap or agent id; a tile's packed column and row
+    part: int = 0
+
+
+class IdOf(Enum):
+    """What the id in a record's key names: the record's field, and the largest id."""
+
+    AGENT = "agent", MAX_AGENT_ID
+    SUBMAP = "submap", MAX_SUBMAP_ID
+    KEYFRAME = "keyframe", MAX_KEYFRAME_ID  # of the agent's own map: archived, restored and deleted with the keyframe
+    CACHED_KEYFRAME = "keyframe", MAX_KEYFRAME_ID, "cached"  # of a map cache: made anew by each base process
+    TILE = "tile", MAX_TILE_ID
+
+    @property
+    def field(self) -> str:
+        """The record's field that holds the id."""
+        return str(self.value[0])
+
+    @property
+    def max_id(self) -> int:
+        """The largest id."""
+        return int(self.value[1])
+
+
+class Priority(IntEnum):
+    """The order of sending, first to last; within one priority the newest keyframe goes first."""
+
+    POSE = 0  # live pose, and what a pose cannot be read without
+    CORRECTION = 1
+    KEYFRAME = 2
+    LANDMARKS = 3
+    OBSERVATIONS = 4  # after the landmarks, from which the next keyframe's observations are predicted
+    REST = 5  # what improves a map that can already be used
+    GRID = 6
+
+
+class Record:
+    """A value that one side writes and the other holds; a later record of the same key replaces it."""
+
+    __slots__ = ()
+    KIND: ClassVar[int]  # number on the wire, 1 to 62
+    ID: ClassVar[IdOf]
+    PRIORITY: ClassVar[Priority]
+    PARTS: ClassVar[int] = 1  # how many records may share an id; with more than one there is a field `part`
+    FIRST_PARTS: ClassVar[int] = 1  # parts that go at PRIORITY; the others wait until REST
+    PREDICTS: ClassVar[bool] = False  # whether residual codes are predicted from it
+    IN_WORLD: ClassVar[bool] = False  # whether it is in the world frame of the base that wrote it
+
+    @classmethod
+    def written_by_agent(cls) -> bool:
+        """True for records of the agent, False for those of the base."""
+        return cls.KIND < FIRST_BASE_KIND
+
+    def key(self) -> Key:
+        """The name under which the record is shared."""
+        return Key(self.KIND, int(getattr(self, self.ID.field)), int(self.part) if self.PARTS > 1 else 0)  # type: ignore[attr-defined]
+
+    def write(self, out: Writer) -> None:
+        """Append all but the key, quantised. Raises ValueError for values that have no code."""
+        raise NotImplementedError
+
+    @classmethod
+    def read(cls, source: Reader, key: Key) -> Self:
+        """The record of a key and a code. Raises WireError."""
+        raise NotImplementedError
+
+
+RECORD_TYPES: dict[int, type[Record]] = {}  # by kind; complete once kiteline_codec.schema is imported
+_Type = TypeVar("_Type", bound=type[Record])
+
+
+def register(record_type: _Type) -> _Type:
+    """Enter a record type into `RECORD_TYPES`. Raises ValueError when its number is taken or out of range."""
+    if record_type.KIND in RECORD_TYPES or not 0 < record_type.KIND < 63:
+        raise ValueError(f"{record_type.__name__}: kind {record_type.KIND} is taken or not within 1..62")
+    RECORD_TYPES[record_type.KIND] = record_type
+    return record_type
+
+
+def kinds_keyed_by(what: IdOf) -> frozenset[int]:
+    """The kinds whose id names a thing."""
+    return frozenset(kind for kind, record_type in RECORD_TYPES.items() if record_type.ID is what)
