@@ -20,13 +20,20 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.flight_log import RESTORED, metadata_of, station_of, write_step
-from kiteline_basestation.runtime.jobs import JobDone
-from kiteline_basestation.runtime.options import BaseSpec, base_config, coded_channels, from_json, of_arguments, parser
+from kiteline_basestation.runtime.options import (
+    BaseOptions,
+    base_config,
+    coded_channels,
+    from_json,
+    of_arguments,
+    parser,
+)
 from kiteline_basestation.runtime.outputs import counts, map_files
-from kiteline_basestation.runtime.summary import Flown, as_flown, settled, timings
-from kiteline_basestation.runtime.terminal import Narrator
+from kiteline_basestation.runtime.summary import FlightSummary, flight_summary, settled, timings
+from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_basestation.station import Import, Station, StationOutput
@@ -77,7 +84,7 @@ class Ground:
 
     def __init__(
         self,
-        spec: BaseSpec,
+        spec: BaseOptions,
         open_channel: Callable[[AgentId], RecordChannel],
         jobs: Worker | None = None,
         plain: bool = False,
@@ -99,7 +106,7 @@ class Ground:
         self.step_ms: deque[float] = deque(maxlen=SAMPLES)
         self.drained_ns = 0
         self.digest_equal = False
-        self.flown: Flown | None = None  # the base when the last frame had come
+        self.flown: FlightSummary | None = None  # the base when the last frame had come
         self.agents_lost: set[int] = set()
         self._last_frame_ns = 0
         self._folder = Path(spec.folder)
@@ -180,9 +187,9 @@ class Ground:
                 for name, content in map_files(self.station.mapper).items():
                     (self._folder / name).write_bytes(content)
 
-    def snapshot(self) -> Flown:
+    def snapshot(self) -> FlightSummary:
         """The base as it stands."""
-        return as_flown(self.station.mapper)
+        return flight_summary(self.station.mapper)
 
     def step(
         self,
@@ -245,7 +252,7 @@ def place_words() -> Vocabulary | None:
     return shipped_words()
 
 
-def fly_lockstep(spec: BaseSpec, parent: process.Parent) -> None:
+def fly_lockstep(spec: BaseOptions, parent: process.Parent) -> None:
     """Keep the barrier: step once all agents have handed in their messages. An agent that ends is left out."""
     return_large_arrays()
     ground = Ground(spec, coded_channels(spec))
@@ -285,7 +292,7 @@ def _collect(server: LockstepServer, here: set[int], ground: Ground, parent: pro
     return {}
 
 
-def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSignal) -> None:
+def fly_live(spec: BaseOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
     """Serve any number of agents on real clocks until told to stop; long work is done by a process beside."""
     return_large_arrays()
     clock = MonotonicClock()
@@ -310,7 +317,7 @@ def fly_live(spec: BaseSpec, parent: process.Parent | None, stop: process.StopSi
         if parent is not None:
             parent.tell("ready")
         process.notify("READY=1")
-        narrator = Narrator(ground.station) if parent is None and not spec.quiet else None
+        narrator = TerminalReporter(ground.station) if parent is None and not spec.quiet else None
         begin_ns, stepped_ns = clock.now_ns(), 0
         if narrator is not None:
             kept = f", store {spec.store}" if spec.store else ", nothing is kept: no --store"
@@ -352,7 +359,7 @@ def _say(lines: Sequence[str]) -> None:
             print(line, file=sys.stderr, flush=True)
 
 
-def _sealed(spec: BaseSpec, hub: LinkHub) -> LinkHub:
+def _sealed(spec: BaseOptions, hub: LinkHub) -> LinkHub:
     """The hub with its packets sealed; agents without a key are not heard. Raises LinkError."""
     keys = read_keys(Path(spec.key))
 
@@ -385,7 +392,7 @@ def _tell(restored: Restored | None, parent: process.Parent | None) -> None:
         )  # fmt: skip
 
 
-def _questions(spec: BaseSpec, hub: LinkHub, stack: contextlib.ExitStack) -> QueryServer | None:
+def _questions(spec: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack) -> QueryServer | None:
     """Where other programs ask for maps: --maps, else the agents' link, where it is Zenoh and not sealed."""
     if spec.maps:
         server = QueryServer("maps", endpoint=spec.maps.removeprefix("zenoh:"))
@@ -413,7 +420,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     process.leave(0)
 
 
-def run_child(spec: BaseSpec) -> int:
+def run_child(spec: BaseOptions) -> int:
     """Fly as a child process; an error that a user can mend ends in one line."""
 
     def fly(parent: process.Parent) -> None:

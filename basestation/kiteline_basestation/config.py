@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from kiteline_basestation.grid.grid import GridConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 from kiteline_core.pose.pnp import RansacConfig
@@ -34,7 +33,7 @@ class MeasurementConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class WindowConfig:
+class BundleWindowConfig:
     """Which keyframes a local bundle adjusts."""
 
     free: int = 10  # keyframes whose poses move: more cost time and change little
@@ -44,7 +43,7 @@ class WindowConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkConfig:
+class OdometryFactorConfig:
     """The agent's own pose of a keyframe in its parent."""
 
     enough: int = 80  # observations of a keyframe above which its points hold it: every keyframe of a wide link
@@ -54,7 +53,7 @@ class LinkConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class RefindConfig:
+class LandmarkMatchingConfig:
     """Known points recognised where the agent bore new ones."""
 
     keyframes: int = 12  # covisible keyframes searched
@@ -71,7 +70,7 @@ class RefindConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class NewPointConfig:
+class TriangulationConfig:
     """Points made from two views, where stereo saw no depth."""
 
     keyframes: int = 6  # covisible keyframes searched
@@ -200,7 +199,7 @@ class PublishConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class SupplyConfig:
+class MapCacheConfig:
     """The window of the map that each agent is kept supplied with."""
 
     copies: int = 24  # keyframes an agent holds copies of; 0: none. They cover two views of a room and its way there
@@ -218,20 +217,55 @@ class SupplyConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GroundConfig:
+    """How the ground is found."""
+
+    camera_above_m: float = 0.1  # m; ground points lie at least this far below every camera that sees them
+    patch_m: float = 2.0  # m; side of the neighbourhoods; three by three of them share their points
+    height_bin_m: float = 0.05  # m; a floor's points, with stereo noise, fill two or three bins
+    slope: float = 0.25  # m/m; how steep the ground may be: a ramp, or a map whose z is 10 degrees off the vertical
+    peak_share: float = 0.25  # of the highest peak: a lower peak with this share is the ground, below it is noise
+    peak_points: float = 4.0  # points; fewer make no peak
+    bands_m: tuple[float, ...] = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
+    plane_points: float = 12.0  # points that a neighbourhood's plane needs; with fewer it stays as it is
+    level_m: float = 0.3  # m; a patch of points with less spread than this says nothing of the slope
+
+
+@dataclass(frozen=True, slots=True)
+class GridConfig:
+    """The grid's numbers. Heights are relative to the local ground."""
+
+    cell_m: float = 0.1  # m; finer cells fall between the rays to sparse points; 0.2 suits streets
+    max_ray_m: float = 20.0  # m; beyond, a stereo point is wrong by more than a cell
+    obstacle_low_m: float = 0.1  # m; lower than this is ground: a vehicle rolls, and noise reaches this far
+    vehicle_height_m: float = 2.0  # m; what hangs higher is passed below
+    noise_per_m: float = 0.01  # m of height per m of distance from the nearest view: stereo noise grows with distance
+    free_below_m: float = 0.7  # m; a ray to the ground that is still higher says nothing about the floor below it
+    clear_below_m: float = 0.5  # m; the same of a ray to an obstacle: higher up it passes over boxes and chairs
+    log_hit: float = 0.6  # log-odds of one view of an obstacle point (p = 0.65): two views make 0.77
+    log_through: float = -0.3  # log-odds of one ray through an obstacle's heights (p = 0.43)
+    log_free: float = -0.7  # log-odds of one ray over a cell without obstacle (p = 0.33)
+    log_limit: float = 3.5  # log-odds; p within 0.03..0.97, so that the grid can still change its mind
+    quartile: float = 0.675  # standard deviations from the mean to a quartile of a normal distribution
+    fence: float = 1.5  # interquartile ranges above the upper quartile: longer rays are outliers (Segfloor eq. 5.3)
+    floor: GroundConfig = field(default_factory=GroundConfig)
+
+
+@dataclass(frozen=True, slots=True)
 class BaseConfig:
     """All sections."""
 
     intake: IntakeConfig = field(default_factory=IntakeConfig)
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
-    links: LinkConfig = field(default_factory=LinkConfig)
+    window: BundleWindowConfig = field(default_factory=BundleWindowConfig)
+    links: OdometryFactorConfig = field(default_factory=OdometryFactorConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
-    refind: RefindConfig = field(default_factory=RefindConfig)
-    new_points: NewPointConfig = field(default_factory=NewPointConfig)
+    refind: LandmarkMatchingConfig = field(default_factory=LandmarkMatchingConfig)
+    new_points: TriangulationConfig = field(default_factory=TriangulationConfig)
     cull: CullConfig = field(default_factory=CullConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     disparity: DisparityConfig = field(default_factory=DisparityConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
-    supply: SupplyConfig = field(default_factory=SupplyConfig)
+    supply: MapCacheConfig = field(default_factory=MapCacheConfig)
     grid: GridConfig = field(default_factory=GridConfig)

@@ -97,7 +97,7 @@ def _get(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
     map_id = _map(mapper, given, "map")
     out = _overview(mapper, map_id, _points(mapper))
     for submap, told in zip(mapper.map.submaps_of_map(map_id), out["submaps"], strict=True):
-        told["T_map_m"] = matrix(sim3.inverse(mapper.map.frame(map_id)) @ mapper.map.frame(submap))
+        told["T_map_m"] = matrix(sim3.inverse(mapper.map.submap_pose(map_id)) @ mapper.map.submap_pose(submap))
         told["poses"] = [
             {"id": int(k), "t_ns": int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]), "T_m_k": matrix(pose)}
             for k in mapper.map.submaps[submap]
@@ -138,9 +138,9 @@ def _merge(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
         raise _Refused(
             '"T_into_map" is a rigid motion, or with a scale where one eye mapped: 16 numbers, the rows of a 4x4 matrix'
         ) from error
-    if sim3.scale_of(S) != 1.0 and not mapper.map.own_unit(other):
+    if sim3.scale_of(S) != 1.0 and not mapper.map.is_up_to_scale(other):
         raise _Refused(f"{called(other)} is in metres: it is laid into another map as long as it is")
-    frames = mapper.map.frame(into), mapper.map.frame(other)
+    frames = mapper.map.submap_pose(into), mapper.map.submap_pose(other)
     merger.join(other, into, sim3.normalise(frames[0] @ S @ sim3.inverse(frames[1])))
     return {"merged": True, **_overview(mapper, into, _points(mapper))}
 
@@ -226,7 +226,7 @@ def _map(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
 
 def _points(mapper: Mapper) -> dict[int, int]:
     """How many live points each submap has."""
-    born = mapper.map.point_ids(mapper.map.roots()) >> (SEQUENCE_BITS + KEYPOINT_BITS)
+    born = mapper.map.landmark_ids(mapper.map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS)
     submaps, counts = np.unique(born, return_counts=True)
     return dict(zip(submaps.tolist(), counts.tolist(), strict=True))
 
@@ -245,8 +245,8 @@ def _overview(mapper: Mapper, map_id: SubmapId, points: Mapping[int, int]) -> Js
                 "points": points.get(submap, 0),
                 "first_t_ns": min(stamps),
                 "last_t_ns": max(stamps),
-                "unit": "own" if mapper.map.own_unit(submap) else "metre",
-                "scale": mapper.map.unit(submap),
+                "unit": "own" if mapper.map.is_up_to_scale(submap) else "metre",
+                "scale": mapper.map.scale(submap),
                 "T_w_m": matrix(mapper.placements.get(submap)),
             }
         )
@@ -254,7 +254,7 @@ def _overview(mapper: Mapper, map_id: SubmapId, points: Mapping[int, int]) -> Js
         "id": called(map_id),
         "name": mapper.names.get(map_id, ""),
         "placed": map_id in mapper.placements,
-        "unit": "own" if mapper.map.own_unit(map_id) else "metre",
+        "unit": "own" if mapper.map.is_up_to_scale(map_id) else "metre",
         "agents": sorted({s["agent"] for s in told}),
         "keyframes": sum(s["keyframes"] for s in told),
         "points": sum(s["points"] for s in told),

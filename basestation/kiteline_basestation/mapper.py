@@ -13,22 +13,23 @@ from numpy.typing import NDArray
 
 from kiteline_basestation import management
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.exchange.publisher import Published, Publisher, apply_record
 from kiteline_basestation.grid.grid import Grid, GridMap
+from kiteline_basestation.grid.grid_job import GRID, GridInputs
+from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.intake.placements import World
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
-from kiteline_basestation.map.covisibility import Window, local_window
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK
-from kiteline_basestation.map.publisher import Published, Publisher, adopt
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.merging.map_merger import MapMerger
-from kiteline_basestation.refinement import culling, refind
-from kiteline_basestation.refinement import new_landmarks as newpoints
+from kiteline_basestation.refinement import culling, landmark_matching, triangulation
 from kiteline_basestation.refinement.apply_bundle import apply_bundle
-from kiteline_basestation.refinement.odometry_links import with_links, without_links
-from kiteline_basestation.refinement.whole_maps import WholeMaps
-from kiteline_basestation.runtime.jobs import BundleInputs, GridInputs, Job, JobDone
+from kiteline_basestation.refinement.bundle_job import LOCAL_BUNDLE, BundleInputs
+from kiteline_basestation.refinement.bundle_window import BundleWindow, local_bundle_window
+from kiteline_basestation.refinement.full_bundle_schedule import FullBundleSchedule
+from kiteline_basestation.refinement.odometry_factors import with_odometry_factors, without_odometry_factors
 from kiteline_basestation.store.state import Json, Memory, matrix, parsed, plain, similarity_of
 from kiteline_codec.schema import CulledLandmarks, DisparityCalibration, Key, LivePose, Record
 from kiteline_core.geometry import sim3
@@ -87,11 +88,11 @@ class Mapper:
         self._publisher = Publisher(self.map)
         self.world = World(self.config.intake, self.map, self._intake, self._publisher)
         self._last_job = 0
-        self._windows: dict[int, tuple[SubmapId, Window]] = {}  # open bundle jobs
+        self._windows: dict[int, tuple[SubmapId, BundleWindow]] = {}  # open bundle jobs
         self._stale: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet, in order
         self._served: dict[SubmapId, int] = {}  # the last bundle of each submap, by its number
         self._told: dict[AgentId, F64] = {}  # offsets of disparities as agents have them
-        self._whole = WholeMaps(self.config.graph)
+        self._whole = FullBundleSchedule(self.config.graph)
         self._grid_job = 0  # id of the open grid job, 0 none
         self._grid_due = 0  # keyframes since the last grid
         self.merger: MapMerger | None = None
@@ -109,8 +110,10 @@ class Mapper:
         answers = tuple(management.answer(self, command, now_ns) for command in given.commands)
         for keyframe in self._intake.ready(now_ns):
             self.world.begin(keyframe)  # the first submap is the world
-            self.counts.found += refind.refind(self.map, keyframe, self.config.refind, self._publisher)
-            self.counts.triangulated += newpoints.triangulate(
+            self.counts.found += landmark_matching.match_landmarks(
+                self.map, keyframe, self.config.refind, self._publisher
+            )
+            self.counts.triangulated += triangulation.triangulate_landmarks(
                 self.map, keyframe, self.config.new_points, self.config.measurement, self._publisher
             )
             self.counts.culled += culling.cull_weak(self.map, keyframe, self.config.cull, self._publisher)
@@ -122,7 +125,7 @@ class Mapper:
             self.counts.keyframes += 1
         self._go_on_with_atlas()
         self._bundle_whole_maps(now_ns)
-        self._tell_calibrations()
+        self._send_calibrations()
         jobs = self._bundle_jobs() + self._grid_jobs()
         if self.merger is not None:
             jobs += self.merger.jobs()
@@ -131,7 +134,7 @@ class Mapper:
 
     def adopt(self, record: Record) -> None:
         """Compute on with a published record as the other side will hold it."""
-        adopt(self.map, record)
+        apply_record(self.map, record)
 
     def restore(
         self, agent: AgentId, received: tuple[Record, ...], own: tuple[Record, ...], now_ns: int
@@ -148,7 +151,7 @@ class Mapper:
         out: Memory = {f"submap/{s}": plain(self._submap_memory(s)) for s in sorted(submaps - self.deleted)}
         for agent in sorted(self.map.cameras):
             offset = self.map.disparity_offset_px.get(agent)
-            known = agent in self.map.disparity_known
+            known = agent in self.map.disparity_calibrated
             out[f"agent/{agent}"] = plain({"offset_px": None if offset is None else offset.tolist(), "known": known})
         stale = {s: list(waiting) for s, waiting in self._stale.items()}
         for submap, _ in self._windows.values():
@@ -169,7 +172,7 @@ class Mapper:
     def _submap_memory(self, submap: SubmapId) -> Json:
         joined = self.map.root_submaps.get(submap)
         return {
-            "frame": matrix(self.map.frames.get(submap)),
+            "frame": matrix(self.map.submap_poses.get(submap)),
             "island": None if joined is None else int(joined),
             "T_w_m": matrix(self.placements.get(submap)),
             "name": self.names.get(submap),
@@ -191,7 +194,7 @@ class Mapper:
             if value["offset_px"] is not None:
                 self.map.disparity_offset_px[AgentId(int(number))] = np.array(value["offset_px"], np.float64)
             if value["known"]:
-                self.map.disparity_known.add(AgentId(int(number)))
+                self.map.disparity_calibrated.add(AgentId(int(number)))
         unused: set[KeyframeId] = set()
         for _, value in parsed(texts, "base"):
             self.counts = MapperCounts(**value["counts"])
@@ -224,7 +227,7 @@ class Mapper:
                 slots = self.map.slots_of(keyframe)
                 self.map.set_flags(slots[self.map.keypoints.kind[slots] == LANDMARK], CULLED)
                 self.map.cull_keyframe(keyframe)
-                self._publisher.touch(CulledLandmarks.KIND, keyframe)
+                self._publisher.mark_changed(CulledLandmarks.KIND, keyframe)
             self._stale.pop(submap, None)
             self.placements.pop(submap, None)
             self.names.pop(submap, None)
@@ -265,7 +268,7 @@ class Mapper:
             }
         return {
             "keyframes": len(self.map),
-            "points": len(self.map.roots()),
+            "points": len(self.map.live_landmarks()),
             "observations": int(np.count_nonzero(self.map.keypoints.usable[: self.map.slots])),
             "map_bytes": self.map.nbytes(),
             "agents": agents,
@@ -298,7 +301,7 @@ class Mapper:
         if isinstance(done.result, BundleResult):
             opened = self._windows.pop(done.id, None)
             if opened is not None:  # else superseded
-                result = without_links(opened[1], done.result)
+                result = without_odometry_factors(opened[1], done.result)
                 apply_bundle(self.map, opened[1], result, self._publisher, self.config.cull, self.config.publish)
                 self.counts.bundles += 1
         elif isinstance(done.result, GridMap) and done.id == self._grid_job:
@@ -351,7 +354,7 @@ class Mapper:
             out[map_id] = out.get(map_id, 0) + len(keyframes)
         return {map_id: size for map_id, size in out.items() if size <= self.config.graph.max_full}
 
-    def _tell_calibrations(self) -> None:
+    def _send_calibrations(self) -> None:
         """Agents track better on disparities without the offset that was found."""
         for agent, offset in sorted(self.map.disparity_offset_px.items(), key=lambda item: item[0]):
             if not np.array_equal(self._told.get(agent, 0.0), offset):
@@ -372,14 +375,14 @@ class Mapper:
             # Around the newest keyframe; where many came at once, from the oldest on, half a window at a time.
             waiting, size = self._stale.pop(submap), self.config.window.free
             keyframe = waiting[-1] if len(waiting) <= size else waiting[size // 2]
-            part = local_window(self.map, keyframe, self.config.window, self.config.measurement)
+            part = local_bundle_window(self.map, keyframe, self.config.window, self.config.measurement)
             moved = set() if part is None else set(self.map.keyframes.id[part.rows[part.problem.free]].tolist())
             left = [k for k in waiting if k != keyframe and k not in moved]
             if left:
                 self._stale[submap] = left
             if part is not None:
-                problem = with_links(self.map, part, self.config.links)
-                job = Job(self._next_job(), "bundle", BundleInputs(problem, self.config.bundle))
+                problem = with_odometry_factors(self.map, part, self.config.links)
+                job = Job(self._next_job(), LOCAL_BUNDLE.name, BundleInputs(problem, self.config.bundle))
                 jobs.append(job)
                 self._windows[job.id] = (submap, part)
                 self._served[submap] = job.id
@@ -391,9 +394,9 @@ class Mapper:
         if self._grid_job or self._grid_due < pause:
             return []
         self._grid_due = 0
-        view = world_view(self.map, self.placements)
+        view = placed_map(self.map, self.placements)
         self._grid_job = self._next_job()
-        return [Job(self._grid_job, "grid", GridInputs(self.config.grid, view.positions, view.points, view.rays))]
+        return [Job(self._grid_job, GRID.name, GridInputs(self.config.grid, view.positions, view.points, view.rays))]
 
     def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
         live = self._intake.live.get(agent)

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.runtime.jobs import Job, JobDone
-from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.schema import Key, Record, WireError, messages
 from kiteline_core.ids import AgentId
@@ -40,7 +40,7 @@ class Station:
         self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], words: Vocabulary | None = None
     ) -> None:  # fmt: skip
         self.mapper = Mapper(config, words)
-        self.supply = Supply(config.supply, config.loops, self.mapper.map)
+        self.supply = MapCachePlanner(config.supply, config.loops, self.mapper.map)
         self.channels: dict[AgentId, RecordChannel] = {}
         self.touched: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `note_changes`
         self.unreadable = 0  # imported values whose code was no valid record

@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import grid_kernels as kernels
-from kiteline_basestation.grid.grid import GridConfig, percent
+from kiteline_basestation.grid.grid import percent
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]

@@ -23,7 +23,7 @@ from kiteline_codec.sync.endpoint import SyncConfig
 MakeFlight = Callable[..., Any]
 
 
-class Flown:
+class FlightSummary:
     """A station that hears of one keyframe a step, and its keeper."""
 
     def __init__(self, flight: Any, folder: Path) -> None:
@@ -46,7 +46,7 @@ def test_a_disk_that_refuses_for_a_while_loses_nothing(
     make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(keeper_module, "_RETRY_S", 0.02)
-    flown, write, refused = Flown(make_flight(keyframes=6, turns=0.1), tmp_path), Store.write, []
+    flown, write, refused = FlightSummary(make_flight(keyframes=6, turns=0.1), tmp_path), Store.write, []
 
     def sometimes(store: Store, batch: Batch) -> None:
         if len(refused) < 3:
@@ -67,7 +67,7 @@ def test_a_disk_that_refuses_for_a_while_loses_nothing(
 def test_a_slow_disk_makes_fewer_batches_and_holds_nobody_up(
     make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flown, write, go = Flown(make_flight(keyframes=12, turns=0.2), tmp_path), Store.write, threading.Event()
+    flown, write, go = FlightSummary(make_flight(keyframes=12, turns=0.2), tmp_path), Store.write, threading.Event()
 
     def slow(store: Store, batch: Batch) -> None:
         go.wait(20.0)

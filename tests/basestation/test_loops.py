@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import BaseConfig, RefindConfig
+from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig
+from kiteline_basestation.exchange.sharing import SharingPolicy
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.merging.loop_detector import Shares
-from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
 from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record
 from kiteline_core.ids import AgentId
 
@@ -111,14 +112,14 @@ def test_windows_that_repeat_along_a_corridor_close_no_loop(
 
 def test_who_shares_with_whom() -> None:
     a, b, c = AgentId(0), AgentId(1), AgentId(2)
-    assert Shares("all").together(a, c)
-    assert not Shares("none").together(a, c) and Shares("none").together(a, a)
-    chain = Shares("0 1, 1 2")
-    assert chain.together(a, b) and chain.together(c, b) and not chain.together(a, c)
+    assert SharingPolicy("all").allows(a, c)
+    assert not SharingPolicy("none").allows(a, c) and SharingPolicy("none").allows(a, a)
+    chain = SharingPolicy("0 1, 1 2")
+    assert chain.allows(a, b) and chain.allows(c, b) and not chain.allows(a, c)
     with pytest.raises(ValueError, match="expected"):
-        Shares("0-1")
+        SharingPolicy("0-1")
 
 
 def test_a_config_without_loops_has_none(make_flight: MakeFlight, words: Any) -> None:
-    config = replace(BaseConfig(), refind=RefindConfig(), loops=replace(BaseConfig().loops, enabled=False))
+    config = replace(BaseConfig(), refind=LandmarkMatchingConfig(), loops=replace(BaseConfig().loops, enabled=False))
     assert Mapper(config, words).merger is None

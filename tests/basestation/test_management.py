@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import VERBS, Answer, Command, called
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record
 from kiteline_core.geometry import se3
@@ -83,7 +84,7 @@ def test_list_and_get_tell_what_there_is(pair: Base) -> None:
     assert told["placed"] is True
     assert [s["id"] for s in told["submaps"]] == ["0.1.0", "1.1.0"]
     assert told["keyframes"] == 60 == sum(s["keyframes"] for s in told["submaps"])
-    assert told["points"] == len(pair.mapper.map.roots())
+    assert told["points"] == len(pair.mapper.map.live_landmarks())
     got = pair.ask("get", map="1.1.0")
     assert got["id"] == "0.1.0"
     submap = got["submaps"][1]

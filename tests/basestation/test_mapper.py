@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import BaseConfig, NewPointConfig, RefindConfig
+from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig, TriangulationConfig
+from kiteline_basestation.grid.placed_map import placed_map
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
-from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.store.state import Scribe
 from kiteline_codec.schema import (
     CameraIntrinsics,
@@ -74,7 +75,7 @@ def test_refind_fuses_doubles_and_nothing_else(make_flight: MakeFlight) -> None:
     feed(mapper, flight, flight.records)
     table = mapper.map.keypoints
     slots = np.flatnonzero((table.kind == LANDMARK) & (table.root != np.arange(len(table.root)))).astype(np.int32)
-    aliases, roots = mapper.map.point_ids(slots).tolist(), mapper.map.point_ids(table.root[slots]).tolist()
+    aliases, roots = mapper.map.landmark_ids(slots).tolist(), mapper.map.landmark_ids(table.root[slots]).tolist()
     doubles = len(flight.point_of) - len(set(flight.point_of.values()))
     assert len(aliases) > 0.8 * doubles
     assert all(flight.point_of[a] == flight.point_of[r] for a, r in zip(aliases, roots))
@@ -85,7 +86,7 @@ def test_without_refind_the_second_round_does_not_join_the_first(make_flight: Ma
     apart, together = [], []
     for seed in (0, 1):
         flight = make_flight(keyframes=60, turns=2.0, memory=3, seed=seed)
-        mapper = Mapper(replace(BaseConfig(), refind=RefindConfig(max_hamming=-1)))
+        mapper = Mapper(replace(BaseConfig(), refind=LandmarkMatchingConfig(max_hamming=-1)))
         feed(mapper, flight, flight.records)
         assert mapper.counts.found == 0
         joined = Mapper()
@@ -142,12 +143,12 @@ def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight
     mapper = Mapper()
     published = feed(mapper, flight, flight.records)
     assert mapper.counts.triangulated > 40
-    points = mapper.map.roots()
+    points = mapper.map.live_landmarks()
     seen = np.diff(mapper.map.observations(points)[0])
     blind = mapper.map.keypoints.inv_depth[points] == 0
     xyz, known = mapper.map.positions(points)
     placed = known & blind & (seen >= 3)
-    truth = np.array([flight.world[flight.point_of[i]] for i in mapper.map.point_ids(points[placed]).tolist()])
+    truth = np.array([flight.world[flight.point_of[i]] for i in mapper.map.landmark_ids(points[placed]).tolist()])
     error = np.linalg.norm(xyz[placed] - truth, axis=1)
     assert placed.sum() > 30
     assert np.median(error) < 0.08
@@ -156,7 +157,7 @@ def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight
 
 def test_strict_new_point_rules_refuse_two_views_that_are_one(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=8, turns=0.2, no_depth=1.0)
-    mapper = Mapper(replace(BaseConfig(), new_points=NewPointConfig(max_cosine=-1.0)))
+    mapper = Mapper(replace(BaseConfig(), new_points=TriangulationConfig(max_cosine=-1.0)))
     feed(mapper, flight, flight.records)
     assert mapper.counts.triangulated == 0
 
@@ -199,10 +200,10 @@ def test_late_sections_are_waited_for_then_done_without_and_taken_up_when_they_c
     assert mapper.counts.keyframes == 7
     mapper.step(MapperInput(()), now_ns + 2_500_000_000)
     assert mapper.counts.keyframes == 8
-    before = len(mapper.map.observed(flight.keyframes[5]))
+    before = len(mapper.map.observations_of(flight.keyframes[5]))
     mapper.step(MapperInput(((flight.agent, (late,)),)), now_ns + 3_000_000_000)
     assert mapper.counts.keyframes == 9  # the completed keyframe is searched once more
-    assert len(mapper.map.observed(flight.keyframes[5])) > before
+    assert len(mapper.map.observations_of(flight.keyframes[5])) > before
 
 
 def test_what_is_published_replaces_older_values_and_matches_the_map(make_flight: MakeFlight) -> None:
@@ -221,7 +222,7 @@ def test_what_is_published_replaces_older_values_and_matches_the_map(make_flight
     found = {r.keyframe: r for r in published if isinstance(r, FusedLandmarks)}
     for keyframe, same in found.items():
         births = mapper.map.slots_of(keyframe)[same.index]
-        assert np.array_equal(mapper.map.point_ids(mapper.map.keypoints.root[births]), same.point)
+        assert np.array_equal(mapper.map.landmark_ids(mapper.map.keypoints.root[births]), same.point)
     for record in {r.keyframe: r for r in published if isinstance(r, RefinedLandmarks)}.values():
         births = mapper.map.slots_of(record.keyframe)[record.index]
         current = mapper.map.keypoints.root[births] == births
@@ -276,12 +277,12 @@ def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
     assert agents[3]["keyframes"] == 5
     assert agents[3]["quality"] == 80
     assert agents[3]["T_w_c"] is not None
-    view = world_view(mapper.map, mapper.placements)
+    view = placed_map(mapper.map, mapper.placements)
     assert len(view.positions) == 5
     assert view.observations[:, 1].max() == len(view.points) - 1
     assert np.bincount(view.observations[:, 1]).min() >= 2
     table = mapper.map.keypoints
-    assert not (table.flags[mapper.map.find_points(view.point_ids)] & CULLED).any()
+    assert not (table.flags[mapper.map.find_landmarks(view.landmark_ids)] & CULLED).any()
 
 
 def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFlight) -> None:
@@ -295,15 +296,20 @@ def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFligh
     second.recall({name: text for name, text in Scribe().changes(first.memory()).items() if text is not None})
     assert second.idle
     assert not second.step(MapperInput(()), 0).publish
-    assert np.array_equal(first.map.point_ids(first.map.roots()), second.map.point_ids(second.map.roots()))
+    assert np.array_equal(
+        first.map.landmark_ids(first.map.live_landmarks()), second.map.landmark_ids(second.map.live_landmarks())
+    )
     for keyframe in flight.keyframes[:20]:
         a, b = first.map.pose(keyframe), second.map.pose(keyframe)
         assert a is not None and b is not None
         assert np.array_equal(a, b)
         assert np.array_equal(
-            first.map.point_ids(first.map.points_of(keyframe)), second.map.point_ids(second.map.points_of(keyframe))
+            first.map.landmark_ids(first.map.landmarks_of(keyframe)),
+            second.map.landmark_ids(second.map.landmarks_of(keyframe)),
         )
-    assert np.array_equal(first.map.positions(first.map.roots())[0], second.map.positions(second.map.roots())[0])
+    assert np.array_equal(
+        first.map.positions(first.map.live_landmarks())[0], second.map.positions(second.map.live_landmarks())[0]
+    )
     feed(second, flight, flight.records[20:])
     assert second.counts.bundles > 2
     assert len(second.map) == 24

@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, Key, Record, SubmapPlacement

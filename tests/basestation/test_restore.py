@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.runtime.jobs import JobDone, run_job
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.integrity import contradictions, sound
@@ -84,7 +85,7 @@ def whole(station: Station) -> dict[str, Any]:
     for keyframe in sorted(sparse_map.rows):
         slots = sparse_map.slots_of(keyframe)
         roots = table.root[slots]
-        points = np.where(roots >= 0, sparse_map.point_ids(np.maximum(roots, 0)), -1)
+        points = np.where(roots >= 0, sparse_map.landmark_ids(np.maximum(roots, 0)), -1)
         refined = table.flags[slots] & 4 != 0
         alive = refined & (roots == slots) & (table.flags[slots] & 2 == 0)
         pose, world = sparse_map.pose(keyframe), sparse_map.world_pose(keyframe)

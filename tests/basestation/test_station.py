@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.runtime.jobs import run_job
+from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
 from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record, RefinedLandmarks

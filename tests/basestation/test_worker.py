@@ -6,9 +6,11 @@ import time
 
 import numpy as np
 
-from kiteline_basestation.grid.grid import GridConfig
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid_job import GridInputs
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.runtime.flight_log import fingerprint
-from kiteline_basestation.runtime.jobs import GridInputs, Job, JobDone, run_job
 from kiteline_basestation.runtime.worker import Worker
 
 

@@ -19,7 +19,8 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation import web
-from kiteline_basestation.grid.grid import GridConfig, build
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid import build
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_basestation.grid.grid import GridConfig, build, to_pgm, to_yaml
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid import build, to_pgm, to_yaml
 from kiteline_basestation.runtime.export import map_ply, tum
 from kiteline_lab.plots.plot_map import MapFileError, main, read_map_ply
 

@@ -16,14 +16,15 @@ nor the floor under a high ray.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import grid_kernels as kernels
-from kiteline_basestation.grid.ground_height import FloorConfig, ground_heights
+from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_codec.schema import GridTile
 
 F64 = NDArray[np.float64]
@@ -38,26 +39,6 @@ TILE = kernels.TILE
 UNKNOWN = -1
 
 UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of map points
-
-
-@dataclass(frozen=True, slots=True)
-class GridConfig:
-    """The grid's numbers. Heights are relative to the local ground."""
-
-    cell_m: float = 0.1  # m; finer cells fall between the rays to sparse points; 0.2 suits streets
-    max_ray_m: float = 20.0  # m; beyond, a stereo point is wrong by more than a cell
-    obstacle_low_m: float = 0.1  # m; lower than this is ground: a vehicle rolls, and noise reaches this far
-    vehicle_height_m: float = 2.0  # m; what hangs higher is passed below
-    noise_per_m: float = 0.01  # m of height per m of distance from the nearest view: stereo noise grows with distance
-    free_below_m: float = 0.7  # m; a ray to the ground that is still higher says nothing about the floor below it
-    clear_below_m: float = 0.5  # m; the same of a ray to an obstacle: higher up it passes over boxes and chairs
-    log_hit: float = 0.6  # log-odds of one view of an obstacle point (p = 0.65): two views make 0.77
-    log_through: float = -0.3  # log-odds of one ray through an obstacle's heights (p = 0.43)
-    log_free: float = -0.7  # log-odds of one ray over a cell without obstacle (p = 0.33)
-    log_limit: float = 3.5  # log-odds; p within 0.03..0.97, so that the grid can still change its mind
-    quartile: float = 0.675  # standard deviations from the mean to a quartile of a normal distribution
-    fence: float = 1.5  # interquartile ranges above the upper quartile: longer rays are outliers (Segfloor eq. 5.3)
-    floor: FloorConfig = field(default_factory=FloorConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +73,11 @@ def empty(config: GridConfig, points: F64 | None = None) -> GridMap:
 
 
 class Grid:
-    """The newest grid and which of its tiles changed when."""
+    """The newest grid; returns the tiles that changed."""
 
     def __init__(self, config: GridConfig | None = None) -> None:
         self.config = config or GridConfig()
         self.map = empty(self.config)
-        self.revision = 0
-        self.changed: dict[tuple[int, int], int] = {}  # (row, column) -> revision of the last change
 
     def update(self, positions: F64, points: F64, observations: I64) -> tuple[GridTile, ...]:
         """Rebuild from the whole map and return the tiles that changed; arguments as those of `build`."""
@@ -107,8 +86,6 @@ class Grid:
     def adopt(self, new: GridMap) -> tuple[GridTile, ...]:
         """Take a grid made by `build` and return the tiles that changed. A tile that vanished comes as unknown."""
         changed = differences(self.map, new)
-        self.revision += 1
-        self.changed.update({(t.row, t.column): self.revision for t in changed})
         self.map = new
         return changed
 

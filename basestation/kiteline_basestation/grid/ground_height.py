@@ -6,11 +6,10 @@ plane for each neighbourhood, fitted to the points near it in ever narrower band
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.config import GroundConfig
 from kiteline_basestation.grid import grid_kernels as kernels
 
 F64 = NDArray[np.float64]
@@ -18,22 +17,7 @@ I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class FloorConfig:
-    """How the ground is found."""
-
-    camera_above_m: float = 0.1  # m; ground points lie at least this far below every camera that sees them
-    patch_m: float = 2.0  # m; side of the neighbourhoods; three by three of them share their points
-    height_bin_m: float = 0.05  # m; a floor's points, with stereo noise, fill two or three bins
-    slope: float = 0.25  # m/m; how steep the ground may be: a ramp, or a map whose z is 10 degrees off the vertical
-    peak_share: float = 0.25  # of the highest peak: a lower peak with this share is the ground, below it is noise
-    peak_points: float = 4.0  # points; fewer make no peak
-    bands_m: tuple[float, ...] = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
-    plane_points: float = 12.0  # points that a neighbourhood's plane needs; with fewer it stays as it is
-    level_m: float = 0.3  # m; a patch of points with less spread than this says nothing of the slope
-
-
-def ground_heights(config: FloorConfig, points: F64, camera_z: F64) -> F64:
+def ground_heights(config: GroundConfig, points: F64, camera_z: F64) -> F64:
     """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that sees each.
 
     NaN at all points when the heights below the cameras have no peak.
@@ -88,7 +72,7 @@ class _Patches:
         return out
 
 
-def _levels(config: FloorConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
+def _levels(config: GroundConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
     """z (rows, columns) of the lowest peak in every neighbourhood; None where there is no peak at all."""
     if not below.any():
         return None
@@ -117,7 +101,7 @@ def _levels(config: FloorConfig, patches: _Patches, z: F64, below: Bool) -> F64 
     return np.asarray(base + (ground.astype(np.float64) + 0.5) * config.height_bin_m)
 
 
-def _fit(config: FloorConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
+def _fit(config: GroundConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
     """Least-squares plane (3, rows, columns) of the points `near` in every neighbourhood; slopes kept small."""
     x, y = patches.xy.T
     n = patches.total(near, np.ones_like(x))
@@ -145,7 +129,7 @@ def _box3(values: F64, axis: int) -> F64:
     return out
 
 
-def _lowest_peak(count: NDArray[np.float32], config: FloorConfig) -> int:
+def _lowest_peak(count: NDArray[np.float32], config: GroundConfig) -> int:
     """The lowest bin that is a peak, with enough points and a fair share of the highest count; -1 none."""
     after = np.append(count[1:], 0.0)
     need = max(config.peak_share * float(count.max()), config.peak_points)

@@ -79,7 +79,7 @@ class Intake:
             elif isinstance(record, SubmapScale):
                 self.units[record.submap] = record.metres
                 if record.metres == 1.0:
-                    self._map.metric.add(record.submap)
+                    self._map.metric_submaps.add(record.submap)
             elif isinstance(record, NewLandmarks | Observations):
                 if record.keyframe in self._map:
                     self._take_section(record)
@@ -101,21 +101,21 @@ class Intake:
                 break
             if not self._known(keyframe):
                 continue
-            complete = self._map.complete(keyframe)
+            complete = self._map.is_complete(keyframe)
             if complete or now_ns - since_ns >= patience_ns:
                 out.append(keyframe)
                 if not complete:
                     self._partial.add(keyframe)
         for keyframe in out:
             del self._waiting[keyframe]
-        late = [k for k in sorted(self._partial) if k not in out and self._map.complete(k)][: self._config.per_step]
+        late = [k for k in sorted(self._partial) if k not in out and self._map.is_complete(k)][: self._config.per_step]
         self._partial.difference_update(late)
         return sorted(out + late)
 
     @property
     def backlog(self) -> bool:
         """Whether keyframes are ready that no step has taken up yet."""
-        return any(self._map.complete(k) and self._known(k) for k in self._waiting)
+        return any(self._map.is_complete(k) and self._known(k) for k in self._waiting)
 
     def memory(self, submap: SubmapId) -> Json:
         """What a successor cannot have from the newest values of a submap."""
@@ -163,12 +163,12 @@ class Intake:
 
     def _take_section(self, section: NewLandmarks | Observations) -> None:
         if isinstance(section, NewLandmarks):
-            self._map.put_births(
+            self._map.put_new_landmarks(
                 section.keyframe, section.part, section.index, section.uv, section.inv_depth, section.octave,
                 section.angle, section.descriptor,
             )  # fmt: skip
         else:
-            self._map.put_sightings(
+            self._map.put_observations(
                 section.keyframe, section.part, section.index, section.uv, section.inv_depth, section.octave,
                 section.point,
             )  # fmt: skip

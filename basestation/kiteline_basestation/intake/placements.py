@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import IntakeConfig
+from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3, sim3
@@ -65,7 +65,7 @@ class World:
         """
         first = self.first
         metres = None if first is None else self._intake.units.get(first)
-        if first is None or metres is None or not self._map.own_unit(self._map.map_id(first)):
+        if first is None or metres is None or not self._map.is_up_to_scale(self._map.map_id(first)):
             return False
         if sim3.scale_of(self.placements[first]) != 1.0 or metres == 1.0:
             return False
@@ -92,7 +92,7 @@ class World:
             if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > self._config.carry_s * 1e9:
                 return  # a place that it reached unseen: it is found when it is recognised
             there = sim3.place(S_w_before, left @ live.T_k_c)
-            unit = sim3.scale_of(S_w_before) if self._map.own_unit(submap) else 1.0
+            unit = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
             S_w_m = sim3.normalise(sim3.of(unit, there) @ se3.inverse(begin))
         self.carried[submap] = S_w_m
         self._set(submap, S_w_m)
@@ -100,7 +100,7 @@ class World:
     def grow(self, units: Mapping[SubmapId, float]) -> None:
         """Units of submaps have grown in their maps: these stay as long in the world as they were."""
         for submap, more in units.items():
-            begin = self._map.beginning(submap)
+            begin = self._map.first_pose(submap)
             if submap in self.placements:
                 self._set(submap, sim3.grown(self.placements[submap], more, begin))
             if submap in self.carried:
@@ -114,7 +114,7 @@ class World:
                 self._set(submap, self.carried[submap])
             else:
                 del self.placements[submap]
-                self._publisher.forget_place(submap)
+                self._publisher.withdraw_placement(submap)
                 self._withdrawn.append((agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0)))
 
     def lay_out(self, map_id: SubmapId) -> None:
@@ -127,16 +127,16 @@ class World:
         anchor = next((s for s in [first, eldest, *submaps] if s in self.placements and s in submaps), None)
         if first is None or anchor is None:
             return
-        S_w_i = sim3.normalise(self.placements[anchor] @ sim3.inverse(self._map.frame(anchor)))
+        S_w_i = sim3.normalise(self.placements[anchor] @ sim3.inverse(self._map.submap_pose(anchor)))
         unit = sim3.scale_of(S_w_i)
-        if unit != 1.0 and not self._map.own_unit(eldest):
+        if unit != 1.0 and not self._map.is_up_to_scale(eldest):
             at = self.placements[anchor][:3, 3]
             stretch = sim3.of(1.0 / unit, se3.from_rt(np.eye(3), at - at / unit))
-            if anchor == first or self._map.own_unit(self._map.map_id(first)):
+            if anchor == first or self._map.is_up_to_scale(self._map.map_id(first)):
                 self._move_world(stretch, submaps)
             S_w_i = sim3.normalise(stretch @ S_w_i)
         for submap in submaps:
-            S_w_m = sim3.normalise(S_w_i @ self._map.frame(submap))
+            S_w_m = sim3.normalise(S_w_i @ self._map.submap_pose(submap))
             held = self.placements.get(submap)
             if held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
                 self._set(submap, S_w_m)
@@ -145,7 +145,7 @@ class World:
 
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
         self.placements[submap] = S_w_m
-        self._publisher.place(submap, S_w_m)
+        self._publisher.publish_placement(submap, S_w_m)
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
         """Turn or stretch the world with all that is placed in it, but for some; metres stay metres."""
@@ -156,7 +156,7 @@ class World:
 
     def _moved(self, submap: SubmapId, S_new_old: F64, S_w_m: F64) -> F64:
         """Where a submap lies in a world that moved: where its first keyframe does, as long as it is in metres."""
-        if sim3.scale_of(S_new_old) == 1.0 or self._map.own_unit(submap):
+        if sim3.scale_of(S_new_old) == 1.0 or self._map.is_up_to_scale(submap):
             return sim3.normalise(S_new_old @ S_w_m)
-        begin = self._map.beginning(submap)
+        begin = self._map.first_pose(submap)
         return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, begin)) @ se3.inverse(begin))

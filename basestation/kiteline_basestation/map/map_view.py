@@ -37,14 +37,16 @@ class MapView:
         self.slots = 0
         self.rows: dict[KeyframeId, int] = {}
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes of each submap in order of id
-        self.frames: dict[SubmapId, F64] = {}  # S_w_m of each submap that does not lie as it was begun: a similarity
-        self._units: dict[SubmapId, float] = {}  # the scales of these
+        self.submap_poses: dict[
+            SubmapId, F64
+        ] = {}  # S_w_m of each submap that does not lie as it was begun: a similarity
+        self._scales: dict[SubmapId, float] = {}  # the scales of these
         self.root_submaps: dict[SubmapId, SubmapId] = {}  # submaps joined to others -> the eldest of them
         self.cameras: dict[AgentId, RectifiedCamera] = {}
-        self.metric: set[SubmapId] = set()  # of one eye, whose agent knows the metre
+        self.metric_submaps: set[SubmapId] = set()  # of one eye, whose agent knows the metre
         self.measures_depth: set[AgentId] = set()  # agents whose sightings have depth of their own (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # what an agent's disparities are too large by, see the base
-        self.disparity_known: set[AgentId] = set()  # agents whose offset is known well
+        self.disparity_calibrated: set[AgentId] = set()  # agents whose offset is known well
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots that name a point of a keyframe that is not here yet
 
@@ -65,12 +67,12 @@ class MapView:
         """Keypoint indices within their keyframes."""
         return np.asarray(slots - self.keyframes.start[self.keypoints.row[slots]], np.int32)
 
-    def point_ids(self, slots: I32) -> I64:
+    def landmark_ids(self, slots: I32) -> I64:
         """Ids (n,) of the points born at slots (n,)."""
         anchors = self.keyframes.id[self.keypoints.row[slots]]
         return np.asarray((anchors << KEYPOINT_BITS) | self.keypoint_of(slots), np.int64)
 
-    def find_points(self, points: I64) -> I32:
+    def find_landmarks(self, points: I64) -> I32:
         """Slots (n,) of the births of points (n,), -1 where the keyframe is unknown or has no such keypoint."""
         anchors, which = np.unique(points >> KEYPOINT_BITS, return_inverse=True)
         rows = np.array([self.rows.get(KeyframeId(a), -1) for a in anchors.tolist()], np.int64)[which]
@@ -81,27 +83,27 @@ class MapView:
         out[known] = self.keyframes.start[rows[known]] + index[known]
         return out
 
-    def observed(self, keyframe: KeyframeId) -> I32:
+    def observations_of(self, keyframe: KeyframeId) -> I32:
         """Slots of a keyframe's valid observations whose point is known and not culled."""
         slots = self.slots_of(keyframe)
         return np.asarray(slots[self._counts(slots)])
 
-    def points_of(self, keyframe: KeyframeId) -> I32:
+    def landmarks_of(self, keyframe: KeyframeId) -> I32:
         """Slots of the points that a keyframe observes, in order of id."""
-        return self.in_order(self.keypoints.root[self.observed(keyframe)])
+        return self.sorted_by_id(self.keypoints.root[self.observations_of(keyframe)])
 
-    def in_order(self, points: I32) -> I32:
+    def sorted_by_id(self, points: I32) -> I32:
         """Points without repetition in order of id: an order that does not tell what arrived first."""
         points = np.unique(points)
-        return np.asarray(points[np.argsort(self.point_ids(points))])
+        return np.asarray(points[np.argsort(self.landmark_ids(points))])
 
-    def roots(self) -> I32:
+    def live_landmarks(self) -> I32:
         """Slots of all points that live, in order of id: born, not fused into another, not culled."""
         table = self.keypoints
         n = self.slots
         here = np.arange(n, dtype=np.int32)
         live = (table.kind[:n] == LANDMARK) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
-        return self.in_order(here[live])
+        return self.sorted_by_id(here[live])
 
     def observations(self, points: I32) -> tuple[I32, I32]:
         """Valid observations of points (n,), in order of keyframe id, one a keyframe.
@@ -116,14 +118,22 @@ class MapView:
         )  # fmt: skip
         return starts, slots[:n]
 
-    def covisible(self, points: I32) -> I32:
+    def covisibility(self, points: I32) -> I32:
         """How many of the points (n,) each keyframe (by row) observes."""
         shared = np.zeros(len(self), np.int32)
         table = self.keypoints
         kernels.covisibility(points, table.first, table.next, table.row, table.usable, shared)
         return shared
 
-    def one_keyframe_sees_both(self, a: int, b: int) -> bool:
+    def covisible_keyframes(self, keyframe: KeyframeId, min_shared: int) -> list[KeyframeId]:
+        """Keyframes of the same map that share at least min_shared landmarks, most first, newer first among equals."""
+        shared = self.covisibility(self.landmarks_of(keyframe))
+        rows = np.flatnonzero(shared >= max(min_shared, 1))
+        ids = self.keyframes.id[rows]
+        order = np.lexsort((-ids, -shared[rows]))
+        return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe]
+
+    def observed_together(self, a: int, b: int) -> bool:
         """Whether some keyframe observes both points: then they cannot be one."""
         table = self.keypoints
         return bool(kernels.share_keyframe(a, b, table.first, table.next, table.row, table.usable))
@@ -151,7 +161,7 @@ class MapView:
         pose = self.keyframes.T_w_k[rows]
         return np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3], valid & (fx > 0)
 
-    def bearing_of(self, points: I32, positions: F64) -> tuple[F32, F32, Bool]:
+    def project_into_anchor(self, points: I32, positions: F64) -> tuple[F32, F32, Bool]:
         """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, whether each lies before its anchor."""
         rows = self.keypoints.row[points]
         pose = self.keyframes.T_w_k[rows]
@@ -177,21 +187,21 @@ class MapView:
             return None
         return np.asarray(self.keyframes.T_w_k[row]).copy()
 
-    def frame(self, submap: SubmapId) -> F64:
+    def submap_pose(self, submap: SubmapId) -> F64:
         """S_w_m (4,4) of a submap: a rigid motion, or a similarity where its unit of length is not that of w."""
-        held = self.frames.get(submap)
+        held = self.submap_poses.get(submap)
         return np.eye(4) if held is None else held.copy()
 
-    def unit(self, submap: SubmapId) -> float:
+    def scale(self, submap: SubmapId) -> float:
         """How many units of w one of a submap is."""
-        return self._units.get(submap, 1.0)
+        return self._scales.get(submap, 1.0)
 
-    def own_unit(self, submap: SubmapId) -> bool:
+    def is_up_to_scale(self, submap: SubmapId) -> bool:
         """Whether a submap's unit of length is its own: one eye saw it, that knows no metre."""
         agent = agent_of_submap(submap)
         camera = self.cameras.get(agent)
         deep = camera is None or camera.stereo or agent in self.measures_depth
-        return not (deep or submap in self.metric)
+        return not (deep or submap in self.metric_submaps)
 
     def map_id(self, submap: SubmapId) -> SubmapId:
         """The eldest of the submaps that are one map with this one."""
@@ -202,7 +212,7 @@ class MapView:
         eldest = self.map_id(submap)
         return sorted({eldest} | {s for s, root in self.root_submaps.items() if root == eldest})
 
-    def complete(self, keyframe: KeyframeId) -> bool:
+    def is_complete(self, keyframe: KeyframeId) -> bool:
         """Whether all keypoints that the header announced have arrived."""
         row = self.rows[keyframe]
         return bool(self.keyframes.filled[row] >= self.keyframes.count[row])

@@ -97,10 +97,10 @@ class SparseMap(MapView):
             self._compose(row)
         waiting = self._waiting.pop(keyframe, None)
         if waiting is not None:
-            self._link_sightings(np.array(waiting, np.int32))
+            self._link_observations(np.array(waiting, np.int32))
         return row
 
-    def put_births(
+    def put_new_landmarks(
         self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,
         angle: U8, descriptor: U8,
     ) -> None:  # fmt: skip
@@ -119,7 +119,7 @@ class SparseMap(MapView):
         kernels.link(fresh, fresh, table.root, table.first, table.next)
         self._refresh_usable(self.rows[keyframe])
 
-    def put_sightings(
+    def put_observations(
         self,
         keyframe: KeyframeId,
         part: int,
@@ -140,7 +140,7 @@ class SparseMap(MapView):
         table.point[slots] = point[keep]
         if bool(np.any(inv_depth > 0)):
             self.measures_depth.add(agent_of_keyframe(keyframe))
-        self._link_sightings(slots)
+        self._link_observations(slots)
         self._refresh_usable(self.rows[keyframe])
 
     # -- what the base wrote -----------------------------------------------------------------------------------------
@@ -158,22 +158,22 @@ class SparseMap(MapView):
 
     def set_world_pose(self, keyframe: KeyframeId, T_w_k: F64) -> None:
         """The base's pose of a keyframe, said in w; its submap stays where it is."""
-        frame = self.frames.get(submap_of_keyframe(keyframe))
+        frame = self.submap_poses.get(submap_of_keyframe(keyframe))
         self.set_pose(keyframe, T_w_k if frame is None else se3.orthonormalise(sim3.place(sim3.inverse(frame), T_w_k)))
 
     def move_submap(self, submap: SubmapId, S_w_m: F64) -> None:
         """Lay a submap, with all that hangs on it, at S_w_m (4,4): a rigid motion, or with another unit of length."""
-        if submap in self.frames or not np.array_equal(S_w_m, np.eye(4)):
-            self.frames[submap] = np.array(S_w_m)
-            self._units[submap] = sim3.scale_of(S_w_m)
+        if submap in self.submap_poses or not np.array_equal(S_w_m, np.eye(4)):
+            self.submap_poses[submap] = np.array(S_w_m)
+            self._scales[submap] = sim3.scale_of(S_w_m)
         for keyframe in self.submaps.get(submap, []):
             self._follow(self.rows[keyframe])
 
-    def stretch_submap(self, submap: SubmapId, factor: float) -> None:
+    def scale_submap(self, submap: SubmapId, factor: float) -> None:
         """Let lengths of a submap be so many times as long in w; its beginning stays where it is."""
-        self.move_submap(submap, sim3.grown(self.frame(submap), factor, self.beginning(submap)))
+        self.move_submap(submap, sim3.grown(self.submap_pose(submap), factor, self.first_pose(submap)))
 
-    def beginning(self, submap: SubmapId) -> F64:
+    def first_pose(self, submap: SubmapId) -> F64:
         """T_m_k (4,4) of the first keyframe of a submap; the identity while that has no pose."""
         begin = self.pose(self.submaps[submap][0]) if submap in self.submaps else None
         return np.eye(4) if begin is None else begin
@@ -209,13 +209,13 @@ class SparseMap(MapView):
         rows = np.union1d(table.row[births], table.row[one])
         return [KeyframeId(k) for k in np.sort(self.keyframes.id[rows]).tolist()]
 
-    def part(self, births: I32) -> None:
+    def unfuse(self, births: I32) -> None:
         """The opposite of `fuse` for births at slots (n,): each is a point of its own again, seen where it is named."""
         table = self.keypoints
         kernels.link(births, births, table.root, table.first, table.next)
         hangs = (table.kind[: self.slots] == OBSERVATION) & (table.root[: self.slots] >= 0)
         slots = np.flatnonzero(hangs).astype(np.int32)
-        self._link_sightings(slots[np.isin(self.find_points(table.point[slots]), births)])
+        self._link_observations(slots[np.isin(self.find_landmarks(table.point[slots]), births)])
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
@@ -247,11 +247,11 @@ class SparseMap(MapView):
         table.kind[gone] = EMPTY
         return slots, keep
 
-    def _link_sightings(self, slots: I32) -> None:
+    def _link_observations(self, slots: I32) -> None:
         """Hang sightings on the points they name; those whose keyframe is not here wait for it."""
         table = self.keypoints
         slots = slots[table.kind[slots] == OBSERVATION]
-        named = self.find_points(table.point[slots])
+        named = self.find_landmarks(table.point[slots])
         roots = np.full(len(slots), -1, np.int32)
         known = named >= 0
         target = named[known]
@@ -293,7 +293,7 @@ class SparseMap(MapView):
         """Where a keyframe lies in w, from its place in m."""
         table = self.keyframes
         submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
-        frame, unit = self.frames.get(submap), self._units.get(submap, 1.0)
+        frame, unit = self.submap_poses.get(submap), self._scales.get(submap, 1.0)
         table.unit[row] = unit
         table.T_w_k[row] = table.T_m_k[row] if frame is None else frame @ table.T_m_k[row]
         if unit != 1.0:

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, GraphConfig, PublishConfig
-from kiteline_basestation.map.covisibility import Window, covisible_keyframes, window
+from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import LANDMARK
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
 from kiteline_basestation.merging.loop_edges import depth_of, edge_of
 from kiteline_basestation.merging.loop_verification import LoopMatch
+from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window
 from kiteline_codec.schema import KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
@@ -45,7 +45,7 @@ def graph_of(
         parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[keyframe]]))
         if parent in number:
             pairs.add((number[parent], number[keyframe]))
-        for other in covisible_keyframes(sparse_map, keyframe, config.min_shared):
+        for other in sparse_map.covisible_keyframes(keyframe, config.min_shared):
             if other < keyframe and other in number:
                 pairs.add((number[other], number[keyframe]))
     edges = np.array(sorted(pairs), np.int64).reshape(-1, 2)
@@ -61,7 +61,7 @@ def graph_of(
     ).reshape(-1, 2)  # fmt: skip
     held = np.zeros(len(keyframes), np.bool_)
     held[number[KeyframeId(sparse_map.submaps[sparse_map.map_id(map_id)][0])]] = True
-    own = {s for s in sparse_map.submaps_of_map(map_id) if sparse_map.own_unit(s)}
+    own = {s for s in sparse_map.submaps_of_map(map_id) if sparse_map.is_up_to_scale(s)}
     scaled = None
     if own:
         free = np.array([submap_of_keyframe(k) in own for k in keyframes])
@@ -103,9 +103,9 @@ def move_keyframes(
     for submap in sparse_map.submaps_of_map(map_id):
         first = sparse_map.submaps[submap][0]
         T_m_k = sparse_map.pose(first)
-        stays = submap == sparse_map.map_id(map_id) and not sparse_map.own_unit(submap)
+        stays = submap == sparse_map.map_id(map_id) and not sparse_map.is_up_to_scale(submap)
         if T_m_k is not None and not stays:
-            unit = sparse_map.unit(submap)
+            unit = sparse_map.scale(submap)
             sparse_map.move_submap(submap, sim3.normalise(sim3.of(unit, goal[first]) @ se3.inverse(T_m_k)))
     firsts = {sparse_map.submaps[s][0] for s in sparse_map.submaps_of_map(map_id)}
     for keyframe in keyframes:
@@ -118,7 +118,7 @@ def move_keyframes(
         turned = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)
         if moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, goal[keyframe])
-            publisher.touch(KeyframePose.KIND, keyframe)
+            publisher.mark_changed(KeyframePose.KIND, keyframe)
     return largest
 
 
@@ -133,13 +133,13 @@ def rescale(
     units: dict[SubmapId, float] = {}
     left: dict[KeyframeId, float] = {}
     for submap in sparse_map.submaps_of_map(map_id):
-        if not sparse_map.own_unit(submap):
+        if not sparse_map.is_up_to_scale(submap):
             continue
         known = [k for k in sparse_map.submaps[submap] if k in growth]
         if not known:
             continue
         newest = units[submap] = growth[known[-1]]
-        sparse_map.stretch_submap(submap, newest)
+        sparse_map.scale_submap(submap, newest)
         for keyframe in known:
             more = growth[keyframe] / newest
             if abs(more - 1.0) > _SAME:
@@ -156,12 +156,12 @@ def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher:
     known = (table.kind[slots] == LANDMARK) & (inverse > 0.0)
     if known.any():
         sparse_map.set_depths(slots[known], (inverse[known] / factor).astype(np.float32), offset[known])
-        publisher.touch(RefinedLandmarks.KIND, keyframe)
+        publisher.mark_changed(RefinedLandmarks.KIND, keyframe)
 
 
 def whole_window(
     sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopMatch], base: BaseConfig
-) -> Window | None:  # fmt: skip
+) -> BundleWindow | None:  # fmt: skip
     """The problem of a whole map, or of the part around its newest loop when it is too large."""
     config = base.graph
     keyframes = [k for k in keyframes_of(sparse_map, map_id) if not sparse_map.keyframes.culled[sparse_map.rows[k]]]
@@ -177,4 +177,4 @@ def whole_window(
     if len(keyframes) < 2:
         return None
     wide = replace(base.window, fixed=config.max_full // 2)
-    return window(sparse_map, keyframes, wide, base.measurement, {first})
+    return bundle_window(sparse_map, keyframes, wide, base.measurement, {first})

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_edges import depth_of, motion_of, rescaled
 from kiteline_basestation.merging.loop_verification import LoopMatch, View, verify_loop, view_of
 from kiteline_basestation.store.state import Memory, parsed, plain, votes_entry, votes_of
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
+from kiteline_core.ids import KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 
 F64 = NDArray[np.float64]
@@ -44,23 +45,6 @@ class LoopClosure:
         return self.newer == self.older
 
 
-class Shares:
-    """Whose maps may become one. Raises ValueError on words that are no groups of agents."""
-
-    def __init__(self, text: str) -> None:
-        self._all = text.strip() == "all"
-        self._groups: list[set[int]] = []
-        if not self._all and text.strip() not in ("", "none"):
-            try:
-                self._groups = [{int(a) for a in group.split()} for group in text.split(",")]
-            except ValueError as error:
-                raise ValueError(f'share {text!r}: expected "all", "none", or groups such as "0 1, 1 2"') from error
-
-    def together(self, a: AgentId, b: AgentId) -> bool:
-        """Whether two agents share."""
-        return a == b or self._all or any(a in group and b in group for group in self._groups)
-
-
 class LoopDetector:
     """The place index over all keyframes, and the votes that are open."""
 
@@ -68,7 +52,7 @@ class LoopDetector:
         self._config = config
         self._map = sparse_map
         self._index = PlaceIndex(words)
-        self._shares = Shares(config.share)
+        self._sharing = SharingPolicy(config.share)
         self._votes: dict[tuple[SubmapId, SubmapId], list[LoopMatch]] = {}  # by the submaps of old and new
         self._doubts: dict[tuple[SubmapId, SubmapId], int] = {}  # how often a join of two submaps was taken back
         self._born: dict[SubmapId, int] = {}  # when the base first heard of a submap
@@ -144,7 +128,7 @@ class LoopDetector:
             for other in sparse_map.submaps[submap]:
                 if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
                     continue
-                if sparse_map.own_unit(new) or sparse_map.own_unit(submap):
+                if sparse_map.is_up_to_scale(new) or sparse_map.is_up_to_scale(submap):
                     continue  # how long the unit of the one is in the other, nobody says
                 if self._doubts.get((min(new, submap), max(new, submap)), 0) or self._kept_apart(new, submap):
                     continue
@@ -158,7 +142,7 @@ class LoopDetector:
         sparse_map, config = self._map, self._config
         if len(view.slots) < config.min_inliers:
             return []
-        shared = sparse_map.covisible(sparse_map.points_of(keyframe))
+        shared = sparse_map.covisibility(sparse_map.landmarks_of(keyframe))
         known = set(sparse_map.keyframes.id[np.flatnonzero(shared > config.max_shared)].tolist())
         same = sparse_map.submaps[submap_of_keyframe(keyframe)]
         at = same.index(keyframe)
@@ -180,13 +164,13 @@ class LoopDetector:
             if (
                 key in taken
                 or left[here] == 0
-                or not self._shares.together(agent_of_keyframe(keyframe), agent_of_keyframe(old))
+                or not self._sharing.allows(agent_of_keyframe(keyframe), agent_of_keyframe(old))
                 or self._kept_apart(submap_of_keyframe(keyframe), submap_of_keyframe(old))
             ):
                 continue
             out.append(old)
             left[here] -= 1
-            around = sparse_map.covisible(sparse_map.points_of(old))
+            around = sparse_map.covisibility(sparse_map.landmarks_of(old))
             taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > config.max_shared)].tolist())
         return out
 
@@ -261,7 +245,7 @@ class LoopDetector:
 
     def _closure(self, best: LoopMatch, chosen: list[LoopMatch]) -> LoopClosure:
         root_submaps = tuple(self._map.map_id(submap_of_keyframe(k)) for k in (best.new, best.old))
-        metric = [i for i in root_submaps if not self._map.own_unit(i)]
+        metric = [i for i in root_submaps if not self._map.is_up_to_scale(i)]
         older = metric[0] if len(metric) == 1 else self.eldest(root_submaps)  # who knows the metre keeps it
         newer = root_submaps[1] if older == root_submaps[0] else root_submaps[0]
         X = motion_of(self._map, best)  # island of old from island of new
@@ -312,7 +296,7 @@ class LoopDetector:
     def _drift_m(self, vote: LoopMatch, way: float) -> float:
         """By how much the end of a way may be off: where the unit of length drifts, by as much as it did, too."""
         config, share = self._config, self._config.drift_path
-        if any(self._map.own_unit(submap_of_keyframe(k)) for k in (vote.new, vote.old)):
+        if any(self._map.is_up_to_scale(submap_of_keyframe(k)) for k in (vote.new, vote.old)):
             share = config.own_drift_path + abs(float(np.log(sim3.scale_of(motion_of(self._map, vote)))))
         return config.drift_m + share * way
 
@@ -345,7 +329,7 @@ class LoopDetector:
             T_other = sparse_map.world_pose(other)
             if sparse_map.map_id(submap_of_keyframe(other)) != map_id or T_other is None:
                 continue
-            own = sparse_map.own_unit(submap_of_keyframe(keyframe))
+            own = sparse_map.is_up_to_scale(submap_of_keyframe(keyframe))
             way = self._way_m(other, keyframe)
             limit = config.twin_m + (config.own_drift_path if own else config.drift_path) * way
             if float(np.linalg.norm(T_other[:3, 3] - T[:3, 3])) <= limit and (T_other[:3, 2] @ T[:3, 2]) > 0.5:

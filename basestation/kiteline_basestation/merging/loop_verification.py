@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
-from kiteline_basestation.map.covisibility import covisible_keyframes
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.refinement.refind import foresee
+from kiteline_basestation.refinement.landmark_matching import predict_projections
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.imaging import matching
@@ -74,7 +73,7 @@ def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
     """All that a keyframe sees; what was born elsewhere is described by its birth, turned as the keyframe sees it."""
     table = sparse_map.keypoints
     row = sparse_map.rows[keyframe]
-    slots = sparse_map.observed(keyframe)
+    slots = sparse_map.observations_of(keyframe)
     points = table.root[slots]
     from_birth = np.where(table.kind[slots] == LANDMARK, slots, points)
     T = sparse_map.keyframes.T_w_k
@@ -83,7 +82,7 @@ def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
     angle = (table.angle[from_birth].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
     xyz, known = sparse_map.positions(points)
     bf = sparse_map.keyframes.camera[row, 4]
-    ranged = (table.inv_depth[slots] > 0) & (bf > 0) & (not sparse_map.own_unit(submap_of_keyframe(keyframe)))
+    ranged = (table.inv_depth[slots] > 0) & (bf > 0) & (not sparse_map.is_up_to_scale(submap_of_keyframe(keyframe)))
     measured = np.where(ranged, bf * table.inv_depth[slots].astype(np.float64), -1.0)
     return View(
         slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle.astype(np.uint8),
@@ -105,7 +104,7 @@ def verify_loop(
     a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
     if len(a) < config.min_inliers:
         return None
-    free = any(sparse_map.own_unit(submap_of_keyframe(k)) for k in (new, old))
+    free = any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (new, old))
     if free:
         mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # of another metre than the old map's
     start = _with_scale(sparse_map, new, old, mine, theirs, a, b, config) if free else None
@@ -239,15 +238,15 @@ def _with_neighbours(
     scale: how much longer the old map has what the new one's has. Returns the pose, rows of `mine` and points
     (k,) that agree, and the share of what should be seen that is.
     """
-    around = [old, *covisible_keyframes(sparse_map, old, 1)[: config.neighbours]]
-    points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in around]))
+    around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.neighbours]]
+    points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
     _, known = sparse_map.positions(points)
     points = points[known]
     size = sparse_map.cameras[agent_of_keyframe(new)]
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
     T = T_c_w
     for radius in (config.radius_px, 0.5 * config.radius_px):
-        seen, uv, octave, _, _ = foresee(sparse_map, points, new, se3.inverse(T))
+        seen, uv, octave, _, _ = predict_projections(sparse_map, points, new, se3.inverse(T))
         if len(seen) < config.min_inliers:
             return None
         wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)

@@ -14,21 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.map.covisibility import Window, covisible_keyframes
+from kiteline_basestation.exchange.publisher import Publisher
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.map_tables import LANDMARK
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.correction import graph_of, keyframes_of, move_keyframes, rescale, whole_window
 from kiteline_basestation.merging.essential_graph import GraphResult
+from kiteline_basestation.merging.graph_job import POSE_GRAPH
 from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
 from kiteline_basestation.merging.loop_edges import rescaled, similarity
 from kiteline_basestation.merging.loop_verification import LoopMatch
 from kiteline_basestation.merging.merge import Merge
 from kiteline_basestation.refinement import disparity_calibration as disparity
-from kiteline_basestation.refinement import refind
-from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_units
-from kiteline_basestation.refinement.odometry_links import with_links, without_links
-from kiteline_basestation.runtime.jobs import BundleInputs, Job, JobDone
+from kiteline_basestation.refinement import landmark_matching
+from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
+from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, BundleInputs
+from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_basestation.refinement.odometry_factors import with_odometry_factors, without_odometry_factors
 from kiteline_basestation.store import merger_state as merger_state
 from kiteline_basestation.store.state import Memory
 from kiteline_codec.schema import FusedLandmarks
@@ -66,7 +68,9 @@ class MapMerger:
         self._plain: set[SubmapId] = set()  # of those, the ones whose disparities are to be taken as they are
         self._doubted: dict[SubmapId, int] = {}  # keyframes of maps at which offsets were last looked for in vain
         self._graphs: dict[int, SubmapId] = {}  # open jobs
-        self._fulls: dict[int, tuple[SubmapId, Window, tuple[AgentId, ...]]] = {}  # whose disparities are found, too
+        self._fulls: dict[
+            int, tuple[SubmapId, BundleWindow, tuple[AgentId, ...]]
+        ] = {}  # whose disparities are found, too
         self._revisit: list[KeyframeId] = []  # keyframes of merged maps that have not looked around in the other yet
 
     @property
@@ -111,7 +115,7 @@ class MapMerger:
 
     def _old_company(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe sees points together with one that its submap left long ago."""
-        shared = self._map.covisible(self._map.points_of(keyframe))
+        shared = self._map.covisibility(self._map.landmarks_of(keyframe))
         rows = np.flatnonzero(shared >= self._config.loops.min_inliers)
         same = self._map.submaps[submap_of_keyframe(keyframe)]
         old = set(same[: max(0, same.index(keyframe) - self._config.loops.loop_gap)])
@@ -129,7 +133,7 @@ class MapMerger:
         """A few keyframes of merged maps look for what the other map knows. Returns them: bundles are due there."""
         now, self._revisit = self._revisit[: self._config.graph.revisits], self._revisit[self._config.graph.revisits :]
         for keyframe in now:
-            refind.refind(self._map, keyframe, self._config.refind, self._publisher)
+            landmark_matching.match_landmarks(self._map, keyframe, self._config.refind, self._publisher)
             self._ask(keyframe)
         if now and not self._revisit:
             self._full_due.add(self._map.map_id(submap_of_keyframe(now[-1])))  # with all that they have in common
@@ -141,7 +145,7 @@ class MapMerger:
         for map_id in sorted(self._graph_due):
             inputs = graph_of(self._map, map_id, tuple(self._edges), self._config.graph)
             if inputs is not None:
-                job = Job(self._next_job(), "graph", inputs)
+                job = Job(self._next_job(), POSE_GRAPH.name, inputs)
                 self._graphs[job.id] = map_id
                 out.append(job)
         self._graph_due.clear()
@@ -154,8 +158,8 @@ class MapMerger:
                         self._map, part.slots, part.problem, self._config.disparity
                     )  # fmt: skip
                     part = replace(part, problem=problem)
-                linked = with_links(self._map, part, self._config.links)
-                job = Job(self._next_job(), "full", BundleInputs(linked, self._full_config()))
+                linked = with_odometry_factors(self._map, part, self._config.links)
+                job = Job(self._next_job(), FULL_BUNDLE.name, BundleInputs(linked, self._full_config()))
                 self._fulls[job.id] = (map_id, part, agents)
                 out.append(job)
             self._full_due.discard(map_id)
@@ -171,7 +175,7 @@ class MapMerger:
             return True
         if isinstance(done.result, BundleResult) and done.id in self._fulls:
             map_id, part, agents = self._fulls.pop(done.id)
-            result = without_links(part, done.result)
+            result = without_odometry_factors(part, done.result)
             if agents and not disparity.stands_out(result, self._config.disparity):
                 disparity.forget(self._map, agents)
                 self._doubted[map_id] = len(keyframes_of(self._map, map_id))
@@ -244,7 +248,7 @@ class MapMerger:
         for waiting in (self._graph_due, self._full_due):
             waiting.discard(closure.newer)
         self._fresh.setdefault(closure.older, []).extend(self._fresh.pop(closure.newer, []))
-        merge = Merge(closure.newer, closure.older, {s: sparse_map.frame(s) for s in submaps})
+        merge = Merge(closure.newer, closure.older, {s: sparse_map.submap_pose(s) for s in submaps})
         for submap in submaps:
             sparse_map.move_submap(submap, sim3.normalise(closure.S_older_newer @ merge.moved[submap]))
             sparse_map.root_submaps[submap] = closure.older
@@ -284,28 +288,28 @@ class MapMerger:
         for vote in votes:
             for a, b in zip(vote.mine.tolist(), vote.theirs.tolist()):
                 a, b = int(table.root[a]), int(table.root[b])
-                if a != b and refind.fuse(self._map, a, b, self._publisher) and merge is not None:
+                if a != b and landmark_matching.fuse_landmarks(self._map, a, b, self._publisher) and merge is not None:
                     merge.fused.append((a, b))
         seen: set[KeyframeId] = set()
         for vote in votes:
-            around = covisible_keyframes(self._map, vote.new, self._config.window.min_shared)
+            around = self._map.covisible_keyframes(vote.new, self._config.window.min_shared)
             for keyframe in [vote.new, *around[: self._config.loops.neighbours]]:
                 if keyframe not in seen:
                     seen.add(keyframe)
-                    refind.refind(self._map, keyframe, self._config.refind, self._publisher)
+                    landmark_matching.match_landmarks(self._map, keyframe, self._config.refind, self._publisher)
 
     def _full_config(self) -> BundleConfig:
         config = self._config.graph
         return replace(self._config.bundle, robust_trials=config.robust_trials, final_trials=config.final_trials)
 
-    def _settle(self, map_id: SubmapId, part: Window, result: BundleResult) -> bool:
+    def _settle(self, map_id: SubmapId, part: BundleWindow, result: BundleResult) -> bool:
         """Take a full bundle in; what came meanwhile moves along the spanning tree. Returns whether it was taken."""
         if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
             return False
         if self._contradicted(map_id, part, result):
             return False
         if self.fits(map_id):
-            result, units = keep_units(self._map, map_id, part, result)
+            result, units = keep_scales(self._map, map_id, part, result)
             self._note_growth(units)
         rows = part.rows[part.problem.free]
         poses = np.linalg.inv(result.T_c_m[part.problem.free])
@@ -357,7 +361,7 @@ class MapMerger:
 
     # -- second thoughts ---------------------------------------------------------------------------------------------
 
-    def _contradicted(self, map_id: SubmapId, part: Window, result: BundleResult) -> bool:
+    def _contradicted(self, map_id: SubmapId, part: BundleWindow, result: BundleResult) -> bool:
         """Undo the last merge into a map when the bundle rejects most of what it fused. Returns whether it did."""
         merge = next((m for m in reversed(self.merges) if m.into == map_id), None)
         if merge is None or not merge.fused:
@@ -389,8 +393,8 @@ class MapMerger:
         inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, sorted(mine))
         roots = table.root[: sparse_map.slots]
         crossing = np.flatnonzero((roots >= 0) & (inside != inside[np.maximum(roots, 0)])).astype(np.int32)
-        sparse_map.part(crossing[table.kind[crossing] == LANDMARK])
-        self._publisher.touch_slots(FusedLandmarks.KIND, crossing[table.kind[crossing] == LANDMARK])
+        sparse_map.unfuse(crossing[table.kind[crossing] == LANDMARK])
+        self._publisher.mark_changed_slots(FusedLandmarks.KIND, crossing[table.kind[crossing] == LANDMARK])
         for submap, frame in merge.moved.items():
             sparse_map.root_submaps.pop(submap, None)
             if submap != merge.eldest:

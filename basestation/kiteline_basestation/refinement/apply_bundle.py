@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import CullConfig, PublishConfig
-from kiteline_basestation.map.covisibility import Window
+from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_codec.schema import CulledLandmarks, KeyframePose, RefinedLandmarks, RemovedObservations
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
@@ -25,7 +25,7 @@ _ENOUGH = 20  # points that tell how much lengths have grown there
 
 
 def apply_bundle(
-    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, cull: CullConfig,
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, cull: CullConfig,
     publish: PublishConfig,
 ) -> None:  # fmt: skip
     """Write what a bundle found where it differs enough from what both sides hold."""
@@ -39,7 +39,7 @@ def apply_bundle(
 
 
 def _poses(
-    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, publish: PublishConfig
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, publish: PublishConfig
 ) -> None:
     for i in np.flatnonzero(window.problem.free).tolist():
         row = int(window.rows[i])
@@ -51,10 +51,10 @@ def _poses(
         first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # said once, so that an older base's value goes
         if first or moved > publish.pose_m or turned > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, new)
-            publisher.touch(KeyframePose.KIND, keyframe)
+            publisher.mark_changed(KeyframePose.KIND, keyframe)
 
 
-def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher: Publisher) -> None:
+def _culled_follow(sparse_map: SparseMap, window: BundleWindow, before: F64, publisher: Publisher) -> None:
     """A culled keyframe sees nothing that could move it: it goes with the one from which it was measured."""
     table = sparse_map.keyframes
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
@@ -68,11 +68,11 @@ def _culled_follow(sparse_map: SparseMap, window: Window, before: F64, publisher
         keyframe = KeyframeId(int(table.id[row]))
         moved = table.T_w_k[window.rows[i]] @ np.linalg.inv(before[i]) @ table.T_w_k[row]
         sparse_map.set_world_pose(keyframe, se3.orthonormalise(moved))
-        publisher.touch(KeyframePose.KIND, keyframe)
+        publisher.mark_changed(KeyframePose.KIND, keyframe)
 
 
 def _observations(
-    sparse_map: SparseMap, window: Window, result: BundleResult, publisher: Publisher, cull: CullConfig
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, cull: CullConfig
 ) -> NDArray[np.bool_]:
     """Remove outliers. Returns which points of the window (n,) have too few observations left, and drops them."""
     table = sparse_map.keypoints
@@ -82,23 +82,23 @@ def _observations(
     bad = window.slots[~result.inlier & current]
     if len(bad):
         sparse_map.set_flags(bad, REMOVED)
-        publisher.touch_slots(RemovedObservations.KIND, bad)
+        publisher.mark_changed_slots(RemovedObservations.KIND, bad)
     left = np.diff(sparse_map.observations(window.points)[0])
     dropped = np.asarray((left < cull.min_observations) & (table.root[window.points] == window.points))
-    drop_points(sparse_map, window.points[dropped], publisher)
+    cull_landmarks(sparse_map, window.points[dropped], publisher)
     return dropped
 
 
 def _points(
-    sparse_map: SparseMap, window: Window, result: BundleResult, dropped: NDArray[np.bool_], publisher: Publisher,
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, dropped: NDArray[np.bool_], publisher: Publisher,
     cull: CullConfig, publish: PublishConfig,
 ) -> None:  # fmt: skip
     table = sparse_map.keypoints
     alive = ~dropped & (table.root[window.points] == window.points) & (table.flags[window.points] & CULLED == 0)
     points, positions = window.points[alive], result.points[alive]
-    inv, offset, ahead = sparse_map.bearing_of(points, positions)
+    inv, offset, ahead = sparse_map.project_into_anchor(points, positions)
     far_off = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > cull.max_offset_px * np.exp2(table.octave[points]))
-    drop_points(sparse_map, points[far_off], publisher)
+    cull_landmarks(sparse_map, points[far_off], publisher)
     points, inv, offset = points[~far_off], inv[~far_off], offset[~far_off]
     bf = sparse_map.keyframes.camera[table.row[points], 4]
     change = np.maximum(
@@ -108,32 +108,32 @@ def _points(
     moved = points[change > publish.depth_px]
     if len(moved):
         sparse_map.set_depths(moved, inv[change > publish.depth_px], offset[change > publish.depth_px])
-        publisher.touch_slots(RefinedLandmarks.KIND, moved)
+        publisher.mark_changed_slots(RefinedLandmarks.KIND, moved)
 
 
-def keep_units(
-    sparse_map: SparseMap, map_id: SubmapId, window: Window, result: BundleResult
+def keep_scales(
+    sparse_map: SparseMap, map_id: SubmapId, window: BundleWindow, result: BundleResult
 ) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
     """What a bundle of a whole map did to the units of one eye's submaps is said by their scale, as far as it did it
     before the newest keyframes: lengths there stay as the agent has them. In a map without a metre, lengths before the
     oldest keyframes stay as they were in w. Returns the result so, and by what units grew.
     """
-    own = [submap for submap in sparse_map.submaps_of_map(map_id) if sparse_map.own_unit(submap)]
+    own = [submap for submap in sparse_map.submaps_of_map(map_id) if sparse_map.is_up_to_scale(submap)]
     growth = {s: _growth(sparse_map, sparse_map.submaps[s][-_AROUND:], window, result) for s in own}
     eldest = sparse_map.map_id(map_id)
     if eldest in growth:
         whole = _growth(sparse_map, sparse_map.submaps[eldest][:_AROUND], window, result)
-        centre = sim3.place(sparse_map.frame(eldest), sparse_map.beginning(eldest))[:3, 3]
+        centre = sim3.place(sparse_map.submap_pose(eldest), sparse_map.first_pose(eldest))[:3, 3]
         poses = np.linalg.inv(result.T_c_m)
         poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
         growth = {submap: more / whole for submap, more in growth.items()}
     for submap, more in growth.items():
-        sparse_map.stretch_submap(submap, more)
+        sparse_map.scale_submap(submap, more)
     return result, growth
 
 
-def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: Window, result: BundleResult) -> float:
+def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult) -> float:
     """By what a bundle stretched depths before keyframes: the median."""
     table = sparse_map.keyframes
     rows = [sparse_map.rows[k] for k in keyframes]
@@ -150,9 +150,9 @@ def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: Window, 
     return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _ENOUGH else 1.0
 
 
-def drop_points(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:
+def cull_landmarks(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:
     """Cull points (n,) by their slots."""
     points = points[sparse_map.keypoints.kind[points] == LANDMARK]
     if len(points):
         sparse_map.set_flags(points, CULLED)
-        publisher.touch_slots(CulledLandmarks.KIND, points)
+        publisher.mark_changed_slots(CulledLandmarks.KIND, points)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_basestation.config import CullConfig
-from kiteline_basestation.map.covisibility import covisible_keyframes
+from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.refinement.apply_bundle import drop_points
-from kiteline_basestation.refinement.refind import foresee
+from kiteline_basestation.refinement.apply_bundle import cull_landmarks
+from kiteline_basestation.refinement.landmark_matching import predict_projections
 from kiteline_codec.schema import CulledLandmarks
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 
@@ -29,10 +28,10 @@ def cull_weak(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, p
     visible = np.zeros(sparse_map.slots, np.int32)
     for later in same[number - config.age + 1 : number + 1]:
         if sparse_map.pose(later) is not None:
-            visible[foresee(sparse_map, points, later)[0]] += 1
+            visible[predict_projections(sparse_map, points, later)[0]] += 1
     found = np.diff(sparse_map.observations(points)[0]) - 1
     weak = (visible[points] >= config.min_visible) & (found < config.min_found * visible[points])
-    drop_points(sparse_map, points[weak], publisher)
+    cull_landmarks(sparse_map, points[weak], publisher)
     return int(np.count_nonzero(weak))
 
 
@@ -41,23 +40,23 @@ def cull_redundant(
 ) -> list[KeyframeId]:
     """Judge the keyframes around this one: nearly all that they see, others see as well. Returns those dropped."""
     out: list[KeyframeId] = []
-    for other in covisible_keyframes(sparse_map, keyframe, 15):
+    for other in sparse_map.covisible_keyframes(keyframe, 15):
         same = sparse_map.submaps[submap_of_keyframe(other)]
         at = same.index(other)
-        if at == 0 or len(same) - at <= config.keyframe_age or not sparse_map.complete(other):
+        if at == 0 or len(same) - at <= config.keyframe_age or not sparse_map.is_complete(other):
             continue
         if sparse_map.keyframes.pose_source[sparse_map.rows[other]] == REFINED_POSE and _redundant(
             sparse_map, other, config
         ):
             sparse_map.cull_keyframe(other)
-            publisher.touch(CulledLandmarks.KIND, other)
+            publisher.mark_changed(CulledLandmarks.KIND, other)
             out.append(other)
     return out
 
 
 def _redundant(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig) -> bool:
     table, row = sparse_map.keypoints, sparse_map.rows[keyframe]
-    mine = sparse_map.observed(keyframe)
+    mine = sparse_map.observations_of(keyframe)
     points = table.root[mine]
     starts, slots = sparse_map.observations(points)
     which = np.repeat(np.arange(len(points)), np.diff(starts))

@@ -93,7 +93,7 @@ def take(
         cov = result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         sigma_px = config.inflation * float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", at, cov, at))))
         if sigma_px < config.settled_px:
-            sparse_map.disparity_known.add(agent)
+            sparse_map.disparity_calibrated.add(agent)
 
 
 def _agents(sparse_map: SparseMap, slots: I32) -> I64:

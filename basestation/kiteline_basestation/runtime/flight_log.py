@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
-from kiteline_basestation.runtime.jobs import JobDone
-from kiteline_basestation.runtime.options import BaseSpec, coded_channels, from_json
+from kiteline_basestation.runtime.options import BaseOptions, coded_channels, from_json
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store.saved_map import Codes, SavedMap, pack, unpack
 from kiteline_core import config as configuration
@@ -28,7 +28,7 @@ from kiteline_core.places.place_index import Vocabulary
 STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/import", "/command", "/answer"
 
 
-def metadata_of(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
+def metadata_of(spec: BaseOptions, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
     """What a log says of its base, so that it can be run again."""
     unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
@@ -40,7 +40,7 @@ def metadata_of(spec: BaseSpec, config: BaseConfig, plain_channels: bool) -> dic
 def station_of(metadata: Mapping[str, str], words: Vocabulary | None) -> Station:
     """A station as the one of a base's log was."""
     config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
-    logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseSpec.__dataclass_fields__}
+    logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseOptions.__dataclass_fields__}
     spec = from_json(json.dumps({"folder": "", **logged}))
     return Station(config, coded_channels(replace(spec, link=spec.link + ":")), words)
 

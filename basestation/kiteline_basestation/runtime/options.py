@@ -17,7 +17,7 @@ from kiteline_core.ids import AgentId
 
 
 @dataclass(frozen=True, slots=True)
-class BaseSpec:
+class BaseOptions:
     """All that the base's flight is told. Plain values, so that it travels as JSON."""
 
     folder: str  # for the log, the map and the grid
@@ -43,15 +43,15 @@ class BaseSpec:
     maps: str = ""  # a Zenoh endpoint on which maps are managed; "": the agents' link
 
 
-def from_json(text: str) -> BaseSpec:
+def from_json(text: str) -> BaseOptions:
     """A spec from its JSON; unknown keys are an error."""
     values: dict[str, Any] = json.loads(text)
-    known = {f.name for f in fields(BaseSpec)}
+    known = {f.name for f in fields(BaseOptions)}
     if unknown := set(values) - known:
         raise ValueError(f"unknown key in spec: {sorted(unknown)}")
     for name in ("agents", "imports"):
         values[name] = tuple(values.get(name, ()))
-    return BaseSpec(**values)
+    return BaseOptions(**values)
 
 
 def base_config(path: str) -> BaseConfig:
@@ -85,16 +85,16 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def of_arguments(a: argparse.Namespace, session: int) -> BaseSpec:
+def of_arguments(a: argparse.Namespace, session: int) -> BaseOptions:
     """What `kiteline base` was told on the command line."""
-    return BaseSpec(
+    return BaseOptions(
         folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
         config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
         imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
     )  # fmt: skip
 
 
-def coded_channels(spec: BaseSpec) -> Callable[[AgentId], RecordChannel]:
+def coded_channels(spec: BaseOptions) -> Callable[[AgentId], RecordChannel]:
     """Opens our end of the codec to an agent."""
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
     return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)

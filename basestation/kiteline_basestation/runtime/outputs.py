@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid import build, to_pgm, to_yaml
-from kiteline_basestation.map.world_view import world_view
+from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.runtime.export import map_ply
 from kiteline_core.ids import KeyframeId
@@ -27,7 +27,7 @@ def keyframe_poses(mapper: Mapper) -> dict[KeyframeId, F64]:
 
 def map_files(mapper: Mapper) -> dict[str, bytes]:
     """map.ply, grid.pgm and grid.yaml of the map as it stands."""
-    view = world_view(mapper.map, mapper.placements)
+    view = placed_map(mapper.map, mapper.placements)
     grid = build(mapper.config.grid, view.positions, view.points, view.rays)
     seen = np.bincount(view.observations[:, 1], minlength=len(view.points)).astype(np.int64)
     return {

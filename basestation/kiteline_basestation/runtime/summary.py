@@ -18,17 +18,17 @@ def settled(channel: RecordChannel) -> tuple[bool, bool]:
 
 
 @dataclass(slots=True)
-class Flown:
+class FlightSummary:
     """The base at one moment: its counts, and where its keyframes are (T_w_k as 16 numbers by keyframe id)."""
 
     counts: dict[str, int]
     keyframes: dict[str, list[float]]
 
 
-def as_flown(mapper: Mapper) -> Flown:
+def flight_summary(mapper: Mapper) -> FlightSummary:
     """The base as it stands."""
     poses = keyframe_poses(mapper)
-    return Flown(counts(mapper), {str(k): pose.ravel().tolist() for k, pose in poses.items()})
+    return FlightSummary(counts(mapper), {str(k): pose.ravel().tolist() for k, pose in poses.items()})
 
 
 def timings(jobs_ms: Mapping[str, Iterable[float]], step_ms: Iterable[float]) -> dict[str, list[float]]:

@@ -17,7 +17,7 @@ from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, su
 _EVERY_NS = 10_000_000_000  # between two lines while nothing happens
 
 
-class Narrator:
+class TerminalReporter:
     """Makes lines of text from a station, looked at after each step."""
 
     def __init__(self, station: Station) -> None:

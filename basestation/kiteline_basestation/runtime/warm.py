@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig, GraphConfig
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
 from kiteline_basestation.merging.loop_verification import verify_loop
-from kiteline_basestation.runtime.jobs import JobDone, run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, Record

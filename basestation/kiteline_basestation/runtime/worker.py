@@ -13,7 +13,8 @@ from multiprocessing.connection import Connection
 
 import cv2
 
-from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_hw.system.cpu import return_large_arrays
 

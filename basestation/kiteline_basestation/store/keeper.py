@@ -12,14 +12,15 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from kiteline_basestation.exchange.map_cache_planner import is_copy
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log
-from kiteline_basestation.runtime.jobs import Job, run_job
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import Codes, SavedMap, unpack
 from kiteline_basestation.store.state import Scribe
 from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read, submap_of
-from kiteline_basestation.supply.supply import is_copy
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import Key, record_log
 from kiteline_core.ids import AgentId, SubmapId

@@ -55,7 +55,7 @@ def _merge_text(merger: MapMerger, merge: Merge) -> Json:
         "eldest": int(merge.eldest),
         "into": int(merge.into),
         "moved": [[int(s), matrix(T)] for s, T in merge.moved.items()],
-        "fused": [merger._map.point_ids(fused[:, side]).tolist() for side in (0, 1)],
+        "fused": [merger._map.landmark_ids(fused[:, side]).tolist() for side in (0, 1)],
     }
 
 

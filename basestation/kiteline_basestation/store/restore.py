@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from kiteline_basestation.exchange.map_cache_planner import is_copy
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import Checked, contradictions, sound
 from kiteline_basestation.store.saved_map import SavedMap
-from kiteline_basestation.supply.supply import is_copy
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError, messages
 

@@ -99,7 +99,7 @@ def _vote(sparse_map: SparseMap, vote: LoopMatch, points: bool) -> Json:
     return {
         "new": int(vote.new), "old": int(vote.old), "T": matrix(vote.T_old_new), "inliers": int(vote.inliers),
         "scale": float(vote.scale), "depth_m": float(vote.depth_m),
-        "points": [sparse_map.point_ids(slots).tolist() for slots in pairs],
+        "points": [sparse_map.landmark_ids(slots).tolist() for slots in pairs],
     }  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def votes_of(sparse_map: SparseMap, value: Json) -> list[LoopMatch]:
 
 def slots_of(sparse_map: SparseMap, a: Sequence[int], b: Sequence[int]) -> tuple[I32, I32]:
     """Slots (n,) of pairs of points of which both are known."""
-    both = [sparse_map.find_points(np.array(ids, np.int64)) for ids in (a, b)]
+    both = [sparse_map.find_landmarks(np.array(ids, np.int64)) for ids in (a, b)]
     known = (both[0] >= 0) & (both[1] >= 0)
     return both[0][known], both[1][known]
 

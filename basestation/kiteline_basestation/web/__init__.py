@@ -13,8 +13,8 @@ waits, and while nobody looks nothing is computed.
 
 from __future__ import annotations
 
-from kiteline_basestation.web.overview import nothing, overview
+from kiteline_basestation.web.page_snapshot import AgentView, Snapshot, status
 from kiteline_basestation.web.server import Handle, address, serve
-from kiteline_basestation.web.view import AgentView, Snapshot, status
+from kiteline_basestation.web.take_snapshot import nothing, overview
 
 __all__ = ["AgentView", "Handle", "Snapshot", "address", "nothing", "overview", "serve", "status"]

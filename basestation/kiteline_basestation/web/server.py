@@ -23,7 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from kiteline_basestation.grid.grid import GridMap
-from kiteline_basestation.web.view import Snapshot, map_messages, status
+from kiteline_basestation.web.page_snapshot import Snapshot, map_messages, status
 
 STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read
 MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larger

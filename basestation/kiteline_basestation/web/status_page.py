@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from kiteline_basestation.station import Station
-from kiteline_basestation.web.overview import nothing, overview
 from kiteline_basestation.web.server import address, serve
+from kiteline_basestation.web.take_snapshot import nothing, overview
 from kiteline_hw.ports import LinkError
 
 _PERIOD_NS = 400_000_000  # ns between two snapshots: a little faster than the page asks for them

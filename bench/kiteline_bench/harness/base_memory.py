@@ -25,8 +25,9 @@ import numpy as np
 
 from kiteline_basestation.__main__ import place_words
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log
-from kiteline_basestation.runtime.jobs import Job, run_job
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.station import Station
 from kiteline_codec import warm as codec_warm

@@ -16,7 +16,7 @@ from kiteline_agent.__main__ import Onboard
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.__main__ import Ground
-from kiteline_basestation.runtime.options import BaseSpec, coded_channels
+from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_hw.lockstep.messages import Down, Phase
 from kiteline_hw.logs.spill_file import SpillFile
@@ -39,7 +39,7 @@ class Flight:
     """
 
     agents: Sequence[AgentOptions]
-    base: BaseSpec | None
+    base: BaseOptions | None
     frames: int | None
     quiet: bool = False
     deaths: Sequence[tuple[float, float]] = ()
@@ -173,7 +173,7 @@ class _Supervisor:
     def __init__(
         self,
         crew: Crew,
-        base: BaseSpec,
+        base: BaseOptions,
         agents: Sequence[AgentOptions],
         progress: Progress | None,
         deaths: Sequence[tuple[float, float]],

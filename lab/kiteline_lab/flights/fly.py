@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from kiteline_agent.runtime.options import AgentOptions
-from kiteline_basestation.runtime.options import BaseSpec
+from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
 from kiteline_hw.logs.mcap_mend import mend
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
@@ -59,7 +59,7 @@ class Plan:
 
     sources: list[FrameSource] = field(default_factory=list)
     agents: list[AgentOptions] = field(default_factory=list)
-    base: BaseSpec | None = None
+    base: BaseOptions | None = None
     frames: int | None = None
 
     def close(self) -> None:
@@ -156,7 +156,7 @@ def plan(o: Options) -> Plan:
             )
         )  # fmt: skip
     if o.mode != "tracker":
-        made.base = BaseSpec(
+        made.base = BaseOptions(
             folder=str(o.out / "base"), agents=tuple(range(len(o.sources))), config=o.config, start_ns=starts[0],
             down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
             seed=o.seed, session=max(1, boot), store=o.store, kill_at_s=o.kill_base_at_s,

@@ -23,9 +23,10 @@ from kiteline_agent.runtime.warm import warm as agent_warm
 from kiteline_agent.step import Identity, StepInput
 from kiteline_basestation.__main__ import place_words
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
-from kiteline_basestation.runtime.jobs import Job, run_job
-from kiteline_basestation.runtime.options import BaseSpec
+from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_basestation.runtime.warm import warm as base_warm
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
@@ -215,7 +216,7 @@ def spec_of_log(log: LogReader) -> dict[str, Any]:
         fields = AgentOptions.__dataclass_fields__
         known = {name: fields[name].default for name in ("up_bytes_s", "log_name")}
     elif log.metadata.get("role") == "base":
-        known = {"down_bytes_s": BaseSpec.__dataclass_fields__["down_bytes_s"].default}
+        known = {"down_bytes_s": BaseOptions.__dataclass_fields__["down_bytes_s"].default}
     else:
         raise SourceError("no log of an agent or a base: a recording is flown with `kiteline fly`, not replayed")
     return {**known, **json.loads(log.metadata["spec"])}

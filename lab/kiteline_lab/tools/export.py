@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.map.covisibility import covisible_keyframes
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.runtime.export import g2o, tum
 from kiteline_basestation.runtime.outputs import keyframe_poses, map_files
@@ -79,7 +78,7 @@ def _graph(mapper: Mapper) -> bytes:
     for k, i in number.items():
         parent = KeyframeId(int(mapper.map.keyframes.parent[mapper.map.rows[k]]))
         near = [parent] if parent != NO_KEYFRAME else []
-        near += covisible_keyframes(mapper.map, k, ESSENTIAL_LANDMARKS)
+        near += mapper.map.covisible_keyframes(k, ESSENTIAL_LANDMARKS)
         pairs |= {(min(i, number[n]), max(i, number[n])) for n in near if n in number}
     edges: I64 = np.array(sorted(pairs), np.int64).reshape(-1, 2)
     scale = np.array([sim3.scale_of(S) for S in poses.values()])

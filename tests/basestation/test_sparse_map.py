@@ -39,7 +39,7 @@ class Writer:
 
     def births(self, n: int) -> None:
         rng = np.random.default_rng(n)
-        self.map.put_births(
+        self.map.put_new_landmarks(
             kf(n), 0, np.arange(6, dtype=np.uint16), rng.uniform(50, 400, (6, 2)).astype(np.float32),
             np.full(6, 0.25, np.float32), np.zeros(6, np.uint8), np.zeros(6, np.uint8),
             rng.integers(0, 256, (6, 32), dtype=np.uint8),
@@ -48,7 +48,7 @@ class Writer:
     def sightings(self, n: int) -> None:
         if n:
             points = np.array([point_id(kf(n - 1), i) for i in range(4)], np.int64)
-            self.map.put_sightings(
+            self.map.put_observations(
                 kf(n), 0, np.arange(6, 10, dtype=np.uint16), np.full((4, 2), 100, np.float32), np.zeros(4, np.float32),
                 np.zeros(4, np.uint8), points,
             )  # fmt: skip
@@ -73,13 +73,13 @@ def by_id(sparse_map: SparseMap) -> list[tuple[object, ...]]:
     out: list[tuple[object, ...]] = []
     for keyframe in sorted(sparse_map.rows):
         pose = sparse_map.pose(keyframe)
-        out.append((keyframe, None if pose is None else pose.tobytes(), sparse_map.complete(keyframe)))
-    roots = sparse_map.roots()
-    roots = roots[np.argsort(sparse_map.point_ids(roots))]
+        out.append((keyframe, None if pose is None else pose.tobytes(), sparse_map.is_complete(keyframe)))
+    roots = sparse_map.live_landmarks()
+    roots = roots[np.argsort(sparse_map.landmark_ids(roots))]
     starts, seen = sparse_map.observations(roots)
     ids = sparse_map.keyframes.id[sparse_map.keypoints.row[seen]]
     xyz, known = sparse_map.positions(roots)
-    for i, point in enumerate(sparse_map.point_ids(roots).tolist()):
+    for i, point in enumerate(sparse_map.landmark_ids(roots).tolist()):
         where = xyz[i].tobytes() if known[i] else None
         out.append((point, where, ids[starts[i] : starts[i + 1]].tolist()))
     return out
@@ -105,7 +105,7 @@ def test_poses_compose_along_parents_and_follow_what_the_base_moves() -> None:
 
 def test_points_hang_on_their_anchor() -> None:
     sparse_map = chain(3)
-    points = sparse_map.find_points(np.array([point_id(kf(1), 2), point_id(kf(2), 5)], np.int64))
+    points = sparse_map.find_landmarks(np.array([point_id(kf(1), 2), point_id(kf(2), 5)], np.int64))
     before, known = sparse_map.positions(points)
     assert known.all()
     row = sparse_map.rows[kf(1)]
@@ -119,10 +119,10 @@ def test_points_hang_on_their_anchor() -> None:
 
 def test_bearing_is_the_inverse_of_position() -> None:
     sparse_map = chain(3)
-    points = sparse_map.roots()
+    points = sparse_map.live_landmarks()
     xyz, _ = sparse_map.positions(points)
     target = xyz + np.random.default_rng(0).normal(0, 0.02, xyz.shape)
-    inverse, offset, ahead = sparse_map.bearing_of(points, target)
+    inverse, offset, ahead = sparse_map.project_into_anchor(points, target)
     assert ahead.all()
     sparse_map.set_depths(points, inverse, offset)
     assert np.allclose(sparse_map.positions(points)[0], target, atol=2e-6)
@@ -147,47 +147,47 @@ def test_any_order_and_any_repetition_of_sections_gives_the_same_map(
 def test_a_newer_section_withdraws_what_it_no_longer_has() -> None:
     sparse_map = chain(3)
     point = point_id(kf(1), 0)
-    before = sparse_map.points_of(kf(2))
-    sparse_map.put_sightings(
+    before = sparse_map.landmarks_of(kf(2))
+    sparse_map.put_observations(
         kf(2), 0, np.array([7], np.uint16), np.full((1, 2), 100, np.float32), np.zeros(1, np.float32),
         np.zeros(1, np.uint8), np.array([point], np.int64),
     )  # fmt: skip
     assert len(before) == 10
-    assert len(sparse_map.points_of(kf(2))) == 7
-    assert not sparse_map.complete(kf(2))
-    starts, seen = sparse_map.observations(sparse_map.find_points(np.array([point, point_id(kf(1), 3)], np.int64)))
+    assert len(sparse_map.landmarks_of(kf(2))) == 7
+    assert not sparse_map.is_complete(kf(2))
+    starts, seen = sparse_map.observations(sparse_map.find_landmarks(np.array([point, point_id(kf(1), 3)], np.int64)))
     assert np.diff(starts).tolist() == [2, 1]
     assert sparse_map.keypoint_of(seen).tolist() == [0, 7, 3]
 
 
 def test_removed_observations_culled_points_and_culled_keyframes_stop_counting() -> None:
     sparse_map = chain(3)
-    (root,) = sparse_map.find_points(np.array([point_id(kf(0), 1)], np.int64))
+    (root,) = sparse_map.find_landmarks(np.array([point_id(kf(0), 1)], np.int64))
     starts, seen = sparse_map.observations(slots(root))
     assert starts.tolist() == [0, 2]
     sparse_map.set_flags(seen[1:], REMOVED)
     assert sparse_map.observations(slots(root))[0].tolist() == [0, 1]
-    assert root not in sparse_map.points_of(kf(1))
+    assert root not in sparse_map.landmarks_of(kf(1))
     sparse_map.set_flags(slots(root), CULLED)
-    assert root not in sparse_map.roots()
-    assert root not in sparse_map.points_of(kf(0))
+    assert root not in sparse_map.live_landmarks()
+    assert root not in sparse_map.landmarks_of(kf(0))
     sparse_map.cull_keyframe(kf(2))
-    assert len(sparse_map.points_of(kf(2))) == 0
+    assert len(sparse_map.landmarks_of(kf(2))) == 0
     assert sparse_map.pose(kf(2)) is not None
 
 
 def test_fusing_moves_all_observations_and_late_sightings_follow() -> None:
     sparse_map = chain(3)
-    old, new = sparse_map.find_points(np.array([point_id(kf(0), 4), point_id(kf(2), 0)], np.int64))
-    assert not sparse_map.one_keyframe_sees_both(old, new)
+    old, new = sparse_map.find_landmarks(np.array([point_id(kf(0), 4), point_id(kf(2), 0)], np.int64))
+    assert not sparse_map.observed_together(old, new)
     assert sparse_map.fuse(int(new), int(old)) == [kf(2)]
     Writer(sparse_map).everything(3)  # sees the fused point under its old name
     _, seen = sparse_map.observations(slots(old))
     assert sparse_map.keyframes.id[sparse_map.keypoints.row[seen]].tolist() == [kf(0), kf(2), kf(3)]
-    assert new not in sparse_map.roots()
-    (older,) = sparse_map.find_points(np.array([point_id(kf(1), 5)], np.int64))
+    assert new not in sparse_map.live_landmarks()
+    (older,) = sparse_map.find_landmarks(np.array([point_id(kf(1), 5)], np.int64))
     # An alias of an alias is flattened: both keyframes whose births now show another root are named.
-    third = int(sparse_map.find_points(np.array([point_id(kf(1), 4)], np.int64))[0])
+    third = int(sparse_map.find_landmarks(np.array([point_id(kf(1), 4)], np.int64))[0])
     assert sparse_map.fuse(third, int(older)) == [kf(1)]
     assert sparse_map.fuse(int(old), int(older)) == [kf(0), kf(2)]
     assert set(sparse_map.keypoints.root[[old, new, third]].tolist()) == {int(older)}
@@ -195,7 +195,7 @@ def test_fusing_moves_all_observations_and_late_sightings_follow() -> None:
 
 def test_covisibility_counts_shared_points() -> None:
     sparse_map = chain(4)
-    shared = sparse_map.covisible(sparse_map.points_of(kf(2)))
+    shared = sparse_map.covisibility(sparse_map.landmarks_of(kf(2)))
     assert [int(shared[sparse_map.rows[kf(n)]]) for n in range(4)] == [0, 4, 10, 4]
 
 
@@ -218,11 +218,11 @@ def test_a_sighting_that_names_no_birth_is_kept_apart() -> None:
     sparse_map = chain(2)
     odd = np.array([point_id(kf(1), 7), point_id(kf(0), 40), point_id(kf(9), 0), -1], np.int64)
     sparse_map.add_keyframe(kf(5), 50, kf(1), np.eye(4), 4)
-    sparse_map.put_sightings(
+    sparse_map.put_observations(
         kf(5), 0, np.arange(4, dtype=np.uint16), np.zeros((4, 2), np.float32), np.zeros(4, np.float32),
         np.zeros(4, np.uint8), odd,
     )  # fmt: skip
-    assert len(sparse_map.points_of(kf(5))) == 0
+    assert len(sparse_map.landmarks_of(kf(5))) == 0
     assert (sparse_map.keypoints.kind[sparse_map.slots_of(kf(5))] == OBSERVATION).all()
 
 
@@ -232,7 +232,7 @@ def test_memory_stays_within_its_budget() -> None:
     rng = np.random.default_rng(0)
     for n in range(300):
         sparse_map.add_keyframe(kf(n), n, kf(n - 1) if n else NO_KEYFRAME, np.eye(4), 450)
-        sparse_map.put_births(
+        sparse_map.put_new_landmarks(
             kf(n), 0, np.arange(200, dtype=np.uint16), np.zeros((200, 2), np.float32), np.zeros(200, np.float32),
             np.zeros(200, np.uint8), np.zeros(200, np.uint8), rng.integers(0, 256, (200, 32), dtype=np.uint8),
         )  # fmt: skip

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.runtime.jobs import JobDone, run_job
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Station
 from kiteline_basestation.web import nothing, overview, status
 from kiteline_codec.channel import CodedChannel

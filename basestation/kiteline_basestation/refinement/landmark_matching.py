@@ -10,12 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import RefindConfig
-from kiteline_basestation.map.covisibility import covisible_keyframes
+from kiteline_basestation.config import LandmarkMatchingConfig
+from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE, REFINED, REMOVED
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.refinement import refind_kernels as kernels
+from kiteline_basestation.refinement import landmark_matching_kernels as kernels
 from kiteline_codec.schema import FusedLandmarks, RefinedLandmarks
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.imaging.descriptors import comparable
@@ -25,27 +24,29 @@ I32 = NDArray[np.int32]
 U64 = NDArray[np.uint64]
 
 
-def refind(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig, publisher: Publisher) -> int:
+def match_landmarks(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig, publisher: Publisher
+) -> int:
     """Search both ways between a new keyframe and those that look at the same place. Returns how many points fused."""
-    others = candidates(sparse_map, keyframe, config)
+    others = nearby_keyframes(sparse_map, keyframe, config)
     if not others:
         return 0
     found = 0
-    known = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in others]))
-    known = known[~np.isin(known, sparse_map.points_of(keyframe))]
+    known = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in others]))
+    known = known[~np.isin(known, sparse_map.landmarks_of(keyframe))]
     found += _search(sparse_map, known, keyframe, config, publisher)
     for other in others:
-        new = sparse_map.points_of(keyframe)
+        new = sparse_map.landmarks_of(keyframe)
         born_here = new[sparse_map.keypoints.row[new] == sparse_map.rows[keyframe]]
         found += _search(sparse_map, born_here, other, config, publisher)
     return found
 
 
-def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig) -> list[KeyframeId]:
+def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig) -> list[KeyframeId]:
     """Covisible keyframes, then those that stand near and look the same way; never ones without a pose."""
-    covisible = covisible_keyframes(sparse_map, keyframe, 1)[: config.keyframes]
+    covisible = sparse_map.covisible_keyframes(keyframe, 1)[: config.keyframes]
     table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
-    points = sparse_map.points_of(keyframe)
+    points = sparse_map.landmarks_of(keyframe)
     inverse = sparse_map.inverse_depths(points) / table.unit[sparse_map.keypoints.row[points]]
     inverse = inverse[inverse > 0]
     if len(inverse) == 0:
@@ -64,7 +65,9 @@ def candidates(sparse_map: SparseMap, keyframe: KeyframeId, config: RefindConfig
     return covisible + extra[: config.near_keyframes]
 
 
-def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: RefindConfig, publisher: Publisher) -> int:
+def _search(
+    sparse_map: SparseMap, points: I32, target: KeyframeId, config: LandmarkMatchingConfig, publisher: Publisher
+) -> int:
     """Match points (n,) (roots) with the births of a keyframe and fuse what is one."""
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(target)
@@ -72,12 +75,12 @@ def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: Refi
     slots = slots[table.flags[table.root[slots]] & CULLED == 0]
     if len(points) == 0 or len(slots) == 0:
         return 0
-    points, uv, octave, angle, disparity = foresee(sparse_map, points, target)
+    points, uv, octave, angle, disparity = predict_projections(sparse_map, points, target)
     if len(points) == 0:
         return 0
     row = sparse_map.rows[target]
     bf = sparse_map.keyframes.camera[row, 4]
-    ranged = (table.inv_depth[slots] > 0) & (not sparse_map.own_unit(submap_of_keyframe(target)))
+    ranged = (table.inv_depth[slots] > 0) & (not sparse_map.is_up_to_scale(submap_of_keyframe(target)))
     measured = np.where(ranged, bf * table.inv_depth[slots], -1.0).astype(np.float64)
     best = np.empty(len(points), np.int32)
     distance = np.zeros(len(points), np.int32)
@@ -91,11 +94,11 @@ def _search(sparse_map: SparseMap, points: I32, target: KeyframeId, config: Refi
     )  # fmt: skip
     found = 0
     for i in np.flatnonzero(best >= 0).tolist():
-        found += fuse(sparse_map, int(points[i]), int(table.root[slots[best[i]]]), publisher)
+        found += fuse_landmarks(sparse_map, int(points[i]), int(table.root[slots[best[i]]]), publisher)
     return found
 
 
-def foresee(
+def predict_projections(
     sparse_map: SparseMap, points: I32, target: KeyframeId, T_w_k: F64 | None = None
 ) -> tuple[I32, F64, F64, NDArray[np.uint8], F64]:  # fmt: skip
     """How a keyframe would see points (n,): those inside its image, with pixel, octave, angle and disparity.
@@ -130,23 +133,25 @@ def descriptors(sparse_map: SparseMap, a: I32, b: I32) -> tuple[U64, U64]:
     return np.ascontiguousarray(left).view(np.uint64), np.ascontiguousarray(right).view(np.uint64)
 
 
-def fuse(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
+def fuse_landmarks(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
     """Make two roots one, the older the root, unless one keyframe sees both. A depth known to one is known to both."""
-    if a == b or sparse_map.one_keyframe_sees_both(a, b):
+    if a == b or sparse_map.observed_together(a, b):
         return False
     pair = np.array([a, b], np.int32)
-    ids = sparse_map.point_ids(pair)
+    ids = sparse_map.landmark_ids(pair)
     parent, child = pair[np.argsort(ids)]
     xyz, known = sparse_map.positions(pair[np.argsort(ids)])
     if not known[0] and known[1]:
         one = np.array([parent], np.int32)
-        inverse, offset, ahead = sparse_map.bearing_of(one, xyz[1:])
+        inverse, offset, ahead = sparse_map.project_into_anchor(one, xyz[1:])
         if not ahead[0]:
             return False
         sparse_map.set_depths(one, inverse, offset)
-        publisher.touch_slots(RefinedLandmarks.KIND, one)
+        publisher.mark_changed_slots(RefinedLandmarks.KIND, one)
     if sparse_map.keypoints.flags[child] & REFINED:
-        publisher.touch_slots(RefinedLandmarks.KIND, np.array([child], np.int32))  # it leaves its keyframe's table
+        publisher.mark_changed_slots(
+            RefinedLandmarks.KIND, np.array([child], np.int32)
+        )  # it leaves its keyframe's table
     for keyframe in sparse_map.fuse(int(child), int(parent)):
-        publisher.touch(FusedLandmarks.KIND, keyframe)
+        publisher.mark_changed(FusedLandmarks.KIND, keyframe)
     return True

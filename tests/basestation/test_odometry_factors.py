@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from kiteline_basestation.config import BaseConfig, LinkConfig
-from kiteline_basestation.map.covisibility import window
+from kiteline_basestation.config import BaseConfig, OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.bundle_window import bundle_window
 from kiteline_basestation.refinement.disparity_calibration import with_border
-from kiteline_basestation.refinement.odometry_links import with_links, without_links
+from kiteline_basestation.refinement.odometry_factors import with_odometry_factors, without_odometry_factors
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
@@ -38,7 +38,7 @@ def flight(noise_px: float) -> tuple[SparseMap, list[np.ndarray]]:
         rho = rng.uniform(0.2, 0.5, BIRTHS)
         noisy = (rho + rng.normal(0, noise_px, BIRTHS) / CAMERA.bf).astype(np.float32)
         index = np.arange(BIRTHS, dtype=np.uint16)
-        sparse_map.put_births(
+        sparse_map.put_new_landmarks(
             keyframe, 0, index, uv, noisy, np.zeros(BIRTHS, np.uint8), np.zeros(BIRTHS, np.uint8),
             rng.integers(0, 256, (BIRTHS, 32)).astype(np.uint8),
         )  # fmt: skip
@@ -48,7 +48,7 @@ def flight(noise_px: float) -> tuple[SparseMap, list[np.ndarray]]:
             at = (at + rng.normal(0, noise_px, at.shape)).astype(np.float32)
             depth = (1.0 / local[:, 2] + rng.normal(0, noise_px, seen) / CAMERA.bf).astype(np.float32)
             rows = np.arange(BIRTHS, BIRTHS + seen, dtype=np.uint16)
-            sparse_map.put_sightings(keyframe, 0, rows, at, depth, np.zeros(seen, np.uint8), before[1])
+            sparse_map.put_observations(keyframe, 0, rows, at, depth, np.zeros(seen, np.uint8), before[1])
         ray = np.column_stack([(uv - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(BIRTHS)])
         before = se3.transform(T, ray / rho[:, None]), keyframe << 11 | np.arange(BIRTHS)
     return sparse_map, truth
@@ -62,12 +62,12 @@ def test_links_hold_what_few_points_cannot() -> None:
     sparse_map, truth = flight(noise_px=1.5)
     config = BaseConfig()
     keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    part = window(sparse_map, keyframes, config.window, config.measurement)
+    part = bundle_window(sparse_map, keyframes, config.window, config.measurement)
     assert part is not None
     alone = bundle(part.problem, config.bundle)
-    linked = with_links(sparse_map, part, config.links)
+    linked = with_odometry_factors(sparse_map, part, config.links)
     assert len(linked.points) > len(part.problem.points)
-    result = without_links(part, bundle(linked, config.bundle))
+    result = without_odometry_factors(part, bundle(linked, config.bundle))
     assert len(result.points) == len(part.points)
     assert len(result.inlier) == len(part.slots)
     assert error_m(result.T_c_m, truth) < 0.5 * error_m(alone.T_c_m, truth)
@@ -82,12 +82,17 @@ def test_keyframes_with_many_points_are_told_how_they_turned_and_no_lengths() ->
     for row in sparse_map.rows.values():  # the agent's steps are 3 % too long, its turns are right
         sparse_map.keyframes.T_p_k[row, :3, 3] *= 1.03
     config = BaseConfig()
-    part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
+    part = bundle_window(
+        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement
+    )
     assert part is not None
     far = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
     alone = bundle(far.problem, config.bundle)
     loose, firm = (
-        without_links(part, bundle(with_links(sparse_map, far, LinkConfig(enough=e)), config.bundle)) for e in (5, 80)
+        without_odometry_factors(
+            part, bundle(with_odometry_factors(sparse_map, far, OdometryFactorConfig(enough=e)), config.bundle)
+        )
+        for e in (5, 80)
     )
     assert turn_error(loose.T_c_m, truth) < 0.5 * turn_error(alone.T_c_m, truth)
 
@@ -106,21 +111,25 @@ def test_turns_that_are_all_off_the_same_way_count_less() -> None:
             off = se3.from_rt(se3.so3_exp(np.array([0.0, sign * 5e-4, 0.0])), np.zeros(3))
             sparse_map.keyframes.T_p_k[row] = sparse_map.keyframes.T_p_k[row] @ off
         config = BaseConfig()
-        part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
+        part = bundle_window(
+            sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement
+        )
         assert part is not None
         part = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
-        sigma[name] = with_links(sparse_map, part, LinkConfig(enough=5)).sigma[-1, 0]
+        sigma[name] = with_odometry_factors(sparse_map, part, OdometryFactorConfig(enough=5)).sigma[-1, 0]
     assert sigma["alike"] > 1.3 * sigma["by chance"]
 
 
 def test_links_stand_aside_of_the_border() -> None:
     sparse_map, _ = flight(noise_px=0.3)
     config = BaseConfig()
-    part = window(sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement)
+    part = bundle_window(
+        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement
+    )
     assert part is not None
     problem, agents = with_border(sparse_map, part.slots, part.problem, config.disparity)
     assert agents == (AgentId(0),)
-    linked = with_links(sparse_map, replace(part, problem=problem), config.links)
+    linked = with_odometry_factors(sparse_map, replace(part, problem=problem), config.links)
     assert linked.border is not None
     assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
     assert (linked.border.group[len(part.slots) :] == -1).all()

@@ -32,20 +32,20 @@ class Publisher:
         self._dirty: set[tuple[int, KeyframeId]] = set()
         self._records: list[tuple[AgentId, Record]] = []
 
-    def touch(self, kind: int, keyframe: KeyframeId) -> None:
+    def mark_changed(self, kind: int, keyframe: KeyframeId) -> None:
         """A value of a keyframe has changed."""
         self._dirty.add((int(kind), keyframe))
 
-    def touch_slots(self, kind: int, slots: I32) -> None:
+    def mark_changed_slots(self, kind: int, slots: I32) -> None:
         """Values of the keyframes that own these slots have changed."""
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
-            self.touch(kind, KeyframeId(keyframe))
+            self.mark_changed(kind, KeyframeId(keyframe))
 
-    def place(self, submap: SubmapId, S_w_m: F64) -> None:
+    def publish_placement(self, submap: SubmapId, S_w_m: F64) -> None:
         """A submap has a new place in the world, or another unit of length in it."""
         self._records.append((agent_of_submap(submap), SubmapPlacement(submap, S_w_m)))
 
-    def forget_place(self, submap: SubmapId) -> None:
+    def withdraw_placement(self, submap: SubmapId) -> None:
         """A submap has no place any more: what is not said yet is not to be said."""
         self._records = [
             (a, r) for a, r in self._records if not (isinstance(r, SubmapPlacement) and r.submap == submap)
@@ -82,7 +82,7 @@ class Publisher:
             return RefinedLandmarks(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
         if kind == FusedLandmarks.KIND:
             here = slots[born & (table.root[slots] != slots)]
-            return FusedLandmarks(keyframe, self._index(here), sparse_map.point_ids(table.root[here]))
+            return FusedLandmarks(keyframe, self._index(here), sparse_map.landmark_ids(table.root[here]))
         if kind == RemovedObservations.KIND:
             return RemovedObservations(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
         if kind == CulledLandmarks.KIND:
@@ -94,7 +94,7 @@ class Publisher:
         return self._map.keypoint_of(slots).astype(np.uint16)
 
 
-def adopt(sparse_map: SparseMap, record: Record) -> None:
+def apply_record(sparse_map: SparseMap, record: Record) -> None:
     """Make a record that the base wrote true in the map: as quantised just now, or as an earlier base left it.
 
     Records of keyframes that are not here, and what is true already, change nothing.
@@ -114,7 +114,7 @@ def adopt(sparse_map: SparseMap, record: Record) -> None:
     if isinstance(record, RefinedLandmarks):
         sparse_map.set_depths(slots, record.inv_depth[known], record.offset[known])
     elif isinstance(record, FusedLandmarks):
-        roots = sparse_map.find_points(record.point[known])
+        roots = sparse_map.find_landmarks(record.point[known])
         for slot, root in zip(slots.tolist(), roots.tolist()):
             if root >= 0 and sparse_map.keypoints.root[slot] == slot != root:
                 sparse_map.fuse(slot, int(sparse_map.keypoints.root[root]))

@@ -17,16 +17,16 @@ I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class GridView:
+class PlacedMap:
     """The placed part of the map as `grid.build` takes it, and what its rows mean.
 
-    keyframes: (n,) ids of the rows of positions. point_ids: (m,). observations: (k,2) rows of positions and of points.
+    keyframes: (n,) ids of the rows of positions. landmark_ids: (m,). observations: (k,2) rows of positions and of points.
     metric: (n,) keyframes of maps in metres.
     """
 
     keyframes: I64
     positions: F64
-    point_ids: I64
+    landmark_ids: I64
     points: F64
     observations: I64
     metric: NDArray[np.bool_]
@@ -37,11 +37,11 @@ class GridView:
         return self.observations[self.metric[self.observations[:, 0]]]
 
 
-def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> GridView:
+def placed_map(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> PlacedMap:
     """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
     rows, positions, metric = [], [], []
     for submap in sorted(placements):
-        S_w_m, metres = placements[submap], not sparse_map.own_unit(sparse_map.map_id(submap))
+        S_w_m, metres = placements[submap], not sparse_map.is_up_to_scale(sparse_map.map_id(submap))
         for keyframe in sparse_map.submaps.get(submap, []):
             pose = sparse_map.pose(keyframe)
             if pose is not None:
@@ -50,7 +50,7 @@ def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Gri
                 metric.append(metres)
     number = np.full(len(sparse_map), -1, np.int64)
     number[rows] = np.arange(len(rows))
-    points = sparse_map.roots()
+    points = sparse_map.live_landmarks()
     xyz, known = sparse_map.positions(points)
     known &= number[sparse_map.keypoints.row[points]] >= 0
     points, xyz = points[known], xyz[known]
@@ -62,13 +62,13 @@ def world_view(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Gri
     pairs = np.stack([number[sparse_map.keypoints.row[slots[keep]]], renumber[which[keep]]], 1).astype(np.int64)
     points, xyz = points[seen >= 2], xyz[seen >= 2]
     for submap in sorted(placements):
-        inside = sparse_map.point_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
-        T = placements[submap] @ sim3.inverse(sparse_map.frame(submap))
+        inside = sparse_map.landmark_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
+        T = placements[submap] @ sim3.inverse(sparse_map.submap_pose(submap))
         xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
-    return GridView(
+    return PlacedMap(
         sparse_map.keyframes.id[rows].copy(),
         np.array(positions).reshape(-1, 3),
-        sparse_map.point_ids(points),
+        sparse_map.landmark_ids(points),
         xyz,
         pairs,
         np.array(metric, np.bool_),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import MeasurementConfig, WindowConfig
+from kiteline_basestation.config import BundleWindowConfig, MeasurementConfig
 from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.disparity_calibration import offsets
@@ -20,7 +20,7 @@ Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class BundleWindow:
     """A part of the map as rows and slots, and the problem made of it: same order, same lengths."""
 
     rows: I32  # (k,) keyframe rows
@@ -29,20 +29,11 @@ class Window:
     problem: BundleProblem
 
 
-def covisible_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, min_shared: int) -> list[KeyframeId]:
-    """Keyframes of the same map that share at least min_shared points, most first, newer first among equals."""
-    shared = sparse_map.covisible(sparse_map.points_of(keyframe))
-    rows = np.flatnonzero(shared >= max(min_shared, 1))
-    ids = sparse_map.keyframes.id[rows]
-    order = np.lexsort((-ids, -shared[rows]))
-    return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe]
-
-
-def local_window(
-    sparse_map: SparseMap, keyframe: KeyframeId, config: WindowConfig, measurement: MeasurementConfig
-) -> Window | None:
+def local_bundle_window(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: BundleWindowConfig, measurement: MeasurementConfig
+) -> BundleWindow | None:
     """The keyframe, its most covisible ones, all they see, and the keyframes that hold these points in place."""
-    free = [keyframe, *covisible_keyframes(sparse_map, keyframe, config.min_shared)[: config.free - 1]]
+    free = [keyframe, *sparse_map.covisible_keyframes(keyframe, config.min_shared)[: config.free - 1]]
     parent = keyframe
     while len(free) < config.free // 2:  # few points are known: go on along the way that the agent came
         parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[parent]]))
@@ -50,20 +41,20 @@ def local_window(
             break
         if parent not in free:
             free.append(parent)
-    return window(sparse_map, free, config, measurement)
+    return bundle_window(sparse_map, free, config, measurement)
 
 
-def window(
-    sparse_map: SparseMap, free: list[KeyframeId], config: WindowConfig, measurement: MeasurementConfig,
+def bundle_window(
+    sparse_map: SparseMap, free: list[KeyframeId], config: BundleWindowConfig, measurement: MeasurementConfig,
     held: set[KeyframeId] | None = None,
-) -> Window | None:  # fmt: skip
+) -> BundleWindow | None:  # fmt: skip
     """The bundle problem that moves the keyframes `free`, all of one map, but none of `held`, which is the first one
     of each submap unless it is said.
     """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     submaps = sparse_map.submaps_of_map(submap_of_keyframe(free[0]))
     held = {sparse_map.submaps[s][0] for s in submaps} if held is None else held
-    points = sparse_map.in_order(np.concatenate([sparse_map.points_of(k) for k in free]))
+    points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in free]))
     _, known = sparse_map.positions(points)
     points = points[known]
     starts, slots = sparse_map.observations(points)
@@ -107,7 +98,7 @@ def window(
         _inverted(keyframes.T_w_k[rows]), keyframes.camera[rows], moves, positions, starts,
         number[table.row[slots]], measured, sigma,
     )  # fmt: skip
-    return Window(rows, points, slots, problem)
+    return BundleWindow(rows, points, slots, problem)
 
 
 def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -> tuple[F64, F64]:
@@ -119,7 +110,7 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     for row in np.unique(rows).tolist():
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
-        if agent in sparse_map.disparity_known:
+        if agent in sparse_map.disparity_calibrated:
             sigma[row] = config.sigma_settled_px
         deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & deep[rows]

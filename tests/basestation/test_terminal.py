@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.runtime.jobs import JobDone, run_job
-from kiteline_basestation.runtime.terminal import Narrator
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import CameraIntrinsics
@@ -22,13 +23,13 @@ STEP_NS = 200_000_000
 ELSEWHERE = se3.from_rt(np.eye(3), np.array([1.0, -2.0, 0.0]))
 
 
-def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[list[str], Station, Narrator]:
+def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[list[str], Station, TerminalReporter]:
     """Flights through coded channels. away: steps at which the last agent is out of reach. restart: when the first one
     begins anew.
     """
     ends = {f.agent: CodedChannel(SyncConfig(), 1) for f in flights}
     station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1), words)
-    narrator, lines = Narrator(station), []
+    narrator, lines = TerminalReporter(station), []
     done: tuple[JobDone, ...] = ()
     for n in range(max(len(f.records) for f in flights) + 30):
         if n == restart:

@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.runtime.jobs import Job, JobDone, run_job
 from kiteline_codec.schema import CameraIntrinsics, NewLandmarks, Observations, Record
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId

@@ -9,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import MeasurementConfig, NewPointConfig
-from kiteline_basestation.map.covisibility import covisible_keyframes
+from kiteline_basestation.config import MeasurementConfig, TriangulationConfig
+from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REMOVED
-from kiteline_basestation.map.publisher import Publisher
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.refinement import refind_kernels as kernels
-from kiteline_basestation.refinement.refind import descriptors, fuse
+from kiteline_basestation.refinement import landmark_matching_kernels as kernels
+from kiteline_basestation.refinement.landmark_matching import descriptors, fuse_landmarks
 from kiteline_codec.schema import RefinedLandmarks
 from kiteline_core.geometry.se3 import skew
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
@@ -26,10 +25,10 @@ I32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
 
-def triangulate(
+def triangulate_landmarks(
     sparse_map: SparseMap,
     keyframe: KeyframeId,
-    config: NewPointConfig,
+    config: TriangulationConfig,
     measurement: MeasurementConfig,
     publisher: Publisher,
 ) -> int:
@@ -44,9 +43,11 @@ def _without_depth(sparse_map: SparseMap, points: I32) -> I32:
     return points[~known]
 
 
-def _from_sightings(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, publisher: Publisher) -> int:
+def _from_sightings(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher
+) -> int:
     """Points that several keyframes see: from the two outermost views, tested in all of them."""
-    points = _without_depth(sparse_map, sparse_map.points_of(keyframe))
+    points = _without_depth(sparse_map, sparse_map.landmarks_of(keyframe))
     starts, slots = sparse_map.observations(points)
     several = np.diff(starts) >= 2
     points = points[several]
@@ -56,16 +57,16 @@ def _from_sightings(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPoin
     return _make(sparse_map, points, first, last, config, publisher)
 
 
-def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointConfig, publisher: Publisher) -> int:
+def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher) -> int:
     """Births without depth of this keyframe and of covisible ones that are one point."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[keyframe]
     made = 0
-    seen = sparse_map.points_of(keyframe)
+    seen = sparse_map.landmarks_of(keyframe)
     inverse = sparse_map.inverse_depths(seen) / keyframes.unit[table.row[seen]]
     inverse = inverse[inverse > 0]
     here = _open_births(sparse_map, keyframe)
-    for other in covisible_keyframes(sparse_map, keyframe, 1)[: config.keyframes]:
+    for other in sparse_map.covisible_keyframes(keyframe, 1)[: config.keyframes]:
         if len(here) == 0:
             break
         there = _open_births(sparse_map, other)
@@ -90,7 +91,7 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: NewPointCo
         a, b = here[matched], there[best[matched]]
         position, good = _intersect(sparse_map, a, b, config)
         for i in np.flatnonzero(good).tolist():
-            if fuse(sparse_map, int(a[i]), int(b[i]), publisher):
+            if fuse_landmarks(sparse_map, int(a[i]), int(b[i]), publisher):
                 root = table.root[a[i : i + 1]]
                 made += _set(sparse_map, root, position[i : i + 1], publisher)
         here = here[table.root[here] == here]
@@ -108,20 +109,20 @@ def _open_births(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
 
 
 def _make(
-    sparse_map: SparseMap, points: I32, first: I32, last: I32, config: NewPointConfig, publisher: Publisher
+    sparse_map: SparseMap, points: I32, first: I32, last: I32, config: TriangulationConfig, publisher: Publisher
 ) -> int:
     position, good = _intersect(sparse_map, first, last, config)
     return _set(sparse_map, points[good], position[good], publisher)
 
 
 def _set(sparse_map: SparseMap, points: I32, position: F64, publisher: Publisher) -> int:
-    inverse, offset, ahead = sparse_map.bearing_of(points, position)
+    inverse, offset, ahead = sparse_map.project_into_anchor(points, position)
     sparse_map.set_depths(points[ahead], inverse[ahead], offset[ahead])
-    publisher.touch_slots(RefinedLandmarks.KIND, points[ahead])
+    publisher.mark_changed_slots(RefinedLandmarks.KIND, points[ahead])
     return int(np.count_nonzero(ahead))
 
 
-def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: NewPointConfig) -> tuple[F64, Bool]:
+def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: TriangulationConfig) -> tuple[F64, Bool]:
     """Points from the rays of keypoints a and b (n,), and whether parallax, depth and reprojection allow them."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     views = []

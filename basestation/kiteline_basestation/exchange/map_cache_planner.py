@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import LoopConfig, SupplyConfig
+from kiteline_basestation.config import LoopConfig, MapCacheConfig
+from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.loop_detector import Shares
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, Key, LivePose, messages
 from kiteline_core.geometry import se3, sim3
@@ -48,13 +48,13 @@ class _Reader:
     lent: dict[KeyframeId, _Lent] = field(default_factory=dict)
 
 
-class Supply:
+class MapCachePlanner:
     """The windows of all agents."""
 
-    def __init__(self, config: SupplyConfig, loops: LoopConfig, sparse_map: SparseMap) -> None:
+    def __init__(self, config: MapCacheConfig, loops: LoopConfig, sparse_map: SparseMap) -> None:
         self._config = config
         self._map = sparse_map
-        self._shares = Shares(loops.share)
+        self._sharing = SharingPolicy(loops.share)
         self._readers: dict[AgentId, _Reader] = {}
 
     def lent(self, agent: AgentId) -> list[KeyframeId]:
@@ -131,14 +131,14 @@ class Supply:
         )
         remembered = {k for _, k in newest[-self._config.remembered :]}
         for other in self._map.submaps_of_map(submap):
-            if self._shares.together(agent, agent_of_submap(other)):
+            if self._sharing.allows(agent, agent_of_submap(other)):
                 rows += [self._map.rows[k] for k in self._map.submaps.get(other, []) if k not in remembered]
         return np.array([r for r in rows if self._map.keyframes.pose_source[r]], np.int64)
 
     def _depth_m(self, submap: SubmapId, here: F64) -> float:
         """How far the points of the agent's newest keyframes are, roughly."""
         slots = np.concatenate([self._map.slots_of(k) for k in self._map.submaps[submap][-3:]])
-        inverse = self._map.inverse_depths(slots) / self._map.unit(submap)
+        inverse = self._map.inverse_depths(slots) / self._map.scale(submap)
         inverse = inverse[inverse > 0.0]
         return 1.0 / float(np.median(inverse)) if len(inverse) else 1.0
 
@@ -212,12 +212,12 @@ class Supply:
         T_w_k = self._map.world_pose(keyframe)
         assert T_w_k is not None
         return CachedKeyframe(
-            keyframe, submap, se3.orthonormalise(sim3.place(sim3.inverse(self._map.frame(submap)), T_w_k))
+            keyframe, submap, se3.orthonormalise(sim3.place(sim3.inverse(self._map.submap_pose(submap)), T_w_k))
         )
 
     def _length(self, keyframe: KeyframeId, submap: SubmapId) -> float:
         """How many units of a submap one of a keyframe's is."""
-        return self._map.unit(submap_of_keyframe(keyframe)) / self._map.unit(submap)
+        return self._map.scale(submap_of_keyframe(keyframe)) / self._map.scale(submap)
 
     def _copied(self, agent: AgentId, keyframe: KeyframeId, length: float) -> tuple[CachedLandmarks, F64]:
         """A keyframe's points as the reader's camera would see them, its lengths so many times as long, and how often

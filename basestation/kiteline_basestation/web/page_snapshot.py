@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.grid.grid import UNKNOWN, GridConfig, GridMap, differences, empty
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid import UNKNOWN, GridMap, differences, empty
 from kiteline_codec.schema import GridTile
 from kiteline_core.ids import AgentId
 

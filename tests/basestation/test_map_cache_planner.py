@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_basestation.config import BaseConfig, SupplyConfig
+from kiteline_basestation.config import BaseConfig, MapCacheConfig
+from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import Codes, SavedMap
-from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import CodedChannel, plain_pair
 from kiteline_codec.pacing.profiles import RADIO
 from kiteline_codec.schema import (
@@ -45,8 +45,8 @@ class Base:
         for flight in flights:
             intake.take(flight.agent, (CameraIntrinsics(flight.agent, flight.camera), *flight.all_records()), 0)
         self.agent = flights[0].agent
-        config = replace(SupplyConfig(), **supply)
-        self.supply = Supply(config, replace(BaseConfig().loops, share=share), self.map)
+        config = replace(MapCacheConfig(), **supply)
+        self.supply = MapCachePlanner(config, replace(BaseConfig().loops, share=share), self.map)
         self.here, self.there = plain_pair()
         self.heard: list[Record] = []
         self.taken_back: list[Key] = []

@@ -12,15 +12,17 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
+from kiteline_basestation.grid.placed_map import placed_map
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import _list
-from kiteline_basestation.map.world_view import world_view
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_edges import similarity
 from kiteline_basestation.merging.loop_verification import LoopMatch, depth_scale
-from kiteline_basestation.runtime.jobs import BundleInputs, Job, JobDone, run_job
+from kiteline_basestation.refinement.bundle_job import BundleInputs
 from kiteline_basestation.runtime.outputs import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
-from kiteline_basestation.supply.supply import Supply
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import (
     CachedKeyframe,
@@ -59,7 +61,7 @@ def untouched(job: Job) -> JobDone:
     assert isinstance(job.inputs, BundleInputs)
     problem = job.inputs.problem
     kept = np.ones(len(problem.camera), np.bool_)
-    return JobDone(job.id, BundleResult(problem.T_c_m, problem.points, kept, 1.0, 1.0, 0, 1), 1)
+    return JobDone(job.id, job.kind, BundleResult(problem.T_c_m, problem.points, kept, 1.0, 1.0, 0, 1), 1)
 
 
 def feed(
@@ -177,14 +179,14 @@ def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: Ma
     assert mapper.summary()["merges"] == 1
     both = np.concatenate([placed(mapper, a), placed(mapper, b)])
     assert error_m(both, np.concatenate([true_places(a), true_places(b)]))[0] < 0.01
-    assert world_view(mapper.map, mapper.placements).observations.size > 0
-    assert world_view(mapper.map, mapper.placements).rays.size == 0  # no metre, no grid
+    assert placed_map(mapper.map, mapper.placements).observations.size > 0
+    assert placed_map(mapper.map, mapper.placements).rays.size == 0  # no metre, no grid
     young = submap_of_keyframe(b.keyframes[0])
-    assert abs(mapper.map.unit(young) * 0.37 / 2.0 - 1.0) < 0.1
+    assert abs(mapper.map.scale(young) * 0.37 / 2.0 - 1.0) < 0.1
     assert mapper.merger is not None
     mapper.merger.undo(mapper.merger.merges[0])
     mapper.step(MapperInput(((a.agent, ()),)), 10**12)
-    assert abs(mapper.map.unit(young) - 1.0) < 0.01  # as long as it was when it was laid into the other
+    assert abs(mapper.map.scale(young) - 1.0) < 0.01  # as long as it was when it was laid into the other
     assert young not in mapper.placements
     assert contradictions(mapper) == []
     alone = np.array([mapper.map.world_pose(k)[:3, 3] for k in b.keyframes])  # type: ignore[index]
@@ -198,12 +200,12 @@ def test_what_one_eye_is_lent_is_said_in_its_unit(make_flight: MakeFlight, words
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [pair, eye])
     base, reader = plain_pair()
-    supply = Supply(replace(BaseConfig().supply, min_cosine=-1.0, reach=9.0), BaseConfig().loops, mapper.map)
+    supply = MapCachePlanner(replace(BaseConfig().supply, min_cosine=-1.0, reach=9.0), BaseConfig().loops, mapper.map)
     supply.serve(eye.agent, LivePose(eye.agent, 10**9, eye.keyframes[-1], np.eye(4), 90), base, 10**9)
     records = reader.receive((), 0)
     copies = {r.keyframe: r for r in records if isinstance(r, CachedKeyframe)}
     assert any(k in pair.keyframes for k in copies)
-    S_w_m = mapper.map.frame(submap_of_keyframe(eye.keyframes[0]))
+    S_w_m = mapper.map.submap_pose(submap_of_keyframe(eye.keyframes[0]))
     compared = 0
     for copied in (r for r in records if isinstance(r, CachedLandmarks)):
         T_m_k, camera = copies[copied.keyframe].T_m_k, eye.camera
@@ -293,8 +295,8 @@ def test_what_a_base_remembers_of_units_is_known_to_the_next(make_flight: MakeFl
         assert np.allclose(placed(again, flight), placed(mapper, flight), atol=1e-9)
         for k in flight.keyframes:
             assert np.allclose(again.map.world_pose(k), mapper.map.world_pose(k), atol=1e-9)
-    points = mapper.map.point_ids(mapper.map.roots())
-    here, there = mapper.map.find_points(points), again.map.find_points(points)
+    points = mapper.map.landmark_ids(mapper.map.live_landmarks())
+    here, there = mapper.map.find_landmarks(points), again.map.find_landmarks(points)
     assert np.allclose(mapper.map.positions(here)[0], again.map.positions(there)[0], atol=1e-6)
     assert again.merger is not None and mapper.merger is not None
     assert [v.scale for v in again.merger._edges] == [v.scale for v in mapper.merger._edges]

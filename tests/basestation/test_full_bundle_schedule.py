@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kiteline_basestation.config import GraphConfig
-from kiteline_basestation.refinement.whole_maps import WholeMaps
+from kiteline_basestation.refinement.full_bundle_schedule import FullBundleSchedule
 from kiteline_core.ids import SubmapId, submap_id
 
 ONE, TWO = submap_id(0, 0, 0), submap_id(1, 0, 0)
@@ -12,7 +12,7 @@ SECOND = 1_000_000_000
 
 
 def test_a_map_is_bundled_when_it_has_grown_and_no_more_often() -> None:
-    whole = WholeMaps(CONFIG)
+    whole = FullBundleSchedule(CONFIG)
     assert whole.next({ONE: 11}, (), 0) is None
     assert whole.next({ONE: 12}, (), 1) == ONE
     assert whole.next({ONE: 12}, (), 2) is None and not whole.waiting({ONE: 12})
@@ -20,7 +20,7 @@ def test_a_map_is_bundled_when_it_has_grown_and_no_more_often() -> None:
 
 
 def test_the_worker_rests_in_between() -> None:
-    whole = WholeMaps(CONFIG)
+    whole = FullBundleSchedule(CONFIG)
     assert whole.next({ONE: 20}, (), 0) == ONE
     whole.done(SECOND // 10, SECOND)  # a tenth of a second: a tenth of the next
     assert whole.next({ONE: 21}, (), 2 * SECOND - 1) is None
@@ -30,7 +30,7 @@ def test_the_worker_rests_in_between() -> None:
 
 def test_the_map_that_grew_most_is_next_unless_it_is_busy() -> None:
     sizes: dict[SubmapId, int] = {ONE: 40, TWO: 20}
-    whole = WholeMaps(CONFIG)
+    whole = FullBundleSchedule(CONFIG)
     whole.bundled.update({ONE: 36, TWO: 15})  # a tenth and a quarter
     assert whole.next(sizes, (TWO,), 0) == ONE
     assert whole.next(sizes, (), 1) == TWO
@@ -38,6 +38,6 @@ def test_the_map_that_grew_most_is_next_unless_it_is_busy() -> None:
 
 
 def test_a_map_of_which_a_part_was_taken_is_bundled_anew() -> None:
-    whole = WholeMaps(CONFIG)
+    whole = FullBundleSchedule(CONFIG)
     whole.bundled[ONE] = 40
     assert whole.next({ONE: 25}, (), 0) == ONE

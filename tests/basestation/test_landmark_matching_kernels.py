@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.refinement import refind_kernels as kernels
+from kiteline_basestation.refinement import landmark_matching_kernels as kernels
 
 U64 = NDArray[np.uint64]
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_basestation.grid.grid import UNKNOWN, GridMap
-from kiteline_basestation.web import view
-from kiteline_basestation.web.view import AgentView, Snapshot
+from kiteline_basestation.web import page_snapshot as view
+from kiteline_basestation.web.page_snapshot import AgentView, Snapshot
 from kiteline_core.ids import AgentId
 
 S = 1_000_000_000

@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import LinkConfig
-from kiteline_basestation.map.covisibility import Window
+from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
@@ -31,7 +31,7 @@ _FAR = (8.0,)  # the same where only the turn is to be held
 _DEPTHS = (0.7, 1.8)  # times the median depth: near points hold the position, far ones the direction
 
 
-def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> BundleProblem:
+def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig) -> BundleProblem:
     """The window's problem with the links between its keyframes, firmer where few points are; made-up points last."""
     problem = window.problem
     table = sparse_map.keyframes
@@ -78,7 +78,7 @@ def with_links(sparse_map: SparseMap, window: Window, config: LinkConfig) -> Bun
     )
 
 
-def _turns_differ_px(sparse_map: SparseMap, window: Window, number: dict[int, int], run: int) -> float:
+def _turns_differ_px(sparse_map: SparseMap, window: BundleWindow, number: dict[int, int], run: int) -> float:
     """By how much the window's turns from keyframe to keyframe differ from what agents said, an axis: the median, or,
     where more, what runs of them differ by together. Disparities that are off turn all keyframes a little the same way.
     """
@@ -124,6 +124,6 @@ def _seen(lens: F64, xyz: F64) -> F64:
     return np.column_stack([lens[0] * xyz[:, 0] * inv + lens[2], lens[1] * xyz[:, 1] * inv + lens[3], lens[4] * inv])
 
 
-def without_links(window: Window, result: BundleResult) -> BundleResult:
+def without_odometry_factors(window: BundleWindow, result: BundleResult) -> BundleResult:
     """The result for the window's own points and observations."""
     return replace(result, points=result.points[: len(window.points)], inlier=result.inlier[: len(window.slots)])

@@ -13,7 +13,7 @@ from kiteline_basestation.config import GraphConfig
 from kiteline_core.ids import SubmapId
 
 
-class WholeMaps:
+class FullBundleSchedule:
     """Which map is next, and when. Maps are named by their eldest submap, their size is their number of keyframes."""
 
     def __init__(self, config: GraphConfig) -> None:

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.grid.grid import GridConfig, empty
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid import empty
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.station import Station
-from kiteline_basestation.web.view import AgentView, Snapshot
+from kiteline_basestation.web.page_snapshot import AgentView, Snapshot
 from kiteline_codec.channel import CodedChannel
 from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
 
@@ -70,7 +71,7 @@ def _path(mapper: Mapper, agent: AgentId) -> F64:
 
 def _points_of_agents(mapper: Mapper) -> dict[AgentId, int]:
     submaps, count = np.unique(
-        mapper.map.point_ids(mapper.map.roots()) >> (SEQUENCE_BITS + KEYPOINT_BITS), return_counts=True
+        mapper.map.landmark_ids(mapper.map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS), return_counts=True
     )
     out: dict[AgentId, int] = {}
     for submap, n in zip(submaps.tolist(), count.tolist(), strict=True):

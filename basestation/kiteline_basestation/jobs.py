@@ -1,0 +1,38 @@
+"""Jobs: long work done outside the state machine, by a worker process or in modelled time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work to be done elsewhere. kind: name of a `JobKind`. inputs: frozen, all that the kind's `run` needs."""
+
+    id: int
+    kind: str
+    inputs: Any
+
+
+@dataclass(frozen=True, slots=True)
+class JobDone:
+    """Result of a job. cost_ops: arithmetic operations, at one a nanosecond on the modelled core."""
+
+    id: int
+    kind: str
+    result: Any
+    cost_ops: int
+
+
+@dataclass(frozen=True, slots=True)
+class JobKind:
+    """A kind of job, defined beside the inputs that it takes.
+
+    run: pure; the same inputs give the same result, bit for bit. cost_ops: cost of a run in arithmetic operations.
+    """
+
+    name: str
+    run: Callable[[Any], Any]
+    cost_ops: Callable[[Any, Any], int]
