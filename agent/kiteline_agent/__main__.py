@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +30,17 @@ from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
     channel_for,
-    from_json,
     options_of,
     parser,
-    settled,
 )
 from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
-from kiteline_codec.channel import CodedChannel, RecordChannel
+from kiteline_codec.channel import CodedChannel, RecordChannel, settled
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.open import open_link
@@ -288,7 +287,7 @@ def fly_live(spec: AgentOptions, parent: process.Parent | None, stop: process.St
         process.notify("READY=1")
         narrator = StatusMessages()
         if parent is None:
-            _tell([f"flying {source.name}, {_link_words(spec)}"])
+            process.print_lines([f"flying {source.name}, {_link_words(spec)}"])
         begin_ns = clock.now_ns()
         onboard.begin_at(begin_ns)
         if sink is not None:
@@ -317,23 +316,16 @@ def fly_live(spec: AgentOptions, parent: process.Parent | None, stop: process.St
                 sink.push(PoseSample(captured_ns, e.T_l_b, e.tracked, quality, spec.boot, e.cov_l), clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is None:
-                _tell(narrator.lines(onboard.output, onboard.tally, now_ns - begin_ns) if onboard.output else ())
+                process.print_lines(
+                    narrator.lines(onboard.output, onboard.tally, now_ns - begin_ns) if onboard.output else ()
+                )
             elif onboard.tally.frames % _PROGRESS_FRAMES == 0:
                 parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
         if parent is None:
-            _tell([f"over: {summary(onboard.tally)}"])
+            process.print_lines([f"over: {summary(onboard.tally)}"])
         _drain_live(onboard, link, clock, parent, stop)
         if parent is not None:
             parent.tell("result", report=onboard.report())
-
-
-def _tell(lines: Sequence[str]) -> None:
-    """Lines for whoever looks on; without anyone, the flight goes on all the same."""
-    try:
-        for line in lines:
-            print(line, file=sys.stderr, flush=True)
-    except OSError:
-        pass
 
 
 def _link_words(spec: AgentOptions) -> str:
@@ -412,27 +404,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = parser()
     a = p.parse_args(argv)
     if a.spec:
-        process.leave(run_child(from_json(a.spec)))
+        spec = configuration.from_json(AgentOptions, a.spec)
+        expected = (SourceError, LinkError, ValueError)
+        process.leave(process.run_child(spec.link, partial(fly_lockstep, spec), partial(fly_live, spec), expected))
     if not a.source:
         p.error("a SOURCE is required")
-    state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
-    folder = (Path(a.log) if a.log else state) / f"agent{a.agent}"
+    folder = (Path(a.log) if a.log else process.state_folder()) / f"agent{a.agent}"
     spec = options_of(a, folder, process.next_number(folder / "boot"))
     fly_live(spec, None, process.StopSignal())
     process.leave(0)
-
-
-def run_child(spec: AgentOptions) -> int:
-    """Fly as a child process; an error that a user can mend ends in one line."""
-
-    def fly(parent: process.Parent) -> None:
-        if spec.link.startswith("lockstep:"):
-            process.exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
-            fly_lockstep(spec, parent)
-        else:
-            fly_live(spec, parent, process.StopSignal())
-
-    return process.run_child(fly, (SourceError, LinkError, ValueError))
 
 
 if __name__ == "__main__":

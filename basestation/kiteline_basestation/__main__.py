@@ -15,6 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,12 +28,11 @@ from kiteline_basestation.runtime.options import (
     BaseOptions,
     base_config,
     coded_channels,
-    from_json,
-    of_arguments,
+    options_of,
     parser,
 )
 from kiteline_basestation.runtime.outputs import counts, map_files
-from kiteline_basestation.runtime.summary import FlightSummary, flight_summary, settled, timings
+from kiteline_basestation.runtime.summary import FlightSummary, flight_summary, timings
 from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
@@ -43,10 +43,11 @@ from kiteline_basestation.store.restore import Restored, restore
 from kiteline_basestation.store.saved_map import SavedMap, pack
 from kiteline_basestation.store.store import StoreError
 from kiteline_codec import warm as codec_warm
-from kiteline_codec.channel import RecordChannel
+from kiteline_codec.channel import RecordChannel, settled
 from kiteline_codec.schema import WireError
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.links.open import open_link
@@ -321,7 +322,7 @@ def fly_live(spec: BaseOptions, parent: process.Parent | None, stop: process.Sto
         begin_ns, stepped_ns = clock.now_ns(), 0
         if narrator is not None:
             kept = f", store {spec.store}" if spec.store else ", nothing is kept: no --store"
-            _say([f"base on {spec.link}, session {spec.session}{kept}"])
+            process.print_lines([f"base on {spec.link}, session {spec.session}{kept}"])
         while not stop:
             now_ns = clock.now_ns()
             packets = {agent: received for agent, link in hub.links().items() if (received := link.receive())}
@@ -337,7 +338,7 @@ def fly_live(spec: BaseOptions, parent: process.Parent | None, stop: process.Sto
                 ground.compare(hub.alive())
                 if narrator is not None:
                     stored = None if ground.keeper is None else ground.keeper.idle
-                    _say(narrator.lines(hub.alive(), now_ns - begin_ns, ground.rss_mib, stored))
+                    process.print_lines(narrator.lines(hub.alive(), now_ns - begin_ns, ground.rss_mib, stored))
             if page is not None:
                 page.renew(ground.station, now_ns)
             if parent is not None and parent.said() == "frames_over":
@@ -345,18 +346,11 @@ def fly_live(spec: BaseOptions, parent: process.Parent | None, stop: process.Sto
             process.notify("WATCHDOG=1")
             stop.wait(_LIVE_WAIT_S)
         if narrator is not None:
-            _say([f"over: {narrator.summary()}"])
+            process.print_lines([f"over: {narrator.summary()}"])
         ground.frames_are_over()
         if parent is not None and ground.flown is not None:
             parent.tell("flown", keyframes=ground.flown.keyframes)
             parent.tell("result", report=ground.report(), keyframes=ground.snapshot().keyframes)
-
-
-def _say(lines: Sequence[str]) -> None:
-    """Lines for whoever looks on; without anyone, the flight goes on all the same."""
-    with contextlib.suppress(OSError):
-        for line in lines:
-            print(line, file=sys.stderr, flush=True)
 
 
 def _sealed(spec: BaseOptions, hub: LinkHub) -> LinkHub:
@@ -409,28 +403,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = parser()
     a = p.parse_args(argv)
     if a.spec:
-        process.leave(run_child(from_json(a.spec)))
+        options = configuration.from_json(BaseOptions, a.spec)
+        expected = (LinkError, SourceError, StoreError, WireError, ValueError)
+        process.leave(
+            process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
+        )
     if not a.link:
         p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
-    state = Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline" / "base"
-    # Seconds, so that a base on another machine, which knows nothing of this one, begins a later session all the same.
-    session = process.next_number((Path(a.store) if a.store else state) / "session", int(time.time()) - _SESSION_S)
-    spec = of_arguments(a, session)
-    fly_live(spec, None, process.StopSignal())
+    # Seconds since a fixed date: a base on another machine, without this one's files, still begins a later session.
+    folder = Path(a.store) if a.store else process.state_folder() / "base"
+    session = process.next_number(folder / "session", int(time.time()) - _SESSION_S)
+    fly_live(options_of(a, session), None, process.StopSignal())
     process.leave(0)
-
-
-def run_child(spec: BaseOptions) -> int:
-    """Fly as a child process; an error that a user can mend ends in one line."""
-
-    def fly(parent: process.Parent) -> None:
-        if spec.link.startswith("lockstep:"):
-            process.exit_on_sigterm()  # waiting at the barrier, no loop could ask for a flag
-            fly_lockstep(spec, parent)
-        else:
-            fly_live(spec, parent, process.StopSignal())
-
-    return process.run_child(fly, (LinkError, SourceError, StoreError, WireError, ValueError))
 
 
 if __name__ == "__main__":

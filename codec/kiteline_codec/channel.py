@@ -211,6 +211,13 @@ class CodedChannel:
         return packets
 
 
+def settled(channel: RecordChannel) -> tuple[bool, bool]:
+    """Whether a channel has nothing left to send, and whether the last digests of both ends were equal."""
+    if isinstance(channel, CodedChannel):
+        return channel.endpoint.quiet, channel.endpoint.digest_equal
+    return True, True
+
+
 # What a link adds to a packet: IPv4 and UDP; frames of a serial line; four pieces in MAVLink's TUNNEL.
 _LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
 _RADIOS = ("serial", "mavlink")

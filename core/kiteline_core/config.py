@@ -5,6 +5,7 @@ The unit and the reason of a value are in the comment beside its default; a tabl
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 import types
@@ -87,6 +88,14 @@ def in_range(config: T, default: T, path: str) -> T:
             if value < 0 <= normal:
                 raise ConfigError(f"{inner}: found {_shown(value)}, expected a number that is not negative")
     return config
+
+
+def from_json(kind: type[T], text: str) -> T:
+    """A flat frozen dataclass from its JSON; lists become tuples. Raises ConfigError for an unknown key."""
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(text).items()}
+    if unknown := values.keys() - get_type_hints(kind).keys():
+        raise ConfigError(f"{kind.__name__} has no {', '.join(sorted(unknown))}")
+    return kind(**values)
 
 
 def describe(config: object) -> str:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
-from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
+from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
@@ -58,15 +56,6 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
     )  # fmt: skip
 
 
-def from_json(text: str) -> AgentOptions:
-    """A spec from its JSON; unknown keys are an error."""
-    values: dict[str, Any] = json.loads(text)
-    known = {f.name for f in fields(AgentOptions)}
-    if unknown := set(values) - known:
-        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
-    return AgentOptions(**values)
-
-
 def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
     """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError.
 
@@ -89,13 +78,6 @@ def channel_for(spec: AgentOptions, spill: Spill | None = None) -> RecordChannel
         return NoBaseChannel()
     sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
     return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
-
-
-def settled(channel: RecordChannel) -> tuple[bool, bool]:
-    """Whether a channel is quiet, and whether both sides were seen to hold the same."""
-    if isinstance(channel, CodedChannel):
-        return channel.endpoint.quiet, channel.endpoint.digest_equal
-    return True, True
 
 
 def parser() -> argparse.ArgumentParser:

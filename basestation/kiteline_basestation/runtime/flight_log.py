@@ -18,7 +18,7 @@ import numpy as np
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
-from kiteline_basestation.runtime.options import BaseOptions, coded_channels, from_json
+from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store.saved_map import Codes, SavedMap, pack, unpack
 from kiteline_core import config as configuration
@@ -41,7 +41,7 @@ def station_of(metadata: Mapping[str, str], words: Vocabulary | None) -> Station
     """A station as the one of a base's log was."""
     config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
     logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseOptions.__dataclass_fields__}
-    spec = from_json(json.dumps({"folder": "", **logged}))
+    spec = configuration.from_json(BaseOptions, json.dumps({"folder": "", **logged}))
     return Station(config, coded_channels(replace(spec, link=spec.link + ":")), words)
 
 

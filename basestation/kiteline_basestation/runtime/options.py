@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_codec.channel import RecordChannel, coded_channel
@@ -43,17 +41,6 @@ class BaseOptions:
     maps: str = ""  # a Zenoh endpoint on which maps are managed; "": the agents' link
 
 
-def from_json(text: str) -> BaseOptions:
-    """A spec from its JSON; unknown keys are an error."""
-    values: dict[str, Any] = json.loads(text)
-    known = {f.name for f in fields(BaseOptions)}
-    if unknown := set(values) - known:
-        raise ValueError(f"unknown key in spec: {sorted(unknown)}")
-    for name in ("agents", "imports"):
-        values[name] = tuple(values.get(name, ()))
-    return BaseOptions(**values)
-
-
 def base_config(path: str) -> BaseConfig:
     """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
     if not path:
@@ -85,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def of_arguments(a: argparse.Namespace, session: int) -> BaseOptions:
+def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
     """What `kiteline base` was told on the command line."""
     return BaseOptions(
         folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,

@@ -7,14 +7,6 @@ from dataclasses import dataclass
 
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.runtime.outputs import counts, keyframe_poses
-from kiteline_codec.channel import CodedChannel, RecordChannel
-
-
-def settled(channel: RecordChannel) -> tuple[bool, bool]:
-    """Whether a channel is quiet, and whether both sides were seen to hold the same."""
-    if isinstance(channel, CodedChannel):
-        return channel.endpoint.quiet, channel.endpoint.digest_equal
-    return True, True
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -106,15 +106,39 @@ class Parent:
             pass  # it is gone: the watch ends us
 
 
-def run_child(work: Callable[[Parent], None], expected: tuple[type[Exception], ...]) -> int:
-    """Do the work of a child process; errors that a user can mend become one word to the parent. The exit status."""
+def run_child(
+    link: str,
+    fly_lockstep: Callable[[Parent], None],
+    fly_live: Callable[[Parent, StopSignal], None],
+    expected: tuple[type[Exception], ...],
+) -> int:
+    """Fly as a child process, in lock-step if the link says so. Returns the exit status.
+
+    expected: errors that a user can mend; they are sent to the parent as one line.
+    """
     parent = Parent()
     try:
-        work(parent)
+        if link.startswith("lockstep:"):
+            exit_on_sigterm()  # a process that waits at the barrier polls no flag
+            fly_lockstep(parent)
+        else:
+            fly_live(parent, StopSignal())
     except expected as error:
         parent.tell("error", text=str(error))
         return 2
     return 0
+
+
+def state_folder() -> Path:
+    """Folder for what survives a restart: $XDG_STATE_HOME/kiteline."""
+    return Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines on stderr; a closed terminal does not stop the flight."""
+    with contextlib.suppress(OSError):
+        for line in lines:
+            print(line, file=sys.stderr, flush=True)
 
 
 def next_number(path: Path, least: int = 1) -> int:
