@@ -21,7 +21,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_edges import similarity
 from kiteline_basestation.merging.loop_verification import LoopMatch, depth_scale
 from kiteline_basestation.refinement.bundle_job import BundleInputs
-from kiteline_basestation.runtime.outputs import keyframe_poses
+from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import (

@@ -10,7 +10,7 @@ import pytest
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.grid import build, to_pgm, to_yaml
-from kiteline_basestation.runtime.export import map_ply, tum
+from kiteline_basestation.runtime.map_formats import map_ply, tum
 from kiteline_lab.plots.plot_map import MapFileError, main, read_map_ply
 
 

@@ -24,7 +24,7 @@ class StatusPage:
         """Where it is."""
         return self._handle.url
 
-    def renew(self, station: Station, now_ns: int) -> None:
+    def update(self, station: Station, now_ns: int) -> None:
         """Take a new snapshot, if the last one is old enough."""
         if now_ns - self._taken_ns >= _PERIOD_NS:
             self._taken_ns = now_ns

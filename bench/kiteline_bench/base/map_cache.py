@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.runtime.warm import warm
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.runtime.outputs import keyframe_poses
+from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.sorties import Flight, Flown, Part, Sortie, fly
 from kiteline_core.geometry import se3

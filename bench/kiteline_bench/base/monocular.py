@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.mapper import Mapper
-from kiteline_basestation.runtime.outputs import keyframe_poses
+from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.sorties import Flight, Part, Sortie, fly
 from kiteline_core.geometry import se3, sim3

@@ -23,11 +23,11 @@ from types import BuiltinFunctionType, FunctionType, ModuleType
 import cv2
 import numpy as np
 
-from kiteline_basestation.__main__ import place_words
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log
+from kiteline_basestation.runtime.base_runtime import load_vocabulary
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.station import Station
 from kiteline_codec import warm as codec_warm
@@ -92,7 +92,7 @@ def replayed(log: Path, every: int = _EVERY, trace: bool = False) -> Iterator[Sa
         spec = spec_of_log(reader)
         config = configuration.apply(BaseConfig(), tomllib.loads(reader.metadata["config"]))
         codec_warm.warm()
-        words = place_words()
+        words = load_vocabulary()
         warm(config, words)
         if words is not None:
             warm_graphs()

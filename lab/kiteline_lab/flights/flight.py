@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kiteline_agent.__main__ import Onboard
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.options import AgentOptions
-from kiteline_basestation.__main__ import Ground
+from kiteline_basestation.runtime.base_runtime import BaseRuntime
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_hw.lockstep.messages import Down, Phase
@@ -92,13 +92,13 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
             _fly_alone(onboards, progress)
         else:
             open_channel = theirs.__getitem__ if theirs else coded_channels(flight.base)
-            ground = Ground(flight.base, open_channel, plain=bool(theirs))
-            stack.callback(ground.close)
-            _fly_joined(onboards, ground, progress)
-            outcome.base = ground.report()
-            assert ground.flown is not None
-            outcome.flown = poses_from_json(ground.flown.keyframes)
-            outcome.drained = poses_from_json(ground.snapshot().keyframes)
+            base = BaseRuntime(flight.base, open_channel, plain=bool(theirs))
+            stack.callback(base.close)
+            _fly_joined(onboards, base, progress)
+            outcome.base = base.report()
+            assert base.at_last_frame is not None
+            outcome.flown = poses_from_json(base.at_last_frame.keyframes)
+            outcome.drained = poses_from_json(base.summary().keyframes)
         outcome.agents = [onboards[spec.agent].report() for spec in flight.agents]
     return outcome
 
@@ -110,11 +110,11 @@ def _fly_alone(onboards: Mapping[int, Onboard], progress: Progress | None) -> No
             _show(onboards, progress)
 
 
-def _fly_joined(onboards: Mapping[int, Onboard], ground: Ground, progress: Progress | None) -> None:
+def _fly_joined(onboards: Mapping[int, Onboard], base: BaseRuntime, progress: Progress | None) -> None:
     ups = {agent: onboard.hello() for agent, onboard in onboards.items()}
     while True:
-        downs = ground.turn(ups)
-        if ground.phase is Phase.END:
+        downs = base.tick(ups)
+        if base.phase is Phase.END:
             return
         ups = {agent: onboard.turn(downs[agent]) for agent, onboard in onboards.items()}
         _show(onboards, progress)
@@ -269,7 +269,7 @@ class _Supervisor:
         why = self._errors.get(event.child) or self._crew.children[event.child].last_words()
         self._note(f"{event.child} {ended_by(code)}" + (f": {why}" if why else ""))
         self.outcome.failed = True
-        if not any(self._frames):  # it never got off the ground: what the others wait for will not come
+        if not any(self._frames):  # it never started: what the others wait for will not come
             raise LinkError(self.outcome.notes[-1])
 
     @property

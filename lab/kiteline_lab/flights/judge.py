@@ -24,8 +24,6 @@ from kiteline_lab.plots.plot import Line, plot_trajectories
 
 F64 = NDArray[np.float64]
 
-_SAMPLES = ("cpu_ms_per_frame", "decode_ms", "bundle_ms", "grid_ms", "step_ms")  # lists that become statistics
-
 
 def judge(
     out: Path,
@@ -85,7 +83,7 @@ def read_estimates(log: Path) -> list[Estimate]:
 
 
 def _with_statistics(part: Report) -> Report:
-    timing = {key: statistic(value) if key in _SAMPLES else value for key, value in part["timing"].items()}
+    timing = {key: statistic(value) if isinstance(value, list) else value for key, value in part["timing"].items()}
     return {**part, "timing": timing}
 
 

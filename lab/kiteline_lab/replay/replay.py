@@ -21,11 +21,11 @@ from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.runtime.warm import warm as agent_warm
 from kiteline_agent.step import Identity, StepInput
-from kiteline_basestation.__main__ import place_words
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
+from kiteline_basestation.runtime.base_runtime import load_vocabulary
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_basestation.runtime.warm import warm as base_warm
 from kiteline_basestation.station import Station
@@ -172,7 +172,9 @@ def replay_base(log: LogReader, progress: Progress | None = None, stop_at_first:
     config = configuration.apply(BaseConfig(), tomllib.loads(log.metadata["config"]))
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: what its agents handed over was no packet, and is not in it")
-    station = Station(config, lambda agent: channel_of_log(spec, spec["session"], spec["down_bytes_s"]), place_words())
+    station = Station(
+        config, lambda agent: channel_of_log(spec, spec["session"], spec["down_bytes_s"]), load_vocabulary()
+    )
     jobs: dict[int, Job] = {}
     out = Replayed()
     for kept in log.messages((base_log.RESTORED,)):

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
-from kiteline_basestation.runtime.export import g2o, tum
-from kiteline_basestation.runtime.outputs import keyframe_poses, map_files
+from kiteline_basestation.runtime.flight_summary import keyframe_poses
+from kiteline_basestation.runtime.map_files import map_files
+from kiteline_basestation.runtime.map_formats import g2o, tum
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.store import read

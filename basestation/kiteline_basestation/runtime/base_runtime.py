@@ -1,0 +1,224 @@
+"""The base in flight: the station with its store, its log and a modelled link to each agent."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.management import Command
+from kiteline_basestation.runtime.flight_log import RESTORED, metadata_of, station_of, write_step
+from kiteline_basestation.runtime.flight_summary import FlightSummary, counts, flight_summary, timings
+from kiteline_basestation.runtime.map_files import map_files
+from kiteline_basestation.runtime.options import BaseOptions, base_config
+from kiteline_basestation.runtime.warm import warm, warm_graphs
+from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
+from kiteline_basestation.station import Import, Station, StationOutput
+from kiteline_basestation.store.combine import combine
+from kiteline_basestation.store.keeper import Keeper, read_imports
+from kiteline_basestation.store.restore import Restored, restore
+from kiteline_basestation.store.saved_map import SavedMap, pack
+from kiteline_codec import warm as codec_warm
+from kiteline_codec.channel import RecordChannel, settled
+from kiteline_core.ids import AgentId
+from kiteline_core.places.place_index import Vocabulary
+from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.logs.mcap_log import LogWriter
+from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
+from kiteline_hw.system import process
+from kiteline_hw.system.cpu import rss_mib
+from kiteline_hw.system.vocabulary import shipped_words
+
+_DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
+_DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is not quiet yet is given up
+_RSS_STEPS = 10  # steps between two readings of the resident memory
+
+
+def load_vocabulary() -> Vocabulary | None:
+    """The shipped visual vocabulary; None if gtsam, which loop closing needs, is not installed."""
+    if importlib.util.find_spec("gtsam") is None:
+        print("gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'", file=sys.stderr)
+        return None
+    return shipped_words()
+
+
+class BaseRuntime:
+    """The base in flight, in lock-step (`tick`) or live (`step`)."""
+
+    def __init__(
+        self,
+        options: BaseOptions,
+        open_channel: Callable[[AgentId], RecordChannel],
+        jobs: Worker | None = None,
+        plain: bool = False,
+    ) -> None:
+        """open_channel: makes the base's end of a channel. plain: no codec, so no packets are logged."""
+        cv2.setNumThreads(1)
+        self.options = options
+        self.config = base_config(options.config)
+        codec_warm.warm()
+        vocabulary = load_vocabulary()
+        warm(self.config, vocabulary)
+        if jobs is None and vocabulary is not None:
+            warm_graphs()
+        self.station = Station(self.config, open_channel, vocabulary)
+        self.jobs: LockstepJobs | Worker = LockstepJobs() if jobs is None else jobs
+        self.phase = Phase.FLY
+        self.now_ns: int | None = None  # flight time of the next tick in lock-step
+        self.rss_mib = 0.0
+        self.digest_equal = False
+        self.at_last_frame: FlightSummary | None = None
+        self.agents_lost: set[int] = set()
+        self.keeper: Keeper | None = None
+        self._steps = 0
+        self._step_ms: deque[float] = deque(maxlen=SAMPLES)
+        self._drained_ns = 0
+        self._last_frame_ns = 0
+        self._folder = Path(options.folder)
+        self._log: LogWriter | None = None
+        if options.log_name:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._log = LogWriter(self._folder / options.log_name, metadata_of(options, self.config, plain))
+            self._log.text("/log", options.start_ns, "info", f"base, session {options.session}")
+            self._log.flush()  # a base that dies at once leaves a log that can be read
+        disorder = LinkModelConfig(
+            loss=options.loss, duplicate=options.disorder, reorder=options.disorder,
+            delay_ns=round(options.delay_s * 1e9),
+        )  # fmt: skip
+        self._links = LinkModels(disorder, options.seed * 64 + 32)
+        self._imports: list[Import] = []
+
+    def restore_maps(self, now_ns: int) -> Restored | None:
+        """Load the map of the store and the imported ones; None if there are none.
+
+        Raises StoreError, SourceError, WireError.
+        """
+        self.keeper = Keeper(Path(self.options.store)) if self.options.store else None
+        stored = saved = SavedMap() if self.keeper is None else self.keeper.load()
+        maps, self._imports = read_imports(self.options.imports, lambda data: station_of(data, load_vocabulary()))
+        for other in maps:
+            saved = combine(saved, other)
+        restored = None
+        if not saved.empty:
+            if self._log is not None:
+                self._log.blob(RESTORED, now_ns + self.options.start_ns, pack(saved))
+            restored = restore(self.station, saved, now_ns)
+            saved = restored.kept
+        if self.keeper is not None:
+            self.keeper.begin(self.station, saved, stored)
+        return restored
+
+    def tick(self, ups: Mapping[int, Up]) -> dict[int, Down]:
+        """One tick of a lock-step flight: takes each agent's message, returns the next tick and packets for it.
+
+        The first call only sets the time of the first tick.
+        """
+        if self.now_ns is not None:
+            packets = {agent: up.packets for agent, up in ups.items()}
+            self.step(packets, self.jobs.done(self.now_ns), self.now_ns)
+        frames = [up.next_ns for up in ups.values() if up.next_ns != NO_MORE_FRAMES_NS]
+        self.now_ns = min(frames) if frames else self._drain(ups, self.now_ns or 0)
+        sent = self.outgoing(self.now_ns)
+        return {agent: Down(self.now_ns, self.phase, sent.get(AgentId(agent), ())) for agent in sorted(ups)}
+
+    def _drain(self, ups: Mapping[int, Up], now_ns: int) -> int:
+        """After the last frame, wait until links are quiet and digests equal. Returns the time of the next tick."""
+        if self.phase is Phase.FLY:
+            self.phase = Phase.DRAIN
+            self._last_frame_ns = now_ns
+            self.end_of_frames()
+        ends = [settled(channel) for agent, channel in self.station.channels.items() if agent in ups]
+        ends += [(up.quiet, up.digest_equal) for up in ups.values()]
+        self.digest_equal = bool(ends) and all(equal for _, equal in ends)
+        self._drained_ns = now_ns - self._last_frame_ns
+        quiet = self.digest_equal and all(q for q, _ in ends) and self.station.mapper.idle and self.jobs.idle
+        if not ups or quiet or self._drained_ns >= _DRAIN_NS:
+            self.phase = Phase.END
+        return now_ns + _DRAIN_TICK_NS
+
+    def step(
+        self,
+        packets: Mapping[int, Sequence[bytes]],
+        done: Sequence[JobDone],
+        now_ns: int,
+        commands: Sequence[Command] = (),
+    ) -> StationOutput:
+        """Step the station once, log the step and store its changes; packets wait in the modelled links."""
+        begin_ns = time.process_time_ns()
+        arrived = {AgentId(agent): tuple(packets[agent]) for agent in sorted(packets)}
+        orders: list[Import | Command] = [*self._imports[:1], *commands]
+        self._imports = self._imports[1:]
+        output = self.station.step(arrived, done, now_ns, orders)
+        if self._log is not None:
+            write_step(self._log, arrived, done, output, now_ns, now_ns + self.options.start_ns, orders)
+        if self.keeper is not None:
+            self.keeper.keep_at_times(self.station, now_ns)
+        for agent, out in output.packets:
+            self._links.send(agent, out, now_ns)
+        self._step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
+        self.jobs.add(output.jobs, now_ns)
+        self._steps += 1
+        if self._steps % _RSS_STEPS == 1:
+            self.rss_mib = max(self.rss_mib, rss_mib())
+        return output
+
+    def outgoing(self, now_ns: int) -> dict[AgentId, tuple[bytes, ...]]:
+        """Packets that leave the modelled links by now."""
+        return {AgentId(agent): packets for agent, packets in self._links.deliver(now_ns).items()}
+
+    def compare_digests(self, reachable: Collection[int]) -> None:
+        """Note whether reachable agents hold equal values; without any, the last comparison stands."""
+        ends = [settled(channel) for agent, channel in self.station.channels.items() if agent in reachable]
+        if ends:
+            self.digest_equal = all(equal for _, equal in ends)
+
+    def end_of_frames(self) -> None:
+        """Write the map and remember the counts as they stand at the last frame; draining follows."""
+        if self.at_last_frame is None:
+            self.at_last_frame = self.summary()
+            if self._log is not None:
+                for name, content in map_files(self.station.mapper).items():
+                    (self._folder / name).write_bytes(content)
+
+    def summary(self) -> FlightSummary:
+        """Counts and keyframe poses now."""
+        return flight_summary(self.station.mapper)
+
+    def report(self) -> dict[str, Any]:
+        """The base's part of report.json, with raw samples in place of statistics."""
+        self.end_of_frames()
+        assert self.at_last_frame is not None
+        rss = max(self.rss_mib, rss_mib())
+        return {
+            **self.at_last_frame.counts,
+            "digest_equal": self.digest_equal,
+            "agents_lost": sorted(self.agents_lost),
+            "drain": {"flight_ms": self._drained_ns // 1_000_000, **counts(self.station.mapper)},
+            "timing": {**timings(self.jobs.cpu_ms, self._step_ms), "rss_mib": round(rss, 1)},
+        }
+
+    def close(self) -> None:
+        """Close the store and the log."""
+        if self.keeper is not None:
+            self.keeper.close(self.station)
+        if self._log is not None:
+            self._log.close()
+
+
+def report_restored(restored: Restored | None, parent: process.Parent | None) -> None:
+    """Print what was restored and repaired, and send it to the parent process."""
+    if restored is None:
+        return
+    print(f"store: {restored.keyframes} keyframes, {restored.awaited} values awaited", file=sys.stderr)
+    for fault in restored.faults:
+        print(f"store: repaired: {fault}", file=sys.stderr)
+    if parent is not None:
+        faults = list(restored.faults)
+        parent.tell("restored", keyframes=restored.keyframes, faults=faults, awaited=restored.awaited)

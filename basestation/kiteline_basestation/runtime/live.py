@@ -1,0 +1,129 @@
+"""A live base: real clocks, any number of agents; jobs are done by a worker process."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kiteline_basestation.management import Command
+from kiteline_basestation.runtime.base_runtime import BaseRuntime, report_restored
+from kiteline_basestation.runtime.options import BaseOptions, coded_channels
+from kiteline_basestation.runtime.terminal import TerminalReporter
+from kiteline_basestation.runtime.worker import Worker
+from kiteline_codec.transport.framing import StreamFramer
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_core.ids import AgentId
+from kiteline_hw.links.open import open_link
+from kiteline_hw.links.sealed_link import SealedHub
+from kiteline_hw.links.zenoh_link import ZenohHub
+from kiteline_hw.links.zenoh_queries import QueryServer
+from kiteline_hw.ports import LinkHub
+from kiteline_hw.system import process
+from kiteline_hw.system.clock import MonotonicClock
+from kiteline_hw.system.cpu import return_large_arrays
+from kiteline_hw.system.key_store import read_keys
+
+if TYPE_CHECKING:
+    from kiteline_basestation.web.status_page import StatusPage
+
+_POLL_S = 0.005  # s between two polls of the links: small beside the camera's period
+_STEP_NS = 50_000_000  # ns between two steps without input: keeps acknowledgements and heartbeats moving
+
+
+def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
+    """Serve agents until `stop`. parent: the process that started this one, if it is a child of `kiteline fly`."""
+    return_large_arrays()
+    clock = MonotonicClock()
+    with contextlib.ExitStack() as stack:
+        link = open_link(options.link, "base", framer=StreamFramer, required=False)
+        stack.callback(link.close)
+        hub = _sealed(options, link) if options.key else link
+        worker = Worker()
+        stack.callback(worker.close)
+        base = BaseRuntime(options, coded_channels(options), worker)
+        stack.callback(base.close)
+        report_restored(base.restore_maps(clock.now_ns()), parent)
+        queries = _open_queries(options, link, stack)
+        page = _open_page(options, clock.now_ns(), stack)
+        if parent is not None:
+            parent.tell("ready")
+        process.notify("READY=1")
+        terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None
+        begin_ns, stepped_ns = clock.now_ns(), 0
+        if terminal is not None:
+            store = f"store {options.store}" if options.store else "no --store: the map is not saved"
+            process.print_lines([f"base on {options.link}, session {options.session}, {store}"])
+        while not stop:
+            now_ns = clock.now_ns()
+            packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}
+            done = worker.done(now_ns)
+            commands = [Command(q.number, q.verb, q.text) for q in queries.questions()] if queries else []
+            if packets or done or commands or now_ns - stepped_ns >= _STEP_NS:
+                output = base.step(packets, done, now_ns, commands)
+                for answer in output.answers:
+                    if queries is not None:
+                        queries.answer(answer.id, answer.ok, answer.text)
+                stepped_ns = now_ns
+                _send(hub, base.outgoing(now_ns))
+                base.compare_digests(hub.alive())
+                if terminal is not None:
+                    stored = None if base.keeper is None else base.keeper.idle
+                    process.print_lines(terminal.lines(hub.alive(), now_ns - begin_ns, base.rss_mib, stored))
+            if page is not None:
+                page.update(base.station, now_ns)
+            if parent is not None and parent.said() == "frames_over":
+                base.end_of_frames()
+            process.notify("WATCHDOG=1")
+            stop.wait(_POLL_S)
+        if terminal is not None:
+            process.print_lines([f"stopped: {terminal.summary()}"])
+        base.end_of_frames()
+        if parent is not None and base.at_last_frame is not None:
+            parent.tell("flown", keyframes=base.at_last_frame.keyframes)
+            parent.tell("result", report=base.report(), keyframes=base.summary().keyframes)
+
+
+def _sealed(options: BaseOptions, hub: LinkHub) -> LinkHub:
+    """The hub with sealed packets; packets of agents without a key are dropped. Raises LinkError."""
+    keys = read_keys(Path(options.key))
+
+    def sealer(agent: int) -> Sealer | None:
+        key = keys.get(agent)
+        return None if key is None else Sealer(key, agent, options.session, Direction.DOWN, suite_for(options.link))
+
+    return SealedHub(hub, sealer, Opener(keys, Direction.UP))
+
+
+def _open_queries(options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack) -> QueryServer | None:
+    """Server for `kiteline maps`: on --maps, else on the agents' link if that is Zenoh and not sealed."""
+    if options.maps:
+        server = QueryServer("maps", endpoint=options.maps.removeprefix("zenoh:"))
+    elif isinstance(hub, ZenohHub) and not options.key:
+        server = QueryServer("maps", session=hub.session)
+    else:
+        return None
+    stack.callback(server.close)
+    return server
+
+
+def _open_page(options: BaseOptions, now_ns: int, stack: contextlib.ExitStack) -> StatusPage | None:
+    """The status page on --web. Raises LinkError."""
+    if not options.web:
+        return None
+    from kiteline_basestation.web.status_page import open_page  # imports a web server
+
+    page = open_page(options.web, now_ns)
+    stack.callback(page.close)
+    print(f"status page: {page.url}", file=sys.stderr)
+    return page
+
+
+def _send(hub: LinkHub, packets: Mapping[AgentId, Sequence[bytes]]) -> None:
+    links = hub.links()
+    for agent, out in packets.items():
+        if agent in links:
+            for packet in out:
+                links[agent].send(packet)
