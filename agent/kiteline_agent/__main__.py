@@ -45,14 +45,14 @@ from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
-from kiteline_hw.lockstep.barrier import Barrier
+from kiteline_hw.lockstep.agent_end import Barrier
 from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import ByteLink, ControllerLink, FrameSource, LinkError, PoseSample, SourceError
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.sources.reduced import with_other_imu
+from kiteline_hw.sources.overrides import with_other_imu
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota, release_memory, rss_mib

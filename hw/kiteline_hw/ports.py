@@ -1,4 +1,4 @@
-"""What the edge promises to the rest: small protocols, one per kind of device."""
+"""The interfaces of sources, links, flight controllers and clocks, and the errors that they raise."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class SourceError(KitelineError):
 
 
 class LinkError(KitelineError):
-    """A link that cannot be opened. Loss and silence are no errors: they are what links do."""
+    """A link that cannot be opened. Packet loss and silence are no errors: links have them."""
 
 
 @dataclass(slots=True)
 class SourceReport:
-    """What a source passed over, by reason; it grows while the source is read. `notes` holds a few examples."""
+    """Counts of what a source skipped, by reason, while it is read; `notes` holds a few examples."""
 
     skipped: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -35,11 +35,17 @@ class SourceReport:
         if len(self.notes) < 10:
             self.notes.append(f"{reason}: {note}")
 
+    def clear(self) -> None:
+        """Start a new reading."""
+        self.skipped.clear()
+        self.notes.clear()
+
 
 class FrameSource(Protocol):
-    """A camera or a recording. Iterating yields samples in order of time; an ImuBatch holds all inertial samples
-    since the last one up to and including the time of the Frame that follows it, and an OdometryBatch those of an
-    odometer, where there is one.
+    """A camera or a recording. Iterating yields samples in order of time.
+
+    An ImuBatch holds all inertial samples after the previous one, up to and including the time of the Frame that
+    follows it; an OdometryBatch likewise those of an odometer.
     """
 
     @property
@@ -54,7 +60,7 @@ class FrameSource(Protocol):
     def report(self) -> SourceReport: ...
     @property
     def frame_count(self) -> int | None:
-        """How many frames will come, for a progress bar; None when unknown."""
+        """How many frames will come, for a progress bar; None if unknown."""
         ...
 
     def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]: ...
@@ -62,10 +68,10 @@ class FrameSource(Protocol):
 
 
 class ByteLink(Protocol):
-    """A way to carry packets, unreliable and unordered. Neither call ever blocks."""
+    """Carries packets, unreliably and unordered. Neither call ever blocks."""
 
     def send(self, packet: bytes) -> bool:
-        """Hand over one packet; False when it was dropped at once (full buffer, no peer)."""
+        """Send one packet; False if it was dropped at once (full buffer, no peer)."""
         ...
 
     def receive(self) -> list[bytes]:
@@ -97,16 +103,18 @@ class Framer(Protocol):
         ...
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take what the stream delivered, any bytes in any pieces; the whole and sound packets completed by it."""
+        """Add stream bytes, in pieces of any size; the valid packets that they complete."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class PoseSample:
-    """A pose for a flight controller. T_o_b: (4,4) body in the continuous odometry frame, z up. t_ns: capture time on
-    the clock whose times are handed to the sink. quality: -1 failed, 0 unknown, 1..100. epoch: bumped only when the
-    odometry frame itself began anew (a restart of the agent), never for a map correction. cov: (6,6) of T_o_b,
-    [translation in o in m, rotation about the body's axes in rad], or None where nobody knows.
+    """A pose for a flight controller.
+
+    t_ns: capture time, on the clock whose times are handed to the sink. T_o_b: (4,4) body in the continuous odometry
+    frame, z up. quality: -1 failed, 0 unknown, 1..100. epoch: incremented only when the odometry frame itself was reset
+    (a restart of the agent), never for a map correction. cov: (6,6) of T_o_b, [translation in o in m, rotation about the
+    body's axes in rad]; None if unknown.
     """
 
     t_ns: int
@@ -118,21 +126,21 @@ class PoseSample:
 
 
 class PoseSink(Protocol):
-    """Somebody who wants poses as they come. `push` never blocks and never raises for a peer that is away."""
+    """Receives poses as they are estimated. `push` never blocks and never raises for a peer that is away."""
 
     def push(self, pose: PoseSample, now_ns: int) -> None: ...
     def close(self) -> None: ...
 
 
 class ControllerLink(PoseSink, Protocol):
-    """A flight controller that is told of poses and may tell of its own velocity and of what it feels."""
+    """A flight controller that receives poses and may send its own velocity and inertial samples."""
 
     def take_odometry(self, t_ns: int) -> OdometryBatch | None:
-        """What it said of its velocity since the last call, up to an instant of our clock; None for nothing."""
+        """Its velocities since the last call, up to a time on our clock; None if there are none."""
         ...
 
     def take_imu(self, t_ns: int) -> ImuBatch | None:
-        """What its inertial unit felt since the last call, likewise."""
+        """Its inertial samples since the last call, up to a time on our clock; None if there are none."""
         ...
 
 

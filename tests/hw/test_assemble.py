@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_hw.ports import SourceReport
-from kiteline_hw.sensors.assemble import pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.frames import pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.imu_buffer import ImuStream, ImuTable
 
 STAMPS = st.lists(st.integers(0, 300), max_size=25, unique=True).map(sorted)

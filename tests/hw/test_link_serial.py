@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from cobs import cobs
 
-from kiteline_hw.links.packet_lane import OUTBOX_PACKETS
+from kiteline_hw.links.queued_link import OUTBOX_PACKETS
 from kiteline_hw.links.serial_link import SerialLink
 from kiteline_hw.ports import LinkError
 from kiteline_hw.sim.links.serial_pair import SerialPair

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from kiteline_hw.links.packet_lane import INBOX_PACKETS, OUTBOX_PACKETS, PacketLane
+from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, PacketLane
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
 from kiteline_hw.links.zenoh_session import open_session
 from kiteline_hw.ports import LinkError

@@ -14,7 +14,7 @@ from kiteline_hw.mavlink.messages import MavlinkCodec, VehicleImu
 from kiteline_hw.mavlink.odometry_stream import OdometryStream
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sim.links.flight_controller import FlightController
-from kiteline_hw.sources.reduced import with_other_imu
+from kiteline_hw.sources.overrides import with_other_imu
 
 S, MS = 1_000_000_000, 1_000_000
 

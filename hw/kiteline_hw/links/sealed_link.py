@@ -1,4 +1,4 @@
-"""A link, or a hub of links, whose packets are sealed on their way. How is handed in."""
+"""A link, or a hub of links, whose packets are sealed; the sealing functions are handed in."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from typing import Protocol
 from kiteline_hw.ports import ByteLink, LinkHub
 
 
-class Seals(Protocol):
-    """Seals what goes out."""
+class PacketSealer(Protocol):
+    """Seals outgoing packets."""
 
     def seal(self, packet: bytes) -> bytes: ...
 
 
-class Opens(Protocol):
-    """Opens what comes in; None for what is not sound and new."""
+class PacketOpener(Protocol):
+    """Opens incoming packets: agent number and content, or None for a forged, damaged or repeated packet."""
 
     def open(self, sealed: bytes) -> tuple[int, bytes] | None: ...
 
 
 class SealedLink:
-    """A ByteLink to or from one agent. A packet that names another agent is not handed on."""
+    """A ByteLink to or from one agent. Packets that name another agent are dropped and counted."""
 
-    def __init__(self, link: ByteLink, agent: int, sealer: Seals, opener: Opens) -> None:
+    def __init__(self, link: ByteLink, agent: int, sealer: PacketSealer, opener: PacketOpener) -> None:
         self._link, self._agent, self._sealer, self._opener = link, agent, sealer, opener
         self.misdirected = 0
 
     def send(self, packet: bytes) -> bool:
-        """Seal and hand over one packet."""
+        """Seal and send one packet; False if the link refuses it."""
         return self._link.send(self._sealer.seal(packet))
 
     def receive(self) -> list[bytes]:
-        """The sound and new packets that have arrived."""
+        """The packets that have arrived and opened without fault."""
         packets = []
         for sealed in self._link.receive():
             opened = self._opener.open(sealed)
@@ -50,14 +50,14 @@ class SealedLink:
 
 
 class SealedHub:
-    """A LinkHub with a seal for each agent. Agents for whom `sealer` has none are not there."""
+    """A LinkHub that seals per agent. Agents for which `sealer` returns None are left out."""
 
-    def __init__(self, hub: LinkHub, sealer: Callable[[int], Seals | None], opener: Opens) -> None:
+    def __init__(self, hub: LinkHub, sealer: Callable[[int], PacketSealer | None], opener: PacketOpener) -> None:
         self._hub, self._sealer, self._opener = hub, sealer, opener
         self._links: dict[int, SealedLink] = {}
 
     def links(self) -> Mapping[int, ByteLink]:
-        """The links of all agents with a key, by number."""
+        """The links of all agents with a key, by agent number."""
         for agent, link in self._hub.links().items():
             if agent not in self._links:
                 sealer = self._sealer(agent)
@@ -66,7 +66,7 @@ class SealedHub:
         return self._links
 
     def alive(self) -> frozenset[int]:
-        """Those of them that are reachable now."""
+        """The agents with a key that are reachable now."""
         return self._hub.alive() & frozenset(self.links())
 
     def close(self) -> None:

@@ -1,72 +1,67 @@
-"""Packets over a serial port or a transparent radio. How packets are framed is handed in (ports.Framer)."""
+"""Packets over a serial port or a transparent radio; the framing is handed in (ports.Framer)."""
 
 from __future__ import annotations
 
-import threading
-from types import TracebackType
-from typing import Self
-
-from kiteline_hw.links.packet_lane import LinkCounters, PacketLane
-from kiteline_hw.ports import Framer
-from kiteline_hw.system.serial_port import SerialPort
+from kiteline_hw.links.ends import LinkOptions, OneLinkHub
+from kiteline_hw.links.queued_link import LinkCounters, QueuedLink
+from kiteline_hw.ports import Framer, LinkError, LinkHub
+from kiteline_hw.system.serial_port import SerialPort, parse_serial
 
 
-class SerialLink:
-    """A ByteLink over DEVICE. Survives hang-ups: the port is opened again with back-off, and what could not be sent
-    meanwhile is refused. Raises LinkError when `required` and the port cannot be opened now.
+class SerialLink(QueuedLink):
+    """A ByteLink over a serial device, reopened with back-off after a hang-up; meanwhile packets are refused.
+
+    Packets counted as sent have left the outbox, not necessarily the cable. Raises LinkError if `required` and the
+    port cannot be opened now.
     """
 
     def __init__(self, device: str, baud: int, framer: Framer, *, required: bool = True) -> None:
-        self._lane = PacketLane(threading.Condition())
+        super().__init__()
         self._framer = framer
-        self._port = SerialPort(device, baud, self._on_data, self._next_out, required=required)
-
-    def _on_data(self, data: bytes) -> None:
-        for packet in self._framer.feed(data):
-            self._lane.deliver(packet)
-
-    def _next_out(self) -> bytes:
-        packet = self._lane.next_out()
-        if packet is None:
-            return b""
-        frame = self._framer.encode(packet)
-        self._lane.count_sent(packet)
-        return frame
+        self._port = SerialPort(device, baud, self._on_data, self._next_frame, required=required)
 
     @property
     def counters(self) -> LinkCounters:
-        """What passed and what was lost. Packets counted as sent have left the outbox, not necessarily the cable."""
-        counters = self._lane.counters
-        counters.reconnects = self._port.opened
-        counters.callback_errors = self._port.callback_errors
-        return counters
+        """What was carried and lost so far."""
+        self._counters.reconnects = self._port.opened
+        self._counters.callback_errors = self._port.callback_errors
+        return self._counters
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open. A radio without a peer looks just so."""
+        """True if the port is open; a radio without a peer looks the same."""
         return self._port.connected
 
-    def send(self, packet: bytes) -> bool:
-        """Queue one packet; False when the port is away or the outbox is full. Never blocks."""
-        if not self._port.connected:
-            self._lane.counters.refused_packets += 1
-            return False
-        taken = self._lane.offer(packet)
-        self._port.wake()
-        return taken
+    def _on_data(self, data: bytes) -> None:
+        for packet in self._framer.feed(data):
+            self.deliver(packet)
 
-    def receive(self) -> list[bytes]:
-        """All packets that came in since the last call. Never blocks."""
-        return self._lane.take()
+    def _next_frame(self) -> bytes:
+        packet = self.next_packet()
+        if packet is None:
+            return b""
+        frame = self._framer.encode(packet)
+        self.count_sent(packet)
+        return frame
+
+    def send(self, packet: bytes) -> bool:
+        """Queue one packet; False if the port is away or the outbox is full. Never blocks."""
+        accepted = super().send(packet)
+        self._port.wake()
+        return accepted
 
     def close(self) -> None:
         """Close the port within a second. May be called twice."""
         self._port.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+def open_agent_end(address: str, options: LinkOptions) -> SerialLink:
+    """Open DEVICE:BAUD. Raises LinkError."""
+    if options.framer is None:
+        raise LinkError(f"link serial:{address}: a serial line needs framing and none was handed in")
+    return SerialLink(*parse_serial(address), options.framer(), required=options.required)
+
+
+def open_base_end(address: str, options: LinkOptions) -> LinkHub:
+    """Open DEVICE:BAUD, at whose other end is one agent. Raises LinkError."""
+    return OneLinkHub(open_agent_end(address, options), options.agent)

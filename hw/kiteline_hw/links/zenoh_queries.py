@@ -1,7 +1,7 @@
-"""Questions of other programs over Zenoh: a queryable that keeps them until the loop asks, and the one who asks.
+"""Requests of other programs over Zenoh: a server that queues them until the loop polls it, and a client.
 
-Key: kiteline/1/GROUP/SERVICE/VERB. The payload, or else the selector's parameters, is what is asked; the reply, or the
-error reply, is a text.
+Key: kiteline/1/GROUP/SERVICE/VERB. The request is the payload, or else the selector's parameters; the reply or the
+error reply is a text.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import zenoh
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 from kiteline_hw.ports import LinkError
 
-_RETRY_S = 0.1  # s between two questions that nobody answered
-_WAITING = 64  # questions that may wait; more are refused
+_RETRY_S = 0.1  # s between two requests that nobody answered
+_MAX_WAITING = 64  # requests in the queue; more are refused
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question. number: to answer it by. verb: the last part of its key. text: JSON."""
+    """One request. number: identifies it in `answer`. verb: the last part of its key. text: JSON."""
 
     number: int
     verb: str
@@ -38,25 +38,25 @@ def prefix(service: str, group: str = "default") -> str:
 
 
 class QueryServer:
-    """Takes questions on a session, or on one of its own that listens on an endpoint. Raises LinkError."""
+    """Receives requests on a session, or on one of its own that listens on an endpoint. Raises LinkError."""
 
     def __init__(self, service: str, session: zenoh.Session | None = None, endpoint: str = "") -> None:
-        self._own = open_session(endpoint, "base") if session is None else None
+        self._own_session = open_session(endpoint, "base") if session is None else None
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}
         self._number = 0
         self.callback_errors = 0
-        where = self._own if session is None else session
-        assert where is not None
+        used = self._own_session if session is None else session
+        assert used is not None
         try:
-            self._queryable = where.declare_queryable(f"{prefix(service)}/*", direct(self._on_query), complete=True)
+            self._queryable = used.declare_queryable(f"{prefix(service)}/*", direct(self._on_query), complete=True)
         except zenoh.ZError as error:
             self.close()
             raise LinkError(f"cannot answer questions on {prefix(service)}: {error}") from error
 
     def _on_query(self, query: Any) -> None:
         try:
-            if self._arrived.qsize() >= _WAITING:
+            if self._arrived.qsize() >= _MAX_WAITING:
                 _reply(query, False, json.dumps({"error": "too many questions wait; ask again"}))
             else:
                 self._arrived.put(query)
@@ -64,7 +64,7 @@ class QueryServer:
             self.callback_errors += 1
 
     def questions(self) -> list[Question]:
-        """What came since the last call. Never blocks."""
+        """The requests that came in since the last call. Never blocks."""
         out: list[Question] = []
         while True:
             try:
@@ -78,19 +78,19 @@ class QueryServer:
             out.append(Question(self._number, str(query.key_expr).rsplit("/", 1)[-1], text))
 
     def answer(self, number: int, ok: bool, text: str) -> None:
-        """Answer a question; who asked may be gone."""
+        """Answer a request, whose client may be gone."""
         query = self._open.pop(number, None)
         if query is not None:
             _reply(query, ok, text)
 
     def close(self) -> None:
-        """Take no more questions."""
-        if self._own is not None:
-            close_session(self._own)
+        """Receive no more requests."""
+        if self._own_session is not None:
+            close_session(self._own_session)
 
 
 def _as_json(parameters: str) -> str:
-    """Selector parameters, name=value;name=value, as a JSON object of texts."""
+    """Selector parameters, name=value;name=value, as a JSON object of strings."""
     pairs = [pair.partition("=") for pair in parameters.split(";") if pair]
     return json.dumps({name: value for name, _, value in pairs})
 
@@ -104,21 +104,21 @@ def _reply(query: Any, ok: bool, text: str) -> None:
 
 
 def ask(endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10.0) -> tuple[bool, str]:
-    """Ask, again while nobody answers yet. Returns whether it was done, and the answer. Raises LinkError."""
+    """Send a request, again until it is answered. Returns whether it succeeded, and the answer. Raises LinkError."""
     deadline_s = time.monotonic() + timeout_s
     session = open_session(endpoint, "client", connect_timeout_s=timeout_s)
     try:
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()
             session.get(
-                f"{prefix(service)}/{verb}", direct(partial(_take, replies), partial(replies.put, None)),
+                f"{prefix(service)}/{verb}", direct(partial(_on_reply, replies), partial(replies.put, None)),
                 payload=text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=left_s,
             )  # fmt: skip
             with contextlib.suppress(queue.Empty):
                 first = replies.get(timeout=left_s + 1.0)
                 if first is not None:
                     return first
-            time.sleep(_RETRY_S)  # the base is just starting: it listens, and reads its store
+            time.sleep(_RETRY_S)  # a base that is just starting listens already, but still reads its store
         raise LinkError(f"no base at {endpoint} answers {service}/{verb}: is it one that serves its maps there?")
     except zenoh.ZError as error:
         raise LinkError(f"the link to {endpoint} broke: {error}") from error
@@ -126,7 +126,7 @@ def ask(endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10
         close_session(session)
 
 
-def _take(replies: queue.SimpleQueue[tuple[bool, str] | None], reply: Any) -> None:
+def _on_reply(replies: queue.SimpleQueue[tuple[bool, str] | None], reply: Any) -> None:
     if reply.ok is not None:
         replies.put((True, reply.ok.payload.to_bytes().decode(errors="replace")))
     elif reply.err is not None:

@@ -1,7 +1,7 @@
-"""Opening and closing Zenoh sessions so that nothing hangs: client (drone) or listening peer (base), TCP, no discovery.
+"""Zenoh sessions that never hang a process: client (drone) or listening peer (base), no discovery.
 
-A process that ends while a session is open hangs for ever when a callback has a Python thread of its own. So callbacks
-are `direct`, and every session opened here is closed at the latest when the main thread ends.
+A process that ends while a session is open hangs for ever if a callback has a Python thread of its own. Therefore
+callbacks are `direct`, and every session opened here is closed at the latest when the main thread ends.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ import zenoh
 from kiteline_hw.ports import LinkError
 
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
-_RETRY_S = 0.1  # s between two tries to connect
+_RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
 
 Role = Literal["client", "base"]
 
 
 def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
-    """The configuration of a session. endpoint: a Zenoh locator such as tcp/127.0.0.1:7447, at which the base listens;
-    or router/ and the locator of a router. Raises LinkError.
+    """The configuration of a session. Raises LinkError.
 
-    A file that the environment variable ZENOH_CONFIG names is the ground on which this one stands: it is the place for
-    certificates and access control.
+    endpoint: a Zenoh locator such as tcp/127.0.0.1:7447 at which the base listens, or router/ and a router's locator.
+    The file named by the environment variable ZENOH_CONFIG is read first (certificates, access control).
     """
     try:
         config = zenoh.Config.from_env() if os.environ.get("ZENOH_CONFIG") else zenoh.Config()
@@ -42,7 +41,7 @@ def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
         "mode": "client" if role == "client" else "peer",
         "connect/endpoints": [endpoint] if role == "client" else [],
         "listen/endpoints": [endpoint] if role == "base" else [],
-        "connect/timeout_ms": 4000,  # two round trips over a link that is 900 ms late each way
+        "connect/timeout_ms": 4000,  # two round trips over a link with 900 ms of delay each way
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -65,8 +64,9 @@ def open_session(
     connect_timeout_s: float = 10.0,
     give_up: threading.Event | None = None,
 ) -> zenoh.Session:
-    """Listen (base) or connect (client, trying again until the timeout). Raises LinkError. Blocks: never in a tracking
-    loop. `give_up`, when set by another thread, ends the tries.
+    """Listen (base) or connect (client, with retries until the timeout or until `give_up` is set). Raises LinkError.
+
+    Blocks: never call it in a tracking loop.
     """
     config = session_config(endpoint, role, lease_ms)
     deadline_s = time.monotonic() + connect_timeout_s
@@ -90,39 +90,38 @@ def open_session(
             time.sleep(_RETRY_S)
         else:
             give_up.wait(_RETRY_S)
-    _watch_over(session)
+    _close_at_exit(session)
     return session
 
 
 _open: dict[int, zenoh.Session] = {}  # sessions that are not closed yet
-_watching: list[threading.Thread] = []  # the one thread that closes them at the end
+_closers: list[threading.Thread] = []  # the one thread that closes them at the end
 _open_lock = threading.Lock()
 
 
-def _watch_over(session: zenoh.Session) -> None:
+def _close_at_exit(session: zenoh.Session) -> None:
     with _open_lock:
         _open[id(session)] = session
-        if not _watching:
-            _watching.append(threading.Thread(target=_close_after_main, name="zenoh-exit", daemon=True))
-            _watching[0].start()
+        if not _closers:
+            _closers.append(threading.Thread(target=_close_after_main, name="zenoh-exit", daemon=True))
+            _closers[0].start()
 
 
 def _close_after_main() -> None:
-    """Close forgotten sessions when the main thread has ended: atexit handlers run too late for that."""
+    """Close all open sessions when the main thread has ended: atexit handlers run too late for that."""
     threading.main_thread().join()
     for session in list(_open.values()):
-        with contextlib.suppress(zenoh.ZError):
-            session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
+        _close(session)
+
+
+def _close(session: zenoh.Session) -> None:
+    with contextlib.suppress(zenoh.ZError):
+        session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
 
 
 def close_session(session: zenoh.Session) -> bool:
-    """Close a session within CLOSE_TIMEOUT_S; False when it had to be abandoned. May be called twice."""
-
-    def close() -> None:
-        with contextlib.suppress(zenoh.ZError):
-            session.close()  # type: ignore[no-untyped-call]  # zenoh's stub lacks the return type
-
-    thread = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    """Close a session within CLOSE_TIMEOUT_S; False if it had to be abandoned. May be called twice."""
+    thread = threading.Thread(target=_close, args=(session,), name="zenoh-close", daemon=True)
     thread.start()
     thread.join(CLOSE_TIMEOUT_S)
     closed = not thread.is_alive()

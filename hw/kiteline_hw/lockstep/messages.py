@@ -1,4 +1,4 @@
-"""What the two sides of a lock-step flight say at the barrier, one message each a tick."""
+"""The messages of a lock-step flight: one from each side per tick."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ _LENGTH = struct.Struct("<I")
 
 
 class Phase(IntEnum):
-    """Where the flight stands."""
+    """The phase of the flight."""
 
     FLY = 0
-    DRAIN = 1  # no frames left: the link is emptied
-    END = 2  # nothing follows: close
+    DRAIN = 1  # no frames left: remaining packets are exchanged
+    END = 2  # the last message: close
 
 
 @dataclass(frozen=True, slots=True)
 class Up:
-    """An agent's turn. next_ns: flight time of its next frame, NO_MORE_FRAMES_NS after its last.
-    quiet, digest_equal: as its endpoint sees the link.
+    """An agent's message. next_ns: flight time of its next frame, NO_MORE_FRAMES_NS after its last.
+
+    quiet, digest_equal: state of its sync endpoint.
     """
 
     next_ns: int
@@ -36,32 +37,32 @@ class Up:
     packets: tuple[bytes, ...]
 
     def encode(self) -> bytes:
-        """The message as bytes."""
+        """The encoded message."""
         flags = self.quiet | self.digest_equal << 1
         return _UP.pack(self.next_ns, flags, len(self.packets)) + _join(self.packets)
 
     @classmethod
     def decode(cls, message: bytes) -> Up:
-        """Raises LinkError when the message is none."""
+        """Decode a message. Raises LinkError on any other bytes."""
         next_ns, flags, packets = _split(_UP, message)
         return cls(next_ns, bool(flags & 1), bool(flags & 2), packets)
 
 
 @dataclass(frozen=True, slots=True)
 class Down:
-    """The base's turn. now_ns: flight time of the tick that begins."""
+    """The base's message. now_ns: flight time of the tick that begins."""
 
     now_ns: int
     phase: Phase
     packets: tuple[bytes, ...]
 
     def encode(self) -> bytes:
-        """The message as bytes."""
+        """The encoded message."""
         return _DOWN.pack(self.now_ns, self.phase, len(self.packets)) + _join(self.packets)
 
     @classmethod
     def decode(cls, message: bytes) -> Down:
-        """Raises LinkError when the message is none."""
+        """Decode a message. Raises LinkError on any other bytes."""
         now_ns, phase, packets = _split(_DOWN, message)
         try:
             return cls(now_ns, Phase(phase), packets)

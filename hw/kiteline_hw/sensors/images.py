@@ -1,4 +1,4 @@
-"""Images as sources and logs hold them: encoded bytes, a file, or raw pixels, decoded only when a frame is made.
+"""Images as sources and logs hold them: encoded bytes, a file or raw pixels; decoding and encoding.
 
 Grey images are (h, w) uint8. A depth image is 16-bit PNG whose format carries its scale: "png/5000" means that the
 stored value divided by 5000 is metres, 0 unknown.
@@ -19,14 +19,14 @@ from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 
-DEPTH_FORMAT = "png/1000"  # millimetres: what our own logs write when a source holds no encoded depth
+DEPTH_FORMAT = "png/1000"  # millimetres: what our logs write if a source has no encoded depth
 
 _FORMATS = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\x00": "tiff", b"MM\x00*": "tiff"}
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """An image in a file of its own. format: as EncodedImage's, or "" to find it by the first bytes."""
+    """An image file. format: as in EncodedImage, or "" to detect it by the first bytes."""
 
     path: Path
     format: str = ""
@@ -35,8 +35,8 @@ class ImageFile:
 ImageRef = ImageFile | EncodedImage | RawPixels
 
 
-def sniff(data: bytes) -> str:
-    """The format of encoded bytes by their first bytes; raises BadImage when they are no image."""
+def detect_format(data: bytes) -> str:
+    """The format of an encoded image, by its first bytes. Raises BadImage."""
     for magic, name in _FORMATS.items():
         if data.startswith(magic):
             return name
@@ -49,20 +49,20 @@ def sniff(data: bytes) -> str:
 
 def _encoded(ref: ImageFile | EncodedImage) -> EncodedImage:
     if isinstance(ref, EncodedImage):
-        sniff(ref.data)
+        detect_format(ref.data)
         return ref
     try:
         data = ref.path.read_bytes()
     except OSError as error:
         raise BadImage(f"{ref.path.name}: {error.strerror}") from error
     try:
-        return EncodedImage(data, ref.format or sniff(data))
+        return EncodedImage(data, ref.format or detect_format(data))
     except BadImage as error:
         raise BadImage(f"{ref.path.name}: {error}") from error
 
 
 def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
-    """Grey pixels (h, w) uint8 and the bytes that they came from (None for raw pixels). Raises BadImage."""
+    """Grey pixels (h, w) uint8 and the encoded image they were decoded from (None for raw pixels). Raises BadImage."""
     if isinstance(ref, RawPixels):
         return ref.grey(), None
     image = _encoded(ref)
@@ -71,7 +71,7 @@ def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
 
 
 def decode_depth(ref: ImageRef) -> tuple[F32, EncodedImage | None]:
-    """Depth (h, w) float32 in metres, 0 unknown, and the bytes that it came from. Raises BadImage."""
+    """Depth (h, w) float32 in metres, 0 unknown, and the encoded image. Raises BadImage."""
     if isinstance(ref, RawPixels):
         return ref.metres(), None
     image = _encoded(ref)
@@ -94,13 +94,13 @@ def depth_scale(image_format: str) -> float:
 
 
 def encode_image(pixels: U8) -> EncodedImage:
-    """Code grey pixels (h, w) uint8 without loss, fast rather than small."""
+    """Encode grey pixels (h, w) uint8 as PNG, at the fastest compression level."""
     _, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return EncodedImage(data.tobytes(), "png")
 
 
 def encode_depth(depth_m: F32) -> EncodedImage:
-    """Code depth (h, w) float32 metres in millimetres; beyond 65.5 m it becomes unknown (0)."""
+    """Encode depth (h, w) float32 in metres as 16-bit PNG in millimetres; above 65.5 m it becomes unknown (0)."""
     units = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0) * depth_scale(DEPTH_FORMAT)
     units = np.where((units > 0.0) & (units < 65535.5), np.rint(units), 0.0).astype(np.uint16)
     _, data = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])

@@ -1,4 +1,4 @@
-"""Inertial samples until a frame claims them: what is not finite, repeated or backwards in time is dropped, counted."""
+"""Buffers inertial samples until the next frame; drops and counts non-finite and out-of-order ones."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _LEAP_NS = 1_000_000_000  # ns; no IMU pauses that long and then goes back in ti
 
 
 class ImuSamples(Protocol):
-    """Where a source keeps the samples that no frame has claimed yet."""
+    """The samples of a source that were not taken yet."""
 
     def take_until(self, t_ns: int) -> ImuBatch | None:
-        """All samples not yet taken with a time <= t_ns, or None when there are none."""
+        """All samples not yet taken with a time <= t_ns, or None if there are none."""
         ...
 
 
@@ -48,7 +48,7 @@ class ImuTable:
 
 
 class ImuStream:
-    """Samples as they come in; bounded by what arrives between two frames."""
+    """Samples as they arrive; bounded by the number that arrive between two frames."""
 
     def __init__(self, report: SourceReport) -> None:
         self._report = report
@@ -57,11 +57,11 @@ class ImuStream:
         self._last_ns = -(2**63)
 
     def __len__(self) -> int:
-        """How many samples wait."""
+        """The number of buffered samples."""
         return len(self._t_ns)
 
     def add(self, t_ns: int, row: tuple[float, ...]) -> None:
-        """One sample: gyro x y z rad/s, accel x y z m/s^2."""
+        """Add a sample: gyro x y z rad/s, accel x y z m/s^2."""
         self._t_ns.append(t_ns)
         self._rows.append(row)
 
@@ -83,11 +83,12 @@ class ImuStream:
 
 
 def _usable(t_ns: I64, gyro: F64, accel: F64, last_ns: int, report: SourceReport) -> NDArray[np.bool_]:
+    """Mask (n,) of finite samples whose stamps increase, also over `last_ns`; counts the others in the report."""
     finite = np.asarray(np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1))
     for t in t_ns[~finite]:
         report.skip("imu sample not finite", f"at {t} ns")
     if len(t_ns) > 2:
-        # One stamp far ahead of both neighbours is itself wrong; else all that follow would count as late.
+        # A single stamp far ahead of both neighbours is wrong itself; otherwise all later samples would be dropped.
         ahead = np.zeros(len(t_ns), np.bool_)
         ahead[1:-1] = (t_ns[1:-1] - t_ns[:-2] > _LEAP_NS) & (t_ns[1:-1] > t_ns[2:])
         for t in t_ns[ahead & finite]:

@@ -1,11 +1,8 @@
-"""Velocities of an odometer until a frame claims them: what is not finite, repeated or backwards in time is dropped,
-counted.
-"""
+"""Buffers an odometer's velocities until the next frame; drops and counts non-finite and out-of-order ones."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +13,13 @@ from kiteline_hw.ports import SourceReport
 
 F64 = NDArray[np.float64]
 
-VELOCITY_SIGMA_M_S = 0.1  # of a device that does not say how well it measures
-RATE_SIGMA_RAD_S = 0.05  # likewise
-_NOTHING = 1e3  # variance from which on a device means that it measures nothing: ROS drivers write 1e3 to 1e9
-
-
-class OdometerSamples(Protocol):
-    """Where a source keeps the velocities that no frame has claimed yet."""
-
-    def take_until(self, t_ns: int) -> OdometryBatch | None:
-        """All samples not yet taken with a time <= t_ns, or None when there are none."""
-        ...
+VELOCITY_SIGMA_M_S = 0.1  # m/s; of a device that reports no variance
+RATE_SIGMA_RAD_S = 0.05  # rad/s; likewise
+_UNMEASURED_FROM = 1e3  # a reported variance from here on means "not measured": ROS drivers write 1e3 to 1e9
 
 
 class OdometerStream:
-    """Samples as they come in; bounded by what arrives between two frames."""
+    """Samples as they arrive; bounded by the number that arrive between two frames."""
 
     def __init__(self, report: SourceReport | None = None) -> None:
         self._report = report
@@ -38,14 +27,15 @@ class OdometerStream:
         self._last_ns = -(2**63)
 
     def __len__(self) -> int:
-        """How many samples wait."""
+        """The number of buffered samples."""
         return sum(len(batch.t_ns) for batch in self._waiting)
 
     def add(self, batch: OdometryBatch) -> None:
-        """Samples in the body frame."""
+        """Add samples in the body frame."""
         self._waiting.append(batch)
 
     def take_until(self, t_ns: int) -> OdometryBatch | None:
+        """All samples not yet taken with a time <= t_ns, or None if there are none."""
         batch = odometry.joined(self._waiting)
         if batch is None:
             return None
@@ -68,10 +58,10 @@ class OdometerStream:
                 self._report.skip(reason, f"at {t} ns")
 
 
-def before_frames(
-    items: Iterable[Frame | ImuBatch], samples: OdometerSamples
+def insert_before_frames(
+    items: Iterable[Frame | ImuBatch], samples: OdometerStream
 ) -> Iterator[Frame | ImuBatch | OdometryBatch]:
-    """The same items, each frame after the OdometryBatch that leads up to it."""
+    """The same items, with each Frame after the OdometryBatch of the samples up to its time."""
     for item in items:
         batch = samples.take_until(item.t_ns) if isinstance(item, Frame) else None
         if batch is not None:
@@ -79,10 +69,11 @@ def before_frames(
         yield item
 
 
-def stated_variances(diagonal: F64, sigma: float) -> F64:
-    """(3,3) of three variances as a device states them; one that it does not know (0 or below, not finite) is that of
-    `sigma`, and a huge one means that nothing is measured.
+def reported_covariance(diagonal: F64, sigma: float) -> F64:
+    """Covariance (3,3) of three variances as a device reports them.
+
+    One that it does not know (0 or below, not finite) becomes sigma^2, and a huge one UNMEASURED.
     """
     unknown = ~np.isfinite(diagonal) | (diagonal <= 0.0)
     out = np.where(unknown, sigma * sigma, np.where(unknown, 1.0, diagonal))
-    return np.diag(np.where(out >= _NOTHING, UNMEASURED, out))
+    return np.diag(np.where(out >= _UNMEASURED_FROM, UNMEASURED, out))

@@ -1,4 +1,4 @@
-"""Uncompressed images as ROS and Foxglove messages hold them, turned to grey or to metres when a frame is made."""
+"""Uncompressed images of ROS and Foxglove messages, and their conversion to grey values or metres."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ DEPTH_ENCODINGS = ("16uc1", "32fc1")  # ROS REP 118: millimetres; metres
 
 
 class BadImage(Exception):
-    """One image that cannot be used; the text says why. It stays inside this package: sources count it as a skip."""
+    """One image that cannot be used; the text says why. Raised only inside this package: sources count it as skipped."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawPixels:
-    """Pixels in rows of `step` bytes. encoding: ROS's name of the layout, such as mono8, bgr8, 16UC1."""
+    """Pixels in rows of `step` bytes. encoding: ROS's name of the pixel layout, such as mono8, bgr8, 16UC1."""
 
     width: int
     height: int
@@ -51,7 +51,7 @@ class RawPixels:
 
     @property
     def is_depth(self) -> bool:
-        """Whether the pixels are distances."""
+        """True if the pixels are distances."""
         return self.encoding.lower() in DEPTH_ENCODINGS
 
     def grey(self) -> U8:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig, Lens
-from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.ports import FrameSource, SourceError, SourceReport
 from kiteline_hw.sim.config import SimConfig, read_config
 from kiteline_hw.sim.sensors import imu as inertial
 from kiteline_hw.sim.sensors import odometer
@@ -24,6 +24,7 @@ from kiteline_hw.sim.world.scenes import build_indoor
 from kiteline_hw.sim.world.street import build_street
 from kiteline_hw.sim.world.trajectory import Motion, Path, flight_s, read_trajectory, to_trajectory
 from kiteline_hw.sim.world.world import World
+from kiteline_hw.sources.overrides import SourceView
 
 F64 = NDArray[np.float64]
 
@@ -38,6 +39,12 @@ def open_sim(scene: str, workers: int = 1, **options: object) -> SimSource:
     options: fields of SimConfig. workers > 1 renders ahead in threads; the frames stay the same. Raises SourceError.
     """
     return SimSource(read_config(scene, **options), workers)
+
+
+def open_source(scene: str, mono: bool, imu: bool) -> FrameSource:
+    """A simulated flight as an entry of the table of sources. Raises SourceError."""
+    source = open_sim(scene, mono=True) if mono else open_sim(scene)
+    return source if imu and not mono else SourceView(source, mono, imu)
 
 
 def build_world(config: SimConfig, camera_in_body: F64) -> World:

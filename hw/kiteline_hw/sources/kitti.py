@@ -1,8 +1,8 @@
 """KITTI odometry folders: calib.txt, image_0/1, image_2/3 or image_l/r, times.txt, poses.txt; rectified, no body.
 
-calib.txt has projection matrices as rows of 12 numbers, named (`P0:`…`P3:`) or bare (left, right). A projection is
-K [I | t]; the baseline is the *difference* of the two t along x. What t says along y and z (millimetres between the
-colour cameras) is left alone: the images were rectified so that rows agree.
+calib.txt has projection matrices as rows of 12 numbers, named (`P0:` to `P3:`) or bare (left, right). A projection is
+K [I | t]; the baseline is the difference of the two t along x. The components of t along y and z (millimetres between
+the colour cameras) are ignored: the images were rectified so that their rows agree.
 """
 
 from __future__ import annotations
@@ -16,29 +16,22 @@ from numpy.typing import NDArray
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.assemble import Capture
-from kiteline_hw.sensors.images import ImageFile, decode_grey
-from kiteline_hw.sensors.raw_pixels import BadImage
-from kiteline_hw.sources.tables import (
-    CaptureList,
-    Recording,
-    checked_baseline,
-    checked_camera,
-    list_images,
-    rows,
-    seconds_to_ns,
-    trajectory,
-)
+from kiteline_hw.sensors.frames import EncodedFrame
+from kiteline_hw.sensors.images import ImageFile
+from kiteline_hw.sources.calibration import checked_baseline, checked_camera
+from kiteline_hw.sources.recording import Recording, image_size, list_images, sorted_trajectory
+from kiteline_hw.sources.text_files import read_rows, row_values, seconds_to_ns
 
 F64 = NDArray[np.float64]
 
-NOMINAL_HZ = 10  # KITTI's rate, used when there is no times.txt
+NOMINAL_HZ = 10  # KITTI's rate, used if there is no times.txt
 PAIRS = (("image_0", "image_1", "P0", "P1"), ("image_2", "image_3", "P2", "P3"), ("image_l", "image_r", "P0", "P1"))
 
 
-def open_kitti(folder: Path, *, mono: bool = False, imu: bool = True) -> Recording:
-    """Open a KITTI odometry sequence; `imu` changes nothing, for there is none. Raises SourceError."""
+def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
+    """Open a KITTI odometry sequence, which has no IMU. Raises SourceError."""
     del imu
+    folder = Path(folder_name)
     pair = next((p for p in PAIRS if list_images(folder / p[0])), None)
     if pair is None:
         raise SourceError(
@@ -47,62 +40,59 @@ def open_kitti(folder: Path, *, mono: bool = False, imu: bool = True) -> Recordi
         )
     lefts = list_images(folder / pair[0])
     rights = [] if mono else list_images(folder / pair[1])
-    p_left, p_right = _projections(folder / "calib.txt", pair[2], pair[3])
-    height, width = _size(lefts)
-    left = _camera(p_left, width, height, folder)
-    right = t_c_r = None
+    calib = folder / "calib.txt"
+    p_left, p_right = _read_projections(calib, pair[2], pair[3])
+    size = image_size(lefts)
+    right = T_c_r = None
+    left = _camera(p_left, size, calib)
     if rights:
         if p_right is None:
-            raise SourceError(f"{folder / 'calib.txt'}: one row, but two image folders: expected a row for each camera")
-        right = _camera(p_right, width, height, folder)
-        t_c_r = np.eye(4)
-        t_c_r[0, 3] = _offset_x(p_left) - _offset_x(p_right)
-        checked_baseline(t_c_r, f"{folder / 'calib.txt'}: {pair[2]} and {pair[3]}")
-        if t_c_r[0, 3] < 0:
-            raise SourceError(f"{folder / 'calib.txt'}: baseline {t_c_r[0, 3]:g} m: left and right row are swapped")
-    rig = CameraRig(left, right, np.eye(4), t_c_r, has_body=False)
-    times = _times(folder, lefts)
-    captures = _KittiImages(lefts, rights, times)
-    return Recording(f"kitti:{folder}", rig, captures, None, _truth(folder, lefts, times))
+            raise SourceError(f"{calib}: one row, but two image folders: expected a row for each camera")
+        right = _camera(p_right, size, calib)
+        T_c_r = np.eye(4)
+        T_c_r[0, 3] = _offset_x_m(p_left) - _offset_x_m(p_right)
+        checked_baseline(T_c_r, f"{calib}: {pair[2]} and {pair[3]}")
+        if T_c_r[0, 3] < 0:
+            raise SourceError(f"{calib}: baseline {T_c_r[0, 3]:g} m: left and right row are swapped")
+    rig = CameraRig(left, right, np.eye(4), T_c_r, has_body=False)
+    times = _read_times(folder, lefts)
+    return Recording(
+        f"kitti:{folder}", rig, len(lefts), lambda report: _read_frames(times, lefts, rights, report),
+        ground_truth=_read_ground_truth(folder, lefts, times),
+    )  # fmt: skip
 
 
-class _KittiImages(CaptureList):
-    def __init__(self, lefts: list[Path], rights: list[Path], times: list[int]) -> None:
-        self._lefts, self._times = lefts, times
-        self._rights = {path.stem: path for path in rights}
-        self.count = len(lefts)
-
-    def captures(self, report: SourceReport) -> Iterator[Capture]:
-        for t, left in zip(self._times, self._lefts, strict=True):
-            if not self._rights:
-                yield Capture(t, ImageFile(left))
-            elif left.stem in self._rights:
-                yield Capture(t, ImageFile(left), ImageFile(self._rights[left.stem]))
-            else:
-                report.skip("missing right image", f"{left.name} has no partner")
-        stems = {path.stem for path in self._lefts}
-        for stem, path in self._rights.items():
-            if stem not in stems:
-                report.skip("missing left image", f"{path.name} has no partner")
+def _read_frames(
+    times: list[int], lefts: list[Path], rights: list[Path], report: SourceReport
+) -> Iterator[EncodedFrame]:
+    by_stem = {path.stem: path for path in rights}
+    for t, left in zip(times, lefts, strict=True):
+        if not rights:
+            yield EncodedFrame(t, ImageFile(left))
+        elif left.stem in by_stem:
+            yield EncodedFrame(t, ImageFile(left), ImageFile(by_stem[left.stem]))
+        else:
+            report.skip("missing right image", f"{left.name} has no partner")
+    stems = {path.stem for path in lefts}
+    for path in rights:
+        if path.stem not in stems:
+            report.skip("missing left image", f"{path.name} has no partner")
 
 
-def _projections(path: Path, left: str, right: str) -> tuple[F64, F64 | None]:
+def _read_projections(path: Path, left: str, right: str) -> tuple[F64, F64 | None]:
+    """The projection matrices (3,4) of the left and, if there is one, of the right camera."""
     named: dict[str, F64] = {}
     bare: list[F64] = []
-    for cells in rows(path, "KITTI's projection matrices, 12 numbers a row"):
+    for cells in read_rows(path, "KITTI's projection matrices, 12 numbers a row"):
         name = cells[0].rstrip(":") if cells[0][0].isalpha() else ""
+        if not name:
+            bare.append(row_values(cells, path, 12).reshape(3, 4))
+            continue
         try:
-            values = np.array([float(cell) for cell in (cells[1:] if name else cells)])
-        except ValueError:
-            values = np.zeros(0)
-        if len(values) != 12 or not np.isfinite(values).all():
-            if name and not name.startswith("P"):
-                continue
-            raise SourceError(f"{path}: expected 12 numbers a row, found {' '.join(cells)[:60]!r}")
-        if name:
-            named[name] = values.reshape(3, 4)
-        else:
-            bare.append(values.reshape(3, 4))
+            named[name] = row_values(cells[1:], path, 12).reshape(3, 4)
+        except SourceError:
+            if name.startswith("P"):  # other rows, such as calib_time, need not be matrices
+                raise
     if named:
         if left not in named:
             raise SourceError(f"{path}: expected a row '{left}:', found {', '.join(named)}")
@@ -114,61 +104,46 @@ def _projections(path: Path, left: str, right: str) -> tuple[F64, F64 | None]:
     return bare[0], bare[1] if len(bare) > 1 else None
 
 
-def _offset_x(p: F64) -> float:
-    # p = K [I | t]: t_x = (p03 - cx * t_z) / fx; a camera that stands to the right has a negative t_x.
+def _offset_x_m(p: F64) -> float:
+    # p = K [I | t]: t_x = (p03 - cx * t_z) / fx; a camera to the right of the reference has a negative t_x.
     return float((p[0, 3] - p[0, 2] * p[2, 3]) / p[0, 0])
 
 
-def _camera(p: F64, width: int, height: int, folder: Path) -> CameraModel:
-    camera = CameraModel(width, height, float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
-    return checked_camera(camera, str(folder / "calib.txt"))
+def _camera(p: F64, size: tuple[int, int], calib: Path) -> CameraModel:
+    camera = CameraModel(size[1], size[0], float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
+    return checked_camera(camera, str(calib))
 
 
-def _size(images: list[Path]) -> tuple[int, int]:
-    for path in images[:20]:
-        try:
-            pixels, _ = decode_grey(ImageFile(path))
-        except BadImage:
-            continue
-        return pixels.shape[0], pixels.shape[1]
-    raise SourceError(f"{images[0].parent}: none of the first images can be decoded: expected PNG or JPEG files")
-
-
-def _row_of(images: list[Path], rows_there: int) -> list[int]:
-    """Which row of times.txt or poses.txt belongs to each image: its number, if all are rows, else its place."""
-    if all(path.stem.isdigit() and int(path.stem) < rows_there for path in images):
+def _row_indices(images: list[Path], row_count: int) -> list[int]:
+    """The row of times.txt or poses.txt for each image: the image's number, if all are rows, else its position."""
+    if all(path.stem.isdigit() and int(path.stem) < row_count for path in images):
         return [int(path.stem) for path in images]
     return list(range(len(images)))
 
 
-def _times(folder: Path, lefts: list[Path]) -> list[int]:
+def _read_times(folder: Path, lefts: list[Path]) -> list[int]:
     path = folder / "times.txt"
     if not path.is_file():
         numbers = [int(p.stem) for p in lefts] if all(p.stem.isdigit() for p in lefts) else list(range(len(lefts)))
         return [number * (1_000_000_000 // NOMINAL_HZ) for number in numbers]
     try:
-        times = [seconds_to_ns(cells[0]) for cells in rows(path, "one time in seconds a line")]
+        times = [seconds_to_ns(cells[0]) for cells in read_rows(path, "one time in seconds a line")]
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error
     if len(times) < len(lefts):
         raise SourceError(f"{path}: {len(times)} times for {len(lefts)} images: expected one a line for each image")
-    return [times[row] for row in _row_of(lefts, len(times))]
+    return [times[row] for row in _row_indices(lefts, len(times))]
 
 
-def _truth(folder: Path, lefts: list[Path], times: list[int]) -> Trajectory | None:
+def _read_ground_truth(folder: Path, lefts: list[Path], times: list[int]) -> Trajectory | None:
     name = f"{folder.resolve().name}.txt"
-    places = (folder / "poses.txt", folder.parent / "poses" / name, folder.parent.parent / "poses" / name)
-    path = next((p for p in places if p.is_file()), None)
+    candidates = (folder / "poses.txt", folder.parent / "poses" / name, folder.parent.parent / "poses" / name)
+    path = next((p for p in candidates if p.is_file()), None)
     if path is None:
         return None
-    poses: list[F64] = []
-    for cells in rows(path, "T_world_camera, 3x4 numbers a row"):
-        try:
-            values = np.array([float(cell) for cell in cells])
-        except ValueError:
-            values = np.zeros(0)
-        if len(values) != 12:
-            raise SourceError(f"{path}: expected 12 numbers a row, found {' '.join(cells)[:60]!r}")
-        poses.append(np.vstack([values.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]))
-    picked = _row_of(lefts, len(poses))
-    return trajectory([(t, poses[row]) for t, row in zip(times, picked, strict=True) if row < len(poses)])
+    poses = [
+        np.vstack([row_values(cells, path, 12).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+        for cells in read_rows(path, "T_world_camera, 3x4 numbers a row")
+    ]
+    chosen = _row_indices(lefts, len(poses))
+    return sorted_trajectory([(t, poses[row]) for t, row in zip(times, chosen, strict=True) if row < len(poses)])

@@ -1,6 +1,6 @@
-"""Whether compiled kernels are on disk, and a process of its own to compile them where they are not.
+"""Compiles missing kernels in a process of its own, and records on disk that all are compiled.
 
-A compiler that has run keeps 200 MiB that its process never gets back; and a drone flies in that process.
+The compiler keeps 200 MiB that its process never returns, so it must not run in the process that flies.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-_KERNELS = "_kernels"  # how modules of kernels end
-_PATIENCE_S = 900.0  # s that a slow board may take to compile all
+_KERNELS = "_kernels"  # suffix of kernel modules
+_TIMEOUT_S = 900.0  # s that a slow board may take to compile all
 
 
 def fill(module: str) -> bool:
-    """Unless it is known that all is compiled, let `python -m module` do so. Whether it is compiled now.
+    """Run `python -m module` to compile the kernels of all loaded modules, unless they are; True if they are now.
 
-    Kernels are those of the modules that are loaded. Where nothing can be written the caller compiles for itself.
+    If nothing can be written, the caller compiles in its own process.
     """
     if filled():
         return True
@@ -29,7 +29,7 @@ def fill(module: str) -> bool:
         done = subprocess.run(
             [sys.executable, "-m", module],
             check=False, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            timeout=_PATIENCE_S,
+            timeout=_TIMEOUT_S,
         )  # fmt: skip
         if done.returncode == 0:
             mark()
@@ -37,7 +37,7 @@ def fill(module: str) -> bool:
 
 
 def filled() -> bool:
-    """Whether the kernels of all modules that are loaded were compiled as they stand, for this processor."""
+    """True if the present kernels of all loaded modules are compiled for this processor."""
     path = _path()
     try:
         return path is not None and _needed() <= set(path.read_text().splitlines())
@@ -46,17 +46,17 @@ def filled() -> bool:
 
 
 def mark() -> None:
-    """They have been."""
+    """Record that the kernels of all loaded modules are compiled."""
     path = _path()
     if path is not None:
         with contextlib.suppress(OSError):
-            young = path.with_name(f"{path.name}.{os.getpid()}")
-            young.write_text("\n".join(sorted(_needed())) + "\n")
-            os.replace(young, path)
+            new = path.with_name(f"{path.name}.{os.getpid()}")
+            new.write_text("\n".join(sorted(_needed())) + "\n")
+            os.replace(new, path)
 
 
 def _path() -> Path | None:
-    """Where it is noted: beside the first kernel of the first module."""
+    """The file of the record: beside the first kernel of the first module."""
     for _, module in _modules():
         for value in vars(module).values():
             folder = getattr(getattr(value, "stats", None), "cache_path", None)
@@ -66,7 +66,7 @@ def _path() -> Path | None:
 
 
 def _needed() -> set[str]:
-    """One line a module, with all that its compiled code depends on."""
+    """One line per module, with everything its compiled code depends on."""
     import llvmlite.binding as llvm
     import numba
 

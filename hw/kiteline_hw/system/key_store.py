@@ -1,4 +1,4 @@
-"""Keys of agents in a file that only its owner may read: one line an agent, its number and 64 hexadecimal digits."""
+"""Keys of agents in a file readable by its owner only: per line an agent's number and 64 hexadecimal digits."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _HEAD = "# kiteline keys: agent, secret. Give an agent its own line, the base st
 
 
 def default_path() -> Path:
-    """Where keys are kept unless told otherwise."""
+    """The default path of the key file."""
     return Path(os.environ.get("XDG_CONFIG_HOME", "~/.config")).expanduser() / "kiteline" / "keys"
 
 
 def read_keys(path: Path) -> dict[int, bytes]:
-    """Keys by agent. Raises LinkError when the file is missing, malformed, or readable by others."""
+    """Keys by agent. Raises LinkError if the file is missing, malformed, or readable by others."""
     try:
         text = path.read_text(encoding="ascii")
         mode = path.stat().st_mode
@@ -47,7 +47,7 @@ def read_keys(path: Path) -> dict[int, bytes]:
 
 
 def new_key(path: Path, agent: int, *, replace: bool = False) -> bytes:
-    """Make a key for an agent and keep it. Raises LinkError when it has one and `replace` is not set."""
+    """Create a key for an agent and store it. Raises LinkError if it has one and `replace` is not set."""
     if not 0 <= agent <= _MAX_AGENT:
         raise LinkError(f"agent number {agent}: expected 0 to {_MAX_AGENT}")
     keys = read_keys(path) if path.exists() else {}
@@ -59,13 +59,13 @@ def new_key(path: Path, agent: int, *, replace: bool = False) -> bytes:
 
 
 def _write(path: Path, keys: dict[int, bytes]) -> None:
-    """Replace the file at once; it never exists with another mode or half written."""
+    """Replace the file atomically; it never exists with another mode or half written."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    beside = path.with_name(path.name + ".new")
-    beside.unlink(missing_ok=True)
-    fd = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    new = path.with_name(path.name + ".new")
+    new.unlink(missing_ok=True)
+    fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(fd, "w", encoding="ascii") as out:
         out.write(_HEAD + "".join(f"{agent} {keys[agent].hex()}\n" for agent in sorted(keys)))
         out.flush()
         os.fsync(out.fileno())
-    os.replace(beside, path)
+    os.replace(new, path)

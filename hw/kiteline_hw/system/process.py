@@ -1,4 +1,4 @@
-"""A process and those who watch over it: signals, systemd, the parent that started it, and what survives its end."""
+"""Signals, systemd, the pipe to the parent process, and files that survive a crash."""
 
 from __future__ import annotations
 
@@ -18,45 +18,47 @@ from typing import Any, NoReturn
 
 
 class StopSignal:
-    """Turns SIGTERM and SIGINT into a flag that a loop asks for, so that logs and sessions are closed in order.
+    """Turns SIGTERM and SIGINT into a flag that a loop reads, so that logs and sessions are closed in order.
 
-    No threading.Event: its lock may be held by the very `wait` that a signal interrupts, and `set` would wait for ever.
+    It is no threading.Event: a signal may interrupt `wait` while it holds the event's lock, and `set` would deadlock.
     """
 
     def __init__(self) -> None:
-        self._asked = False
+        self._received = False
         self._wake, self._waker = os.pipe()
         os.set_blocking(self._waker, False)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
+        self._received = True
         with contextlib.suppress(BlockingIOError):
             os.write(self._waker, b"!")
 
     def __bool__(self) -> bool:
-        return self._asked
+        return self._received
 
     def wait(self, seconds: float) -> bool:
-        """Sleep, but no longer than until a signal comes; True when one has come."""
-        if not self._asked:
+        """Sleep until a signal comes or the time is over; True if a signal has come."""
+        if not self._received:
             select.select([self._wake], [], [], max(0.0, seconds))
-        return self._asked
+        return self._received
 
 
 def exit_on_sigterm() -> None:
     """Turn SIGTERM into SystemExit in the main thread, so that `with` and `finally` close logs and sessions."""
 
-    def leave(number: int, frame: FrameType | None) -> None:
+    def on_signal(number: int, frame: FrameType | None) -> None:
         sys.exit(128 + number)
 
-    signal.signal(signal.SIGTERM, leave)
+    signal.signal(signal.SIGTERM, on_signal)
 
 
-def leave(status: int) -> NoReturn:
-    """End the process now. Logs and sessions must be closed. The interpreter's own end is passed over: it would cancel
-    the threads of native libraries (Zenoh's among them) in mid-call, which now and then aborts the process.
+def exit_now(status: int) -> NoReturn:
+    """End the process now, after logs and sessions were closed.
+
+    The interpreter's own shutdown is skipped: it would cancel threads of native libraries such as Zenoh in mid-call,
+    which sometimes aborts the process.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -64,7 +66,7 @@ def leave(status: int) -> NoReturn:
 
 
 def notify(state: str) -> None:
-    """Tell systemd, if it started us: READY=1, WATCHDOG=1, STATUS=... (sd_notify(3)). Never raises."""
+    """Send READY=1, WATCHDOG=1 or STATUS=... to systemd if it started this process (sd_notify(3)). Never raises."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
@@ -72,14 +74,14 @@ def notify(state: str) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as s:
             s.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
     except OSError:
-        pass  # a watcher that does not listen is no reason to stop flying
+        pass  # no reason to stop flying
 
 
 class Parent:
-    """The process that started this one and holds the other end of stdin and stdout. When it goes, so do we."""
+    """The parent process at the other end of stdin and stdout. This process ends when the parent does."""
 
     def __init__(self) -> None:
-        self._words: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         threading.Thread(target=self._watch, name="parent-watch", daemon=True).start()
 
     def _watch(self) -> None:
@@ -87,23 +89,23 @@ class Parent:
         while chunk := os.read(0, 4096):
             *lines, rest = (rest + chunk).split(b"\n")
             for line in lines:
-                self._words.put(line.decode(errors="replace"))
-        os._exit(3)  # no one is left to close down for
+                self._lines.put(line.decode(errors="replace"))
+        os._exit(3)  # nobody would read the results
 
-    def said(self) -> str | None:
+    def next_line(self) -> str | None:
         """The next line that the parent wrote, or None. Never blocks."""
         try:
-            return self._words.get_nowait()
+            return self._lines.get_nowait()
         except queue.Empty:
             return None
 
-    def tell(self, event: str, **values: Any) -> None:
+    def send_event(self, event: str, **values: Any) -> None:
         """Write one line of JSON to the parent."""
         try:
             sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
-            pass  # it is gone: the watch ends us
+            pass  # the parent is gone: `_watch` ends this process
 
 
 def run_child(
@@ -124,7 +126,7 @@ def run_child(
         else:
             fly_live(parent, StopSignal())
     except expected as error:
-        parent.tell("error", text=str(error))
+        parent.send_event("error", text=str(error))
         return 2
     return 0
 
@@ -142,9 +144,9 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def next_number(path: Path, least: int = 1) -> int:
-    """A number one higher than at the last call with this file, which is made when missing; at least `least`. It
-    survives a crash at any moment. Raises OSError when the folder cannot be written, ValueError when the file holds no
-    number.
+    """The number in a file, plus one, and at least `least`; the new number is stored. Survives a crash at any moment.
+
+    Raises OSError if the folder cannot be written, ValueError if the file holds no number.
     """
     try:
         last = int(path.read_text())
@@ -158,11 +160,11 @@ def next_number(path: Path, least: int = 1) -> int:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content so that a reader or a crash sees either the old or the new one, whole."""
+    """Replace a file so that a reader, also after a crash, sees either the old or the new content in full."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    young = path.with_name(path.name + ".new")
-    with young.open("wb") as file:
+    new = path.with_name(path.name + ".new")
+    with new.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(young, path)
+    os.replace(new, path)

@@ -1,4 +1,4 @@
-"""A serial port that comes back: opened exclusively, read and written without blocking, reopened with back-off."""
+"""A serial port in a thread of its own: exclusive, never blocking, reopened with back-off after a hang-up."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import serial
 
 from kiteline_hw.ports import LinkError
 
-_READ_BYTES = 4096  # bytes a read takes at most: a whole tty buffer
-_FIRST_RETRY_S = 0.05  # s until the first try to open the port again
-_LAST_RETRY_S = 2.0  # s between tries in the end: a replugged adapter is found soon, a missing one costs nothing
+_READ_BYTES = 4096  # bytes per read at most: a whole tty buffer
+_FIRST_RETRY_S = 0.05  # s until the first attempt to reopen the port
+_MAX_RETRY_S = 2.0  # s between attempts at most: a replugged adapter is found soon, a missing one costs no CPU
 _IDLE_S = 0.5  # s that the thread sleeps at most
 
-# pyserial raises TypeError and ValueError when its port vanishes in the middle of a call.
+# pyserial raises TypeError and ValueError if its port vanishes during a call.
 _ERRORS = (serial.SerialException, OSError, termios.error, ValueError, TypeError)
 
 
 def parse_serial(spec: str) -> tuple[str, int]:
-    """Device and baud rate of DEV:BAUD. Raises LinkError."""
+    """Device and baud rate of DEVICE:BAUD. Raises LinkError."""
     device, colon, baud = spec.rpartition(":")
     if not colon or not device or not baud.isdecimal() or int(baud) == 0:
         raise LinkError(f"serial port {spec!r}: expected DEVICE:BAUD, for instance /dev/ttyUSB0:57600")
@@ -31,21 +31,17 @@ def parse_serial(spec: str) -> tuple[str, int]:
 
 
 class SerialPort:
-    """A thread that owns the port. `on_data` gets what arrives, `next_out` is asked for what to write (b"" for
-    nothing); both are called in the thread. Call `wake` when there is something new to write.
+    """A thread that owns the port and calls `on_data` with received bytes and `next_out` for bytes to write (or b"").
 
-    required: raise LinkError when the port cannot be opened now; else keep trying in the background.
+    Call `wake` when there is something new to write. required: raise LinkError if the port cannot be opened now; else
+    it is tried again in the background.
     """
 
     def __init__(
         self,
-        device: str,
-        baud: int,
-        on_data: Callable[[bytes], None],
-        next_out: Callable[[], bytes],
-        *,
+        device: str, baud: int, on_data: Callable[[bytes], None], next_out: Callable[[], bytes], *,
         required: bool = True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._device = device
         self._baud = baud
         self._on_data = on_data
@@ -54,9 +50,9 @@ class SerialPort:
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_read, False)
         os.set_blocking(self._wake_write, False)
-        self._left = b""  # of the frame that is being written
+        self._unwritten = b""  # rest of the frame that is being written
         self.opened = 0
-        self.cut_frames = 0  # frames begun and not finished when the port went away
+        self.cut_frames = 0  # frames that were not written in full when the port went away
         self.callback_errors = 0
         self.connected = False
         port: serial.Serial | None = None
@@ -79,8 +75,8 @@ class SerialPort:
         return port
 
     def wake(self) -> None:
-        """There is something to write. Never blocks; from any thread."""
-        with contextlib.suppress(OSError):  # a full pipe wakes the thread anyway; a closed one needs no wake
+        """Make the thread call `next_out`. Never blocks; from any thread."""
+        with contextlib.suppress(OSError):  # a full pipe wakes the thread anyway; a closed one has no thread
             os.write(self._wake_write, b"\0")
 
     def _run(self, port: serial.Serial | None) -> None:
@@ -92,10 +88,10 @@ class SerialPort:
                     retry_s = _FIRST_RETRY_S
                 except _ERRORS:
                     self._closed.wait(retry_s)
-                    retry_s = min(2.0 * retry_s, _LAST_RETRY_S)
+                    retry_s = min(2.0 * retry_s, _MAX_RETRY_S)
                     continue
             try:
-                self._turn(port)
+                self._exchange(port)
             except _ERRORS:
                 self._hang_up(port)
                 port = None
@@ -103,33 +99,33 @@ class SerialPort:
         if port is not None:
             self._hang_up(port)
 
-    def _turn(self, port: serial.Serial) -> None:
-        """Wait for something to do and do it. A hang-up raises SerialException or plain OSError."""
-        if not self._left:
-            self._left = self._ask()
+    def _exchange(self, port: serial.Serial) -> None:
+        """Wait until the port can be read or written, and do so. A hang-up raises SerialException or OSError."""
+        if not self._unwritten:
+            self._unwritten = self._get_next()
         fd = port.fileno()
-        readable, writable, _ = select.select([fd, self._wake_read], [fd] if self._left else [], [], _IDLE_S)
+        readable, writable, _ = select.select([fd, self._wake_read], [fd] if self._unwritten else [], [], _IDLE_S)
         if self._wake_read in readable:
             os.read(self._wake_read, _READ_BYTES)
         if fd in readable:
             data = port.read(_READ_BYTES)
             if data:
-                self._hand_in(data)
+                self._hand_over(data)
         if fd in writable:
             try:
-                written = port.write(self._left)
+                written = port.write(self._unwritten)
             except serial.SerialTimeoutException:
                 written = 0
-            self._left = self._left[written or 0 :]
+            self._unwritten = self._unwritten[written or 0 :]
 
-    def _ask(self) -> bytes:
+    def _get_next(self) -> bytes:
         try:
             return self._next_out()
         except Exception:
             self.callback_errors += 1
             return b""
 
-    def _hand_in(self, data: bytes) -> None:
+    def _hand_over(self, data: bytes) -> None:
         try:
             self._on_data(data)
         except Exception:
@@ -137,8 +133,8 @@ class SerialPort:
 
     def _hang_up(self, port: serial.Serial) -> None:
         self.connected = False
-        self.cut_frames += bool(self._left)
-        self._left = b""
+        self.cut_frames += bool(self._unwritten)
+        self._unwritten = b""
         with contextlib.suppress(*_ERRORS):
             port.close()
 

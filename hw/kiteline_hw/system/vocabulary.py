@@ -1,4 +1,4 @@
-"""The words that ship with kiteline."""
+"""The visual vocabulary that ships with kiteline."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from importlib.resources import files
 from kiteline_core.places.place_index import Vocabulary, unpack
 
 
-def shipped_words() -> Vocabulary:
-    """The tree of words by which places are recognised, as it lies in the package."""
+def shipped_vocabulary() -> Vocabulary:
+    """The vocabulary tree for place recognition, from the package's data."""
     return unpack(files("kiteline_core.places").joinpath("words.bin").read_bytes())

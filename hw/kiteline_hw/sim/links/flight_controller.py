@@ -1,7 +1,7 @@
-"""A model of how flight controllers treat ODOMETRY: ArduPilot's and PX4's handlers as rules, nothing of their flying.
+"""A model of how ArduPilot and PX4 process ODOMETRY messages (not of how they fly).
 
 Sources: ArduPilot GCS_Common handle_odometry and AP_VisualOdom; PX4 mavlink_receiver handle_message_odometry and
-timesync. A real controller says nothing when it drops a message; the model keeps the reason for tests to read.
+timesync. Real controllers drop messages silently; the model counts them by reason.
 """
 
 from __future__ import annotations
@@ -12,22 +12,23 @@ import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Literal, Self
+from typing import Literal
 
-from kiteline_hw.mavlink.messages import Heartbeat, MavlinkCodec, Odometry, TimeSync, VehicleImu
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.messages import Heartbeat, Odometry, TimeSync, VehicleImu
+from kiteline_hw.system.closing import Closing
 
 Vector = tuple[float, float, float]
 
 _LOCAL_FRAMES_PX4 = {1: "NED", 4: "ENU", 20: "FRD", 21: "FLU"}
-_TIMESYNC_NS = {"px4": 100_000_000, "ardupilot": 10_000_000_000}  # between questions
+_TIMESYNC_NS = {"px4": 100_000_000, "ardupilot": 10_000_000_000}  # ns between requests
 _AUTOPILOT = {"px4": 12, "ardupilot": 3}
-_HEALTHY_NS = 300_000_000  # ns; ArduPilot calls a source unhealthy that is silent for so long
+_HEALTHY_NS = 300_000_000  # ns of silence after which ArduPilot calls a source unhealthy
 
 
 @dataclass(frozen=True, slots=True)
 class VisionSample:
-    """What the controller's filter would get. Position and attitude in its local FRD frame, velocity likewise."""
+    """The input of the controller's filter: position, attitude and velocity in its local FRD frame."""
 
     received_ns: int
     t_ns: int  # capture, on the controller's clock, as far as it knows
@@ -56,29 +57,29 @@ class FlightController:
         self._next_timesync_ns = 0
 
     def poll(self, now_ns: int) -> list[bytes]:
-        """What it sends by itself: HEARTBEAT at 1 Hz and its TIMESYNC questions."""
+        """The messages that it sends by itself: HEARTBEAT at 1 Hz and TIMESYNC requests."""
         out = []
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + 1_000_000_000
-            out.append(self.codec.heartbeat(type_=2, autopilot=_AUTOPILOT[self.kind]))
+            out.append(self.codec.encode(Heartbeat(2, _AUTOPILOT[self.kind])))
         if now_ns >= self._next_timesync_ns:
             self._next_timesync_ns = now_ns + _TIMESYNC_NS[self.kind]
-            out.append(self.codec.timesync(0, now_ns))
+            out.append(self.codec.encode(TimeSync(0, now_ns)))
         return out
 
     def imu(self, t_us: int, accel: Vector, gyro: Vector) -> bytes:
         """A HIGHRES_IMU message."""
-        return self.codec.highres_imu(VehicleImu(t_us, accel, gyro))
+        return self.codec.encode(VehicleImu(t_us, accel, gyro))
 
     def receive(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Take a datagram; what it answers."""
+        """Process a datagram; returns the answers."""
         out = []
         for message in self.codec.receive(data, datagram=True):
             if isinstance(message, Heartbeat):
                 self.heartbeats[message.system, message.component] += 1
             elif isinstance(message, TimeSync):
                 if message.tc1_ns == 0:
-                    out.append(self.codec.timesync(now_ns, message.ts1_ns))
+                    out.append(self.codec.encode(TimeSync(now_ns, message.ts1_ns)))
                 else:
                     self.clock_offset_ns = message.tc1_ns - (message.ts1_ns + now_ns) // 2
             elif isinstance(message, Odometry):
@@ -86,7 +87,7 @@ class FlightController:
         return out
 
     def _odometry(self, m: Odometry, now_ns: int) -> None:
-        reason = self._ardupilot_drops(m) if self.kind == "ardupilot" else self._px4_drops(m)
+        reason = self._ardupilot_fault(m) if self.kind == "ardupilot" else self._px4_fault(m)
         if reason is not None:
             self.dropped[reason] += 1
             return
@@ -107,18 +108,20 @@ class FlightController:
             )
         )
 
-    def _ardupilot_drops(self, m: Odometry) -> str | None:
+    def _ardupilot_fault(self, m: Odometry) -> str | None:
+        """Why ArduPilot drops the message, or None."""
         if m.frame_id != 20 or m.child_frame_id != 12:
             return f"frames {m.frame_id} and {m.child_frame_id} are not LOCAL_FRD and BODY_FRD"
         if m.quality < self._quality_min:
             return "quality below VISO_QUAL_MIN"
         if not all(map(math.isfinite, (*m.position_m, *m.q, *m.velocity_m_s))):
-            return "a filter poisoned by NaN"  # ArduPilot itself would not notice: the model must
+            return "a filter poisoned by NaN"  # ArduPilot itself would not notice
         if abs(math.hypot(*m.q) - 1.0) > 1e-3:
             return "quaternion is not of unit length"
         return None
 
-    def _px4_drops(self, m: Odometry) -> str | None:
+    def _px4_fault(self, m: Odometry) -> str | None:
+        """Why PX4 drops the message, or None."""
         if m.estimator_type not in (0, 1, 2, 3):
             return f"estimator type {m.estimator_type} is no visual odometry"
         if m.frame_id not in _LOCAL_FRAMES_PX4:
@@ -140,19 +143,19 @@ class FlightController:
         return math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2)  # sic: ArduPilot takes the cube root of squares
 
     def healthy(self, now_ns: int) -> bool:
-        """Whether vision is fresh enough to fly on."""
+        """True if the last accepted message is recent enough to fly on."""
         return bool(self.accepted) and now_ns - self.accepted[-1].received_ns < _HEALTHY_NS
 
 
 def _rotate(q: tuple[float, float, float, float], v: Vector) -> Vector:
-    """v turned by q: v + 2w (u x v) + 2 u x (u x v)."""
+    """v rotated by q: v + 2w (u x v) + 2 u x (u x v)."""
     w, x, y, z = q
     a = (y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0])
     b = (y * a[2] - z * a[1], z * a[0] - x * a[2], x * a[1] - y * a[0])
     return v[0] + 2 * (w * a[0] + b[0]), v[1] + 2 * (w * a[1] + b[1]), v[2] + 2 * (w * a[2] + b[2])
 
 
-class UdpFlightController:
+class UdpFlightController(Closing):
     """The model behind a UDP socket on this machine, with a thread. clock_offset_ns: its clock less CLOCK_MONOTONIC."""
 
     def __init__(self, model: FlightController, *, port: int = 0, clock_offset_ns: int = 0) -> None:
@@ -169,17 +172,13 @@ class UdpFlightController:
         self._thread.start()
 
     def connect(self, host: str, port: int) -> None:
-        """Speak first, to a companion that listens."""
+        """Set the address of a companion that listens."""
         self._peer = (host, port)
 
     def send(self, data: bytes) -> None:
-        """Send bytes as they are to the companion, if there is one."""
+        """Send raw bytes to the companion, if there is one."""
         if self._peer is not None:
             self._socket.sendto(data, self._peer)
-
-    def _now_ns(self) -> int:
-
-        return time.monotonic_ns() + self._offset_ns
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -191,20 +190,12 @@ class UdpFlightController:
             except OSError:
                 continue
             with self.lock:
-                now_ns = self._now_ns()
+                now_ns = time.monotonic_ns() + self._offset_ns
                 for message in self.model.receive(data, now_ns) + self.model.poll(now_ns):
                     self.send(message)
 
     def close(self) -> None:
-        """Switch it off."""
+        """Stop the thread."""
         self._closed.set()
         self._thread.join(1.0)
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

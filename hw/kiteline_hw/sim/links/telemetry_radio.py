@@ -1,8 +1,8 @@
-"""A modelled flight controller that routes MAVLink between a companion and its telemetry radio. Pure, a model.
+"""A model of a flight controller that routes MAVLink between a companion and its telemetry radio. Pure.
 
-The radio is a half-duplex pair like SiK's: the two sides take turns, each with a window of time on air, and a buffer in
-front whose free share RADIO_STATUS tells. The controller itself sends telemetry; it forwards without any priority, as
-ArduPilot's and PX4's routers do: first come, first served.
+The radio is a half-duplex pair like SiK's: the two sides transmit in turns, each from a buffer whose free share is
+reported in RADIO_STATUS. The controller also sends its own telemetry; like ArduPilot's and PX4's routers it forwards
+without priorities, first come, first served.
 """
 
 from __future__ import annotations
@@ -10,23 +10,24 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from kiteline_hw.mavlink.messages import MavlinkCodec
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.messages import RadioStatus
 
 
 @dataclass(frozen=True, slots=True)
 class RadioConfig:
-    """A pair of radios."""
+    """A pair of telemetry radios."""
 
-    air_bytes_s: int = 8000  # while a side has its turn: 64 kb/s
+    air_bytes_s: int = 8000  # during a side's turn: 64 kb/s
     window_ns: int = 130_000_000  # ns of a turn (SiK: about 130 ms at full load)
     gap_ns: int = 10_000_000  # ns between turns
-    buffer_bytes: int = 4096  # of each side; what does not fit is lost
+    buffer_bytes: int = 4096  # of each side; messages that do not fit are lost
     status_ns: int = 500_000_000  # ns between RADIO_STATUS
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryConfig:
-    """What the controller sends on its own."""
+    """The controller's own telemetry."""
 
     bytes_s: int = 500
     message_bytes: int = 50  # of one message, about an ATTITUDE or a GLOBAL_POSITION_INT
@@ -40,7 +41,7 @@ class _Side:
         self._turn = turn  # 0: first half of the period, 1: second
         self._waiting: deque[tuple[int, bytes, bool]] = deque()  # ns handed in, message, whether it is telemetry
         self._bytes = 0
-        self._air_ns = 0  # until when the air is known to be used
+        self._air_ns = 0  # until when the air is in use
         self.lost = 0
         self.telemetry_delay_ns: list[int] = []
 
@@ -56,11 +57,11 @@ class _Side:
         self._bytes += len(message)
 
     def advance(self, now_ns: int) -> list[bytes]:
-        """The messages that are through by now."""
+        """The messages that have been sent by now."""
         out = []
         while self._waiting:
             since_ns, message, telemetry = self._waiting[0]
-            end_ns = self._through(max(self._air_ns, since_ns), len(message))
+            end_ns = self._end_of_sending(max(self._air_ns, since_ns), len(message))
             if end_ns > now_ns:
                 break
             self._air_ns = end_ns
@@ -71,8 +72,8 @@ class _Side:
             out.append(message)
         return out
 
-    def _through(self, begin_ns: int, n_bytes: int) -> int:
-        """When so many bytes, begun at a time, have been sent in this side's turns."""
+    def _end_of_sending(self, begin_ns: int, n_bytes: int) -> int:
+        """The time at which n_bytes, begun at begin_ns, have been sent in this side's turns."""
         c = self._config
         left_ns = n_bytes * 1_000_000_000 // c.air_bytes_s
         half_ns = c.window_ns + c.gap_ns
@@ -89,7 +90,7 @@ class _Side:
 
 
 class RoutingController:
-    """Companion on one port, a pair of radios on the other, ground at its far end."""
+    """A router with the companion on one port and, over a pair of radios, the ground station on the other."""
 
     def __init__(self, radio: RadioConfig | None = None, telemetry: TelemetryConfig | None = None) -> None:
         self.radio = radio or RadioConfig()
@@ -103,7 +104,7 @@ class RoutingController:
     def step(
         self, from_companion: list[bytes], from_ground: list[bytes], now_ns: int
     ) -> tuple[list[bytes], list[bytes]]:
-        """Messages in; messages for the companion and for the ground out. Heartbeats and tunnels are forwarded."""
+        """Forward messages; returns those for the companion and those for the ground."""
         t = self.telemetry
         if t.bytes_s:
             period_ns = t.message_bytes * 1_000_000_000 // t.bytes_s
@@ -118,7 +119,7 @@ class RoutingController:
         to_companion = self.down.advance(now_ns)
         if now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + self.radio.status_ns
-            # A radio tells the side that it hangs on; the controller hands it on to its companion.
-            to_companion.append(self._codec.radio_status(self.up.free_percent))
-            to_ground.append(self._codec.radio_status(self.down.free_percent))
+            # Each radio reports to its own side; the controller forwards the report to its companion.
+            to_companion.append(self._codec.encode(RadioStatus(self.up.free_percent)))
+            to_ground.append(self._codec.encode(RadioStatus(self.down.free_percent)))
         return to_companion, to_ground

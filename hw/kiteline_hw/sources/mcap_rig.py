@@ -1,8 +1,8 @@
-"""Finds the camera rig in a recording of messages: which image topics are left, right and depth, and where they sit.
+"""Finds the camera rig in a bag: which image topics are left, right and depth, and their extrinsics.
 
-Topics are told by their type and frame_id, never by their names; names serve only to match a calibration that names no
-frame, and to see that images are rectified already ("image_rect"). The extrinsics come from static transforms, else
-from the projection matrices of a rectified pair. The body frame is that of the IMU, else the root of the transforms.
+Topics are identified by type and frame_id. Their names are used only to match a calibration without a frame_id, and to
+recognise rectified images ("image_rect"). The extrinsics come from static transforms, else from the projection matrices
+of a rectified pair. The body frame is that of the IMU, else the root of the transforms.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
-from kiteline_hw.bags.mcap_messages import Calibration, Transform
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources.tables import checked_baseline, checked_camera, lens_of
+from kiteline_hw.sources.calibration import checked_baseline, checked_camera, parse_lens
+from kiteline_hw.sources.mcap_messages import CameraCalibration, Transform
 
 F64 = NDArray[np.float64]
 
-_WORLDS = ("world", "map", "odom", "earth")
+_WORLD_FRAMES = ("world", "map", "odom", "earth")
 _ALIGNED = 0.8  # cosine between optical axes above which two cameras can be a stereo pair
 
 
@@ -38,17 +38,17 @@ class ImageTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class _Camera:
+class _CameraTopic:
     images: ImageTopic
     model: CameraModel
-    rectified: bool  # the images are those of an ideal camera, and p says where it stands
-    T_c_i: F64  # the frame of the images (turned when they are rectified) in the camera's frame
-    calibration: Calibration
+    rectified: bool  # images of an ideal camera, whose position is in P
+    T_c_i: F64  # frame of the images (rotated if they are rectified) in the camera's frame
+    calibration: CameraCalibration
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """The channels that make a frame, and the rig. T_b_l: (4,4) of the frame that the left images name, in the body."""
+    """The channels that form a frame, and the rig. T_b_l: (4,4) the left images' frame_id in the body frame."""
 
     rig: CameraRig
     left: ImageTopic
@@ -71,7 +71,7 @@ class TransformTree:
             self._parent.setdefault(child, parent)
 
     def between(self, a: str, b: str) -> F64 | None:
-        """T_a_b, or None when the frames are not connected."""
+        """T_a_b, or None if the frames are not connected."""
         if a == b:
             return np.eye(4)
         known: dict[str, F64] = {a: np.eye(4)}
@@ -84,36 +84,36 @@ class TransformTree:
         return known.get(b)
 
     def root(self, frame: str) -> str:
-        """The topmost frame above a frame that is no world."""
+        """The topmost ancestor of a frame that is no world frame."""
         seen = {frame}
-        while (parent := self._parent.get(frame)) is not None and parent not in seen and parent not in _WORLDS:
+        while (parent := self._parent.get(frame)) is not None and parent not in seen and parent not in _WORLD_FRAMES:
             frame = parent
             seen.add(frame)
         return frame
 
 
-def select(
+def select_rig(
     name: str,
     images: list[ImageTopic],
-    calibrations: list[tuple[str, Calibration]],
+    calibrations: list[tuple[str, CameraCalibration]],
     tree: TransformTree,
     imu_frame: str | None,
     mono: bool,
 ) -> Selection:
-    """Choose the topics and make the rig. calibrations: (topic, calibration). Raises SourceError."""
+    """Choose the topics and build the rig. calibrations: (topic, calibration). Raises SourceError."""
     notes: list[str] = []
     cameras = _cameras(name, images, calibrations)
     depths = [i for i in images if i.depth and i.count]
     left, right, t_c_r = cameras[0], None, None
     depth: ImageTopic | None = None
-    pair = None if mono else _pair(cameras, tree)
+    pair = None if mono else _stereo_pair(cameras, tree)
     matched = None if mono else _with_depth(cameras, depths)
     if pair is not None:
         left, right, t_c_r = pair
     elif matched is not None:
         left, depth = matched
     elif len(cameras) > 1 and not mono:
-        _explain_no_pair(name, cameras[0], cameras[1], tree)
+        _check_no_pair(name, cameras[0], cameras[1], tree)
         notes.append(f"no two cameras make a stereo pair: {left.images.topic} alone is used")
     elif depths and not mono:
         frames = ", ".join(d.frame_id for d in depths)
@@ -125,82 +125,86 @@ def select(
     return Selection(rig, left.images, right.images if right else None, depth, imu_usable, t_b_l, tuple(notes))
 
 
-def _cameras(name: str, images: list[ImageTopic], calibrations: list[tuple[str, Calibration]]) -> list[_Camera]:
-    eyes = [i for i in images if not i.depth and i.count]
-    if not eyes:
+def _cameras(name: str, images: list[ImageTopic], calibrations: list[tuple[str, CameraCalibration]]) -> list[_CameraTopic]:
+    topics = [i for i in images if not i.depth and i.count]
+    if not topics:
         raise SourceError(
             f"{name}: no images: expected sensor_msgs/msg/Image, sensor_msgs/msg/CompressedImage, "
             "foxglove.CompressedImage or foxglove.RawImage"
         )
-    # One topic a camera: rectified before raw, encoded before raw pixels, then the one with most images.
-    eyes.sort(key=lambda i: ("rect" not in i.topic, not i.encoded, -i.count, i.topic))
+    # One topic per camera: rectified before raw, encoded before raw pixels, then the one with most images.
+    topics.sort(key=lambda i: ("rect" not in i.topic, not i.encoded, -i.count, i.topic))
     chosen: list[ImageTopic] = []
-    for eye in eyes:
-        if not eye.frame_id or eye.frame_id not in [c.frame_id for c in chosen]:
-            chosen.append(eye)
+    for topic in topics:
+        if not topic.frame_id or topic.frame_id not in [c.frame_id for c in chosen]:
+            chosen.append(topic)
     cameras = []
-    for eye in sorted(chosen, key=lambda i: i.topic):
-        found = _calibration_of(eye, calibrations, len(chosen))
+    for topic in sorted(chosen, key=lambda i: i.topic):
+        found = _match_calibration(topic, calibrations, len(chosen))
         if found is not None:
-            cameras.append(_camera(eye, found, name))
+            cameras.append(_camera(topic, found, name))
     if not cameras:
-        topics = ", ".join(eye.topic for eye in chosen)
+        names = ", ".join(topic.topic for topic in chosen)
         raise SourceError(
-            f"{name}: no calibration for {topics}: expected sensor_msgs/msg/CameraInfo or foxglove.CameraCalibration "
+            f"{name}: no calibration for {names}: expected sensor_msgs/msg/CameraInfo or foxglove.CameraCalibration "
             "with the same frame_id"
         )
     return cameras
 
 
-def _calibration_of(eye: ImageTopic, calibrations: list[tuple[str, Calibration]], eyes: int) -> Calibration | None:
-    def likeness(topic: str) -> int:
-        a, b = eye.topic.strip("/").split("/"), topic.strip("/").split("/")
+def _match_calibration(
+    images: ImageTopic, calibrations: list[tuple[str, CameraCalibration]], n_cameras: int
+) -> CameraCalibration | None:
+    def common_parts(topic: str) -> int:
+        a, b = images.topic.strip("/").split("/"), topic.strip("/").split("/")
         return next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
 
-    ranked = sorted(calibrations, key=lambda c: (c[1].frame_id != eye.frame_id or not eye.frame_id, -likeness(c[0])))
+    own = images.frame_id
+    ranked = sorted(calibrations, key=lambda c: (c[1].frame_id != own or not own, -common_parts(c[0])))
     if not ranked:
         return None
     topic, best = ranked[0]
-    if (eye.frame_id and best.frame_id == eye.frame_id) or likeness(topic) > 0 or (eyes == 1 and len(ranked) == 1):
+    if (own and best.frame_id == own) or common_parts(topic) > 0 or (n_cameras == 1 and len(ranked) == 1):
         return best
     return None
 
 
-def _camera(eye: ImageTopic, c: Calibration, name: str) -> _Camera:
-    where = f"{name}: calibration of {eye.topic}"
-    if "rect" in eye.topic.lower() and c.p[0, 0] > 0:
+def _camera(images: ImageTopic, c: CameraCalibration, name: str) -> _Camera:
+    where = f"{name}: calibration of {images.topic}"
+    if "rect" in images.topic.lower() and c.p[0, 0] > 0:
         model = CameraModel(c.width, c.height, c.p[0, 0], c.p[1, 1], c.p[0, 2], c.p[1, 2])
-        return _Camera(eye, checked_camera(_floats(model), where), True, se3.from_rt(c.r.T, np.zeros(3)), c)
-    lens, d = lens_of(c.model, list(c.d), where)
+        return _CameraTopic(images, checked_camera(_floats(model), where), True, se3.from_rt(c.r.T, np.zeros(3)), c)
+    lens, d = parse_lens(c.model, list(c.d), where)
     model = CameraModel(c.width, c.height, c.k[0, 0], c.k[1, 1], c.k[0, 2], c.k[1, 2], lens, d)
     same = np.allclose(c.r, np.eye(3), atol=1e-9) and np.allclose(c.p[:, :3], c.k, rtol=1e-6)
-    return _Camera(eye, checked_camera(_floats(model), where), lens is Lens.NONE and bool(same), np.eye(4), c)
+    return _CameraTopic(images, checked_camera(_floats(model), where), lens is Lens.NONE and bool(same), np.eye(4), c)
 
 
 def _floats(m: CameraModel) -> CameraModel:
     return CameraModel(m.width, m.height, float(m.fx), float(m.fy), float(m.cx), float(m.cy), m.lens, m.distortion)
 
 
-def _extrinsics(left: _Camera, right: _Camera, tree: TransformTree) -> F64 | None:
-    """Right images in the frame of the left images, or None when nothing says it."""
+def _extrinsics(left: _CameraTopic, right: _CameraTopic, tree: TransformTree) -> F64 | None:
+    """T_l_r (4,4) of the right images in the frame of the left images, or None if the bag does not hold it."""
     cl, cr = left.calibration, right.calibration
-    by_p = np.eye(4)
-    by_p[0, 3] = cl.p[0, 3] / cl.p[0, 0] - cr.p[0, 3] / cr.p[0, 0] if cl.p[0, 0] > 0 and cr.p[0, 0] > 0 else 0.0
-    if left.rectified and right.rectified and by_p[0, 3] != 0.0:
-        return by_p
+    from_p = np.eye(4)
+    from_p[0, 3] = cl.p[0, 3] / cl.p[0, 0] - cr.p[0, 3] / cr.p[0, 0] if cl.p[0, 0] > 0 and cr.p[0, 0] > 0 else 0.0
+    if left.rectified and right.rectified and from_p[0, 3] != 0.0:
+        return from_p
     if cl.frame_id != cr.frame_id:
         t = tree.between(left.images.frame_id, right.images.frame_id)
         if t is not None:
             return se3.inverse(left.T_c_i) @ t @ right.T_c_i
-    if by_p[0, 3] == 0.0:
+    if from_p[0, 3] == 0.0:
         return None
-    # P speaks of rectified frames; R turns each camera into its own.
+    # P relates the rectified frames; R rotates each camera into its rectified frame.
     to_left, to_right = se3.from_rt(cl.r, np.zeros(3)), se3.from_rt(cr.r, np.zeros(3))
-    return se3.inverse(left.T_c_i) @ se3.inverse(to_left) @ by_p @ to_right @ right.T_c_i
+    return se3.inverse(left.T_c_i) @ se3.inverse(to_left) @ from_p @ to_right @ right.T_c_i
 
 
-def _pair(cameras: list[_Camera], tree: TransformTree) -> tuple[_Camera, _Camera, F64] | None:
-    best: tuple[_Camera, _Camera, F64] | None = None
+def _stereo_pair(cameras: list[_CameraTopic], tree: TransformTree) -> tuple[_CameraTopic, _CameraTopic, F64] | None:
+    """Left and right camera and T_l_r of the pair with the most images, or None."""
+    best: tuple[_CameraTopic, _CameraTopic, F64] | None = None
     for left in cameras:
         for right in cameras:
             if left is right or (left.model.width, left.model.height) != (right.model.width, right.model.height):
@@ -215,7 +219,7 @@ def _pair(cameras: list[_Camera], tree: TransformTree) -> tuple[_Camera, _Camera
     return best
 
 
-def _with_depth(cameras: list[_Camera], depths: list[ImageTopic]) -> tuple[_Camera, ImageTopic] | None:
+def _with_depth(cameras: list[_CameraTopic], depths: list[ImageTopic]) -> tuple[_CameraTopic, ImageTopic] | None:
     for camera in cameras:
         for depth in sorted(depths, key=lambda d: (not d.encoded, -d.count)):
             if depth.frame_id == camera.images.frame_id:
@@ -223,8 +227,8 @@ def _with_depth(cameras: list[_Camera], depths: list[ImageTopic]) -> tuple[_Came
     return None
 
 
-def _explain_no_pair(name: str, left: _Camera, right: _Camera, tree: TransformTree) -> None:
-    """Two cameras that could be a pair but for their extrinsics are an error, not a silent single camera."""
+def _check_no_pair(name: str, left: _CameraTopic, right: _CameraTopic, tree: TransformTree) -> None:
+    """Raise SourceError if only missing or zero extrinsics keep two cameras from being a stereo pair."""
     t = _extrinsics(left, right, tree)
     topics = f"{left.images.topic} and {right.images.topic}"
     if t is None:
@@ -237,8 +241,8 @@ def _explain_no_pair(name: str, left: _Camera, right: _Camera, tree: TransformTr
         checked_baseline(t, f"{name}: {topics}")
 
 
-def _body(left: _Camera, tree: TransformTree, imu_frame: str | None, notes: list[str]) -> tuple[F64, bool, bool]:
-    """T_b_c of the left images, whether there is a body frame, whether the IMU can be used."""
+def _body(left: _CameraTopic, tree: TransformTree, imu_frame: str | None, notes: list[str]) -> tuple[F64, bool, bool]:
+    """T_b_c of the left images, whether there is a body frame, and whether the IMU can be used."""
     frame = left.images.frame_id
     if imu_frame is not None:
         t = tree.between(imu_frame, frame)

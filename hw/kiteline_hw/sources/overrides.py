@@ -1,4 +1,4 @@
-"""A source with something left out (the right eye and depth, or the inertial samples), or with another IMU."""
+"""Views of a source: with the right image, depth or IMU left out, or with another IMU."""
 
 from __future__ import annotations
 
@@ -13,12 +13,9 @@ from kiteline_core.geometry.se3 import F64
 from kiteline_hw.ports import FrameSource, SourceReport
 
 
-def reduced(source: FrameSource, mono: bool, imu: bool) -> FrameSource:
-    """The source itself when nothing is left out, else a view of it."""
-    return source if imu and not mono else _Reduced(source, mono, imu)
+class SourceView:
+    """A FrameSource that passes another one on, without right image and depth (mono) or without IMU."""
 
-
-class _Reduced:
     def __init__(self, source: FrameSource, mono: bool, imu: bool) -> None:
         self._source, self._mono, self._imu = source, mono, imu
 
@@ -61,14 +58,7 @@ class _Reduced:
         self._source.close()
 
 
-def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> FrameSource:
-    """A view of a source whose inertial samples come from elsewhere: its own are left out. T_b_c: (4,4) left camera in
-    the body frame of that IMU, which becomes the body of all; None: that of the source stays.
-    """
-    return _OtherImu(source, imu, T_b_c)
-
-
-class _OtherImu(_Reduced):
+class _OtherImuView(SourceView):
     def __init__(self, source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> None:
         super().__init__(source, mono=False, imu=False)
         self._calibration, self._T_b_c = imu, T_b_c
@@ -95,3 +85,12 @@ class _OtherImu(_Reduced):
                 yield odometry.in_body(item, self._T_b_c @ se3.inverse(self._source.rig.T_b_c))
             else:
                 yield item
+
+
+def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> FrameSource:
+    """A view whose own inertial samples are left out, because another IMU's samples replace them.
+
+    T_b_c: (4,4) left camera in that IMU's frame, which becomes the body frame of the rig, the ground truth and the
+    odometry; None: the body frame of the source stays.
+    """
+    return _OtherImuView(source, imu, T_b_c)

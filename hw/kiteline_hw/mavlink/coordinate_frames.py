@@ -1,7 +1,7 @@
-"""From kiteline's frames to those that flight controllers expect. Pure.
+"""Converts poses, rates and covariances from kiteline's coordinate frames to MAVLink's. Pure.
 
-kiteline: o is continuous and right-handed with z up; b is the body frame of the source, whose axes may lie anyhow in
-the vehicle. MAVLink: l = MAV_FRAME_LOCAL_FRD, x as in o, z down; f = MAV_FRAME_BODY_FRD, x forward, y right, z down.
+kiteline: o is continuous and right-handed with z up; b is the body frame of the source, in any orientation in the
+vehicle. MAVLink: l = MAV_FRAME_LOCAL_FRD, x as in o, z down; f = MAV_FRAME_BODY_FRD, x forward, y right, z down.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.se3 import F64
 
-# A vector of o in l: forward stays, left becomes right, up becomes down.
+# Rotates vectors from o to l: x stays, left becomes right, up becomes down.
 R_L_O: F64 = np.diag([1.0, -1.0, -1.0])
 
 # Unit vectors in FRD of the six directions of a vehicle.
@@ -26,10 +26,10 @@ _DIRECTIONS = {
 
 
 def mounting(axes: str, offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> F64:
-    """T_b_f (4,4) of a body whose x, y, z axes point as three letters say: f(orward) b(ack) l(eft) r(ight) u(p) d(own).
+    """T_b_f (4,4) from the directions of the body's x, y, z axes: f(orward) b(ack) l(eft) r(ight) u(p) d(own).
 
-    "flu": a ROS body; "rdf": a camera looking forward; "urf": EuRoC's vehicle. offset_m: where the flight controller's
-    origin lies, in b. Raises ValueError for letters that do not make a right-handed frame.
+    "flu": a ROS body; "rdf": a camera looking forward; "urf": EuRoC's vehicle. offset_m: the flight controller's origin
+    in b. Raises ValueError if the axes form no right-handed frame.
     """
     rows = [_DIRECTIONS.get(letter) for letter in axes.lower()]
     if len(rows) != 3 or any(row is None for row in rows):
@@ -47,7 +47,7 @@ def local_pose(T_o_b: F64, T_b_f: F64) -> tuple[F64, F64]:
 
 
 def body_rates(T_o_b_before: F64, T_o_b_now: F64, dt_s: float, T_b_f: F64) -> tuple[F64, F64]:
-    """Velocity (3,) m/s of the flight controller's origin and turn rate (3,) rad/s, both in f, between two poses."""
+    """Velocity (3,) m/s of the flight controller's origin and angular rate (3,) rad/s, both in f, between two poses."""
     before, now = T_o_b_before @ T_b_f, T_o_b_now @ T_b_f
     r_f_o = now[:3, :3].T
     velocity = r_f_o @ (now[:3, 3] - before[:3, 3]) / dt_s
@@ -56,12 +56,12 @@ def body_rates(T_o_b_before: F64, T_o_b_now: F64, dt_s: float, T_b_f: F64) -> tu
 
 
 def upper_triangle(covariance: F64) -> list[float]:
-    """The 21 numbers of a symmetric (6,6) matrix that MAVLink sends: rows of the upper right triangle."""
+    """The upper right triangle of a (6,6) matrix by rows: the 21 numbers of a covariance in MAVLink."""
     return [float(v) for v in covariance[np.triu_indices(6)]]
 
 
 def local_covariance(covariance_o: F64) -> F64:
-    """A (6,6) covariance [position, rotation vector] given in the axes of o, in those of l."""
+    """Rotate a (6,6) covariance [position, rotation vector] from the axes of o to those of l."""
     a = np.kron(np.eye(2), R_L_O)
     return np.asarray(a @ covariance_o @ a.T)
 
@@ -73,6 +73,6 @@ def controller_covariance(covariance: F64, T_o_b: F64, T_b_f: F64) -> F64:
     """
     r = T_o_b[:3, :3]
     j = np.eye(6)
-    j[:3, 3:] = -r @ se3.skew(T_b_f[:3, 3])  # a turn of the body moves what is mounted away from its origin
+    j[:3, 3:] = -r @ se3.skew(T_b_f[:3, 3])  # a rotation of the body moves the controller by its lever arm
     j[3:, 3:] = r
     return local_covariance(j @ covariance @ j.T)

@@ -1,4 +1,4 @@
-"""An MCAP recording as a source: ROS 2 bags, Foxglove recordings, our own logs (which give the very same frames)."""
+"""MCAP recordings as sources: ROS 2 bags, Foxglove recordings and kiteline logs (which yield identical frames)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,69 +19,83 @@ from numpy.typing import NDArray
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
-from kiteline_hw.bags.mcap_messages import (
-    KINDS,
-    BadMessage,
-    Calibration,
-    Kind,
-    MessageReader,
-    Transform,
-    calibration_of,
-    child_of,
-    frame_of,
-    image_of,
-    imu_of,
-    is_depth,
-    odometry_of,
-    pose_of,
-    stamp_ns,
-    transforms_of,
-)
-from kiteline_hw.bags.mcap_rig import ImageTopic, Selection, TransformTree, select
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.logs.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, ODOMETER, RIG, RIGHT
 from kiteline_hw.logs.rig_json import rig_from_json
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.assemble import DEPTH_TOLERANCE_NS, PAIR_TOLERANCE_NS, Capture, deliver, pair_by_time
+from kiteline_hw.sensors.frames import (
+    DEPTH_TOLERANCE_NS,
+    PAIR_TOLERANCE_NS,
+    EncodedFrame,
+    decode_frames,
+    pair_by_time,
+)
 from kiteline_hw.sensors.images import ImageRef
 from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
-from kiteline_hw.sensors.odometry_buffer import OdometerStream, before_frames
+from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames
 from kiteline_hw.sensors.raw_pixels import RawPixels
-from kiteline_hw.sources.tables import trajectory
+from kiteline_hw.sources.mcap_messages import (
+    KINDS,
+    BadMessage,
+    CameraCalibration,
+    ChannelKind,
+    MessageDecoder,
+    Transform,
+    is_depth,
+    read_calibration,
+    read_child_frame,
+    read_frame_id,
+    read_image,
+    read_imu,
+    read_pose,
+    read_stamp,
+    read_transforms,
+    read_velocities,
+)
+from kiteline_hw.sources.mcap_rig import ImageTopic, Selection, TransformTree, select_rig
+from kiteline_hw.sources.recording import sorted_trajectory
 
-_HOLD_NS = 200_000_000  # ns; how long a message waits for older ones that were recorded later
-_HOLD_MOST_NS = 1_000_000_000  # ns; how long it waits for a stream that has fallen behind or silent
+_REORDER_NS = 200_000_000  # ns that a message is held back for older ones recorded after it
+_MAX_REORDER_NS = 1_000_000_000  # ns that it is held back for a channel that lags or went silent
 _TRUTH_WORDS = ("truth", "ground", "gt", "vicon", "mocap", "optitrack", "leica")
-_SEEN_WORDS = ("vio", "visual", "vins", "slam", "kiteline", "lidar", "icp", "gps", "gnss")  # no wheels
-_GRAVITY_MESSAGES = 200  # messages that tell the unit of acceleration: a second or so
+_NO_ODOMETER_WORDS = ("vio", "visual", "vins", "slam", "kiteline", "lidar", "icp", "gps", "gnss")
+_GRAVITY_MESSAGES = 200  # messages from which the unit of acceleration is found: about a second
 STANDARD_GRAVITY = 9.80665  # m/s^2
-_DYNAMIC_MOST = 2000  # messages of moving transforms that are looked at when static ones do not connect the sensors
+_MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read besides the static ones
 
 
-def open_mcap(path: Path, *, mono: bool = False, imu: bool = True) -> McapSource:
-    """Open a recording. Raises SourceError."""
+def open_source(path_name: str, mono: bool, imu: bool) -> McapSource:
+    """Open a recording, or the only one in a folder. Raises SourceError."""
+    path = Path(path_name)
+    if path.is_dir():
+        files = sorted(path.glob("*.mcap"))
+        if not files:
+            raise SourceError(f"{path}: no *.mcap in this folder: expected one")
+        if len(files) > 1:
+            raise SourceError(
+                f"{path}: {len(files)} MCAP files: name one, or join them with `kiteline log merge OUT.mcap FILES…`"
+            )
+        path = files[0]
     return McapSource(McapFile(path), mono, imu)
 
 
 class McapSource:
-    """A FrameSource over an MCAP file. Messages are read while iterating."""
+    """A FrameSource over an MCAP file, whose messages are read while iterating."""
 
     def __init__(self, file: McapFile, mono: bool, imu: bool) -> None:
         self.name = f"mcap:{file.path}"
         self.report = SourceReport()
         self._file = file
-        self._reader = MessageReader()
-        self._in_g = False
-        self._truth: Trajectory | None = None
-        self._truth_read = False
+        self._decoder = MessageDecoder()
+        self._accel_in_g = False
         self._notes: tuple[str, ...] = ()
         self._odometer_channel: int | None = None
-        self._T_b_d: NDArray[np.float64] | None = None  # the odometer's frame in the body; None: it speaks of the body
+        self._T_b_d: NDArray[np.float64] | None = None  # the odometer's frame in the body; None: they are the same
         rig_channel = self._by_schema("kiteline.Rig")
         if rig_channel is not None:
-            self._open_own(rig_channel, mono)
+            self._open_log(rig_channel, mono)
         else:
-            self._open_foreign(mono)
+            self._open_bag(mono)
         if not imu:
             self.imu = None
 
@@ -92,41 +107,36 @@ class McapSource:
         """Images of the left camera."""
         return self._file.counts.get(self._left, 0)
 
-    @property
+    @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """Poses of the body that the recording calls truth, or the only poses that it has; read when first asked."""
-        if not self._truth_read:
-            self._truth_read = True
-            channel = self._truth_channel()
-            if channel is not None:
-                poses = []
-                for raw in self._file.messages((channel,)):
-                    try:
-                        message = self._decode(raw)
-                        poses.append((stamp_ns(message, raw.log_ns), pose_of(message)))
-                    except BadMessage:
-                        continue
-                self._truth = trajectory(poses) if poses else None
-        return self._truth
+        """Body poses of the topic named as ground truth, else of the only topic with poses."""
+        channel = self._truth_channel()
+        if channel is None:
+            return None
+        poses = []
+        for raw in self._file.messages((channel,)):
+            with suppress(BadMessage):
+                message = self._decode(raw)
+                poses.append((read_stamp(message, raw.log_ns), read_pose(message)))
+        return sorted_trajectory(poses) if poses else None
 
     def close(self) -> None:
         """Nothing is held open between two readings."""
 
     def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
-        self.report.skipped.clear()
-        self.report.notes.clear()
+        self.report.clear()
         self.report.notes.extend(self._notes)
         if self._file.cut:
             self.report.skip("file cut", self._file.cut)
         stream = ImuStream(self.report) if self.imu is not None else None
         odometer = OdometerStream(self.report)
-        captures = self._captures(stream, odometer)
-        items = deliver(captures, stream if stream is not None else NoImu(), self.rig, self.report, self.name)
-        return before_frames(items, odometer) if self._odometer_channel is not None else items
+        frames = self._encoded_frames(stream, odometer)
+        items = decode_frames(frames, stream if stream is not None else NoImu(), self.rig, self.report, self.name)
+        return insert_before_frames(items, odometer) if self._odometer_channel is not None else items
 
     # Opening
 
-    def _open_own(self, rig_channel: int, mono: bool) -> None:
+    def _open_log(self, rig_channel: int, mono: bool) -> None:
         raw = self._file.first(rig_channel)
         if raw is None:
             raise SourceError(f"{self.name}: the log was cut before its calibration")
@@ -148,14 +158,14 @@ class McapSource:
         self._imu_channel = topics.get(IMU)
         self._odometer_channel = topics.get(ODOMETER)
         self._truth_topic: int | None = topics.get(GROUND_TRUTH)
-        self._own = True
+        self._is_log = True
 
-    def _open_foreign(self, mono: bool) -> None:
+    def _open_bag(self, mono: bool) -> None:
         images, calibrations, imu_channel, imu_frame = self._discover()
         tree = TransformTree(self._transforms())
-        found = select(self.name, images, calibrations, tree, imu_frame, mono)
+        found = select_rig(self.name, images, calibrations, tree, imu_frame, mono)
         self._truth_topic = None
-        self._own = False
+        self._is_log = False
         self.rig, self._notes = found.rig, found.notes
         self._left = found.left.channel
         self._right = found.right.channel if found.right is not None else None
@@ -164,28 +174,28 @@ class McapSource:
         self.imu = None
         if self._imu_channel is not None:
             self.imu = ImuCalibration(rate_hz=self._rate_hz(self._imu_channel) or ImuCalibration().rate_hz)
-            self._in_g = self._accelerations_in_g(self._imu_channel)
-            if self._in_g:
+            self._accel_in_g = self._accelerations_in_g(self._imu_channel)
+            if self._accel_in_g:
                 self._notes += ("accelerations were in g and are turned to m/s^2",)
         self._choose_odometer(tree, found)
 
     def _choose_odometer(self, tree: TransformTree, found: Selection) -> None:
-        """The odometer of a foreign recording: no truth, rather no other SLAM, and its place in the body is known."""
+        """Choose the odometry topic of a bag: not ground truth, no other SLAM if possible, with known extrinsics."""
         truth = self._truth_channel(named_only=True)
         topics = [
-            c for c, kind in self._channels() if kind is Kind.ODOMETRY and c != truth and self._file.counts.get(c)
+            c for c, kind in self._channels() if kind is ChannelKind.ODOMETRY and c != truth and self._file.counts.get(c)
         ]
 
         def rank(channel: int) -> tuple[bool, bool, int]:
             name = self._file.channels[channel].topic.lower()
-            return not any(word in name for word in _SEEN_WORDS), "wheel" in name, self._file.counts.get(channel, 0)
+            return not any(word in name for word in _NO_ODOMETER_WORDS), "wheel" in name, self._file.counts.get(channel, 0)
 
         for channel in sorted(topics, key=rank, reverse=True):
             topic, raw = self._file.channels[channel].topic, self._file.first(channel)
             if raw is None or any(word in topic.lower() for word in _TRUTH_WORDS):
                 continue
             try:
-                child = child_of(self._decode(raw))
+                child = read_child_frame(self._decode(raw))
             except BadMessage:
                 continue
             T_l_d = tree.between(found.left.frame_id, child)
@@ -196,9 +206,10 @@ class McapSource:
             frames = f"its frame {child!r} and the camera's {found.left.frame_id!r}"
             self._notes += (f"odometry of {topic} left out: no static transform between {frames}",)
 
-    def _discover(self) -> tuple[list[ImageTopic], list[tuple[str, Calibration]], int | None, str | None]:
+    def _discover(self) -> tuple[list[ImageTopic], list[tuple[str, CameraCalibration]], int | None, str | None]:
+        """Image topics, calibrations by topic, and channel and frame of the IMU with the most messages."""
         images: list[ImageTopic] = []
-        calibrations: list[tuple[str, Calibration]] = []
+        calibrations: list[tuple[str, CameraCalibration]] = []
         imus: list[tuple[int, int, str]] = []
         faults: list[str] = []
         for channel, kind in self._channels():
@@ -208,17 +219,17 @@ class McapSource:
                 continue
             try:
                 message = self._decode(raw)
-                if kind is Kind.IMAGE:
-                    image = image_of(message, self._file.channels[channel].metadata)
+                if kind is ChannelKind.IMAGE:
+                    image = read_image(message, self._file.channels[channel].metadata)
                     encoded = not isinstance(image, RawPixels)
                     count = self._file.counts.get(channel, 0)
-                    images.append(ImageTopic(channel, topic, frame_of(message), count, is_depth(image), encoded))
-                elif kind is Kind.CALIBRATION:
-                    calibrations.append((topic, calibration_of(message)))
-                elif kind is Kind.IMU:
-                    row = imu_of(message, raw.log_ns)[0][1]
-                    if any(row[:3]) and any(row[3:]):  # some drivers send gyro and accelerometer on topics of their own
-                        imus.append((self._file.counts.get(channel, 0), channel, frame_of(message)))
+                    images.append(ImageTopic(channel, topic, read_frame_id(message), count, is_depth(image), encoded))
+                elif kind is ChannelKind.CALIBRATION:
+                    calibrations.append((topic, read_calibration(message)))
+                elif kind is ChannelKind.IMU:
+                    row = read_imu(message, raw.log_ns)[0][1]
+                    if any(row[:3]) and any(row[3:]):  # some drivers have separate topics for gyro and accelerometer
+                        imus.append((self._file.counts.get(channel, 0), channel, read_frame_id(message)))
             except BadMessage as error:
                 faults.append(str(error))
         if faults and not images:
@@ -227,40 +238,38 @@ class McapSource:
         return images, calibrations, best[1] if best else None, best[2] if best else None
 
     def _accelerations_in_g(self, channel: int) -> bool:
-        """Some drivers send g where ROS wants m/s^2: then gravity has a length near 1."""
+        """True if gravity measures near 1: some drivers send g although ROS demands m/s^2."""
         norms = []
         for raw in islice(self._file.messages((channel,), ordered=False), _GRAVITY_MESSAGES):
             with suppress(BadMessage):
-                norms += [float(np.linalg.norm(row[3:])) for _, row in imu_of(self._decode(raw), raw.log_ns)]
+                norms += [float(np.linalg.norm(row[3:])) for _, row in read_imu(self._decode(raw), raw.log_ns)]
         return bool(norms) and 0.5 < float(np.median(norms)) < 2.0
 
     def _transforms(self) -> list[Transform]:
-        channels = [c for c, kind in self._channels() if kind is Kind.TRANSFORM]
+        channels = [c for c, kind in self._channels() if kind is ChannelKind.TRANSFORM]
         static = [c for c in channels if "static" in self._file.channels[c].topic]
         out: list[Transform] = []
-        for group, most in ((static, None), ([c for c in channels if c not in static], _DYNAMIC_MOST)):
+        for group, most in ((static, None), ([c for c in channels if c not in static], _MAX_DYNAMIC_TRANSFORMS)):
             if not group:
                 continue
             for i, raw in enumerate(self._file.messages(group, ordered=False)):
                 if most is not None and i >= most:
                     break
-                try:
-                    out.extend(transforms_of(self._decode(raw)))
-                except BadMessage:
-                    continue
+                with suppress(BadMessage):
+                    out.extend(read_transforms(self._decode(raw)))
         return out
 
     def _truth_channel(self, *, named_only: bool = False) -> int | None:
-        if self._own:
+        if self._is_log:
             return self._truth_topic
-        kinds = (Kind.POSE, Kind.ODOMETRY)
+        kinds = (ChannelKind.POSE, ChannelKind.ODOMETRY)
         poses = [c for c, kind in self._channels() if kind in kinds and self._file.counts.get(c)]
         named = [c for c in poses if any(w in self._file.channels[c].topic.lower() for w in _TRUTH_WORDS)]
         if named:
             return max(named, key=lambda c: self._file.counts.get(c, 0))
         return poses[0] if len(poses) == 1 and not named_only else None
 
-    def _channels(self) -> Iterator[tuple[int, Kind]]:
+    def _channels(self) -> Iterator[tuple[int, ChannelKind]]:
         for channel in sorted(self._file.channels):
             schema = self._file.schema_of(channel)
             kind = KINDS.get(schema.name) if schema is not None else None
@@ -279,11 +288,12 @@ class McapSource:
         return round(self._file.counts.get(channel, 0) / span_s, 1) if span_s > 0 else 0.0
 
     def _decode(self, raw: RawMessage) -> Any:
-        return self._reader.decode(self._file.channels[raw.channel], self._file.schema_of(raw.channel), raw.data)
+        return self._decoder.decode(self._file.channels[raw.channel], self._file.schema_of(raw.channel), raw.data)
 
     # Reading
 
-    def _captures(self, imu: ImuStream | None, odometer: OdometerStream) -> Iterator[Capture]:
+    def _encoded_frames(self, imu: ImuStream | None, odometer: OdometerStream) -> Iterator[EncodedFrame]:
+        """The images, paired by time; samples met on the way are added to the streams."""
         sides = {self._left: 0}
         partner = self._right if self._right is not None else self._depth
         if partner is not None:
@@ -295,7 +305,7 @@ class McapSource:
             for t_ns, channel, item in self._in_order(imu is not None):
                 if channel == self._imu_channel:
                     assert imu is not None
-                    imu.add(t_ns, (*item[:3], *(a * STANDARD_GRAVITY for a in item[3:])) if self._in_g else item)
+                    imu.add(t_ns, (*item[:3], *(a * STANDARD_GRAVITY for a in item[3:])) if self._accel_in_g else item)
                 elif channel == self._odometer_channel:
                     odometer.add(item if self._T_b_d is None else odometry.in_body(item, self._T_b_d))
                 elif both and channel == self._depth:
@@ -305,7 +315,7 @@ class McapSource:
 
         if partner is None:
             for t, _, image in images():
-                yield Capture(t, image)
+                yield EncodedFrame(t, image)
             return
         stereo = self._right is not None
         most_ns = PAIR_TOLERANCE_NS if stereo else DEPTH_TOLERANCE_NS
@@ -314,14 +324,14 @@ class McapSource:
         names = ("left image", "right image" if stereo else "depth image")
         for t, left, other in pair_by_time(images(), tolerance_ns, names, self.report):
             if not both:
-                yield Capture(t, left, other) if stereo else Capture(t, left, depth=other)
+                yield EncodedFrame(t, left, other) if stereo else EncodedFrame(t, left, depth=other)
                 continue
             while depths and depths[0][0] < t:
                 depths.popleft()
-            yield Capture(t, left, other, depths.popleft()[1] if depths and depths[0][0] == t else None)
+            yield EncodedFrame(t, left, other, depths.popleft()[1] if depths and depths[0][0] == t else None)
 
     def _in_order(self, with_imu: bool) -> Iterator[tuple[int, int, Any]]:
-        """Images and samples (t_ns, channel, item) in order of their own stamps, not of their recording."""
+        """Images and samples (t_ns, channel, item) in order of their stamps, not of their recording."""
         wanted = [c for c in (self._left, self._right, self._depth) if c is not None]
         if with_imu and self._imu_channel is not None:
             wanted.append(self._imu_channel)
@@ -334,18 +344,18 @@ class McapSource:
             try:
                 message = self._decode(raw)
                 if raw.channel == self._imu_channel:
-                    items: list[tuple[int, Any]] = list(imu_of(message, raw.log_ns))
+                    items: list[tuple[int, Any]] = list(read_imu(message, raw.log_ns))
                 elif raw.channel == self._odometer_channel:
-                    batch = odometry_of(message, raw.log_ns)
+                    batch = read_velocities(message, raw.log_ns)
                     items = [(int(batch.t_ns[-1]), batch)] if len(batch.t_ns) else []
                 else:
-                    notes = self._file.channels[raw.channel].metadata
-                    items = [(stamp_ns(message, raw.log_ns), image_of(message, notes))]
+                    metadata = self._file.channels[raw.channel].metadata
+                    items = [(read_stamp(message, raw.log_ns), read_image(message, metadata))]
             except BadMessage as error:
                 self.report.skip("unreadable message", str(error))
                 continue
             for t_ns, item in items:
-                # At one instant: samples, then depth, then the eyes.
+                # With equal stamps: samples first, then depth, then left and right images.
                 sampled = raw.channel in (self._imu_channel, self._odometer_channel)
                 rank = 0 if sampled else 1 if raw.channel == self._depth else 2
                 heapq.heappush(heap, (t_ns, rank, order, raw.channel, item))
@@ -353,7 +363,7 @@ class McapSource:
                 newest[raw.channel] = max(newest[raw.channel], t_ns)
             front, back = max(newest.values()), min(newest.values())
             while heap and (
-                heap[0][0] < front - _HOLD_MOST_NS or (heap[0][0] < front - _HOLD_NS and heap[0][0] <= back)
+                heap[0][0] < front - _MAX_REORDER_NS or (heap[0][0] < front - _REORDER_NS and heap[0][0] <= back)
             ):
                 t_ns, _, _, channel, item = heapq.heappop(heap)
                 yield t_ns, channel, item

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 (CDR) and Foxglove (protobuf, JSON), brought to one form whatever their encoding."""
+"""Decodes messages of ROS 2 (CDR) and Foxglove (protobuf, JSON) and converts them to our types."""
 
 from __future__ import annotations
 
@@ -21,51 +21,51 @@ from numpy.typing import NDArray
 from kiteline_core.frame import EncodedImage, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_hw.logs.mcap_log_read import read_odometry
-from kiteline_hw.sensors.images import sniff
-from kiteline_hw.sensors.odometry_buffer import RATE_SIGMA_RAD_S, VELOCITY_SIGMA_M_S, stated_variances
+from kiteline_hw.sensors.images import detect_format
+from kiteline_hw.sensors.odometry_buffer import RATE_SIGMA_RAD_S, VELOCITY_SIGMA_M_S, reported_covariance
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 
 F64 = NDArray[np.float64]
 
 
-class Kind(Enum):
-    """What a channel carries, as far as a source cares."""
+class ChannelKind(Enum):
+    """What a channel carries."""
 
     IMAGE = 1
     CALIBRATION = 2
     IMU = 3
     TRANSFORM = 4
     POSE = 5
-    ODOMETRY = 6  # a pose, and velocities
+    ODOMETRY = 6  # a pose and velocities
 
 
 KINDS = {
-    "sensor_msgs/msg/Image": Kind.IMAGE,
-    "sensor_msgs/msg/CompressedImage": Kind.IMAGE,
-    "foxglove.CompressedImage": Kind.IMAGE,
-    "foxglove.RawImage": Kind.IMAGE,
-    "sensor_msgs/msg/CameraInfo": Kind.CALIBRATION,
-    "foxglove.CameraCalibration": Kind.CALIBRATION,
-    "sensor_msgs/msg/Imu": Kind.IMU,
-    "kiteline.Imu": Kind.IMU,
-    "tf2_msgs/msg/TFMessage": Kind.TRANSFORM,
-    "geometry_msgs/msg/TransformStamped": Kind.TRANSFORM,
-    "foxglove.FrameTransform": Kind.TRANSFORM,
-    "foxglove.FrameTransforms": Kind.TRANSFORM,
-    "geometry_msgs/msg/PoseStamped": Kind.POSE,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": Kind.POSE,
-    "nav_msgs/msg/Odometry": Kind.ODOMETRY,
-    "kiteline.Odometry": Kind.ODOMETRY,
-    "foxglove.PoseInFrame": Kind.POSE,
+    "sensor_msgs/msg/Image": ChannelKind.IMAGE,
+    "sensor_msgs/msg/CompressedImage": ChannelKind.IMAGE,
+    "foxglove.CompressedImage": ChannelKind.IMAGE,
+    "foxglove.RawImage": ChannelKind.IMAGE,
+    "sensor_msgs/msg/CameraInfo": ChannelKind.CALIBRATION,
+    "foxglove.CameraCalibration": ChannelKind.CALIBRATION,
+    "sensor_msgs/msg/Imu": ChannelKind.IMU,
+    "kiteline.Imu": ChannelKind.IMU,
+    "tf2_msgs/msg/TFMessage": ChannelKind.TRANSFORM,
+    "geometry_msgs/msg/TransformStamped": ChannelKind.TRANSFORM,
+    "foxglove.FrameTransform": ChannelKind.TRANSFORM,
+    "foxglove.FrameTransforms": ChannelKind.TRANSFORM,
+    "geometry_msgs/msg/PoseStamped": ChannelKind.POSE,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ChannelKind.POSE,
+    "nav_msgs/msg/Odometry": ChannelKind.ODOMETRY,
+    "kiteline.Odometry": ChannelKind.ODOMETRY,
+    "foxglove.PoseInFrame": ChannelKind.POSE,
 }
 
 
 class BadMessage(Exception):
-    """One message that cannot be read. It stays inside this package: sources count it as a skip."""
+    """One message that cannot be read. Raised only inside this package: sources count it as skipped."""
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class CameraCalibration:
     """CameraInfo or CameraCalibration: K, R (3,3), P (3,4), distortion D of a named model, image size in px."""
 
     frame_id: str
@@ -82,8 +82,8 @@ Transform = tuple[str, str, F64]  # parent frame, child frame, T_parent_child
 ImuRow = tuple[int, tuple[float, ...]]  # t_ns; gyro x y z rad/s, accel x y z m/s^2
 
 
-class MessageReader:
-    """Decodes the messages of one file's channels. All methods raise BadMessage, on any bytes."""
+class MessageDecoder:
+    """Decodes the messages of one file's channels. Raises BadMessage, and nothing else, on any bytes."""
 
     def __init__(self) -> None:
         self._factories = (Ros2Decoders(), ProtobufDecoders())
@@ -98,7 +98,7 @@ class MessageReader:
             return decoder(data)
         except BadMessage:
             raise
-        except Exception as error:  # the decoders raise whatever their parsers happen to raise
+        except Exception as error:  # the decoders document no exceptions
             raise BadMessage(f"{channel.topic}: {type(error).__name__} {error}") from error
 
     def _find(self, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
@@ -119,8 +119,8 @@ def _json(data: bytes) -> Any:
     return json.loads(data, object_hook=lambda value: SimpleNamespace(**value))
 
 
-def stamp_ns(message: Any, otherwise_ns: int) -> int:
-    """When the sensor took it; the log time where the message does not say."""
+def read_stamp(message: Any, otherwise_ns: int) -> int:
+    """Capture time in ns; `otherwise_ns` if the message has none."""
     try:
         header = getattr(message, "header", None)
         if header is not None:
@@ -136,41 +136,41 @@ def stamp_ns(message: Any, otherwise_ns: int) -> int:
     return t or otherwise_ns
 
 
-def frame_of(message: Any) -> str:
-    """The frame that a message names, without the leading slash that old tools write."""
+def read_frame_id(message: Any) -> str:
+    """The frame_id, without the leading slash that old tools write."""
     header = getattr(message, "header", message)
     return str(getattr(header, "frame_id", "")).lstrip("/")
 
 
-def image_of(message: Any, notes: Mapping[str, str]) -> EncodedImage | RawPixels:
-    """The image of a message, still coded. notes: the channel's metadata."""
-    with _fields("image"):
+def read_image(message: Any, metadata: Mapping[str, str]) -> EncodedImage | RawPixels:
+    """The image, still encoded. metadata: of the channel; holds the scale of a depth image in our logs."""
+    with _reading("image"):
         data = message.data if isinstance(message.data, bytes) else _bytes(message.data)
         if hasattr(message, "encoding"):
             big_endian = bool(getattr(message, "is_bigendian", False))
             width, height, step = int(message.width), int(message.height), int(message.step)
             return RawPixels(width, height, str(message.encoding), step, data, big_endian)
-        scale, name = notes.get("depth_scale"), str(message.format)
+        scale, name = metadata.get("depth_scale"), str(message.format)
         if scale:
             return EncodedImage(data, f"png/{scale}")
         if name.lower().startswith("16uc1"):
             if "compresseddepth" in name.lower():
-                data = data[12:]  # image_transport puts a header of its own before the PNG
+                data = data[12:]  # image_transport writes a header of its own before the PNG
             return EncodedImage(data, "png/1000")
         try:
-            return EncodedImage(data, sniff(data))
+            return EncodedImage(data, detect_format(data))
         except BadImage:
             return EncodedImage(data, name)
 
 
 def is_depth(image: EncodedImage | RawPixels) -> bool:
-    """Whether an image holds distances."""
+    """True if an image holds distances."""
     return image.is_depth if isinstance(image, RawPixels) else "/" in image.format
 
 
-def calibration_of(message: Any) -> Calibration:
+def read_calibration(message: Any) -> CameraCalibration:
     """The calibration of a camera, binning and region of interest applied."""
-    with _fields("calibration"):
+    with _reading("calibration"):
         lower = hasattr(message, "k")
         k, r, p = (np.array(getattr(message, name if lower else name.upper()), np.float64) for name in ("k", "r", "p"))
         d = tuple(float(v) for v in (message.d if lower else message.D))
@@ -188,46 +188,46 @@ def calibration_of(message: Any) -> Calibration:
         for m in (k, p):
             m[0] /= bin_x
             m[1] /= bin_y
-        return Calibration(
-            frame_of(message), width // bin_x, height // bin_y, str(message.distortion_model), d, k, r, p
+        return CameraCalibration(
+            read_frame_id(message), width // bin_x, height // bin_y, str(message.distortion_model), d, k, r, p
         )
 
 
-def imu_of(message: Any, otherwise_ns: int) -> list[ImuRow]:
+def read_imu(message: Any, otherwise_ns: int) -> list[ImuRow]:
     """The inertial samples of a message."""
-    with _fields("imu"):
+    with _reading("imu"):
         if hasattr(message, "t_ns"):
             gyro, accel = message.gyro, message.accel
             rows = [(*gyro[3 * i : 3 * i + 3], *accel[3 * i : 3 * i + 3]) for i in range(len(message.t_ns))]
             return list(zip(message.t_ns, rows, strict=True))
         w, a = message.angular_velocity, message.linear_acceleration
-        return [(stamp_ns(message, otherwise_ns), (w.x, w.y, w.z, a.x, a.y, a.z))]
+        return [(read_stamp(message, otherwise_ns), (w.x, w.y, w.z, a.x, a.y, a.z))]
 
 
-def odometry_of(message: Any, otherwise_ns: int) -> OdometryBatch:
-    """The velocities of a message, in the axes of the frame that it names (`child_of`); our own are the body's."""
-    with _fields("odometry"):
+def read_velocities(message: Any, otherwise_ns: int) -> OdometryBatch:
+    """The velocities, in the frame that the message names (`read_child_frame`); in our own logs in the body frame."""
+    with _reading("odometry"):
         if hasattr(message, "velocity_cov"):
             return read_odometry(message)
         v, w = message.twist.twist.linear, message.twist.twist.angular
         diagonal = np.diagonal(np.array(message.twist.covariance, np.float64).reshape(6, 6))
         return OdometryBatch(
-            np.array([stamp_ns(message, otherwise_ns)], np.int64),
+            np.array([read_stamp(message, otherwise_ns)], np.int64),
             np.array([[v.x, v.y, v.z]], np.float64),
             np.array([[w.x, w.y, w.z]], np.float64),
-            stated_variances(diagonal[:3], VELOCITY_SIGMA_M_S)[None],
-            stated_variances(diagonal[3:], RATE_SIGMA_RAD_S)[None],
+            reported_covariance(diagonal[:3], VELOCITY_SIGMA_M_S)[None],
+            reported_covariance(diagonal[3:], RATE_SIGMA_RAD_S)[None],
         )
 
 
-def child_of(message: Any) -> str:
+def read_child_frame(message: Any) -> str:
     """The frame in which an odometry message gives its velocities."""
     return str(getattr(message, "child_frame_id", "")).lstrip("/")
 
 
-def transforms_of(message: Any) -> list[Transform]:
-    """Where frames lie in others."""
-    with _fields("transform"):
+def read_transforms(message: Any) -> list[Transform]:
+    """The frame transforms of a message."""
+    with _reading("transform"):
         out: list[Transform] = []
         for item in getattr(message, "transforms", None) or [message]:
             if hasattr(item, "parent_frame_id"):
@@ -239,9 +239,9 @@ def transforms_of(message: Any) -> list[Transform]:
         return out
 
 
-def pose_of(message: Any) -> F64:
+def read_pose(message: Any) -> F64:
     """T_w_b (4,4) of a pose message."""
-    with _fields("pose"):
+    with _reading("pose"):
         pose = getattr(message.pose, "pose", message.pose)
         return _pose(pose.position, pose.orientation)
 
@@ -258,8 +258,8 @@ def _bytes(value: Any) -> bytes:
     return base64.b64decode(value, validate=True) if isinstance(value, str) else bytes(value)
 
 
-class _fields:
-    """Turns what a message with unexpected fields makes Python raise into BadMessage."""
+class _reading:
+    """Converts the exceptions caused by missing or malformed fields to BadMessage."""
 
     def __init__(self, what: str) -> None:
         self._what = what

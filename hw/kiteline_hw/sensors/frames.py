@@ -1,7 +1,4 @@
-"""From captures (images at one instant, still encoded) and inertial samples to Frames and ImuBatches.
-
-Shared by all recordings: matches the two halves of a pair by time, decodes, checks sizes, and counts what it skips.
-"""
+"""Turns encoded images and inertial samples into Frames and ImuBatches: pairs them by time, decodes, checks sizes."""
 
 from __future__ import annotations
 
@@ -20,15 +17,15 @@ from kiteline_hw.sensors.images import ImageRef, decode_depth, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuSamples
 from kiteline_hw.sensors.raw_pixels import BadImage
 
-PAIR_TOLERANCE_NS = 5_000_000  # ns; unsynchronised halves further apart than this are no pair for a moving vehicle
+PAIR_TOLERANCE_NS = 5_000_000  # ns; left and right image of a moving vehicle must not be further apart
 DEPTH_TOLERANCE_NS = 20_000_000  # ns; what the TUM tools use: free-running depth cameras lag by up to half a period
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Capture:
-    """What was taken at one instant, not yet decoded."""
+class EncodedFrame:
+    """The images of one instant, not yet decoded."""
 
     t_ns: int
     left: ImageRef
@@ -37,7 +34,7 @@ class Capture:
 
 
 def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANCE_NS) -> int:
-    """How far apart two halves may be: at most half the frame period, so that a half never matches two frames."""
+    """Largest time difference of a pair: half the frame period at most, so that an image never fits two frames."""
     if len(stamps_ns) < 2:
         return most_ns
     return min(most_ns, int(np.median(np.diff(stamps_ns))) // 2)
@@ -46,15 +43,15 @@ def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANC
 def pair_by_time(
     items: Iterable[tuple[int, int, T]], tolerance_ns: int, names: tuple[str, str], report: SourceReport
 ) -> Iterator[tuple[int, T, T]]:
-    """Match items (t_ns, side 0 or 1, item), which come in order of time, into (t_ns of side 0, item 0, item 1).
+    """Pair items (t_ns, side 0 or 1, item), given in order of time; yields (t_ns of side 0, item 0, item 1).
 
-    Each item is matched to the nearest of the other side within the tolerance; one that stays alone is counted as
-    "missing <name>". Holds no more than the items of one tolerance.
+    Each item is paired with the nearest of the other side within the tolerance; one without a partner is counted as
+    "missing <name>". Buffers the items of one tolerance at most.
     """
     waiting: tuple[deque[tuple[int, T]], deque[tuple[int, T]]] = (deque(), deque())
 
-    def settle(now_ns: int | None) -> Iterator[tuple[int, T, T]]:
-        # An item is settled once nothing nearer can come: its own time plus the tolerance has passed.
+    def pair_waiting(now_ns: int | None) -> Iterator[tuple[int, T, T]]:
+        # An item can be paired once no nearer one can follow: after its own time plus the tolerance.
         while waiting[0] or waiting[1]:
             side = 0 if waiting[0] and (not waiting[1] or waiting[0][0][0] <= waiting[1][0][0]) else 1
             mine, other = waiting[side], waiting[1 - side]
@@ -71,7 +68,7 @@ def pair_by_time(
                 mine.popleft()
                 report.skip(f"missing {names[1 - side]}", f"{names[side]} at {t} ns has no partner")
                 continue
-            # The partner lies later: a later item of this side may be nearer to it.
+            # The candidate is later than this item: a later item of the same side may be nearer to it.
             t_other = other[0][0]
             rival = mine[1][0] if len(mine) > 1 else None
             if rival is not None and abs(rival - t_other) < t_other - t:
@@ -86,34 +83,34 @@ def pair_by_time(
 
     for t_ns, side, item in items:
         waiting[side].append((t_ns, item))
-        yield from settle(t_ns)
-    yield from settle(None)
+        yield from pair_waiting(t_ns)
+    yield from pair_waiting(None)
 
 
-def deliver(
-    captures: Iterable[Capture], imu: ImuSamples, rig: CameraRig, report: SourceReport, name: str
+def decode_frames(
+    frames: Iterable[EncodedFrame], imu: ImuSamples, rig: CameraRig, report: SourceReport, name: str
 ) -> Iterator[Frame | ImuBatch]:
-    """Decode captures into Frames, each after the ImuBatch that leads up to it.
+    """Decode images into Frames; each Frame comes after the ImuBatch of the samples up to its time.
 
     Unreadable images, images of another size and stamps that do not increase are skipped and counted.
-    Raises SourceError when not one frame came of it.
+    Raises SourceError if no frame is usable.
     """
     last_ns = -(2**63)
     delivered = 0
-    for capture in captures:
-        if capture.t_ns <= last_ns:
-            report.skip("frame stamp not increasing", f"{capture.t_ns} ns after {last_ns} ns")
+    for encoded in frames:
+        if encoded.t_ns <= last_ns:
+            report.skip("frame stamp not increasing", f"{encoded.t_ns} ns after {last_ns} ns")
             continue
         try:
-            frame = _decode(capture, rig)
+            frame = _decode(encoded, rig)
         except BadImage as error:
-            report.skip("unreadable image", f"at {capture.t_ns} ns: {error}")
+            report.skip("unreadable image", f"at {encoded.t_ns} ns: {error}")
             continue
         except _WrongSize as error:
-            report.skip("image of another size", f"at {capture.t_ns} ns: {error}")
+            report.skip("image of another size", f"at {encoded.t_ns} ns: {error}")
             continue
-        last_ns = capture.t_ns
-        batch = imu.take_until(capture.t_ns)
+        last_ns = encoded.t_ns
+        batch = imu.take_until(encoded.t_ns)
         if batch is not None:
             yield batch
         delivered += 1
@@ -127,21 +124,21 @@ class _WrongSize(Exception):
     pass
 
 
-def _decode(capture: Capture, rig: CameraRig) -> Frame:
-    left, left_bytes = decode_grey(capture.left)
+def _decode(encoded: EncodedFrame, rig: CameraRig) -> Frame:
+    left, left_bytes = decode_grey(encoded.left)
     _check_size("left", left.shape, rig.left.height, rig.left.width)
     kept = [left_bytes]
     right = depth = None
-    if capture.right is not None and rig.right is not None:
-        right, right_bytes = decode_grey(capture.right)
+    if encoded.right is not None and rig.right is not None:
+        right, right_bytes = decode_grey(encoded.right)
         _check_size("right", right.shape, rig.right.height, rig.right.width)
         kept.append(right_bytes)
-    if capture.depth is not None and rig.has_depth:
-        depth, depth_bytes = decode_depth(capture.depth)
+    if encoded.depth is not None and rig.has_depth:
+        depth, depth_bytes = decode_depth(encoded.depth)
         _check_size("depth", depth.shape, rig.left.height, rig.left.width)
         kept.append(depth_bytes)
-    encoded: tuple[EncodedImage, ...] = tuple(image for image in kept if image is not None)
-    return Frame(capture.t_ns, left, right, depth, encoded if len(encoded) == len(kept) else ())
+    images: tuple[EncodedImage, ...] = tuple(image for image in kept if image is not None)
+    return Frame(encoded.t_ns, left, right, depth, images if len(images) == len(kept) else ())
 
 
 def _check_size(what: str, shape: tuple[int, ...], height: int, width: int) -> None:

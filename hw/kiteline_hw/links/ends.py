@@ -1,0 +1,43 @@
+"""What the ends of all links share: the options they are opened with, and the hub of a link to a single agent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from kiteline_hw.ports import ByteLink, Framer
+
+
+@dataclass(frozen=True, slots=True)
+class LinkOptions:
+    """How one end of a link is opened.
+
+    agent: number of the agent at this end or, for a base on a serial line, at the other end. group: flights with
+    different group names on one network do not see each other (zenoh). framer: makes the framing of a byte stream
+    (serial). required: a port that cannot be opened is an error; else the link waits for it.
+    """
+
+    agent: int = 0
+    group: str = "default"
+    framer: Callable[[], Framer] | None = None
+    required: bool = True
+
+
+class OneLinkHub:
+    """A LinkHub whose link leads to one agent (cable, radio) or to none."""
+
+    def __init__(self, link: ByteLink | None, agent: int) -> None:
+        self._links = {} if link is None else {agent: link}
+
+    def links(self) -> Mapping[int, ByteLink]:
+        """The link by agent number."""
+        return self._links
+
+    def alive(self) -> frozenset[int]:
+        """The agent at the other end: a silent one cannot be distinguished from one that is away."""
+        return frozenset(self._links)
+
+    def close(self) -> None:
+        """Close the link."""
+        for link in self._links.values():
+            link.close()

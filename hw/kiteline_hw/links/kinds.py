@@ -1,0 +1,57 @@
+"""The table of LINK kinds: the parser, the help texts, the error messages and the codec's settings come from it.
+
+It imports nothing heavy, because `kiteline --help` prints it. The module of a row has
+`open_agent_end(address, options) -> ByteLink` and `open_base_end(address, options) -> LinkHub`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class LinkTraits:
+    """What the codec has to know about a link.
+
+    overhead_bytes: added to each packet on the wire; None: as the transmission profile says. profile: used unless the
+    user names one; "": chosen by the measured throughput. thin: few bytes to spare, so packets are sealed with short
+    tags and not encrypted.
+    """
+
+    overhead_bytes: int | None = None
+    profile: str = ""
+    thin: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LinkKind:
+    """One kind of link, written SCHEME:ADDRESS. address: its form, "" if there is none."""
+
+    scheme: str
+    address: str
+    about: str
+    module: str
+    traits: LinkTraits = LinkTraits()
+
+
+LINKS: tuple[LinkKind, ...] = (
+    LinkKind("zenoh", "tcp/HOST:PORT", "IP network, any number of agents (a base listens on 0.0.0.0:PORT)",
+             "kiteline_hw.links.zenoh_link", LinkTraits(28)),  # IPv4 and UDP
+    LinkKind("serial", "DEVICE:BAUD", "cable or transparent radio",
+             "kiteline_hw.links.serial_link", LinkTraits(7, "radio", thin=True)),  # COBS, two zeros and a CRC-32
+    LinkKind("mavlink", "udp:HOST:PORT", "tunnel through a flight controller's telemetry",
+             "kiteline_hw.mavlink.tunnel_link", LinkTraits(76, "radio", thin=True)),  # four pieces in TUNNEL messages
+    LinkKind("none", "", "no base", "kiteline_hw.links.no_link"),
+)  # fmt: skip
+
+
+def link_forms() -> str:
+    """All forms of LINK in one line, for help texts and errors."""
+    *forms, last = [f"{kind.scheme}:{kind.address}" if kind.address else kind.scheme for kind in LINKS]
+    return f"{', '.join(forms)} or {last}"
+
+
+def link_traits(spec: str) -> LinkTraits:
+    """The traits of a LINK; the default ones for a link that is not in the table (the barrier of a lock-step flight)."""
+    scheme = spec.partition(":")[0]
+    return next((kind.traits for kind in LINKS if kind.scheme == scheme), LinkTraits())

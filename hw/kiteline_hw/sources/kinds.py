@@ -1,0 +1,52 @@
+"""The table of SOURCE kinds: the parser, the layout recogniser, the help texts and the error messages read it.
+
+It imports nothing heavy, because `kiteline --help` prints it. The module of a row has
+`open_source(argument, mono, imu) -> FrameSource`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class SourceKind:
+    """One kind of source, written SCHEME:ARGUMENT.
+
+    argument: what follows the colon, in capitals; DIR and FILE are paths that must exist. layout: glob patterns, one of
+    which a folder of this kind matches (with a trailing slash: a sub-folder), and `shown` names them in error messages.
+    """
+
+    scheme: str
+    argument: str
+    about: str
+    module: str
+    layout: tuple[str, ...] = ()
+    shown: str = ""
+
+
+SOURCES: tuple[SourceKind, ...] = (
+    SourceKind("euroc", "DIR", "EuRoC folder (ASL layout), stereo and IMU",
+               "kiteline_hw.sources.euroc", ("mav0/", "cam0/"), "mav0/ (EuRoC)"),
+    SourceKind("tum", "DIR", "TUM RGB-D folder",
+               "kiteline_hw.sources.tum", ("rgb.txt", "rgb/"), "rgb.txt (TUM)"),
+    SourceKind("kitti", "DIR", "KITTI odometry sequence",
+               "kiteline_hw.sources.kitti", ("calib.txt", "image_[0123lr]/"), "calib.txt with image_0/ (KITTI)"),
+    SourceKind("mcap", "FILE", "ROS 2 bag, Foxglove recording or kiteline log",
+               "kiteline_hw.sources.mcap", ("*.mcap",), "*.mcap"),
+    SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images"),
+    SourceKind("sim", "SCENE", "simulated flight: room, hall, corridor or street", "kiteline_hw.sim.source"),
+    SourceKind("v4l2", "DEV[,DEV]", "camera (not supported yet)", "kiteline_hw.sources.v4l2"),
+)  # fmt: skip
+
+
+def source_forms() -> str:
+    """All forms of SOURCE in one line, for help texts."""
+    forms = " ".join(f"{kind.scheme}:{kind.argument}" for kind in SOURCES)
+    return f"{forms}, or a plain path, recognised by its layout"
+
+
+def is_source(spec: str) -> bool:
+    """True if `spec` begins with the scheme of a source."""
+    scheme, colon, _ = spec.partition(":")
+    return bool(colon) and scheme in {kind.scheme for kind in SOURCES}
