@@ -45,7 +45,7 @@ from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
-from kiteline_hw.lockstep.agent_end import Barrier
+from kiteline_hw.lockstep.agent_end import AgentBarrier
 from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
@@ -55,9 +55,10 @@ from kiteline_hw.sources.open import open_source
 from kiteline_hw.sources.overrides import with_other_imu
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
-from kiteline_hw.system.cpu import CpuQuota, release_memory, rss_mib
+from kiteline_hw.system.cpu import CpuQuota
 from kiteline_hw.system.key_store import read_keys
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.memory import release_memory, rss_mib
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
@@ -95,7 +96,7 @@ class Onboard:
         self._log_shift_ns = spec.start_ns  # log time minus the time handed to the agent: logs stand in source time
         self._record = self._open_record(config) if spec.log_name else None
         self.agent = Agent(
-            source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel, shipped_words()
+            source.rig, source.imu, config, Identity(AgentId(spec.agent), spec.boot), channel, shipped_vocabulary()
         )
         disorder = LinkModelConfig(
             loss=spec.loss, duplicate=spec.disorder, reorder=spec.disorder, delay_ns=round(spec.delay_s * 1e9)
@@ -237,8 +238,8 @@ def fly_lockstep(spec: AgentOptions, parent: process.Parent) -> None:
     """Fly behind the base's barrier; where the base ends, go on alone."""
     source = open_source(spec.source, mono=spec.mono, imu=spec.imu)
     onboard = Onboard(spec, source, channel_for(spec, _spill(spec)), whole_process=True)
-    parent.tell("ready", frames=source.frame_count)
-    line = Barrier(spec.link.removeprefix("lockstep:"), spec.agent, parent)
+    parent.send_event("ready", frames=source.frame_count)
+    line = AgentBarrier(spec.link.removeprefix("lockstep:"), spec.agent, parent)
     try:
         up, now_ns, phase = onboard.hello(), -1, Phase.FLY
         while phase is not Phase.END:
@@ -254,12 +255,12 @@ def fly_lockstep(spec: AgentOptions, parent: process.Parent) -> None:
                 break
             up = onboard.turn(down)
             if onboard.tally.frames % _PROGRESS_FRAMES == 0:
-                parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
+                parent.send_event("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
             if line.lost and (spec.await_bases or 0 <= spec.await_base_at_s * 1e9 <= now_ns):
-                parent.tell("awaiting_base")
-                line.meet_again()
+                parent.send_event("awaiting_base")
+                line.reconnect()
                 up = onboard.hello()
-        parent.tell("result", report={**onboard.report(), "base_lost": line.times_lost})
+        parent.send_event("result", report={**onboard.report(), "base_lost": line.times_lost})
     finally:
         line.close()
         onboard.close()
@@ -283,7 +284,7 @@ def fly_live(spec: AgentOptions, parent: process.Parent | None, stop: process.St
         if spec.cpu_percent > 0.0:
             stack.enter_context(CpuQuota(spec.cpu_percent)).add(os.getpid())
         if parent is not None:
-            parent.tell("ready", frames=source.frame_count)
+            parent.send_event("ready", frames=source.frame_count)
         process.notify("READY=1")
         narrator = StatusMessages()
         if parent is None:
@@ -320,12 +321,12 @@ def fly_live(spec: AgentOptions, parent: process.Parent | None, stop: process.St
                     narrator.lines(onboard.output, onboard.tally, now_ns - begin_ns) if onboard.output else ()
                 )
             elif onboard.tally.frames % _PROGRESS_FRAMES == 0:
-                parent.tell("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
+                parent.send_event("progress", frames=onboard.tally.frames, tracked=onboard.tally.tracked)
         if parent is None:
             process.print_lines([f"over: {summary(onboard.tally)}"])
         _drain_live(onboard, link, clock, parent, stop)
         if parent is not None:
-            parent.tell("result", report=onboard.report())
+            parent.send_event("result", report=onboard.report())
 
 
 def _link_words(spec: AgentOptions) -> str:
@@ -348,7 +349,7 @@ def _drain_live(
     """After the last frame: until both sides were seen to hold the same, or patience ends."""
     onboard.frames_are_over()
     if parent is not None:
-        parent.tell("frames_over")
+        parent.send_event("frames_over")
     now_ns = quiet_ns = clock.now_ns()
     end_ns = now_ns + round(_DRAIN_S * 1e9)
     while not stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
@@ -406,13 +407,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if a.spec:
         spec = configuration.from_json(AgentOptions, a.spec)
         expected = (SourceError, LinkError, ValueError)
-        process.leave(process.run_child(spec.link, partial(fly_lockstep, spec), partial(fly_live, spec), expected))
+        process.exit_now(process.run_child(spec.link, partial(fly_lockstep, spec), partial(fly_live, spec), expected))
     if not a.source:
         p.error("a SOURCE is required")
     folder = (Path(a.log) if a.log else process.state_folder()) / f"agent{a.agent}"
     spec = options_of(a, folder, process.next_number(folder / "boot"))
     fly_live(spec, None, process.StopSignal())
-    process.leave(0)
+    process.exit_now(0)
 
 
 if __name__ == "__main__":

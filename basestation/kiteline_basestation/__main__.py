@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if a.spec:
         options = configuration.from_json(BaseOptions, a.spec)
         expected = (LinkError, SourceError, StoreError, WireError, ValueError)
-        process.leave(
+        process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )
     if not a.link:
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder = Path(a.store) if a.store else process.state_folder() / "base"
     session = process.next_number(folder / "session", int(time.time()) - _SESSION_EPOCH_S)
     fly_live(options_of(a, session), None, process.StopSignal())
-    process.leave(0)
+    process.exit_now(0)
 
 
 if __name__ == "__main__":

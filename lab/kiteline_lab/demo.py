@@ -21,8 +21,8 @@ SEED = 7
 _WARM_ALL = "import gc; gc.disable(); from kiteline_lab.tools.doctor import warm; warm()"
 _WARM_BASE = (
     "import gc; gc.disable(); from kiteline_basestation.runtime.warm import warm; "
-    "from kiteline_hw.system.vocabulary import shipped_words; "
-    "warm(words=shipped_words())"
+    "from kiteline_hw.system.vocabulary import shipped_vocabulary; "
+    "warm(words=shipped_vocabulary())"
 )
 
 

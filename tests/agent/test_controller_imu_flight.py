@@ -13,7 +13,7 @@ from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
-from kiteline_hw.mavlink.imu import ControllerImu
+from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.messages import VehicleImu
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sim.source import SimSource, open_sim

@@ -22,7 +22,7 @@ from kiteline_core.ids import MAX_SUBMAPS, NO_KEYFRAME, AgentId, KeyframeId, sub
 from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 PERIOD_NS = 50_000_000
 
@@ -82,7 +82,7 @@ def wall(like: Frame, level: float, frames: int) -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def words() -> Vocabulary:
-    return shipped_words()
+    return shipped_vocabulary()
 
 
 @dataclass

@@ -14,7 +14,7 @@ from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
@@ -87,7 +87,7 @@ def world() -> World:
 
 def window(**limits: float) -> MapCache:
     config = AgentConfig()
-    return MapCache(CAMERA, replace(config.window, **limits), config.matching, config.ransac, shipped_words())
+    return MapCache(CAMERA, replace(config.window, **limits), config.matching, config.ransac, shipped_vocabulary())
 
 
 def ring(world: World, box: MapCache, copies: int = 12, submap: SubmapId = HERE) -> None:

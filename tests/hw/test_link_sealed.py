@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
-from kiteline_hw.links.open import OneLinkHub
+from kiteline_hw.links.ends import OneLinkHub
 from kiteline_hw.links.sealed_link import SealedHub, SealedLink
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import new_key, read_keys

@@ -84,7 +84,7 @@ def test_noise_costs_packets_but_never_forges_one() -> None:
         received: list[bytes] = []
         for packet in packets:
             assert a.send(packet)
-            wait_for(lambda: not a._lane.pending())
+            wait_for(lambda: not a.pending())
         wait_for(lambda: pair.pumped_bytes[0] >= 200 * 108)
         time.sleep(0.05)
         received = b.receive()

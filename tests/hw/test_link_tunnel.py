@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_hw.mavlink.messages import MavlinkCodec
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.messages import RadioStatus, Tunnel
 from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
 from kiteline_hw.mavlink.tunnel_link import MavlinkTunnelLink
 from kiteline_hw.sim.links.telemetry_radio import RadioConfig, RoutingController, TelemetryConfig
@@ -49,9 +50,9 @@ def test_lost_pieces_lose_their_packet_only() -> None:
 def test_other_tunnels_are_not_ours() -> None:
     end = TunnelEnd(BASE)
     codec = MavlinkCodec(1, 197)
-    assert end.receive(codec.tunnel(255, 197, 0x9000, b"\0\0other")) == []
-    assert end.receive(codec.tunnel(7, 197, BASE.payload_type, b"\0\0other")) == []
-    assert end.receive(codec.tunnel(255, 197, BASE.payload_type, b"")) == []
+    assert end.receive(codec.encode(Tunnel(255, 197, 0x9000, b"\0\0other"))) == []
+    assert end.receive(codec.encode(Tunnel(7, 197, BASE.payload_type, b"\0\0other"))) == []
+    assert end.receive(codec.encode(Tunnel(255, 197, BASE.payload_type, b""))) == []
     assert end.counters.foreign == 3
     with pytest.raises(ValueError, match="payload_type"):
         TunnelConfig(payload_type=100)
@@ -61,13 +62,13 @@ def test_the_rate_follows_the_radio() -> None:
     end, radio = TunnelEnd(TunnelConfig(rate_bytes_s=1000)), MavlinkCodec(51, 68)
     for txbuf, factor in ((20, 0.8), (30, 0.975), (40, 1.0), (90, 1.025)):
         before = end.rate_bytes_s
-        end.receive(radio.radio_status(txbuf))
+        end.receive(radio.encode(RadioStatus(txbuf)))
         assert end.rate_bytes_s == pytest.approx(before * factor)
     for _ in range(100):
-        end.receive(radio.radio_status(0))
-    assert end.rate_bytes_s == end.config.least_bytes_s
+        end.receive(radio.encode(RadioStatus(0)))
+    assert end.rate_bytes_s == end.config.min_bytes_s
     for _ in range(300):
-        end.receive(radio.radio_status(100))
+        end.receive(radio.encode(RadioStatus(100)))
     assert end.rate_bytes_s == 1000
 
 

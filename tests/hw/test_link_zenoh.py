@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, PacketLane
+from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, QueuedLink
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
 from kiteline_hw.links.zenoh_session import open_session
 from kiteline_hw.ports import LinkError
@@ -130,21 +129,25 @@ def test_a_callback_that_raises_is_counted() -> None:
         def broken(packet: bytes) -> None:
             raise RuntimeError(packet)
 
-        link._lane.deliver = broken  # type: ignore[method-assign]
+        link.deliver = broken  # type: ignore[method-assign]
         hub.links()[3].send(b"x")
         wait_for(lambda: link.counters.callback_errors == 1)
 
 
+class AlwaysConnected(QueuedLink):
+    connected = True  # type: ignore[assignment]
+
+
 def test_queues_stay_bounded() -> None:
-    lane = PacketLane(threading.Condition())
+    link = AlwaysConnected()
     for i in range(INBOX_PACKETS + 50):
-        lane.deliver(b"%d" % i)
-    assert lane.take() == [b"%d" % i for i in range(50, INBOX_PACKETS + 50)]  # the newest are kept
-    assert lane.counters.overrun_packets == 50 and lane.take() == []
-    assert [lane.offer(b"%d" % i) for i in range(OUTBOX_PACKETS + 1)] == [True] * OUTBOX_PACKETS + [False]
-    assert lane.next_out() == b"0" and lane.pending()
-    lane.drop_out()
-    assert lane.next_out() is None and lane.counters.failed_packets == OUTBOX_PACKETS - 1
+        link.deliver(b"%d" % i)
+    assert link.receive() == [b"%d" % i for i in range(50, INBOX_PACKETS + 50)]  # the newest are kept
+    assert link.counters.overrun_packets == 50 and link.receive() == []
+    assert [link.send(b"%d" % i) for i in range(OUTBOX_PACKETS + 1)] == [True] * OUTBOX_PACKETS + [False]
+    assert link.next_packet() == b"0" and link.pending()
+    link.clear_outbox()
+    assert link.next_packet() is None and link.counters.failed_packets == OUTBOX_PACKETS - 1
 
 
 BASE = """

@@ -7,7 +7,7 @@ from math import cos, radians, sin
 import numpy as np
 import pytest
 
-from kiteline_hw.mavlink.frames import body_rates, local_covariance, local_pose, mounting, upper_triangle
+from kiteline_hw.mavlink.coordinate_frames import body_rates, local_covariance, local_pose, mounting, upper_triangle
 
 FLU = mounting("flu")
 

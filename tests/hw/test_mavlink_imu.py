@@ -8,10 +8,11 @@ from pymavlink.dialects.v20 import common
 
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
-from kiteline_hw.mavlink.frames import mounting
-from kiteline_hw.mavlink.imu import ControllerImu, ControllerImuConfig
-from kiteline_hw.mavlink.messages import MavlinkCodec, VehicleImu
-from kiteline_hw.mavlink.odometry_stream import OdometryStream
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.controller_imu import ControllerImu, ControllerImuConfig
+from kiteline_hw.mavlink.controller_session import ControllerSession
+from kiteline_hw.mavlink.coordinate_frames import mounting
+from kiteline_hw.mavlink.messages import Heartbeat, VehicleImu
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sim.links.flight_controller import FlightController
 from kiteline_hw.sources.overrides import with_other_imu
@@ -32,8 +33,8 @@ def unit(axes: str = "flu", **config: int) -> ControllerImu:
     return ControllerImu(mounting(axes)[:3, :3], 200.0, SourceReport(), ControllerImuConfig(**config))
 
 
-def stream_of(imu: ControllerImu, kind: str = "ardupilot") -> tuple[OdometryStream, FlightController]:
-    stream, controller = OdometryStream(mounting("flu"), imu=imu), FlightController(kind)  # type: ignore[arg-type]
+def stream_of(imu: ControllerImu, kind: str = "ardupilot") -> tuple[ControllerSession, FlightController]:
+    stream, controller = ControllerSession(mounting("flu"), imu=imu), FlightController(kind)  # type: ignore[arg-type]
     stream.receive(controller.poll(0)[0], 0)  # its heartbeat
     return stream, controller
 
@@ -126,7 +127,7 @@ def test_late_samples_come_with_the_next_frame() -> None:
 
 
 def test_what_nobody_takes_is_bounded() -> None:
-    imu = unit(most_samples=10)
+    imu = unit(max_samples=10)
     for k in range(30):
         imu.receive(VehicleImu(k * 5000, *NOSE_UP), None, S + k * 5 * MS)
     batch = imu.take_until(9 * S)
@@ -136,8 +137,8 @@ def test_what_nobody_takes_is_bounded() -> None:
 
 
 def test_a_controller_is_asked_for_its_best_and_then_for_any() -> None:
-    stream, controller = OdometryStream(mounting("flu"), imu=unit()), MavlinkCodec(7, 1)
-    heartbeat = controller.heartbeat(type_=2, autopilot=12)
+    stream, controller = ControllerSession(mounting("flu"), imu=unit()), MavlinkCodec(7, 1)
+    heartbeat = controller.encode(Heartbeat(2, 12))
     asked = [
         (m.target_system, m.target_component, m.command, m.param1, m.param2)
         for t in range(4)
@@ -146,7 +147,7 @@ def test_a_controller_is_asked_for_its_best_and_then_for_any() -> None:
     ]
     assert asked == [(7, 1, 511, number, 5000.0) for number in (105.0, 105.0, 27.0, 26.0)]
     for k in range(8):
-        stream.receive(controller.highres_imu(VehicleImu(k * 500_000, *NOSE_UP)), 4 * S + k * S // 2)
+        stream.receive(controller.encode(VehicleImu(k * 500_000, *NOSE_UP)), 4 * S + k * S // 2)
         assert stream.receive(heartbeat, 4 * S + k * S // 2) == []
 
 

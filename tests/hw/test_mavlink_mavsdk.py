@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_hw.mavlink.frames import mounting
-from kiteline_hw.mavlink.out import MavlinkPoseSink
+from kiteline_hw.mavlink.coordinate_frames import mounting
+from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.ports import PoseSample
 from kiteline_hw.sim.links.flight_controller import FlightController
 from kiteline_hw.system.clock import MonotonicClock

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_hw.mavlink.frames import mounting
-from kiteline_hw.mavlink.messages import MavlinkCodec, Odometry, Signing, TimeSync
-from kiteline_hw.mavlink.odometry_stream import OdometryStream
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.controller_session import ControllerSession
+from kiteline_hw.mavlink.coordinate_frames import mounting
+from kiteline_hw.mavlink.messages import Heartbeat, Odometry, TimeSync
 from kiteline_hw.ports import PoseSample
 from kiteline_hw.sim.links.flight_controller import FlightController
 
@@ -36,7 +37,7 @@ def circling(t_ns: int, *, tracked: bool = True, quality: int = 80, epoch: int =
 
 
 def fly(
-    stream: OdometryStream, controller: FlightController, seconds: float, rate_hz: float, start_ns: int = 0
+    stream: ControllerSession, controller: FlightController, seconds: float, rate_hz: float, start_ns: int = 0
 ) -> list[int]:
     """Feed poses at a rate; times at which ODOMETRY was accepted or dropped."""
     sent = []
@@ -53,7 +54,7 @@ def fly(
 @pytest.mark.parametrize("kind", KINDS)
 def test_controllers_take_every_message_and_see_the_true_motion(kind: str) -> None:
     controller = FlightController(kind)  # type: ignore[arg-type]
-    stream = OdometryStream(mounting("flu"))
+    stream = ControllerSession(mounting("flu"))
     fly(stream, controller, 3.0, 30.0)
     assert not controller.dropped
     assert len(controller.accepted) == 89  # all but the first, which has no velocity yet
@@ -70,7 +71,7 @@ def test_controllers_take_every_message_and_see_the_true_motion(kind: str) -> No
 
 @pytest.mark.parametrize("rate_hz", [10.0, 20.0, 30.0, 31.0, 60.0, 90.0, 200.0])
 def test_rate(rate_hz: float) -> None:
-    stream = OdometryStream(mounting("flu"))
+    stream = ControllerSession(mounting("flu"))
     sent = fly(stream, FlightController("px4"), 10.0, rate_hz)
     rate = (len(sent) - 1) / ((sent[-1] - sent[0]) / S)
     assert rate <= 30.1
@@ -79,7 +80,7 @@ def test_rate(rate_hz: float) -> None:
 
 def test_rate_with_a_jittering_camera() -> None:
     rng = np.random.default_rng(5)
-    stream = OdometryStream(mounting("flu"))
+    stream = ControllerSession(mounting("flu"))
     for i in range(300):
         t_ns = round(i * S / 30.0)
         stream.step(circling(t_ns), t_ns + int(rng.integers(0, 4_000_000)))
@@ -87,7 +88,7 @@ def test_rate_with_a_jittering_camera() -> None:
 
 
 def test_a_pose_that_is_not_tracked_says_so_and_ardupilot_leaves_it() -> None:
-    ardupilot, stream = FlightController("ardupilot"), OdometryStream(mounting("flu"))
+    ardupilot, stream = FlightController("ardupilot"), ControllerSession(mounting("flu"))
     fly(stream, ardupilot, 1.0, 30.0)
     accepted = len(ardupilot.accepted)
     for message in stream.step(circling(S, tracked=False, quality=70), S):
@@ -97,7 +98,7 @@ def test_a_pose_that_is_not_tracked_says_so_and_ardupilot_leaves_it() -> None:
 
 
 def test_reset_counter_follows_the_epoch_alone() -> None:
-    controller, stream = FlightController("ardupilot"), OdometryStream(mounting("flu"))
+    controller, stream = FlightController("ardupilot"), ControllerSession(mounting("flu"))
     for i in range(60):
         pose = circling(i * S // 30, epoch=300 if i < 30 else 301)
         for message in stream.step(pose, pose.t_ns):
@@ -107,7 +108,7 @@ def test_reset_counter_follows_the_epoch_alone() -> None:
 
 
 def test_what_is_not_sent() -> None:
-    stream = OdometryStream(mounting("flu"))
+    stream = ControllerSession(mounting("flu"))
     stream.step(circling(0), 0)
     broken = circling(S // 30)
     broken.T_o_b[0, 3] = np.nan
@@ -115,7 +116,7 @@ def test_what_is_not_sent() -> None:
     far.T_o_b[1, 3] = 1e7
     for pose in (broken, far):
         assert stream.step(pose, S // 30) == []
-    assert stream.counters.broken == 2
+    assert stream.counters.invalid == 2
     assert stream.step(circling(0), S // 30) == [] and stream.counters.stale == 1
     assert stream.step(circling(S // 2), S // 2) == []  # after half a second without poses
     assert stream.counters.without_velocity == 2
@@ -138,7 +139,7 @@ def test_the_model_rejects_what_controllers_reject(
     change: dict[str, object], ardupilot_takes: bool, px4_takes: bool
 ) -> None:
     good = Odometry(1, (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3, (0.1,) * 21, (0.1,) * 21, 0, 90)
-    data = MavlinkCodec().odometry(replace(good, **change))  # type: ignore[arg-type]
+    data = MavlinkCodec().encode(replace(good, **change))  # type: ignore[arg-type]
     for kind, takes in (("ardupilot", ardupilot_takes), ("px4", px4_takes)):
         controller = FlightController(kind)  # type: ignore[arg-type]
         assert controller.receive(data, 0) == []  # never a word
@@ -147,7 +148,7 @@ def test_the_model_rejects_what_controllers_reject(
 
 
 def test_timesync_is_answered_from_the_same_clock() -> None:
-    controller, stream = FlightController("px4"), OdometryStream(mounting("flu"))
+    controller, stream = FlightController("px4"), ControllerSession(mounting("flu"))
     ahead_ns = 5 * S  # the companion's clock
     for message in controller.poll(1000):
         for answer in stream.receive(message, 1000 + ahead_ns + 300):
@@ -160,18 +161,18 @@ def test_timesync_is_answered_from_the_same_clock() -> None:
     last = controller.accepted[-1]
     assert abs(last.t_ns - last.received_ns) < 1000
     # An answer (tc1 set) is no question: answering it would never end.
-    assert stream.receive(MavlinkCodec(1, 1).timesync(7, 8), 0) == []
+    assert stream.receive(MavlinkCodec(1, 1).encode(TimeSync(7, 8)), 0) == []
 
 
 def test_the_controller_is_seen() -> None:
-    controller, stream = FlightController("ardupilot"), OdometryStream(mounting("flu"))
+    controller, stream = FlightController("ardupilot"), ControllerSession(mounting("flu"))
     assert stream.autopilot(0) is None
     for message in controller.poll(0):
         stream.receive(message, 0)
     seen = stream.autopilot(S)
     assert seen is not None and (seen.system, seen.component, seen.autopilot) == (1, 1, 3)
     assert stream.autopilot(4 * S) is None
-    stream.receive(MavlinkCodec(255, 190).heartbeat(type_=6, autopilot=8), 4 * S)  # a ground station
+    stream.receive(MavlinkCodec(255, 190).encode(Heartbeat(6, 8)), 4 * S)  # a ground station
     assert stream.autopilot(4 * S) is None
     assert stream.take_imu(9 * S) is None  # nobody asked for it
 
@@ -182,24 +183,24 @@ NOISE = st.one_of(st.binary(max_size=80), st.sampled_from([b"\xfd", b"\xfe\x09",
 @settings(max_examples=150, deadline=None)
 @given(st.lists(NOISE, max_size=8))
 def test_any_bytes_are_survived_and_what_follows_is_understood(pieces: list[bytes]) -> None:
-    stream = OdometryStream(mounting("flu"))
+    stream = ControllerSession(mounting("flu"))
     controller = MavlinkCodec(1, 1)
     for piece in pieces:
         stream.receive(piece, 0)
-        assert len(stream.receive(controller.timesync(0, 5), 0, datagram=True)) == 1  # a datagram starts afresh
+        assert len(stream.receive(controller.encode(TimeSync(0, 5)), 0, datagram=True)) == 1  # a datagram starts afresh
     for piece in pieces:
         stream.receive(piece, 0)
-    answers = [a for _ in range(40) for a in stream.receive(controller.timesync(0, 2**60 + 5), 0)]
+    answers = [a for _ in range(40) for a in stream.receive(controller.encode(TimeSync(0, 2**60 + 5)), 0)]
     assert len(answers) >= 25  # on a byte stream a stray marker hides what follows until 280 bytes have come
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_damaged_messages_are_never_taken(data: st.DataObject) -> None:
-    good = bytearray(MavlinkCodec(1, 1).timesync(0, 123456789))
+    good = bytearray(MavlinkCodec(1, 1).encode(TimeSync(0, 123456789)))
     index = data.draw(st.integers(0, len(good) - 1))
     good[index] ^= data.draw(st.integers(1, 255))
-    stream = OdometryStream(mounting("flu"))
+    stream = ControllerSession(mounting("flu"))
     assert stream.receive(bytes(good), 0, datagram=True) == []
 
 
@@ -210,24 +211,9 @@ def test_noise_does_not_fill_memory() -> None:
     assert len(codec._mav.buf) < 10_000
 
 
-def test_signing() -> None:
-    key = bytes(range(32))
-    sender = MavlinkCodec(1, 197, Signing(key, timestamp=1000))
-    receiver = MavlinkCodec(1, 1, Signing(key, timestamp=1000))
-    data = sender.timesync(0, 42)
-    assert len(data) == len(MavlinkCodec(1, 197).timesync(0, 42)) + 13
-    assert receiver.receive(data) == [TimeSync(1, 197, 0, 42)]
-    assert receiver.receive(data) == []  # played again
-    assert receiver.receive(MavlinkCodec(1, 197).timesync(0, 42)) == []  # not signed
-    assert MavlinkCodec(1, 1, Signing(bytes(32), timestamp=0)).receive(sender.timesync(0, 43)) == []  # another key
-    assert sender.signing_timestamp > 1000
-    with pytest.raises(ValueError, match="32 bytes"):
-        MavlinkCodec(signing=Signing(b"short", 0))
-
-
 def test_a_pose_of_known_covariance_takes_it_along() -> None:
     T_b_f = mounting("flu", (0.0, 2.0, 0.0))
-    stream, controller = OdometryStream(T_b_f), FlightController("px4")
+    stream, controller = ControllerSession(T_b_f), FlightController("px4")
     cov = np.diag([0.09, 0.04, 0.01, 0.0, 0.0, 0.0025])
     for i in range(3):
         pose = replace(circling(i * S // 30), cov=cov)

@@ -12,10 +12,17 @@ from hypothesis import strategies as st
 
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_hw.mavlink.frames import body_rates, local_pose, mounting
-from kiteline_hw.mavlink.messages import Attitude, LocalPosition, MavlinkCodec, Odometry, WheelDistance
-from kiteline_hw.mavlink.odometry import FromController, FromControllerConfig, StampClock, Told, told_of
-from kiteline_hw.mavlink.odometry_stream import OdometryStream
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.controller_odometry import (
+    ControllerOdometry,
+    ControllerOdometryConfig,
+    OdometrySource,
+    StampClock,
+    parse_odometry_option,
+)
+from kiteline_hw.mavlink.controller_session import ControllerSession
+from kiteline_hw.mavlink.coordinate_frames import body_rates, local_pose, mounting
+from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, Odometry, WheelDistance
 from kiteline_hw.sim.links.flight_controller import FlightController
 
 S = 1_000_000_000
@@ -36,7 +43,7 @@ def odometry(
     )  # fmt: skip
 
 
-def told(source: FromController, *messages: object, now_ns: int = 5 * S) -> OdometryBatch | None:
+def told(source: ControllerOdometry, *messages: object, now_ns: int = 5 * S) -> OdometryBatch | None:
     for k, message in enumerate(messages):
         source.receive(message, now_ns + k * 20_000_000)  # type: ignore[arg-type]
     return source.take_until(now_ns + 100 * S)
@@ -44,7 +51,7 @@ def told(source: FromController, *messages: object, now_ns: int = 5 * S) -> Odom
 
 @pytest.mark.parametrize(("axes", "velocity"), BODIES.items())
 def test_a_body_velocity_in_every_body(axes: str, velocity: list[float]) -> None:
-    batch = told(FromController(Told.CONTROLLER, mounting(axes)), odometry((1.0, 2.0, 3.0)))
+    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting(axes)), odometry((1.0, 2.0, 3.0)))
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], velocity, atol=1e-12)
 
@@ -52,21 +59,23 @@ def test_a_body_velocity_in_every_body(axes: str, velocity: list[float]) -> None
 def test_a_turn_to_the_right() -> None:
     # FRD: about down. FLU: about up it is a turn to the left, so negative. A camera's y points down.
     for axes, rate in (("frd", [0, 0, 0.3]), ("flu", [0, 0, -0.3]), ("rdf", [0, 0.3, 0])):
-        batch = told(FromController(Told.CONTROLLER, mounting(axes)), odometry((0.0,) * 3, (0.0, 0.0, 0.3)))
+        batch = told(
+            ControllerOdometry(OdometrySource.CONTROLLER, mounting(axes)), odometry((0.0,) * 3, (0.0, 0.0, 0.3))
+        )
         assert batch is not None
         np.testing.assert_allclose(batch.rate[0], rate, atol=1e-12)
 
 
 def test_the_camera_is_not_where_the_controller_is() -> None:
     # The controller 0.4 m behind the camera (FLU body at the camera); a turn to the right swings the camera right.
-    source = FromController(Told.CONTROLLER, mounting("flu", (-0.4, 0.0, 0.0)))
+    source = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu", (-0.4, 0.0, 0.0)))
     batch = told(source, odometry((1.0, 0.0, 0.0), (0.0, 0.0, 0.5)))
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [1.0, -0.2, 0.0], atol=1e-4)
 
 
 def test_flying_east_with_the_nose_to_the_east_is_ahead() -> None:
-    source = FromController(Told.CONTROLLER, mounting("flu"))
+    source = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu"))
     nose_east = Attitude(1000, (0.0, 0.0, pi / 2), (0.0, 0.0, 0.1))
     batch = told(source, nose_east, LocalPosition(1010, (0.0,) * 3, (0.0, 2.0, -0.5)))  # east, and climbing
     assert batch is not None
@@ -77,14 +86,18 @@ def test_flying_east_with_the_nose_to_the_east_is_ahead() -> None:
 def test_flying_north_with_the_nose_to_the_east_is_to_the_left() -> None:
     nose_east = Attitude(1000, (0.0, 0.0, pi / 2), (0.0,) * 3)
     north = LocalPosition(1010, (0.0,) * 3, (1.5, 0.0, 0.0))
-    batch = told(FromController(Told.CONTROLLER, mounting("flu")), nose_east, north)
+    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu")), nose_east, north)
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [0.0, 1.5, 0.0], atol=1e-12)
 
 
 def test_a_rolled_vehicle_falls_along_its_right_side() -> None:
     rolled = Attitude(1000, (pi / 2, 0.0, 0.0), (0.0,) * 3)  # right wing down
-    batch = told(FromController(Told.CONTROLLER, mounting("frd")), rolled, LocalPosition(1000, (0.0,) * 3, (0, 0, 1.0)))
+    batch = told(
+        ControllerOdometry(OdometrySource.CONTROLLER, mounting("frd")),
+        rolled,
+        LocalPosition(1000, (0.0,) * 3, (0, 0, 1.0)),
+    )
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [0.0, 1.0, 0.0], atol=1e-12)
 
@@ -92,13 +105,13 @@ def test_a_rolled_vehicle_falls_along_its_right_side() -> None:
 def test_local_velocities_of_an_odometry_message_are_turned_too() -> None:
     q = se3.quaternion_from_rotation(se3.so3_exp(np.array([0.0, 0.0, pi / 2])))  # nose east
     message = odometry((0.0, 2.0, 0.0), child=1, q=tuple(float(v) for v in q))
-    batch = told(FromController(Told.CONTROLLER, mounting("frd")), message)
+    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting("frd")), message)
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [2.0, 0.0, 0.0], atol=1e-9)
 
 
 def test_what_nobody_can_turn_is_left_out() -> None:
-    source = FromController(Told.CONTROLLER, mounting("frd"))
+    source = ControllerOdometry(OdometrySource.CONTROLLER, mounting("frd"))
     assert told(source, odometry((1.0, 0.0, 0.0), child=21)) is None
     assert told(source, odometry((NAN, 0.0, 0.0))) is None
     assert told(source, odometry((1.0, 0.0, 0.0), child=1, q=(0.0,) * 4)) is None
@@ -109,7 +122,7 @@ def test_what_nobody_can_turn_is_left_out() -> None:
 
 
 def test_stated_covariances_are_believed() -> None:
-    source = FromController(Told.CONTROLLER, mounting("flu"))
+    source = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu"))
     triangle = [0.0] * 21
     for at, variance in zip((0, 6, 11, 15, 18, 20), (0.01, 0.04, 0.09, 1e-4, 1e-4, 4e-4), strict=True):
         triangle[at] = variance
@@ -127,7 +140,9 @@ def rolled(t_ms: int, left: float, right: float) -> WheelDistance:
 
 
 def test_wheels_that_roll_alike_drive_ahead() -> None:
-    batch = told(FromController(Told.WHEELS, mounting("flu")), rolled(1000, 5.0, 7.0), rolled(1020, 5.03, 7.03))
+    batch = told(
+        ControllerOdometry(OdometrySource.WHEELS, mounting("flu")), rolled(1000, 5.0, 7.0), rolled(1020, 5.03, 7.03)
+    )
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [1.5, 0.0, 0.0], atol=1e-9)
     assert batch.rate_cov[0, 2, 2] >= UNMEASURED  # without a track, no turn
@@ -135,7 +150,7 @@ def test_wheels_that_roll_alike_drive_ahead() -> None:
 
 
 def test_a_faster_left_wheel_turns_right() -> None:
-    source = FromController(Told.WHEELS, mounting("flu"), FromControllerConfig(track_m=0.5))
+    source = ControllerOdometry(OdometrySource.WHEELS, mounting("flu"), ControllerOdometryConfig(track_m=0.5))
     batch = told(source, rolled(1000, 0.0, 0.0), rolled(1100, 0.12, 0.08))
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [1.0, 0.0, 0.0], atol=1e-9)
@@ -143,7 +158,7 @@ def test_a_faster_left_wheel_turns_right() -> None:
 
 
 def test_wheels_over_long_gaps_and_backward_stamps_tell_nothing() -> None:
-    source = FromController(Told.WHEELS, mounting("flu"))
+    source = ControllerOdometry(OdometrySource.WHEELS, mounting("flu"))
     assert told(source, rolled(1000, 0.0, 0.0), rolled(3000, 9.0, 9.0)) is None
     assert told(source, rolled(10, 0.0, 0.0)) is None  # another boot
     batch = told(source, rolled(30, 0.02, 0.02))
@@ -155,30 +170,30 @@ def test_wheels_over_long_gaps_and_backward_stamps_tell_nothing() -> None:
 
 
 def test_the_least_delay_sets_the_clock() -> None:
-    clock = StampClock(FromControllerConfig())
+    clock = StampClock(ControllerOdometryConfig())
     delays = [30, 12, 5, 40, 8]
-    ours = [clock.ours(k * S // 50, 7 * S + k * S // 50 + d * 1_000_000) for k, d in enumerate(delays)]
+    ours = [clock.to_ours(k * S // 50, 7 * S + k * S // 50 + d * 1_000_000) for k, d in enumerate(delays)]
     # what came with 5 ms is as near as it gets; later stamps keep to it but for the drift that clocks may have
     assert ours[2] == 7 * S + 2 * S // 50 + 5_000_000
     assert abs(ours[4] - (7 * S + 4 * S // 50 + 5_000_000)) < 100_000
 
 
 def test_a_new_boot_of_the_controller_sets_the_clock_anew() -> None:
-    clock = StampClock(FromControllerConfig())
-    clock.ours(100 * S, 107 * S)
-    assert clock.ours(1 * S, 110 * S) == 110 * S
+    clock = StampClock(ControllerOdometryConfig())
+    clock.to_ours(100 * S, 107 * S)
+    assert clock.to_ours(1 * S, 110 * S) == 110 * S
 
 
 def test_odometry_comes_through_the_stream_that_sends_poses() -> None:
-    wanted = FromController(Told.CONTROLLER, mounting("flu"))
-    stream = OdometryStream(mounting("flu"), wanted=wanted)
-    stream.receive(CODEC.odometry(odometry((1.0, 2.0, 3.0))), 9 * S)
+    wanted = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu"))
+    stream = ControllerSession(mounting("flu"), odometry=wanted)
+    stream.receive(CODEC.encode(odometry((1.0, 2.0, 3.0))), 9 * S)
     assert stream.take_odometry(8 * S) is None  # later than that instant
     batch = stream.take_odometry(9 * S)
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], [1.0, -2.0, -3.0], atol=1e-6)
     assert batch.t_ns.tolist() == [9 * S]
-    assert OdometryStream(mounting("flu")).take_odometry(9 * S) is None
+    assert ControllerSession(mounting("flu")).take_odometry(9 * S) is None
 
 
 MESSAGES = [
@@ -190,8 +205,7 @@ MESSAGES = [
 
 @pytest.mark.parametrize("message", MESSAGES)
 def test_messages_pass_through_the_wire(message: Attitude | LocalPosition | WheelDistance) -> None:
-    send = {Attitude: CODEC.attitude, LocalPosition: CODEC.local_position, WheelDistance: CODEC.wheel_distance}
-    found = MavlinkCodec().receive(send[type(message)](message))  # type: ignore[operator]
+    found = MavlinkCodec().receive(CODEC.encode(message))
     assert len(found) == 1
     assert type(found[0]) is type(message)
     for a, b in zip(_numbers(found[0]), _numbers(message), strict=True):
@@ -205,14 +219,14 @@ def _numbers(message: object) -> list[float]:
 
 def test_the_controller_is_asked_while_it_is_silent() -> None:
     controller = FlightController("px4")
-    stream = OdometryStream(mounting("flu"), wanted=FromController(Told.WHEELS, mounting("flu")))
-    heartbeat = controller.codec.heartbeat(type_=10, autopilot=12)
+    stream = ControllerSession(mounting("flu"), odometry=ControllerOdometry(OdometrySource.WHEELS, mounting("flu")))
+    heartbeat = controller.codec.encode(Heartbeat(10, 12))
     asked = [len(stream.receive(heartbeat, t * S)) for t in range(4)]
     assert asked == [1, 0, 1, 0]  # once in two seconds
-    stream.receive(CODEC.wheel_distance(rolled(4000, 0.0, 0.0)), 4 * S)
-    stream.receive(CODEC.wheel_distance(rolled(4020, 0.0, 0.0)), 4 * S + 20_000_000)
+    stream.receive(CODEC.encode(rolled(4000, 0.0, 0.0)), 4 * S)
+    stream.receive(CODEC.encode(rolled(4020, 0.0, 0.0)), 4 * S + 20_000_000)
     assert stream.receive(heartbeat, 5 * S) == []
-    assert OdometryStream(mounting("flu")).receive(heartbeat, 0) == []
+    assert ControllerSession(mounting("flu")).receive(heartbeat, 0) == []
 
 
 @given(st.lists(st.floats(-2.0, 2.0), min_size=12, max_size=12).map(np.array), st.sampled_from(["flu", "frd", "rdf"]))
@@ -225,15 +239,15 @@ def test_what_we_send_comes_back_as_our_own_motion(numbers: np.ndarray, axes: st
     velocity, rate = body_rates(before, now, dt, T_b_f)
     _, q = local_pose(now, T_b_f)
     message = odometry(tuple(velocity), tuple(rate), q=tuple(q))  # type: ignore[arg-type]
-    batch = told(FromController(Told.CONTROLLER, T_b_f), message)
+    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, T_b_f), message)
     assert batch is not None
     np.testing.assert_allclose(batch.velocity[0], twist[:3], atol=5e-3)
     np.testing.assert_allclose(batch.rate[0], twist[3:], atol=5e-3)
 
 
 def test_what_is_asked_for_in_words() -> None:
-    assert told_of("controller") == (Told.CONTROLLER, 0.0)
-    assert told_of("wheels:0.42") == (Told.WHEELS, 0.42)
+    assert parse_odometry_option("controller") == (OdometrySource.CONTROLLER, 0.0)
+    assert parse_odometry_option("wheels:0.42") == (OdometrySource.WHEELS, 0.42)
     for text in ("gps", "wheels:x", "controller:1", "wheels:-1", ""):
         with pytest.raises(ValueError, match="expected controller, wheels or wheels:TRACK_M"):
-            told_of(text)
+            parse_odometry_option(text)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from kiteline_core.frame import OdometryBatch
-from kiteline_hw.mavlink.frames import mounting
+from kiteline_hw.mavlink.connection import MavlinkUrl, parse_mavlink_url
+from kiteline_hw.mavlink.controller_odometry import ControllerOdometry, OdometrySource
+from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Odometry
-from kiteline_hw.mavlink.odometry import FromController, Told
-from kiteline_hw.mavlink.out import MavlinkPoseSink
-from kiteline_hw.mavlink.wire import MavlinkUrl, parse_mavlink_url
+from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.ports import LinkError, PoseSample
 from kiteline_hw.sim.links.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.sim.links.serial_pair import SerialPair
@@ -64,10 +64,10 @@ def test_udp_out_to_a_controller_with_another_clock() -> None:
 def test_odometry_comes_from_a_controller_with_another_clock() -> None:
     model = FlightController("px4")
     offset_ns = -3_000_000_000
-    wanted = FromController(Told.CONTROLLER, FLU)
+    wanted = ControllerOdometry(OdometrySource.CONTROLLER, FLU)
     with (
         UdpFlightController(model, clock_offset_ns=offset_ns) as controller,
-        MavlinkPoseSink(f"udp:127.0.0.1:{controller.port}", FLU, CLOCK, wanted=wanted) as sink,
+        MavlinkPoseSink(f"udp:127.0.0.1:{controller.port}", FLU, CLOCK, odometry=wanted) as sink,
     ):
         told: list[OdometryBatch] = []
 
@@ -76,7 +76,7 @@ def test_odometry_comes_from_a_controller_with_another_clock() -> None:
             pose = Odometry(t_us, (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (0.0,) * 3, (0.1,) * 21,
                             (0.01,) * 21, 0, 90)  # fmt: skip
             with controller.lock:
-                controller.send(model.codec.odometry(pose))
+                controller.send(model.codec.encode(pose))
             batch = sink.take_odometry(CLOCK.now_ns())
             told.extend([] if batch is None else [batch])
             return len(told) < 5

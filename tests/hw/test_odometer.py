@@ -11,7 +11,7 @@ from kiteline_core import odometry
 from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
 from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.odometry_buffer import OdometerStream, before_frames, stated_variances
+from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames, reported_covariance
 from kiteline_hw.sim.source import SimSource, open_sim
 from kiteline_hw.sources.open import open_source
 
@@ -58,14 +58,14 @@ def test_odometry_comes_right_before_its_frame() -> None:
     stream.add(batch(5, 15))
     image = np.zeros((2, 2), np.uint8)
     items = [ImuBatch(np.array([4]), np.zeros((1, 3)), np.zeros((1, 3))), Frame(10, image), Frame(20, image)]
-    kinds = [type(item).__name__ for item in before_frames(items, stream)]
+    kinds = [type(item).__name__ for item in insert_before_frames(items, stream)]
     assert kinds == ["ImuBatch", "OdometryBatch", "Frame", "OdometryBatch", "Frame"]
 
 
 def test_variances_as_drivers_state_them() -> None:
-    cov = stated_variances(np.array([0.04, 0.0, 99999.0]), 0.1)
+    cov = reported_covariance(np.array([0.04, 0.0, 99999.0]), 0.1)
     np.testing.assert_allclose(cov.diagonal(), [0.04, 0.01, UNMEASURED])
-    np.testing.assert_allclose(stated_variances(np.full(3, np.nan), 0.1), 0.01 * np.eye(3))
+    np.testing.assert_allclose(reported_covariance(np.full(3, np.nan), 0.1), 0.01 * np.eye(3))
 
 
 def test_a_log_keeps_every_bit(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_a_signal_is_a_flag_and_ends_a_wait() -> None:
 
 def test_a_child_ends_with_its_parent_and_hears_it_before() -> None:
     code = (
-        "import time\np = process.Parent(); p.tell('ready', n=1)\n"
-        "while (word := p.said()) is None: time.sleep(0.01)\np.tell('heard', word=word); time.sleep(60)"
+        "import time\np = process.Parent(); p.send_event('ready', n=1)\n"
+        "while (word := p.next_line()) is None: time.sleep(0.01)\np.send_event('heard', word=word); time.sleep(60)"
     )
     with run(code) as child:
         assert child.stdin is not None and child.stdout is not None
@@ -83,7 +83,7 @@ def test_a_child_ends_with_its_parent_and_hears_it_before() -> None:
 
 
 def test_leaving_says_its_last_words() -> None:
-    with run("print('last'); process.leave(7)") as child:
+    with run("print('last'); process.exit_now(7)") as child:
         assert child.communicate()[0] == b"last\n"
         assert child.returncode == 7
 

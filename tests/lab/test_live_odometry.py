@@ -30,7 +30,7 @@ def test_wheels_of_a_flight_controller_reach_the_agent(recording: Path, tmp_path
                 rolled = SPEED_M_S * t_ns * 1e-9
                 with controller.lock:
                     controller.send(
-                        model.codec.wheel_distance(WheelDistance((t_ns + OFFSET_NS) // 1000, (rolled,) * 2))
+                        model.codec.encode(WheelDistance((t_ns + OFFSET_NS) // 1000, (rolled,) * 2))
                     )
 
         wheels = threading.Thread(target=roll)

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 from kiteline_core.frame import Frame, OdometryBatch
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
-from kiteline_hw.logs.mcap_mend import mend
+from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.fly import Options, fly
@@ -131,8 +131,8 @@ def test_a_cut_log_replays_up_to_the_cut_also_when_mended(
     log.write_bytes(whole[: len(whole) // 2])
     assert main([str(log), "--verify"]) == 0
     assert "cut" in capsys.readouterr().out
-    assert mend(log) is not None
-    assert mend(log) is None
+    assert repair(log) is not None
+    assert repair(log) is None
     with LogReader(log) as reader:
         assert reader.cut is None
         assert 5 < replay_agent(reader).steps < 30

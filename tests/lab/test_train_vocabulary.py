@@ -9,7 +9,7 @@ import pytest
 
 from kiteline_core.imaging.matching import words
 from kiteline_hw.ports import SourceError
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.tools import train_vocabulary_kernels as kernels
 from kiteline_lab.tools.train_vocabulary import train
 
@@ -72,7 +72,7 @@ def test_too_few_descriptors_are_refused() -> None:
 
 def test_the_shipped_tree_is_small_and_tells_words_apart() -> None:
     assert len(files("kiteline_core.places").joinpath("words.bin").read_bytes()) <= 400_000
-    tree = shipped_words()
+    tree = shipped_vocabulary()
     assert (tree.branching, tree.levels) == (10, 4)
     rng = np.random.default_rng(3)
     d = rng.integers(0, 256, (2000, 32), np.uint8)

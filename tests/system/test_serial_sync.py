@@ -7,14 +7,10 @@ import time
 
 from kiteline_codec.schema import Key, KeyframePose, NewLandmarks
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
-from kiteline_codec.transport.framing import Deframer, frame
-from kiteline_hw.links.open import Framing, open_link
+from kiteline_codec.transport.framing import StreamFramer
+from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import ByteLink
 from kiteline_hw.sim.links.serial_pair import SerialPair
-
-
-def framing() -> Framing:
-    return Framing(frame, Deframer().feed)
 
 
 def turn(endpoint: Endpoint, link: ByteLink) -> None:
@@ -30,8 +26,8 @@ def test_endpoints_agree_over_a_noisy_serial_line() -> None:
     config = SyncConfig(packet_bytes=200, budget_bytes=0, first_rto_ns=100_000_000)
     agent, base = Endpoint(config, 1), Endpoint(config, 1)
     with SerialPair(bit_errors=0.0005, seed=2) as pair:
-        up = open_link(f"serial:{pair.a}:57600", "agent", 1, framer=framing)
-        hub = open_link(f"serial:{pair.b}:57600", "base", 1, framer=framing)
+        up = open_link(f"serial:{pair.a}:57600", "agent", 1, framer=StreamFramer)
+        hub = open_link(f"serial:{pair.b}:57600", "base", 1, framer=StreamFramer)
         down = hub.links()[1]
         try:
             for i in range(60):

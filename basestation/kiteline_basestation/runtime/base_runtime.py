@@ -33,8 +33,8 @@ from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
 from kiteline_hw.system import process
-from kiteline_hw.system.cpu import rss_mib
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.memory import rss_mib
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
 _DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is not quiet yet is given up
@@ -46,7 +46,7 @@ def load_vocabulary() -> Vocabulary | None:
     if importlib.util.find_spec("gtsam") is None:
         print("gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'", file=sys.stderr)
         return None
-    return shipped_words()
+    return shipped_vocabulary()
 
 
 class BaseRuntime:
@@ -221,4 +221,4 @@ def report_restored(restored: Restored | None, parent: process.Parent | None) ->
         print(f"store: repaired: {fault}", file=sys.stderr)
     if parent is not None:
         faults = list(restored.faults)
-        parent.tell("restored", keyframes=restored.keyframes, faults=faults, awaited=restored.awaited)
+        parent.send_event("restored", keyframes=restored.keyframes, faults=faults, awaited=restored.awaited)

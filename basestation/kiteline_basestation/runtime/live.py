@@ -23,7 +23,7 @@ from kiteline_hw.links.zenoh_queries import QueryServer
 from kiteline_hw.ports import LinkHub
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
-from kiteline_hw.system.cpu import return_large_arrays
+from kiteline_hw.system.memory import return_large_arrays
 from kiteline_hw.system.key_store import read_keys
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         queries = _open_queries(options, link, stack)
         page = _open_page(options, clock.now_ns(), stack)
         if parent is not None:
-            parent.tell("ready")
+            parent.send_event("ready")
         process.notify("READY=1")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None
         begin_ns, stepped_ns = clock.now_ns(), 0
@@ -74,7 +74,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
                     process.print_lines(terminal.lines(hub.alive(), now_ns - begin_ns, base.rss_mib, stored))
             if page is not None:
                 page.update(base.station, now_ns)
-            if parent is not None and parent.said() == "frames_over":
+            if parent is not None and parent.next_line() == "frames_over":
                 base.end_of_frames()
             process.notify("WATCHDOG=1")
             stop.wait(_POLL_S)
@@ -82,8 +82,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
             process.print_lines([f"stopped: {terminal.summary()}"])
         base.end_of_frames()
         if parent is not None and base.at_last_frame is not None:
-            parent.tell("flown", keyframes=base.at_last_frame.keyframes)
-            parent.tell("result", report=base.report(), keyframes=base.summary().keyframes)
+            parent.send_event("flown", keyframes=base.at_last_frame.keyframes)
+            parent.send_event("result", report=base.report(), keyframes=base.summary().keyframes)
 
 
 def _sealed(options: BaseOptions, hub: LinkHub) -> LinkHub:

@@ -13,7 +13,7 @@ from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import process
-from kiteline_hw.system.cpu import return_large_arrays
+from kiteline_hw.system.memory import return_large_arrays
 
 _COLLECT_S = 120.0  # s that an agent may take for one tick before it counts as lost
 
@@ -25,7 +25,7 @@ def fly_lockstep(options: BaseOptions, parent: process.Parent) -> None:
     report_restored(base.restore_maps(0), parent)
     server = LockstepServer(options.link.removeprefix("lockstep:"))
     try:
-        parent.tell("ready")
+        parent.send_event("ready")
         agents, kill_is_due = set(options.agents), options.kill_at_s >= 0
         while base.phase is not Phase.END:
             ups = _collect(server, agents, base, parent)
@@ -35,8 +35,8 @@ def fly_lockstep(options: BaseOptions, parent: process.Parent) -> None:
             frames_were_over = base.at_last_frame is not None
             _answer(server, base.tick(ups))
             if base.at_last_frame is not None and not frames_were_over:
-                parent.tell("flown", keyframes=base.at_last_frame.keyframes)
-        parent.tell("result", report=base.report(), keyframes=base.summary().keyframes)
+                parent.send_event("flown", keyframes=base.at_last_frame.keyframes)
+        parent.send_event("result", report=base.report(), keyframes=base.summary().keyframes)
     finally:
         server.close()
         base.close()
@@ -51,7 +51,7 @@ def _collect(server: LockstepServer, agents: set[int], base: BaseRuntime, parent
             lost = server.lost() & agents or agents
             agents -= lost
             base.agents_lost |= lost
-            parent.tell("agents_lost", agents=sorted(lost), text=str(error))
+            parent.send_event("agents_lost", agents=sorted(lost), text=str(error))
     return {}
 
 

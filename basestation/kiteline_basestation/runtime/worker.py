@@ -16,7 +16,7 @@ import cv2
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.runtime.warm import warm, warm_graphs
-from kiteline_hw.system.cpu import return_large_arrays
+from kiteline_hw.system.memory import return_large_arrays
 
 SAMPLES = 1 << 15  # newest CPU times that are kept: half an hour of steps, a megabyte
 _END_S = 0.5  # s that a worker may take to end before it is killed

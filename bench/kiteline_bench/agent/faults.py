@@ -20,7 +20,7 @@ from kiteline_bench.harness.clip import Clip, load
 from kiteline_core.geometry import tum
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.flights.fly import Options, fly
 
 _JUMP_M = 0.35  # of the odometry in a frame's time: 7 m/s at 20 Hz
@@ -52,7 +52,7 @@ def fault_bars(bench: Bench, depth: Path) -> list[Bar]:
 
 def _fault(clip: Clip, fault: str, name: str) -> Bar:
     try:
-        found = estimates(faults.faulty(clip, fault), shipped_words())
+        found = estimates(faults.faulty(clip, fault), shipped_vocabulary())
     except Exception as error:  # the bar is that there is none
         return is_true(name, "no exception", False, repr(error)[:100])
     jump = max(_moved_m(a, b) / max((b.t_ns - a.t_ns) / clip.period_ns, 1.0) for a, b in pairwise(found))

@@ -11,7 +11,7 @@ import numpy as np
 from kiteline_agent.config import AgentConfig
 from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.honest_flights import FAULTS, HonestFlight, Judged, flight, fly, no_texture
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 TITLE = "Honest poses"
 
@@ -60,7 +60,7 @@ def honest_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar]:
     by_fault: dict[tuple[str, bool], _Kept] = defaultdict(_Kept)
     tilts: list[float] = []
     again: list[int] = []
-    words = shipped_words()
+    words = shipped_vocabulary()
     for number in range(flights):
         bench.say(f"flight {number + 1} of {flights}")
         one = flight(number, Path(bench.source("trajectories")), bench.folder, scale)

@@ -20,7 +20,7 @@ from kiteline_core.frame import OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from kiteline_hw.sim.source import open_sim
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.evaluation import metrics
 
 _RATE_HZ = 50.0
@@ -61,7 +61,7 @@ def bars(bench: Bench, flights: Mapping[str, Simulated]) -> list[Bar]:
 
 def fly(clip: Clip, driven: OdometryBatch | None) -> tuple[Agent, list[Estimate]]:
     """An agent without a base; the odometry reaches it with the frames that follow."""
-    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), shipped_words())
+    agent = Agent(clip.rig, clip.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), shipped_vocabulary())
     out, done = [], 0
     for frame, imu in clip.items:
         part = None

@@ -29,7 +29,7 @@ from kiteline_core.imaging import stereo_kernels
 from kiteline_core.pose import pose_kernels
 from kiteline_hw.logs.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogReader, read_frame
 from kiteline_hw.logs.rig_json import rig_from_json
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.flights.fly import Options, fly
 from kiteline_lab.replay.replay import steps
 
@@ -103,7 +103,7 @@ def profile(log_path: Path) -> dict[str, list[dict[str, int]]]:
         rig, imu = rig_from_json(next(iter(log.messages((RIG,)))).json())
         codec_warm.warm()
         warm(rig)
-        agent = Agent(rig, imu, AgentConfig(), Identity(AgentId(0), 0), coded_channel(1), shipped_words())
+        agent = Agent(rig, imu, AgentConfig(), Identity(AgentId(0), 0), coded_channel(1), shipped_vocabulary())
         with clocks.running():
             for step in steps(log):
                 frame = batch = None

@@ -23,7 +23,7 @@ from kiteline_core.imaging import matching
 from kiteline_core.places.place_index import PlaceIndex
 from kiteline_core.pose.pnp import solve_pnp
 from kiteline_hw.sim.source import open_sim
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 TITLE = "Places"
 
@@ -60,7 +60,7 @@ def run(bench: Bench) -> list[Bar]:
         flights.append(_places(number, scene, bench.source(f"trajectories/{path}")))
     revisits = found = wrong = impostors = 0
     for flight in flights:
-        index, known = PlaceIndex(shipped_words()), {}
+        index, known = PlaceIndex(shipped_vocabulary()), {}
         for key, place in enumerate(p for other in flights if other is not flight for p in other):
             index.add(key, place.descriptor)
             known[key] = place
@@ -132,7 +132,7 @@ def _judge(place: _Place, old: _Place) -> str:
 def _query_ms(flights: list[list[_Place]]) -> float:
     """Median CPU of a query among 1000 places."""
     places = [p for flight in flights for p in flight]
-    index, times = PlaceIndex(shipped_words()), []
+    index, times = PlaceIndex(shipped_vocabulary()), []
     for key in range(_PLACES):
         index.add(key, places[key % len(places)].descriptor)
     for place in places[:100]:

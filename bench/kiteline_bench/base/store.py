@@ -16,7 +16,7 @@ from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
 from kiteline_bench.harness import ratios as bench_ratios
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.endpoint import SyncConfig
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.evaluation import trajectories
 from kiteline_lab.flights import simulate
 from kiteline_lab.flights.flight import Outcome
@@ -84,7 +84,7 @@ def _whole(bench: Bench, killed: dict[str, Any], outcome: Outcome) -> list[Bar]:
     faults = [fault for restored in outcome.restored for fault in restored["faults"]]
     agent, base = killed["agents"][0], killed["base"]
     last = restore(
-        Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1), shipped_words()),
+        Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1), shipped_vocabulary()),
         read(bench.folder / "store_of_killed1"), 0,
     )  # fmt: skip
     return [

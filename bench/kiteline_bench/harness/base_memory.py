@@ -35,7 +35,7 @@ from kiteline_codec.channel import CodedChannel
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LogReader
-from kiteline_hw.system.cpu import return_large_arrays, rss_mib
+from kiteline_hw.system.memory import return_large_arrays, rss_mib
 from kiteline_lab.replay.replay import channel_of_log, spec_of_log, steps
 
 _EVERY = 50  # keyframes between two looks

@@ -11,7 +11,7 @@ from kiteline_codec.schema import Key, KeyframeHeader, LivePose, NewLandmarks, O
 from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
-from kiteline_hw.system.cpu import rss_mib
+from kiteline_hw.system.memory import rss_mib
 
 _MINUTE_NS = 60_000_000_000
 _TICK_NS = 50_000_000

@@ -23,7 +23,7 @@ from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.evaluation import metrics
 
 F64 = NDArray[np.float64]
@@ -90,7 +90,7 @@ def fly(
     each_tick: Callable[[int, Station], None] | None = None,
 ) -> Flight:
     """Fly until the last sortie is over. bytes_s: budget up and down. each_tick: called with the time and the base."""
-    words = shipped_words()
+    words = shipped_vocabulary()
     station = Station(base or BaseConfig(), lambda _: coded_channel(1, bytes_s[1], profile), words)
     jobs = LockstepJobs()
     crews = [_Crew(sortie, agent or AgentConfig(), bytes_s[0], profile) for sortie in sorties]
@@ -126,7 +126,7 @@ class _Crew:
         source = open_source(sortie.source, mono=sortie.mono, imu=_has_imu(sortie))
         self._channel: CodedChannel = coded_channel(sortie.boot + 1, bytes_s, profile)
         identity = Identity(self.agent, sortie.boot)
-        self._box = Agent(source.rig, source.imu, config, identity, self._channel, shipped_words())
+        self._box = Agent(source.rig, source.imu, config, identity, self._channel, shipped_vocabulary())
         source.close()
 
     def tick(self, packets: Sequence[bytes], now_ns: int) -> tuple[bytes, ...]:

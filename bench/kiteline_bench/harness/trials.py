@@ -33,7 +33,8 @@ from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.system.cpu import CpuQuota, release_memory, rss_mib
+from kiteline_hw.system.cpu import CpuQuota
+from kiteline_hw.system.memory import release_memory, rss_mib
 
 _PATIENCE_S = 900.0
 

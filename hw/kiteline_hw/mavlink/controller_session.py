@@ -17,7 +17,13 @@ from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
-from kiteline_hw.mavlink.coordinate_frames import body_rates, controller_covariance, local_covariance, local_pose, upper_triangle
+from kiteline_hw.mavlink.coordinate_frames import (
+    body_rates,
+    controller_covariance,
+    local_covariance,
+    local_pose,
+    upper_triangle,
+)
 from kiteline_hw.mavlink.messages import Heartbeat, MavlinkMessage, Odometry, TimeSync, VehicleImu
 from kiteline_hw.ports import PoseSample
 

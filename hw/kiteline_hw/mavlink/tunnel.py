@@ -31,7 +31,9 @@ class TunnelConfig:
     peer_system: int = 255
     peer_component: int = COMPONENT_VIO
     payload_type: int = 0xB17E  # any above 32767 is for private use
-    chunk_bytes: int = 64  # of payload; at most 128, or 80 with the radio's error correction: short ones delay other messages less
+    chunk_bytes: int = (
+        64  # of payload; at most 128, or 80 with the radio's error correction: short ones delay other messages less
+    )
     rate_bytes_s: int = 1000  # on the wire, MAVLink's framing included, while the radio's buffer has room
     low_percent: int = 35  # free buffer below which the rate falls slowly (PX4: RADIO_BUFFER_LOW_PERCENTAGE)
     critical_percent: int = 25  # below which it falls fast

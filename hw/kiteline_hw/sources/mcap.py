@@ -183,12 +183,18 @@ class McapSource:
         """Choose the odometry topic of a bag: not ground truth, no other SLAM if possible, with known extrinsics."""
         truth = self._truth_channel(named_only=True)
         topics = [
-            c for c, kind in self._channels() if kind is ChannelKind.ODOMETRY and c != truth and self._file.counts.get(c)
+            c
+            for c, kind in self._channels()
+            if kind is ChannelKind.ODOMETRY and c != truth and self._file.counts.get(c)
         ]
 
         def rank(channel: int) -> tuple[bool, bool, int]:
             name = self._file.channels[channel].topic.lower()
-            return not any(word in name for word in _NO_ODOMETER_WORDS), "wheel" in name, self._file.counts.get(channel, 0)
+            return (
+                not any(word in name for word in _NO_ODOMETER_WORDS),
+                "wheel" in name,
+                self._file.counts.get(channel, 0),
+            )
 
         for channel in sorted(topics, key=rank, reverse=True):
             topic, raw = self._file.channels[channel].topic, self._file.first(channel)

@@ -125,7 +125,9 @@ def select_rig(
     return Selection(rig, left.images, right.images if right else None, depth, imu_usable, t_b_l, tuple(notes))
 
 
-def _cameras(name: str, images: list[ImageTopic], calibrations: list[tuple[str, CameraCalibration]]) -> list[_CameraTopic]:
+def _cameras(
+    name: str, images: list[ImageTopic], calibrations: list[tuple[str, CameraCalibration]]
+) -> list[_CameraTopic]:
     topics = [i for i in images if not i.depth and i.count]
     if not topics:
         raise SourceError(
@@ -169,7 +171,7 @@ def _match_calibration(
     return None
 
 
-def _camera(images: ImageTopic, c: CameraCalibration, name: str) -> _Camera:
+def _camera(images: ImageTopic, c: CameraCalibration, name: str) -> _CameraTopic:
     where = f"{name}: calibration of {images.topic}"
     if "rect" in images.topic.lower() and c.p[0, 0] > 0:
         model = CameraModel(c.width, c.height, c.p[0, 0], c.p[1, 1], c.p[0, 2], c.p[1, 2])

@@ -34,7 +34,9 @@ class CpuQuota(Closing):
     def __init__(self, percent: float, *, root: Path = _CGROUP) -> None:
         min_percent = 100.0 * _MIN_QUOTA_US / _MAX_PERIOD_US
         if not min_percent <= percent <= 100.0 * (os.cpu_count() or 1):
-            raise ValueError(f"CPU limit of {percent:g} percent: expected {min_percent:g} to 100 per core of this machine")
+            raise ValueError(
+                f"CPU limit of {percent:g} percent: expected {min_percent:g} to 100 per core of this machine"
+            )
         period_us = max(_PERIOD_US, math.ceil(100.0 * _MIN_QUOTA_US / percent))
         quota_us = max(round(percent / 100.0 * period_us), _MIN_QUOTA_US)
         reason = self.unavailable(root)

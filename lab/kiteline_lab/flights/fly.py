@@ -13,7 +13,7 @@ from pathlib import Path
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
-from kiteline_hw.logs.mcap_mend import mend
+from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
@@ -217,7 +217,7 @@ def mend_logs(out: Path) -> None:
     """Finish the logs of processes that were ended in mid-flight, so that every tool opens them."""
     for log in [*out.glob("agent[0-9]*/*.mcap"), *out.glob("base/*.mcap")]:
         with contextlib.suppress(SourceError):  # not one byte was written
-            mend(log)
+            repair(log)
 
 
 def main(argv: list[str]) -> int:

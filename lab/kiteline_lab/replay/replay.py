@@ -37,11 +37,11 @@ from kiteline_core import config as configuration
 from kiteline_core.frame import EncodedImage, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader, read_frame
-from kiteline_hw.logs.mcap_mend import MENDED
+from kiteline_hw.logs.mcap_repair import REPAIRED
 from kiteline_hw.logs.rig_json import rig_from_json
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import SourceError
-from kiteline_hw.system.vocabulary import shipped_words
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.flights.progress import Progress
 
 
@@ -90,7 +90,7 @@ def steps(log: LogReader) -> Iterator[Step]:
             number += 1
         elif step is not None:
             step.messages.setdefault(message.topic, []).append(message)
-    if step is not None and log.cut is None and MENDED not in log.metadata:
+    if step is not None and log.cut is None and REPAIRED not in log.metadata:
         yield step
 
 
@@ -109,7 +109,7 @@ def replay_agent(log: LogReader, progress: Progress | None = None, stop_at_first
     if kind == "CodedChannel":
         spill = SpillFile(Path(tempfile.gettempdir())) if spec["log_name"] else None
         channel = channel_of_log(spec, spec["boot"] + 1, spec["up_bytes_s"], spill, bounded=True)
-    agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_words())
+    agent = Agent(rig, imu, config, Identity(AgentId(spec["agent"]), spec["boot"]), channel, shipped_vocabulary())
     out = Replayed()
     for step in steps(log):
         frame = batch = None
@@ -252,7 +252,7 @@ def main(argv: list[str]) -> int:
     with LogReader(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
         is_agent = log.metadata.get("role") == "agent"
         done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
-        cut = log.cut or log.metadata.get(MENDED)
+        cut = log.cut or log.metadata.get(REPAIRED)
     if a.out is not None and is_agent:
         a.out.mkdir(parents=True, exist_ok=True)
         (a.out / "live.tum").write_text("".join(done.live))

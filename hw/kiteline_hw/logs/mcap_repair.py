@@ -1,4 +1,4 @@
-"""Gives a log whose writer was ended in mid-flight the index and the end that a finished file has."""
+"""Completes a log whose writer was killed: adds the index and the end that a finished file has."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from mcap.writer import CompressionType, Writer
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log import CHUNK_BYTES
 
-MENDED = "mended"  # metadata key of a log that was finished here; its value says what was wrong
+REPAIRED = "mended"  # metadata key of a repaired log; its value says what was wrong
 
 
-def mend(path: Path) -> str | None:
-    """Rewrite a cut file in place with all messages before the cut; what was wrong, or None when it was whole.
+def repair(path: Path) -> str | None:
+    """Rewrite a cut file in place with all messages before the cut; returns what was wrong, or None for a whole file.
 
-    Raises SourceError when it is no MCAP file at all.
+    Raises SourceError if it is no MCAP file.
     """
     log = McapFile(path)
     if log.cut is None:
         return None
-    young = path.with_name(path.name + ".new")
-    with young.open("wb") as stream:
+    new = path.with_name(path.name + ".new")
+    with new.open("wb") as stream:
         writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         writer.start("", "kiteline")
         for record in log.metadata:
-            writer.add_metadata(record.name, {**record.metadata, MENDED: log.cut})
+            writer.add_metadata(record.name, {**record.metadata, REPAIRED: log.cut})
         schemas = {0: 0}
         for number, schema in sorted(log.schemas.items()):
             schemas[number] = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -40,5 +40,5 @@ def mend(path: Path) -> str | None:
                 channels[message.channel], message.log_ns, message.data, message.publish_ns, message.sequence
             )
         writer.finish()
-    young.replace(path)
+    new.replace(path)
     return log.cut
