@@ -29,9 +29,7 @@ def test_wheels_of_a_flight_controller_reach_the_agent(recording: Path, tmp_path
                 t_ns = time.monotonic_ns()
                 rolled = SPEED_M_S * t_ns * 1e-9
                 with controller.lock:
-                    controller.send(
-                        model.codec.encode(WheelDistance((t_ns + OFFSET_NS) // 1000, (rolled,) * 2))
-                    )
+                    controller.send(model.codec.encode(WheelDistance((t_ns + OFFSET_NS) // 1000, (rolled,) * 2)))
 
         wheels = threading.Thread(target=roll)
         wheels.start()

@@ -23,8 +23,8 @@ from kiteline_hw.links.zenoh_queries import QueryServer
 from kiteline_hw.ports import LinkHub
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
-from kiteline_hw.system.memory import return_large_arrays
 from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.memory import return_large_arrays
 
 if TYPE_CHECKING:
     from kiteline_basestation.web.status_page import StatusPage
