@@ -58,7 +58,7 @@ def _compile_here(room: str) -> None:
     signatures: dict[str, int] = defaultdict(int)
     running: list[list[Any]] = []  # name, CPU seconds at the start, CPU seconds of callees
 
-    class Listener(event.Listener):  # type: ignore[misc]
+    class Listener(event.Listener):
         def on_start(self, data: Any) -> None:
             function = data.data["dispatcher"].py_func
             running.append([f"{function.__module__}.{function.__name__}", time.process_time(), 0.0])
