@@ -43,6 +43,7 @@ from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
+from kiteline_hw.links.kinds import link_forms
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
 from kiteline_hw.lockstep.agent_end import AgentBarrier
@@ -51,6 +52,7 @@ from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import ByteLink, ControllerLink, FrameSource, LinkError, PoseSample, SourceError
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.sources.overrides import with_other_imu
 from kiteline_hw.system import kernel_cache, process
@@ -371,6 +373,7 @@ def _pose_sink(
             raise LinkError("--odometry takes velocities from a flight controller: expected --mavlink URL beside it")
         return None
     from kiteline_hw.mavlink.connect import connect
+from kiteline_hw.mavlink.connection import MAVLINK_FORMS
 
     own = agent_config(spec.config).controller_imu
     return stack.enter_context(
@@ -402,7 +405,7 @@ def _with_imu(spec: AgentOptions, source: FrameSource) -> FrameSource:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """`kiteline agent`, and a child of `kiteline fly` (with --spec); the exit status."""
-    p = parser()
+    p = parser(f"SOURCE is {source_forms()}. LINK is {link_forms()}. URL is {MAVLINK_FORMS}.")
     a = p.parse_args(argv)
     if a.spec:
         spec = configuration.from_json(AgentOptions, a.spec)

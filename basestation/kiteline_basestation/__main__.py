@@ -13,6 +13,7 @@ from kiteline_basestation.runtime.options import BaseOptions, options_of, parser
 from kiteline_basestation.store.store import StoreError
 from kiteline_codec.schema import WireError
 from kiteline_core import config as configuration
+from kiteline_hw.links.kinds import link_forms
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.system import process
 
@@ -21,7 +22,7 @@ _SESSION_EPOCH_S = 1_735_689_600  # s of Unix time at which 2025 began: sessions
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run until stopped; the exit status."""
-    p = parser()
+    p = parser(link_forms())
     a = p.parse_args(argv)
     if a.spec:
         options = configuration.from_json(BaseOptions, a.spec)

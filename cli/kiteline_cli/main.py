@@ -17,6 +17,8 @@ from types import ModuleType
 
 from kiteline_cli import commands
 from kiteline_core.errors import KitelineError
+from kiteline_hw.links.kinds import link_table
+from kiteline_hw.sources.kinds import source_table
 
 EXIT_ERROR = 2  # as argparse uses for a wrong command line
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -35,8 +37,10 @@ examples:
   kiteline agent mcap:bag.mcap --link zenoh:tcp/10.0.0.1:7447
                                                a base on one machine, an agent on another
 
-SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path, recognised by its layout.
-LINK   is zenoh:ENDPOINT serial:DEV:BAUD mavlink:URL none.
+SOURCE, or a plain path, which is recognised by its layout:
+{sources}
+LINK:
+{links}
 `kiteline COMMAND --help` says more about each command."""
 
 
@@ -75,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
         usage="kiteline COMMAND [arguments]",
         description="Visual SLAM for small drones: a light tracker on board, the map on a base station, "
         f"a thin link between.\n\n{table}",
-        epilog=_EXAMPLES,
+        epilog=_EXAMPLES.format(sources=source_table(), links=link_table()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--version", action="store_true", help="print the version and exit")

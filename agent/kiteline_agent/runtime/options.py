@@ -80,13 +80,12 @@ def channel_for(spec: AgentOptions, spill: Spill | None = None) -> RecordChannel
     return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The arguments of `kiteline agent`."""
+def parser(forms: str = "") -> argparse.ArgumentParser:
+    """The arguments of `kiteline agent`. forms: of SOURCE, LINK and URL, for the help text."""
     p = argparse.ArgumentParser(
         prog="kiteline agent",
         description="The onboard half: tracks a camera, sends poses to a flight controller and thin diffs to a base.",
-        epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path. "
-        "LINK is zenoh:tcp/HOST:PORT serial:DEVICE:BAUD none. URL is udp:HOST:PORT udpin:HOST:PORT serial:DEVICE:BAUD.",
+        epilog=forms,
     )
     p.add_argument("source", metavar="SOURCE", nargs="?")
     p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")

@@ -48,12 +48,12 @@ def base_config(path: str) -> BaseConfig:
     return configuration.load(BaseConfig(), Path(path).read_text(encoding="utf-8"), "base", path)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The arguments of `kiteline base`."""
+def parser(link_forms: str = "") -> argparse.ArgumentParser:
+    """The arguments of `kiteline base`. link_forms: of LINK, for the help text."""
     p = argparse.ArgumentParser(
         prog="kiteline base",
         description="The base station: makes one better map of what any number of agents send, and sends it back.",
-        epilog="LINK is zenoh:tcp/HOST:PORT (0.0.0.0 listens on all addresses) or serial:DEVICE:BAUD.",
+        epilog=f"LINK is {link_forms}. The address 0.0.0.0 listens on all interfaces.",
     )
     p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
     p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")

@@ -33,6 +33,11 @@ class LinkKind:
     module: str
     traits: LinkTraits = LinkTraits()
 
+    @property
+    def form(self) -> str:
+        """SCHEME:ADDRESS, as users write it."""
+        return f"{self.scheme}:{self.address}" if self.address else self.scheme
+
 
 LINKS: tuple[LinkKind, ...] = (
     LinkKind("zenoh", "tcp/HOST:PORT", "IP network, any number of agents (a base listens on 0.0.0.0:PORT)",
@@ -47,8 +52,18 @@ LINKS: tuple[LinkKind, ...] = (
 
 def link_forms() -> str:
     """All forms of LINK in one line, for help texts and errors."""
-    *forms, last = [f"{kind.scheme}:{kind.address}" if kind.address else kind.scheme for kind in LINKS]
+    *forms, last = [kind.form for kind in LINKS]
     return f"{', '.join(forms)} or {last}"
+
+
+def link_table() -> str:
+    """The forms of LINK with their meanings, one a line."""
+    return "\n".join(f"  {kind.form:20}  {kind.about}" for kind in LINKS)
+
+
+def is_link(spec: str) -> bool:
+    """True if `spec` has the scheme of a link with an address."""
+    return any(kind.scheme == spec.partition(":")[0] for kind in LINKS if kind.address)
 
 
 def link_traits(spec: str) -> LinkTraits:

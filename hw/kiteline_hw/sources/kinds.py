@@ -42,8 +42,12 @@ SOURCES: tuple[SourceKind, ...] = (
 
 def source_forms() -> str:
     """All forms of SOURCE in one line, for help texts."""
-    forms = " ".join(f"{kind.scheme}:{kind.argument}" for kind in SOURCES)
-    return f"{forms}, or a plain path, recognised by its layout"
+    return " ".join(f"{kind.scheme}:{kind.argument}" for kind in SOURCES) + ", or a plain path"
+
+
+def source_table() -> str:
+    """The forms of SOURCE with their meanings, one a line."""
+    return "\n".join(f"  {f'{kind.scheme}:{kind.argument}':20}  {kind.about}" for kind in SOURCES)
 
 
 def is_source(spec: str) -> bool:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
+from kiteline_hw.sources.kinds import is_source
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 KITTI_PERIOD_NS = 100_000_000  # 10 Hz: for KITTI poses without a times.txt
 QUATERNION_TOLERANCE = 0.02  # a length further from 1 than this is a wrong column
-_PREFIXES = ("euroc:", "kitti:", "tum:", "mcap:", "sim:")
 
 
 class TrajectoryError(KitelineError):
@@ -38,7 +38,7 @@ def read(spec: str) -> TrajectoryFile:
     Raises TrajectoryError; SourceError if the source cannot be read.
     """
     path = Path(spec)
-    if spec.startswith(_PREFIXES) or path.is_dir() or path.suffix == ".mcap":
+    if is_source(spec) or path.is_dir() or path.suffix == ".mcap":
         return TrajectoryFile(_truth_of_source(spec))
     if not path.is_file():
         raise TrajectoryError(f"{spec}: no such file")

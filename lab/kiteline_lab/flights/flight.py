@@ -18,6 +18,7 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.base_runtime import BaseRuntime
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
+from kiteline_hw.links.kinds import is_link, link_forms
 from kiteline_hw.lockstep.messages import Down, Phase
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import FrameSource, LinkError
@@ -140,13 +141,13 @@ def link_ends(link: str, realtime: bool) -> tuple[str, str]:
     the agent's first, with a comma between. Raises LinkError.
     """
     kind, _, address = link.partition(":")
-    if kind in ("zenoh", "serial", "mavlink") and realtime and address.count(",") == 1:
+    if is_link(link) and realtime and address.count(",") == 1:
         ends = address.split(",")
         return f"{kind}:{ends[0]}", f"{kind}:{ends[1]}"
     if link and kind != "zenoh":
         raise LinkError(
-            f"--link {link}: fly joins its processes by zenoh:tcp/HOST:PORT, or with --realtime by "
-            "zenoh:A,B, serial:A:BAUD,B:BAUD or mavlink:URL,URL, the agent's end first"
+            f"--link {link}: fly joins its processes by zenoh:tcp/HOST:PORT, or with --realtime by {link_forms()}, "
+            "with the addresses of both ends, the agent's end first and a comma between"
         )
     endpoint = address or free_endpoint()
     return (f"zenoh:{endpoint}",) * 2 if realtime else (f"lockstep:{endpoint}",) * 2

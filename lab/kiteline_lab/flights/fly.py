@@ -15,6 +15,7 @@ from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
 from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import FrameSource, LinkError, SourceError
+from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
 from kiteline_lab.flights.flight import Flight, Outcome, fly_here, fly_processes
@@ -74,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
         prog="kiteline fly",
         description="Fly recordings or a simulation: one agent a SOURCE, and a base, as processes of this machine over "
         "a real link, in lock-step unless --realtime. Leaves trajectories, map, grid, logs, a plot and report.json.",
-        epilog="SOURCE is euroc:DIR kitti:DIR tum:DIR mcap:FILE sim:SCENE images:GLOB, or a plain path.",
+        epilog=f"SOURCE is {source_forms()}.",
     )
     p.add_argument("sources", metavar="SOURCE", nargs="+")
     p.add_argument("--out", metavar="DIR", required=True, type=Path, help="where everything is left")

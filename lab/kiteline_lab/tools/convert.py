@@ -8,6 +8,7 @@ from pathlib import Path
 from kiteline_core.frame import Frame, ImuBatch, Trajectory
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.out_file import whole_file
 from kiteline_lab.flights.progress import Progress
@@ -16,9 +17,7 @@ from kiteline_lab.flights.progress import Progress
 def main(argv: list[str]) -> int:
     """Run `kiteline convert`; the exit status. Raises SourceError."""
     p = argparse.ArgumentParser(prog="kiteline convert", description="Turn a data set or a ROS 2 bag into a log.")
-    p.add_argument(
-        "source", metavar="SOURCE", help="euroc:DIR kitti:DIR tum:DIR mcap:FILE images:GLOB sim:SCENE or a path"
-    )
+    p.add_argument("source", metavar="SOURCE", help=source_forms())
     p.add_argument("out", metavar="OUT.mcap", type=Path)
     p.add_argument("--mono", action="store_true", help="left images only")
     p.add_argument("--no-imu", dest="imu", action="store_false", help="without inertial samples")
