@@ -43,7 +43,7 @@ from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
-from kiteline_hw.links.kinds import link_forms
+from kiteline_hw.links.kinds import MAVLINK_FORMS, link_forms
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
 from kiteline_hw.lockstep.agent_end import AgentBarrier
@@ -373,7 +373,6 @@ def _pose_sink(
             raise LinkError("--odometry takes velocities from a flight controller: expected --mavlink URL beside it")
         return None
     from kiteline_hw.mavlink.connect import connect
-from kiteline_hw.mavlink.connection import MAVLINK_FORMS
 
     own = agent_config(spec.config).controller_imu
     return stack.enter_context(

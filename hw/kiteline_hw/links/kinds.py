@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# Addresses of a flight controller: of `mavlink:` links and of `--mavlink`.
+MAVLINK_FORMS = "udp:HOST:PORT (send to), udpin:HOST:PORT (listen), serial:DEVICE:BAUD"
+
 
 @dataclass(frozen=True, slots=True)
 class LinkTraits:
@@ -58,7 +61,7 @@ def link_forms() -> str:
 
 def link_table() -> str:
     """The forms of LINK with their meanings, one a line."""
-    return "\n".join(f"  {kind.form:20}  {kind.about}" for kind in LINKS)
+    return "\n".join(f"  {kind.form:21}  {kind.about}" for kind in LINKS)
 
 
 def is_link(spec: str) -> bool:

@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from kiteline_hw.links.kinds import MAVLINK_FORMS
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.serial_port import SerialPort, parse_serial
 
-MAVLINK_FORMS = "udp:HOST:PORT (send to), udpin:HOST:PORT (listen), serial:DEVICE:BAUD"
 _MAX_DATAGRAMS = 64  # read per tick; a flood must not keep messages from being sent
 _DATAGRAM_BYTES = 2048  # larger than any MAVLink message
 

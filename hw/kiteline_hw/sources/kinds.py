@@ -47,7 +47,7 @@ def source_forms() -> str:
 
 def source_table() -> str:
     """The forms of SOURCE with their meanings, one a line."""
-    return "\n".join(f"  {f'{kind.scheme}:{kind.argument}':20}  {kind.about}" for kind in SOURCES)
+    return "\n".join(f"  {f'{kind.scheme}:{kind.argument}':21}  {kind.about}" for kind in SOURCES)
 
 
 def is_source(spec: str) -> bool:
