@@ -1,4 +1,4 @@
-"""Records between one agent and the base: with the codec between them, or handed over as they are."""
+"""The channel that agent and base use to share records: through the codec and a link, or directly in one process."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Protocol
 
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, PROFILES, RADIO, Profile
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Record, WireError, messages
 from kiteline_codec.sync.archive import Spill
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig, SyncStats
+from kiteline_codec.sync.config import SyncConfig, SyncStats
+from kiteline_codec.sync.endpoint import Endpoint
 
 
 class RecordChannel(Protocol):
@@ -22,11 +23,11 @@ class RecordChannel(Protocol):
         ...
 
     def keyframe_gap_ns(self) -> int:
-        """How long after the last keyframe the link can take another, unless it is pressing."""
+        """How long to wait after a keyframe before one that is not urgent."""
         ...
 
     def arrived(self, key: Key) -> bool:
-        """Whether the other side is known to hold what was put last under a key."""
+        """True if the other side is known to hold the newest record of a key."""
         ...
 
     def put(self, record: Record) -> Record:
@@ -34,15 +35,15 @@ class RecordChannel(Protocol):
         ...
 
     def remove(self, key: Key) -> None:
-        """Take back a record that was put; unknown keys are ignored."""
+        """Remove a record that was put; unknown keys are ignored."""
         ...
 
     def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
-        """Take in packets. Returns the records that are new or changed, in the order in which they became so."""
+        """Take in packets. Returns the records that are new or changed, in the order of arrival."""
         ...
 
     def take_removed(self) -> list[Key]:
-        """The keys that the other side took back since the last call."""
+        """The keys that the other side removed since the last call."""
         ...
 
     def poll(self, now_ns: int) -> list[bytes]:
@@ -51,7 +52,7 @@ class RecordChannel(Protocol):
 
 
 class PlainChannel:
-    """One of two joined ends in one process: records pass as they are, at the next `receive`. Made by `plain_pair`."""
+    """One of two joined ends in one process; records pass uncoded, at the next `receive`. Made by `plain_pair`."""
 
     profile = EXACT
 
@@ -61,20 +62,20 @@ class PlainChannel:
         self._partner: PlainChannel = self
 
     def keyframe_gap_ns(self) -> int:
-        """None: there is no link."""
+        """0: there is no link."""
         return 0
 
     def arrived(self, key: Key) -> bool:
-        """As soon as it was put."""
+        """Always true."""
         return True
 
     def put(self, record: Record) -> Record:
-        """Hand a record over."""
+        """Hand over a record."""
         self._partner._arrived.append(record)
         return record
 
     def remove(self, key: Key) -> None:
-        """Take back a record."""
+        """Remove a record."""
         self._partner._arrived = [r for r in self._partner._arrived if messages.key(r) != key]
         self._partner._removed.append(key)
 
@@ -89,7 +90,7 @@ class PlainChannel:
         return removed
 
     def poll(self, now_ns: int) -> list[bytes]:
-        """Nothing: no packets are needed."""
+        """Nothing."""
         return []
 
     @staticmethod
@@ -98,7 +99,7 @@ class PlainChannel:
 
 
 def plain_pair() -> tuple[PlainChannel, PlainChannel]:
-    """Two ends that are joined: what one puts, the other receives."""
+    """Two joined ends: what one puts, the other receives."""
     a, b = PlainChannel(), PlainChannel()
     PlainChannel._join(a, b)
     return a, b
@@ -110,10 +111,10 @@ class CodedChannel:
     def __init__(
         self, config: SyncConfig, session: int, profile: Profile | None = None, spill: Spill | None = None
     ) -> None:
-        """profile: what to share of a keyframe; None: as the link allows. spill: where old values go."""
-        self.endpoint = Endpoint(config, session, tightener=Tightener(), spill=spill)
-        self.undecodable = 0  # values whose code was no valid record: the other side speaks another schema
-        self.noting = False  # whether `take_noted` will be asked
+        """profile: what to share of a keyframe; None: chosen by the link's throughput. spill: keeps old values."""
+        self.endpoint = Endpoint(config, session, ResidualCoder(), spill)
+        self.undecodable = 0  # values whose code is no valid record: the other side has another schema
+        self.noting = False  # whether `take_noted` is used
         self._noted: dict[Key, bytes] = {}
         self._removed: list[Key] = []
         self._pacer = Pacer(profile, config.budget_bytes)
@@ -125,11 +126,11 @@ class CodedChannel:
         return self._pacer.share(self.endpoint.throughput_bytes_s)
 
     def keyframe_gap_ns(self) -> int:
-        """How long after the last keyframe the link can take another, unless it is pressing."""
+        """How long to wait after a keyframe before one that is not urgent."""
         return self._pacer.keyframe_gap_ns(self.endpoint.backlog_bytes, self.endpoint.throughput_bytes_s)
 
     def arrived(self, key: Key) -> bool:
-        """Whether the other side is known to hold what was put last under a key."""
+        """True if the other side is known to hold the newest record of a key."""
         return self.endpoint.arrived(key)
 
     @property
@@ -138,23 +139,23 @@ class CodedChannel:
         return self.endpoint.stats
 
     def report(self) -> dict[str, int | str]:
-        """The link in a few numbers, as seen from this end."""
+        """The state of the link in a few numbers; 0 where unknown or unlimited."""
         stats = self.endpoint.stats
         return {
             "profile": self._pacer.profile.name,
-            "budget_bytes_s": stats.budget_bytes,
+            "budget_bytes_s": self.endpoint.config.budget_bytes or 0,
             "backlog_bytes": stats.backlog_bytes,
             "outbox_bytes": stats.resident_bytes,
             "archived": stats.archived,
             "given_up": stats.dropped,
-            "rtt_ms": stats.rtt_ns // 1_000_000,
+            "rtt_ms": (stats.rtt_ns or 0) // 1_000_000,
             "packets_sent": stats.packets_sent,
             "packets_lost": stats.lost,
             "packets_refused": stats.rejected,
         }
 
     def put(self, record: Record) -> Record:
-        """Code and share a record, but for a live pose that is not due. Raises ValueError where there is no code."""
+        """Code and share a record, unless it is a live pose that is not due. Raises ValueError if it has no code."""
         if isinstance(record, LivePose) and not self._live_is_due(record.t_ns):
             return record
         key = messages.key(record)
@@ -167,12 +168,12 @@ class CodedChannel:
         return messages.decode(key, code)
 
     def take_noted(self) -> dict[Key, bytes]:
-        """The codes that were put since the last call, live poses left out: for a log, while `noting`."""
+        """The codes that were put since the last call, without live poses: for a log, while `noting`."""
         noted, self._noted = self._noted, {}
         return noted
 
     def _live_is_due(self, t_ns: int) -> bool:
-        """Whether the profile has room for another pose; one whose time went back is always due."""
+        """True if the profile has room for another pose; one whose time went back is always due."""
         last = self._live_t_ns
         if last is not None and 0 <= t_ns - last < self._pacer.live_gap_ns:
             return False
@@ -180,7 +181,7 @@ class CodedChannel:
         return True
 
     def remove(self, key: Key) -> None:
-        """Take back a record."""
+        """Remove a record."""
         self.endpoint.remove(key)
 
     def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
@@ -198,7 +199,7 @@ class CodedChannel:
         return records
 
     def take_removed(self) -> list[Key]:
-        """The keys that the other side took back since the last call."""
+        """The keys that the other side removed since the last call."""
         removed, self._removed = self._removed, []
         return removed
 
@@ -221,9 +222,9 @@ def settled(channel: RecordChannel) -> tuple[bool, bool]:
 # What a link adds to a packet: IPv4 and UDP; frames of a serial line; four pieces in MAVLink's TUNNEL.
 _LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
 _RADIOS = ("serial", "mavlink")
-_SPILLED_BYTES = 2 << 20  # of memory for values of keyframes: some 140 of them, three times what a local map holds
-_SPILLED_INBOX_BYTES = 1 << 20  # the same of what the peer says of keyframes: some 400 of them
-_UNSPILLED_BYTES = 7 << 20  # the same where old values are lost: five minutes without a link
+_SPILLED_BYTES = 2 << 20  # memory for own values: some 140 keyframes, three times a local map
+_SPILLED_INBOX_BYTES = 1 << 20  # memory for the peer's values: some 400 keyframes
+_UNSPILLED_BYTES = 7 << 20  # memory for own values if old ones are lost: five minutes without a link
 
 
 def coded_channel(
@@ -235,9 +236,9 @@ def coded_channel(
     spill: Spill | None = None,
     bounded: bool = False,
 ) -> CodedChannel:
-    """One end of a channel over a link. budget_bytes: on the wire in any second, 0 any number. profile: wifi, radio, or
-    "" as the link allows. seal_bytes: what sealing adds to a packet. link: its name, LINK. bounded: whether values of
-    keyframes may take only so much memory, and then go to `spill`. Raises ValueError.
+    """One end of a channel over a link. budget_bytes: on the wire in any second; 0: unlimited. profile: wifi, radio, or
+    "" to choose by the link. seal_bytes: what sealing adds to a packet. link: its name, LINK. bounded: whether values
+    of keyframes may take only so much memory, and then go to `spill`. Raises ValueError.
     """
     kind = link.partition(":")[0]
     if not profile and kind in _RADIOS:
@@ -245,13 +246,14 @@ def coded_channel(
     if profile and profile not in PROFILES:
         raise ValueError(f"profile {profile!r}: expected {' or '.join(PROFILES)}")
     named = PROFILES.get(profile)
-    shape = named or Pacer(None, budget_bytes).profile
+    limit = budget_bytes or None
+    shape = named or Pacer(None, limit).profile
     config = SyncConfig(
         packet_bytes=shape.packet_bytes,
         overhead_bytes=_LINK_BYTES.get(kind, shape.overhead_bytes) + seal_bytes,
-        budget_bytes=budget_bytes,
+        budget_bytes=limit,
         heartbeat_ns=shape.heartbeat_ns,
-        resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else 0,
-        resident_bytes=0 if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
+        resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else None,
+        resident_bytes=None if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
     )
     return CodedChannel(config, session, named, spill)

@@ -18,7 +18,7 @@ from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.store import Batch, Store, StoreError, read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import KeyframeHeader, messages
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 
 MakeFlight = Callable[..., Any]
 

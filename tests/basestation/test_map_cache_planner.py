@@ -28,7 +28,7 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     messages,
 )
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, keyframe_id, submap_id, submap_of_keyframe
 
@@ -151,7 +151,7 @@ def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
     base.serve(flight.keyframes[-1])
     for keyframe in base.supply.lent(flight.agent):
         parts = [r for r in base.heard if isinstance(r, CachedLandmarks) and r.keyframe == keyframe]
-        assert 0 < sum(len(p.index) for p in parts) <= RADIO.copied
+        assert 0 < sum(len(p.index) for p in parts) <= RADIO.cached_landmarks
     assert len(base.supply.lent(flight.agent)) == 1
     base.here.arrived = lambda key: False  # type: ignore[method-assign]
     first = base.supply.lent(flight.agent)

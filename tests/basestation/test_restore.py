@@ -32,7 +32,7 @@ from kiteline_codec.schema import (
     WireError,
     messages,
 )
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, keyframe_id, submap_of_keyframe
 

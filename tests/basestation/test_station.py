@@ -12,7 +12,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
 from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record, RefinedLandmarks
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId
 
 STEP_NS = 100_000_000

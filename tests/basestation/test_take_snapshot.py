@@ -13,7 +13,7 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Station
 from kiteline_basestation.web import nothing, overview, status
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId
 
 S = 1_000_000_000

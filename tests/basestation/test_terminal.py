@@ -15,7 +15,7 @@ from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import CameraIntrinsics
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
 
 MakeFlight = Callable[..., Any]

@@ -23,12 +23,14 @@ from hypothesis.stateful import (
 
 from kiteline_codec.pacing.budget import SlidingBudget
 from kiteline_codec.schema import Key
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
-from kiteline_codec.sync.flights import Flight
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
+from kiteline_codec.sync.in_flight import SentPacket
 from kiteline_codec.sync.inbox import Inbox, Update
 from kiteline_codec.sync.outbox import Outbox
 from kiteline_codec.sync.round_trip import RoundTrip
 from kiteline_codec.transport.packet import Item
+from kiteline_codec.transport.sequence_window import SequenceWindow
 
 MS = 1_000_000
 CONFIG = SyncConfig(packet_bytes=160, overhead_bytes=10, budget_bytes=1500, window_packets=16, ack_packets=4)
@@ -161,7 +163,7 @@ class TwoEnds(RuleBasedStateMachine):
         assert a.digests == b.digests[::-1]
         for i, end in enumerate(self.ends):
             assert end.peer_values() == self.held[1 - i]
-            assert {k: v for k, v in self.shown[i].items() if k not in end.legacy_values()} == self.held[1 - i]
+            assert {k: v for k, v in self.shown[i].items() if k not in end.earlier_values()} == self.held[1 - i]
             assert end._in.tombstones == 0
             assert end.stats.dirty == 0
 
@@ -265,7 +267,7 @@ class OutOfMemory(TwoEnds):
     @invariant()
     def memory_is_bounded(self) -> None:
         for end in self.ends:
-            on_its_way = sum(1000 for f in end._out.flights._flights.values() for _ in f.carried)
+            on_its_way = sum(1000 for f in end._out.packets._packets.values() for _ in f.carried)
             assert end.stats.resident_bytes <= 3000 + 16 * 1300 + on_its_way
 
 
@@ -307,7 +309,7 @@ def older_versions_win(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def losses_are_not_repaired(monkeypatch: pytest.MonkeyPatch) -> None:
-    def planted(self: Outbox, flight: Flight) -> None:
+    def planted(self: Outbox, packet: SentPacket) -> None:
         return
 
     monkeypatch.setattr(Outbox, "_lose", planted)
@@ -365,7 +367,7 @@ def silence_is_forever(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def late_packets_count_as_new(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Inbox, "is_new", lambda self, number: True)
+    monkeypatch.setattr(SequenceWindow, "is_new", lambda self, number: True)
 
     def planted(self: Inbox, item: Item) -> Update | None:
         self._values.pop(item.key, None) if item.whole and item.version > self.watermark else None

@@ -16,7 +16,7 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     messages,
 )
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 

@@ -23,7 +23,9 @@ from kiteline_codec.schema import (
     RefinedLandmarks,
     WireError,
 )
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.digest import hash_value
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.packet import parse
 
 MS = 1_000_000
@@ -258,9 +260,7 @@ def test_a_base_that_starts_again_gets_everything_again() -> None:
     assert pair.b.peer_values() == ours
     assert pair.a.stats.restarts == 1
     assert pair.a.peer_values() == {Key(KeyframePose.KIND, 1000): b"new"}
-    assert pair.a.legacy_values() == {k: v for k, v in theirs.items() if k.id != 1000}
-    pair.a.forget_legacy()
-    assert pair.a.stats.legacy == 0
+    assert pair.a.earlier_values() == {k: v for k, v in theirs.items() if k.id != 1000}
 
 
 def test_an_agent_that_starts_again_leaves_its_old_values_readable() -> None:
@@ -271,7 +271,7 @@ def test_an_agent_that_starts_again_leaves_its_old_values_readable() -> None:
     pair.a.put(Key(NewLandmarks.KIND, 5), b"new")
     pair.settle()
     assert pair.b.peer_values() == {Key(NewLandmarks.KIND, 5): b"new"}
-    assert pair.b.legacy_values() == old
+    assert pair.b.earlier_values() == old
     assert pair.b.peer_session == 2
 
 
@@ -313,7 +313,7 @@ def test_another_protocol_version_is_refused_by_name() -> None:
     assert b.stats.reasons == (("the other side speaks protocol version 9, this one 3", 1),)
     assert b.receive(packet[:-1] + b"?", 0) == []
     assert b.stats.rejected == 2
-    assert b.peer_session == 0
+    assert b.peer_session is None
 
 
 @pytest.mark.parametrize("end", [0, 1])
@@ -328,7 +328,7 @@ def test_states_that_differ_are_found_and_mended(end: int, loss: float) -> None:
     inbox._values[Key(60, 1)] = (3, b"never sent")
     pair.ends[1 - end].put(Key(LivePose.KIND, 2), b"anything new makes them compare")
     values[1 - end][Key(LivePose.KIND, 2)] = b"anything new makes them compare"
-    inbox.digest.add(Key(60, 1), 3, b"never sent")
+    inbox.digest.add(hash_value(Key(60, 1), 3, b"never sent"))
     pair.settle()
     assert pair.ends[end].stats.mismatches >= 1
     assert pair.ends[end].peer_values() == values[1 - end]
@@ -369,7 +369,7 @@ def test_memory_is_bounded_while_there_is_no_peer() -> None:
         a.poll(i * MS)
     out = a._out
     assert len(out) == 1
-    assert max(len(out._waiting), len(out.flights)) <= 70
+    assert max(len(out._queue), len(out.packets)) <= 70
 
 
 def test_a_peer_that_sends_too_much_is_refused() -> None:

@@ -208,7 +208,7 @@ def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:
 def test_a_keyframe_is_short_and_its_sections_fit_packets() -> None:
     head, births, sightings = a_keyframe()
     value = np.random.default_rng(6).uniform(size=480)
-    parts = sections.split_births(births, value[:180]) + sections.split_sightings(sightings, value[180:])
+    parts = sections.split(births, value[:180]) + sections.split(sightings, value[180:])
     sizes = [len(messages.encode(record)) for record in (head, *parts)]
     assert max(sizes) <= sections.SECTION_BYTES
     assert sum(sizes) <= 9500
@@ -221,7 +221,7 @@ def test_sections_hold_each_row_once_best_first(seed: int, n: int, section_bytes
     births = some_records(seed, n)[5]
     assert isinstance(births, NewLandmarks)
     value = np.random.default_rng(seed).integers(0, 50, n).astype(np.float64)
-    parts = sections.split_births(births, value, section_bytes)
+    parts = sections.split(births, value, section_bytes)
     assert [p.part for p in parts] == list(range(len(parts)))
     index = np.concatenate([p.index for p in parts] or [births.index])
     assert np.array_equal(np.sort(index), births.index)

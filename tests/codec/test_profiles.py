@@ -40,18 +40,18 @@ def a_keyframe(births: int, sightings: int, seed: int = 0) -> tuple[NewLandmarks
 @given(st.sampled_from([WIFI, RADIO, EXACT]), st.integers(0, 200), st.integers(0, 250))
 def test_what_is_shared(profile: Profile, births: int, sightings: int) -> None:
     born, strength, seen = a_keyframe(births, sightings)
-    n = min(births, profile.births)
+    n = min(births, profile.landmarks)
     seen = replace(seen, index=np.arange(n, n + sightings, dtype=np.uint16))
     parts, sections = profile.choose(born, strength, seen)
     assert [p.part for p in parts] == list(range(len(parts)))
     index = np.sort(np.concatenate([p.index for p in parts])) if parts else np.zeros(0)
     assert np.array_equal(index, np.arange(n))
     rows = np.concatenate([s.index for s in sections]) if sections else np.zeros(0)
-    assert np.array_equal(rows, np.arange(n, n + min(sightings, profile.sightings)))
+    assert np.array_equal(rows, np.arange(n, n + min(sightings, profile.observations)))
     named = sum(int(p.descriptor.any(axis=1).sum()) for p in parts)
     assert named == min(n, profile.described)
     for part in parts:
-        assert len(messages.encode(part)) <= profile.births_bytes
+        assert len(messages.encode(part)) <= profile.landmarks_bytes
         assert np.abs(part.uv - born.uv[part.index]).max() == 0
         known = born.inv_depth[part.index] > 0
         assert np.array_equal(part.inv_depth > 0, known)
@@ -69,7 +69,7 @@ def test_coarser_depths_leave_the_scale(profile: Profile) -> None:
     born, strength, seen = a_keyframe(1000, 1000)
     born = replace(born, inv_depth=np.linspace(0.05, 1.0, 1000).astype(np.float32))
     seen = replace(seen, inv_depth=born.inv_depth.copy())
-    parts, sections = replace(profile, births=1000, sightings=1000).choose(born, strength, seen)
+    parts, sections = replace(profile, landmarks=1000, observations=1000).choose(born, strength, seen)
     ours = np.concatenate([np.log(p.inv_depth / born.inv_depth[p.index]) for p in parts])
     theirs = np.concatenate([np.log(s.inv_depth / seen.inv_depth[s.index - 1000]) for s in sections])
     assert len(ours) == len(theirs) == 1000
@@ -113,7 +113,7 @@ def test_a_budget_chooses_the_profile() -> None:
 
 
 def test_measured_throughput_chooses_the_profile_with_patience() -> None:
-    pacer = Pacer(None, 0)
+    pacer = Pacer(None, None)
     for tick in range(29):
         pacer.step(2000, tick * SECOND // 10)
     assert pacer.profile is WIFI
@@ -138,7 +138,7 @@ def test_throughput_is_known_only_while_there_is_more_to_send() -> None:
 
 
 def test_the_pause_between_keyframes_follows_the_link() -> None:
-    assert Pacer(None, 0).keyframe_gap_ns(10_000_000, None) == 0
+    assert Pacer(None, None).keyframe_gap_ns(10_000_000, None) == 0
     assert Pacer(RADIO, 1000).keyframe_gap_ns(0, None) == RADIO.keyframe_bytes * SECOND // 1000
     assert Pacer(RADIO, 1000).keyframe_gap_ns(3000, None) == 3 * SECOND
     assert Pacer(RADIO, 300).keyframe_gap_ns(1 << 30, None) == 5 * SECOND
@@ -152,13 +152,13 @@ def test_births_follow_the_pace_of_keyframes() -> None:
     for i in range(30):
         pacer.keyframe(20 * SECOND + i * 3 * SECOND)
     slow = pacer.share(None)
-    assert 7 <= fast.births < slow.births <= RADIO.births
+    assert 7 <= fast.landmarks < slow.landmarks <= RADIO.landmarks
     assert fast.described < slow.described <= RADIO.described
     assert Pacer(WIFI, 1000).share(None) is WIFI
 
 
 def test_poses_take_no_more_than_a_fifth_of_a_budget() -> None:
-    assert Pacer(RADIO, 0).live_gap_ns == Pacer(RADIO, 1000).live_gap_ns == RADIO.live_gap_ns
+    assert Pacer(RADIO, None).live_gap_ns == Pacer(RADIO, 1000).live_gap_ns == RADIO.live_gap_ns
     assert Pacer(RADIO, 500).live_gap_ns == SECOND * 45 // 100
     assert Pacer(RADIO, 300).live_gap_ns == SECOND * 3 // 4
     assert Pacer(WIFI, 1_000_000).live_gap_ns == WIFI.live_gap_ns

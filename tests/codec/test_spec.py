@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from kiteline_codec.schema import RECORD_TYPES, Key, Record, messages
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.packet import PROTOCOL_VERSION
 from kiteline_core.geometry import se3

@@ -6,7 +6,8 @@ import random
 import time
 
 from kiteline_codec.schema import Key, KeyframePose, NewLandmarks
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import ByteLink

@@ -75,10 +75,10 @@ class KeyframeMaker:
         # Births first, in the order of image rows: neighbours code shortest.
         band = fresh.uv[:, 1] // self._config.detector.cell_px
         profile = self._channel.profile
-        order = np.lexsort((fresh.uv[:, 0], band, np.arange(len(band)) >= profile.births))
+        order = np.lexsort((fresh.uv[:, 0], band, np.arange(len(band)) >= profile.landmarks))
         births, strength = self._births(keyframe, fresh, order)
         shared = self._map.is_shared(rows)
-        sightings = self._sightings(keyframe, rows[shared], seen[shared], min(len(order), profile.births))
+        sightings = self._sightings(keyframe, rows[shared], seen[shared], min(len(order), profile.landmarks))
         sections = profile.choose(births, strength, sightings)
         n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
         head = KeyframeHeader(keyframe, t_ns, parent, T_p_k, n_keypoints)

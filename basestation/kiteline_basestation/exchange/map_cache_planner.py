@@ -174,7 +174,7 @@ class MapCachePlanner:
         new = sum(k not in reader.lent for k in wanted)
         idle = [k for k in reader.lent if k not in wanted and k not in gone]
         spare = self._config.copies - len(reader.lent) + len(gone)
-        gone += idle[: max(0, min(new, channel.profile.copies_ahead) - spare)]
+        gone += idle[: max(0, min(new, channel.profile.cached_ahead) - spare)]
         for keyframe in gone:
             for key in reader.lent.pop(keyframe).keys:
                 channel.remove(key)
@@ -197,12 +197,12 @@ class MapCachePlanner:
         self, agent: AgentId, reader: _Reader, wanted: list[KeyframeId], submap: SubmapId, channel: RecordChannel
     ) -> None:  # fmt: skip
         """The best of what is wanted, as far as there is room here and on the link."""
-        ahead = channel.profile.copies_ahead - sum(not _arrived(lent, channel) for lent in reader.lent.values())
+        ahead = channel.profile.cached_ahead - sum(not _arrived(lent, channel) for lent in reader.lent.values())
         room = self._config.copies - len(reader.lent)
         for keyframe in [k for k in wanted if k not in reader.lent][: max(0, min(ahead, room))]:
             copy = self._copy(keyframe, submap)
             points, strength = self._copied(agent, keyframe, self._length(keyframe, submap))
-            records: list[CachedKeyframe | CachedLandmarks] = [copy, *channel.profile.copies(points, strength)]
+            records: list[CachedKeyframe | CachedLandmarks] = [copy, *channel.profile.cached_sections(points, strength)]
             for record in records:
                 channel.put(record)
             keys = [messages.key(record) for record in records]

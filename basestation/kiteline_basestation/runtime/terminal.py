@@ -57,7 +57,7 @@ class TerminalReporter:
             out.append(f"agent {agent} is out of reach; its map stays")
         self._here = here
         for agent, channel in sorted(self._station.channels.items()):
-            session = channel.endpoint.peer_session if isinstance(channel, CodedChannel) else 0
+            session = channel.endpoint.peer_session or 0 if isinstance(channel, CodedChannel) else 0
             before = self._sessions.get(agent, 0)
             if session != before:
                 self._sessions[agent] = session

@@ -128,7 +128,7 @@ def snapshot(station: Station, before: SavedMap) -> SavedMap:
             own = {key: code for key, code in end.own_values().items() if not is_copy(key)}
             noted = (station.touched or {}).items()
             imported = {key: code for (a, _, key), code in noted if a == agent and code is not None}
-            agents[agent] = Codes({**old.received, **imported, **end.legacy_values(), **end.peer_values()}, own)
+            agents[agent] = Codes({**old.received, **imported, **end.earlier_values(), **end.peer_values()}, own)
     texts = Scribe().changes(station.mapper.memory())
     return SavedMap(agents, {name: text for name, text in texts.items() if text is not None})
 

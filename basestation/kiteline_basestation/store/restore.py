@@ -39,7 +39,7 @@ def _restore(station: Station, checked: Checked, now_ns: int) -> Restored:
     for agent, codes in sorted(checked.kept.agents.items()):
         channel = station.join(agent)
         if isinstance(channel, CodedChannel):
-            channel.endpoint.remember(codes.received)  # so that its agent need not send it again
+            channel.endpoint.resume(codes.received)  # so that its agent need not send it again
         received = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
         mapper.restore(agent, received, (), now_ns)
     for agent, codes in sorted(checked.kept.agents.items()):  # what is ours may tell of points of several agents

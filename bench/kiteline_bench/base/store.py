@@ -15,7 +15,7 @@ from kiteline_basestation.store.store import read
 from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
 from kiteline_bench.harness import ratios as bench_ratios
 from kiteline_codec.channel import CodedChannel
-from kiteline_codec.sync.endpoint import SyncConfig
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 from kiteline_lab.evaluation import trajectories
 from kiteline_lab.flights import simulate

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import Key, KeyframeHeader, LivePose, NewLandmarks, Observations
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.system.memory import rss_mib

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from kiteline_codec.pacing.profiles import WIFI
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import (
     CameraIntrinsics,
     Key,
@@ -19,7 +19,8 @@ from kiteline_codec.schema import (
     Record,
     messages,
 )
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
@@ -71,14 +72,14 @@ def flight(keyframes: int) -> list[list[Record]]:
 def coding_ms() -> float:
     """CPU ms of a keyframe's records to codes, to tight forms, and back again on the other side; the median."""
     held: dict[Key, tuple[int, bytes]] = {}
-    ours, theirs = Tightener(), Tightener()
+    ours, theirs = ResidualCoder(), ResidualCoder()
     took = []
     for records in flight(40):
         begin = time.process_time()
         for record in records:
             key, code = messages.key(record), messages.encode(record)
-            form = ours.shrink(key, code, held.get, held.get)
-            got = code if form is None else theirs.grow(key, form, held.get)
+            form = ours.compress(key, code, held.get, held.get)
+            got = code if form is None else theirs.expand(key, form, held.get)
             messages.decode(key, got)
             held[key] = (len(held) + 1, code)
         took.append((time.process_time() - begin) * 1e3)

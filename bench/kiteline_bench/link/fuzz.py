@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import RECORD_TYPES, Key, WireError, messages
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import Deframer, frame
 from kiteline_codec.transport.packet import parse
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
@@ -48,12 +49,12 @@ class Targets:
     def __init__(self, values: Sequence[tuple[Key, bytes]]) -> None:
         self.accepted = 0
         self._held = {key: (i + 1, code) for i, (key, code) in enumerate(values)}
-        self._tightener = Tightener()
+        self._coder = ResidualCoder()
         self._renew()
 
     def _renew(self) -> None:
         config = SyncConfig(max_inbox_bytes=1 << 20, max_assembly_bytes=1 << 20)
-        self._endpoint = Endpoint(config, 5, tightener=Tightener())
+        self._endpoint = Endpoint(config, 5, coder=ResidualCoder())
         self._deframer = Deframer(2000)
         self._opener = Opener({3: _KEY}, Direction.UP)
         self._age = 0
@@ -92,7 +93,7 @@ class Targets:
         key = draw.choice([k for k in self._held if k.kind in (4, 5)] or [Key(4, 1)])
         if draw.random() < 0.2:
             key = Key(17, key.id)
-        self._tightener.grow(key, data, self._held.get)
+        self._coder.expand(key, data, self._held.get)
         self.accepted += 1
 
     def stream(self, data: bytes, draw: random.Random) -> None:

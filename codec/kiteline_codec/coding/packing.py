@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing_kernels import pack_columns, unpack_columns
-from kiteline_codec.coding.residual_column_kernels import LIMIT, pack_tight, unpack_tight
+from kiteline_codec.coding.residual_column_kernels import LIMIT, pack_residuals, unpack_residuals
 from kiteline_core.errors import KitelineError
 
 I64 = NDArray[np.int64]
@@ -85,14 +85,14 @@ class Writer:
             out = np.zeros(c * (5 * n + 16) + 8, np.uint8)
             self._out += out[: pack_columns(values, out)].tobytes()
 
-    def tight(self, values: I64) -> None:
+    def residual_columns(self, values: I64) -> None:
         """Columns (c, n) of integers, |value| < 2^30, as short as can be; nothing is written for n = 0."""
         c, n = values.shape
         if n and c:
             if max(int(values.max()), -int(values.min())) >= LIMIT:
                 raise ValueError(f"numbers below {LIMIT} are expected, found {values.min()}..{values.max()}")
             out = np.zeros(c * (7 * n + 16) + 8, np.uint8)
-            self._out += out[: pack_tight(np.ascontiguousarray(values), out)].tobytes()
+            self._out += out[: pack_residuals(np.ascontiguousarray(values), out)].tobytes()
 
     def bytes(self) -> bytes:
         """What has been written."""
@@ -170,13 +170,13 @@ class Reader:
             self._at = at
         return values
 
-    def tight(self, c: int, n: int) -> I64:
-        """Tight columns (c, n) of integers."""
+    def residual_columns(self, c: int, n: int) -> I64:
+        """Residual columns (c, n) of integers."""
         values = np.zeros((c, n), np.int64)
         if n and c:
-            at = unpack_tight(np.frombuffer(self._data, np.uint8), self._at, values)
+            at = unpack_residuals(np.frombuffer(self._data, np.uint8), self._at, values)
             if at < 0:
-                raise WireError("tight columns are cut short or malformed")
+                raise WireError("residual columns are cut short or malformed")
             self._at = at
         return values
 

@@ -1,4 +1,4 @@
-"""Integer columns as few bits as their spread asks for. The layout is described in SPEC.md, "Tight columns".
+"""Integer columns as few bits as their spread asks for. The layout is described in SPEC.md, "Residual columns".
 
 Numbers are Golomb-Rice coded with a parameter that follows their size (M. Weinberger, G. Seroussi, G. Sapiro, "The
 LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixed width where that is shorter.
@@ -130,7 +130,7 @@ def _shape(values: I64, out: I64) -> None:
 
 
 @njit
-def pack_tight(values: I64, out: U8) -> int:
+def pack_residuals(values: I64, out: U8) -> int:
     """Pack values (c, n) int64, n >= 1, |value| < LIMIT, into `out` (zeroed, at least c * (7 * n + 16) + 8 bytes).
 
     Returns the number of bytes written.
@@ -179,7 +179,7 @@ def pack_tight(values: I64, out: U8) -> int:
 
 
 @njit
-def unpack_tight(data: U8, at: int, values: I64) -> int:
+def unpack_residuals(data: U8, at: int, values: I64) -> int:
     """Read columns into values (c, n), n >= 1. Returns the position after them, or -1 when they are malformed."""
     c, n = values.shape
     shape = np.zeros((c, 4), np.int64)

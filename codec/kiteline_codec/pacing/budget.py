@@ -8,15 +8,15 @@ WINDOW_NS = 1_000_000_000
 
 
 class SlidingBudget:
-    """Bytes within the last second, both ends included, of which `burst_bytes` at once. A limit of 0 means unlimited.
+    """Bytes within the last second, both ends included, of which `burst_bytes` at once. A limit of None means unlimited.
 
     The window alone would let a sender spend a second's bytes at once and then wait for a second; the bucket, which
     fills at the rate of the limit, spreads them, so that a new value waits for no longer than a packet takes.
     """
 
-    def __init__(self, limit_bytes: int, burst_bytes: int) -> None:
+    def __init__(self, limit_bytes: int | None, burst_bytes: int) -> None:
         self._limit = limit_bytes
-        self._burst = min(burst_bytes, limit_bytes)
+        self._burst = min(burst_bytes, limit_bytes or 0)
         self._spent: deque[tuple[int, int]] = deque()
         self._sum = 0
         self._bucket = self._burst * WINDOW_NS  # byte nanoseconds: whole numbers, so that nothing depends on rounding
@@ -24,7 +24,7 @@ class SlidingBudget:
 
     def left(self, now_ns: int) -> int:
         """How many bytes may be sent now."""
-        if not self._limit:
+        if self._limit is None:
             return 1 << 30
         while self._spent and now_ns - self._spent[0][0] > WINDOW_NS:
             self._sum -= self._spent.popleft()[1]
@@ -36,7 +36,7 @@ class SlidingBudget:
 
     def spend(self, now_ns: int, n_bytes: int) -> None:
         """Book bytes that are sent now."""
-        if not self._limit:
+        if self._limit is None:
             return
         self._sum += n_bytes
         self._bucket -= n_bytes * WINDOW_NS

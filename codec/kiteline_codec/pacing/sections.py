@@ -17,29 +17,12 @@ SECTION_BYTES = 1000  # leaves room for headers and a live pose in a packet of 1
 _Section = TypeVar("_Section", NewLandmarks, Observations, CachedLandmarks)
 
 
-def split_births(births: NewLandmarks, value: F64, section_bytes: int = SECTION_BYTES) -> list[NewLandmarks]:
-    """Births (n rows) as parts 0, 1, … by falling value (n,); within a part the index increases.
+def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> list[_Section]:
+    """Split a record (n rows) into parts 0, 1, … by falling value (n,); within a part the index increases.
 
-    Codes are shortest where rows with neighbouring indices lie near each other in the image. Raises ValueError when a
-    single row does not fit, or for values that have no code.
+    Codes are shortest if neighbouring indices lie near each other in the image, or, for observations, if the order of
+    indices is that of landmark ids. Raises ValueError when a single row does not fit, or for values that have no code.
     """
-    return _split(births, value, section_bytes)
-
-
-def split_sightings(sightings: Observations, value: F64, section_bytes: int = SECTION_BYTES) -> list[Observations]:
-    """Sightings (n rows) as parts 0, 1, … by falling value (n,); within a part the index increases.
-
-    Codes are shortest where the order of indices is that of point ids. Raises ValueError as `split_births` does.
-    """
-    return _split(sightings, value, section_bytes)
-
-
-def split_copied(copied: CachedLandmarks, value: F64, section_bytes: int = SECTION_BYTES) -> list[CachedLandmarks]:
-    """Points of a copied keyframe (n rows) as parts 0, 1, … by falling value (n,), as `split_births` does."""
-    return _split(copied, value, section_bytes)
-
-
-def _split(record: _Section, value: F64, section_bytes: int) -> list[_Section]:
     best = np.argsort(-np.asarray(value), kind="stable")
     parts: list[_Section] = []
     start, rows = 0, max(1, section_bytes // 32)
@@ -56,7 +39,7 @@ def _split(record: _Section, value: F64, section_bytes: int) -> list[_Section]:
             continue
         more = len(chosen) * section_bytes // size
         if may_grow and start + len(chosen) < len(best) and more > len(chosen) * 1.15:
-            rows = max(len(chosen) + 1, int(0.95 * more))  # a larger part is worth another try
+            rows = max(len(chosen) + 1, int(0.95 * more))  # enough larger to be worth another try
             continue
         parts.append(part)
         start += len(chosen)

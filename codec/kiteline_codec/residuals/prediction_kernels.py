@@ -1,7 +1,7 @@
-"""Where a keyframe would see points, from what the agent wrote of them alone. Described in SPEC.md, "Foreseen".
+"""Predicted projections of landmarks into a keyframe, from values of the agent. See SPEC.md, "Predicted".
 
 Only + - * / and comparisons of IEEE doubles, each rounded by itself and in the order written here, so that both sides
-get the same integers whatever their machines.
+get the same integers on any machine.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PIXEL_CODES = 1 << 16
 _MANTISSA = 1024
 _DEPTH_CODES = 13 * _MANTISSA
 _DEPTH_SCALE = 0.0078125
-_LEAST_DEPTH = 0.05  # of the point's depth: what comes nearer to the camera than that is not foreseen
+_LEAST_DEPTH = 0.05  # of the landmark's depth: nearer to the camera than that, it is not predicted
 
 
 @njit
@@ -58,37 +58,37 @@ def _inverse_depth(code: int) -> float:
 
 
 @njit
-def pick(births: I32, keypoint: I64, mask: int, out: I64) -> None:
-    """Codes (4, n) of the births at keypoints (n,), as they are where they came with a part that the mask names.
+def select(landmarks: I32, keypoint: I64, mask: int, out: I64) -> None:
+    """Codes (4, n) of the landmarks at keypoints (n,) whose part is in the mask; elsewhere `out` is left as it is.
 
-    births: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part, -1 where there is none.
+    landmarks: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part, -1 where there is none.
     """
     for i in range(keypoint.size):
         at = keypoint[i]
-        if at >= births.shape[1]:
+        if at >= landmarks.shape[1]:
             continue
-        part = births[4, at]
+        part = landmarks[4, at]
         if part >= 0 and (mask >> part) & 1 == 1:
             for k in range(4):
-                out[k, i] = births[k, at]
+                out[k, i] = landmarks[k, at]
 
 
 @njit
-def foresee(born: I64, place: I64, T_k_a: F64, camera: F64, out: I64) -> None:
-    """Codes of u, v and inverse depth (3, n) of points as keyframe k would see them; -1 where nothing can be said.
+def predict(codes: I64, place: I64, T_k_a: F64, camera: F64, out: I64) -> None:
+    """Codes of u, v and inverse depth (3, n) of landmarks projected into keyframe k; -1 where there is no prediction.
 
-    born: (3 or more, n) codes of u, v and inverse depth of births, -1 where they are not known. place: (n,) rows of
+    codes: (3 or more, n) of u, v and inverse depth in the landmark's keyframe a, -1 where unknown. place: (n,) rows of
     T_k_a (m,4,4). camera: fx, fy, cx, cy.
     """
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     for i in range(place.size):
         out[0, i] = out[1, i] = out[2, i] = -1
-        if born[0, i] < 0 or born[2, i] == 0:
+        if codes[0, i] < 0 or codes[2, i] == 0:
             continue
         T = T_k_a[place[i]]
-        rho = _inverse_depth(int(born[2, i]))
-        x = (float(born[0, i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cx) / fx
-        y = (float(born[1, i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cy) / fy
+        rho = _inverse_depth(int(codes[2, i]))
+        x = (float(codes[0, i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cx) / fx
+        y = (float(codes[1, i]) / _PIXEL_STEPS + _PIXEL_ORIGIN - cy) / fy
         px = T[0, 0] * x
         px = px + T[0, 1] * y
         px = px + T[0, 2]

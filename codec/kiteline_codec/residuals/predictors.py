@@ -1,4 +1,4 @@
-"""What tight forms build upon: the agent's own values, decoded once for each version."""
+"""Values of the agent from which residual codes are predicted, decoded once for each version."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding.packing import Reader
+from kiteline_codec.coding.packing import Reader, WireError
 from kiteline_codec.residuals import prediction_kernels as kernels
-from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, WireError, messages
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, messages
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId, agent_of_keyframe
 
 I32 = NDArray[np.int32]
@@ -20,79 +20,85 @@ F64 = NDArray[np.float64]
 
 Held = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value that both sides hold
 
-MAX_GENERATIONS = 64  # steps along parents to a keyframe of birth: farther, the sum of poses says little
-MASK_PARTS = 16  # parts of births that can be named
-_REMEMBERED = 256  # keyframes whose values are kept decoded
+MAX_GENERATIONS = 64  # steps along parents to a landmark's keyframe: beyond, the sum of poses is too inaccurate
+MASK_PARTS = 16  # parts of new landmarks that can be named
+_CACHED_KEYFRAMES = 256
 _NO_PART = -1
-_BIRTHS, _HEAD = NewLandmarks.KIND, KeyframeHeader.KIND
 
 
 @dataclass(slots=True)
 class _Keyframe:
-    """births: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part that they came with, -1 where
-    there is none; as wide as the last birth asks.
+    """Decoded values of a keyframe. landmarks: (5, k) codes of u, v, inverse depth and octave by keypoint, and the
+    part that they came with, -1 where there is none; k is the last landmark's keypoint + 1.
     """
 
-    head: KeyframeHeader | None = None
-    head_version: int = 0
+    header: KeyframeHeader | None = None
+    header_version: int = 0
     part_versions: dict[int, int] = field(default_factory=dict)
-    births: I32 = field(default_factory=lambda: np.empty((5, 0), np.int32))
+    landmarks: I32 = field(default_factory=lambda: np.empty((5, 0), np.int32))
 
 
-class References:
-    """Headers, births and cameras as both sides hold them, kept decoded."""
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """T_k_a (4,4) by keyframe a, and the versions of the headers used, in order of keyframes."""
+
+    T_k_a: dict[int, F64]
+    versions: list[int]
+
+
+class Predictors:
+    """Headers, new landmarks and cameras as both sides hold them."""
 
     def __init__(self) -> None:
         self._keyframes: OrderedDict[int, _Keyframe] = OrderedDict()
         self._cameras: dict[int, tuple[int, F64]] = {}
-        self.told: KeyframeHeader | None = None  # a header that is used as it is, whatever is held
 
     def _keyframe(self, keyframe: int) -> _Keyframe:
         entry = self._keyframes.get(keyframe)
         if entry is None:
             entry = self._keyframes[keyframe] = _Keyframe()
-            if len(self._keyframes) > _REMEMBERED:
+            if len(self._keyframes) > _CACHED_KEYFRAMES:
                 self._keyframes.popitem(last=False)
         else:
             self._keyframes.move_to_end(keyframe)
         return entry
 
     def camera(self, keyframe: int, held: Held) -> tuple[int, F64] | None:
-        """Version, and fx, fy, cx, cy of the camera that saw a keyframe."""
+        """Version, and fx, fy, cx, cy of a keyframe's camera."""
         agent = int(agent_of_keyframe(KeyframeId(keyframe)))
-        now = held(Key(CameraIntrinsics.KIND, agent))
+        key = Key(CameraIntrinsics.KIND, agent)
+        now = held(key)
         if now is None:
             return None
         if agent not in self._cameras or self._cameras[agent][0] != now[0]:
-            record = messages.decode(Key(CameraIntrinsics.KIND, agent), now[1])
+            record = messages.decode(key, now[1])
             assert isinstance(record, CameraIntrinsics)
             c = record.camera
             self._cameras[agent] = now[0], np.array([c.fx, c.fy, c.cx, c.cy])
         return self._cameras[agent]
 
-    def head(self, keyframe: int, held: Held) -> tuple[int, KeyframeHeader] | None:
-        """Version, and header."""
-        if self.told is not None and self.told.keyframe == keyframe:
-            return 0, self.told
-        now = held(Key(_HEAD, keyframe))
+    def _header(self, keyframe: int, held: Held, sent: KeyframeHeader | None) -> tuple[int, KeyframeHeader] | None:
+        """Version, and header; of the keyframe of `sent`, that one as version 0."""
+        if sent is not None and sent.keyframe == keyframe:
+            return 0, sent
+        key = Key(KeyframeHeader.KIND, keyframe)
+        now = held(key)
         if now is None:
             return None
         entry = self._keyframe(keyframe)
-        if entry.head is None or entry.head_version != now[0]:
-            record = messages.decode(Key(KeyframeHeader.KIND, keyframe), now[1])
+        if entry.header is None or entry.header_version != now[0]:
+            record = messages.decode(key, now[1])
             assert isinstance(record, KeyframeHeader)
-            entry.head, entry.head_version = record, now[0]
-        return entry.head_version, entry.head
+            entry.header, entry.header_version = record, now[0]
+        return entry.header_version, entry.header
 
-    def births(self, keyframe: int, held: Held) -> tuple[dict[int, int], I32]:
-        """Versions by part of what both sides hold; codes (5, k) of u, v, inverse depth, octave, and the part, of the
-        first k keypoints: beyond them there are no births.
-        """
+    def landmarks(self, keyframe: int, held: Held) -> tuple[dict[int, int], I32]:
+        """Versions by part of the new landmarks that both sides hold, and codes (5, k) as in `_Keyframe`."""
         versions: dict[int, int] = {}
         entry = self._keyframe(keyframe)
         missing = 0
         for part in range(MASK_PARTS):
-            now = held(Key(_BIRTHS, keyframe, part))
+            now = held(Key(NewLandmarks.KIND, keyframe, part))
             if now is None:
                 missing += 1
                 if missing == 2:
@@ -100,75 +106,77 @@ class References:
                 continue
             versions[part] = now[0]
             if entry.part_versions.get(part) != now[0]:
-                entry.births[4, entry.births[4] == part] = _NO_PART
+                entry.landmarks[4, entry.landmarks[4] == part] = _NO_PART
                 values = NewLandmarks.COLUMNS.read_codes(Reader(now[1]))
                 if values.shape[1]:
                     if values[0].min() < 0 or values[0].max() >= MAX_KEYPOINTS:
                         raise WireError("a keypoint is out of range")
-                    entry.births = _widened(entry.births, int(values[0].max()) + 1)
-                    entry.births[:4, values[0]] = values[1:5]
-                    entry.births[4, values[0]] = part
+                    entry.landmarks = _widened(entry.landmarks, int(values[0].max()) + 1)
+                    entry.landmarks[:4, values[0]] = values[1:5]
+                    entry.landmarks[4, values[0]] = part
                 entry.part_versions[part] = now[0]
-        return versions, entry.births
+        return versions, entry.landmarks
 
-    def poses(self, keyframe: int, wanted: set[int], held: Held) -> tuple[dict[int, F64], list[int]]:
-        """T_k_a (4,4) of the wanted keyframes that are found along parents, up from keyframe k to the nearest common
-        one and down again; and the versions of the headers on these ways, in order of keyframes.
+    def poses(self, keyframe: int, wanted: set[int], held: Held, sent: KeyframeHeader | None) -> Poses:
+        """Poses of the wanted keyframes in keyframe k, as far as headers connect them: along parents up from k to the
+        nearest common ancestor, and down again. sent: k's header, where it goes along with the observations.
         """
-        above = self._above(keyframe, wanted, held)
-        generation = {a: i for i, (a, _, _) in enumerate(above)}
+        ancestors = self._ancestors(keyframe, wanted, held, sent)
+        generation = {a: i for i, (a, _, _) in enumerate(ancestors)}
         poses: dict[int, F64] = {}
         versions: dict[int, int] = {}
         highest = 0
         for a in sorted(wanted):
-            below: list[tuple[int, KeyframeHeader, int]] = []  # from a up to below the common keyframe
+            below: list[tuple[int, KeyframeHeader, int]] = []  # from a up to below the common ancestor
             at = a
             while at not in generation and len(below) < MAX_GENERATIONS:
-                head = self.head(at, held)
-                if head is None or head[1].parent == NO_KEYFRAME:
+                header = self._header(at, held, sent)
+                if header is None or header[1].parent == NO_KEYFRAME:
                     break
-                below.append((at, head[1], head[0]))
-                at = int(head[1].parent)
+                below.append((at, header[1], header[0]))
+                at = int(header[1].parent)
             if at not in generation:
                 continue
-            T_k_a = above[generation[at]][1]
-            for _, head_below, _ in reversed(below):
+            T_k_a = ancestors[generation[at]][1]
+            for _, header_below, _ in reversed(below):
                 T = np.empty((4, 4))
-                kernels.compose(T_k_a, np.ascontiguousarray(head_below.T_p_k), T)
+                kernels.compose(T_k_a, np.ascontiguousarray(header_below.T_p_k), T)
                 T_k_a = T
             poses[a] = T_k_a
             versions.update({b: version for b, _, version in below})
             highest = max(highest, generation[at])
-        versions.update({b: version for b, _, version in above[:highest]})
-        return poses, [versions[b] for b in sorted(versions)]
+        versions.update({b: version for b, _, version in ancestors[:highest]})
+        return Poses(poses, [versions[b] for b in sorted(versions)])
 
-    def _above(self, keyframe: int, wanted: set[int], held: Held) -> list[tuple[int, F64, int]]:
-        """Keyframe k, its parent, and so on until all wanted were met, with T_k_a (4,4) and the version of the header;
-        0 for the last one, whose header is not used.
+    def _ancestors(
+        self, keyframe: int, wanted: set[int], held: Held, sent: KeyframeHeader | None
+    ) -> list[tuple[int, F64, int]]:
+        """Keyframe k, its parent, and so on until all wanted are found, with T_k_a (4,4) and the header's version; 0
+        for the last one, whose header is not used.
         """
         at, T_k_a, step = keyframe, np.eye(4), np.empty((4, 4))
         left = len(wanted - {at})
-        above: list[tuple[int, F64, int]] = []
+        ancestors: list[tuple[int, F64, int]] = []
         for _ in range(MAX_GENERATIONS):
-            head = self.head(at, held) if left else None
-            if head is None or head[1].parent == NO_KEYFRAME:
+            header = self._header(at, held, sent) if left else None
+            if header is None or header[1].parent == NO_KEYFRAME:
                 break
-            above.append((at, T_k_a, head[0]))
-            kernels.invert(np.ascontiguousarray(head[1].T_p_k), step)
+            ancestors.append((at, T_k_a, header[0]))
+            kernels.invert(np.ascontiguousarray(header[1].T_p_k), step)
             T_k_p = np.empty((4, 4))
             kernels.compose(T_k_a, step, T_k_p)
-            at, T_k_a = int(head[1].parent), T_k_p
+            at, T_k_a = int(header[1].parent), T_k_p
             left -= at in wanted
-        above.append((at, T_k_a, 0))
-        return above
+        ancestors.append((at, T_k_a, 0))
+        return ancestors
 
 
-def parts_at(births: I32, keypoint: I64) -> set[int]:
-    """The parts with which the births at keypoints (n,) came, and perhaps -1."""
-    return set(births[4, keypoint[keypoint < births.shape[1]]].tolist())
+def parts_at(landmarks: I32, keypoint: I64) -> set[int]:
+    """The parts that the landmarks at keypoints (n,) came with; it may hold -1, for none."""
+    return set(landmarks[4, keypoint[keypoint < landmarks.shape[1]]].tolist())
 
 
-def _widened(births: I32, width: int) -> I32:
-    """The same with room for so many keypoints at least."""
-    more = width - births.shape[1]
-    return births if more <= 0 else np.pad(births, ((0, 0), (0, more)), constant_values=_NO_PART)
+def _widened(landmarks: I32, width: int) -> I32:
+    """The same with room for at least so many keypoints."""
+    more = width - landmarks.shape[1]
+    return landmarks if more <= 0 else np.pad(landmarks, ((0, 0), (0, more)), constant_values=_NO_PART)

@@ -1,4 +1,4 @@
-"""How an endpoint uses its link, in which order values leave, and what is known of it in numbers."""
+"""How an endpoint uses its link, the order in which values leave, and its statistics."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from kiteline_codec.schema import RECORD_TYPES, Key, Priority
-from kiteline_codec.sync.entries import Order
-from kiteline_codec.sync.remembered import KIND as REMEMBERED
+from kiteline_codec.sync.resumption import SUMMARY_KIND
+from kiteline_codec.sync.send_queue import Order
 from kiteline_codec.transport.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
 
 _ORDERS = {kind: (int(t.PRIORITY), t.FIRST_PARTS) for kind, t in RECORD_TYPES.items()}
-_UNKNOWN = int(Priority.GRID), 1
+_UNKNOWN_KIND = int(Priority.GRID), 1
+_REST = int(Priority.REST)
 MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
 
 
 def default_order(key: Key) -> Order:
-    """The place of a value in the order of sending, least first: its class, then the newest keyframe, then the part."""
-    if key.kind == REMEMBERED:
-        return (0, 0, key.part)  # it saves more than it costs
-    rank, first_parts = _ORDERS.get(key.kind, _UNKNOWN)
+    """The place of a value in the order of sending, least first: priority, then the newest keyframe, then the part."""
+    if key.kind == SUMMARY_KIND:
+        return (0, 0, key.part)  # it saves more bytes than it costs
+    priority, first_parts = _ORDERS.get(key.kind, _UNKNOWN_KIND)
     if key.part >= first_parts:
-        rank = max(rank, Priority.REST)
-    return (rank, -key.id, key.part)
+        priority = max(priority, _REST)
+    return (priority, -key.id, key.part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,47 +31,45 @@ class SyncConfig:
     """How an endpoint uses its link."""
 
     packet_bytes: int = 1200  # largest packet: fits an Ethernet frame inside any tunnel; a MAVLink tunnel wants 128
-    overhead_bytes: int = 28  # a packet costs on the wire beyond its own bytes: IPv4 and UDP
-    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
-    window_packets: int = 64  # on their way at once: what one acknowledgement can tell of
-    ack_delay_ns: int = 20_000_000  # waiting a little lets an acknowledgement ride on a packet with values
+    overhead_bytes: int = 28  # cost of a packet on the wire beyond its own bytes: IPv4 and UDP
+    budget_bytes: int | None = None  # on the wire in any one-second window; None: unlimited
+    window_packets: int = 64  # in flight at once: what one acknowledgement covers
+    ack_delay_ns: int = 20_000_000  # so that an acknowledgement can ride on a packet with values
     ack_packets: int = 16  # acknowledge at once after so many: well inside the window
-    reorder_packets: int = (
-        3  # overtaken by so many, a packet that took longer than a round trip and 2 deviations is lost (as RFC 9002)
-    )
-    first_rto_ns: int = 500_000_000  # patience before any round trip has been measured
+    # Overtaken by so many, a packet that took longer than a round trip and two deviations is lost (as RFC 9002).
+    reorder_packets: int = 3
+    first_rto_ns: int = 500_000_000  # time-out before any round trip has been measured
     min_rto_ns: int = 100_000_000  # an idle process may take so long to answer
     max_rto_ns: int = 2_000_000_000  # a link that comes back is found again within this time
     hello_ns: int = 250_000_000  # between greetings while the peer is unknown
     heartbeat_ns: int = 1_000_000_000  # longest silence while the peer is known
-    oldest_every: int = (
-        8  # in every eighth packet the value that has waited longest follows the poses, so that none starves
-    )
+    # In every eighth packet the value that has waited longest follows the poses, so that none starves.
+    oldest_every: int = 8
     max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
     max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
     max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
-    resident_bytes: int = 0  # of memory for values of keyframes, their pages in the archive apart; 0: any number
-    resident_inbox_bytes: int = 0  # the same of what the peer says of keyframes, where there is a spill
+    resident_bytes: int | None = None  # memory for own values of keyframes, archived pages apart; None: unlimited
+    resident_inbox_bytes: int | None = None  # the same for the peer's values of keyframes; needs a spill
     order: Callable[[Key], Order] = default_order
 
     def __post_init__(self) -> None:
         if not MIN_PACKET_BYTES <= self.packet_bytes <= 1 << 16:
             raise ValueError(f"packet_bytes is {self.packet_bytes}, expected {MIN_PACKET_BYTES}..65536")
         least = 2 * (MIN_PACKET_BYTES + self.overhead_bytes)
-        if self.budget_bytes and self.budget_bytes < least:
-            raise ValueError(f"budget_bytes is {self.budget_bytes}, expected 0 (unlimited) or at least {least}")
+        if self.budget_bytes is not None and self.budget_bytes < least:
+            raise ValueError(f"budget_bytes is {self.budget_bytes}, expected none or at least {least}")
 
     @property
     def filled_bytes(self) -> int:
-        """How long packets are made: within a tight budget no longer than a quarter of it, or the pose would wait."""
-        if not self.budget_bytes:
+        """Length of full packets: at most a quarter of a tight budget, or the pose would wait."""
+        if self.budget_bytes is None:
             return self.packet_bytes
         return max(MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 4 - self.overhead_bytes))
 
     @property
     def burst_bytes(self) -> int:
-        """How many bytes may leave at once: a packet, and what adds up between two frames at 10 Hz."""
-        return max(self.filled_bytes + self.overhead_bytes, self.budget_bytes // 8)
+        """Bytes that may leave at once: a packet, and what adds up between two frames at 10 Hz."""
+        return max(self.filled_bytes + self.overhead_bytes, (self.budget_bytes or 0) // 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,21 +80,20 @@ class SyncStats:
     packets_sent: int
     bytes_received: int
     packets_received: int
-    lost: int  # packets taken for lost
+    lost: int  # packets
     duplicates: int  # packets received again, or too late
     rejected: int
     reasons: tuple[tuple[str, int], ...]  # why packets were rejected, how many
-    rtt_ns: int  # smoothed round trip; 0 before the first
-    dirty: int  # values that the peer is not known to hold
+    rtt_ns: int | None  # smoothed round trip; None before the first
+    dirty: int  # own values that the peer is not known to hold
     in_flight: int  # packets
     values: int  # that the peer's session wrote
-    legacy: int  # that earlier sessions of the peer wrote and its present one has not replaced
-    peer_session: int  # 0: no peer has been heard
+    earlier_values: int  # that earlier sessions of the peer wrote and its present one has not replaced
+    peer_session: int | None  # None before the first packet of the peer
     restarts: int  # of the peer, noticed
     mismatches: int  # digests that differed: a defect, mended by sending everything again
-    backlog_bytes: int = 0  # of values that the peer is not known to hold
-    resident_bytes: int = 0  # of memory that values of keyframes take, about
+    backlog_bytes: int = 0  # of own values that the peer is not known to hold
+    resident_bytes: int = 0  # memory of values of keyframes, roughly
     archived: int = 0  # values that are kept out of memory
-    dropped: int = 0  # values given up for want of memory
-    throughput_bytes_s: int = 0  # what the link delivered lately while values waited; 0: nothing had to wait
-    budget_bytes: int = 0  # on the wire in any one-second window; 0: unlimited
+    dropped: int = 0  # values dropped for want of memory
+    throughput_bytes_s: int | None = None  # what the link delivered lately; None if nothing had to wait

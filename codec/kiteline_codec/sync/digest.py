@@ -1,8 +1,7 @@
-"""A digest of a set of values that is kept up to date in constant time a change.
+"""A digest of a changing set of values, updated in constant time.
 
-Each (key, version, code) is hashed on its own with BLAKE2b; the digest is the sum of the hashes modulo 2^128, which
-does not depend on their order, so nothing needs to be sorted or hashed again (M. Bellare, D. Micciancio, "A new
-paradigm for collision-free hashing", 1997). It guards against defects, not against an attacker who holds the key.
+Each (key, version, code) is hashed with BLAKE2b; the digest is the sum of the hashes modulo 2^128, whatever their
+order (M. Bellare, D. Micciancio, "A new paradigm for collision-free hashing", 1997). It detects defects, not attacks.
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ from hashlib import blake2b
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import Key
+from kiteline_codec.transport.packet import DIGEST_BYTES
 
-DIGEST_BYTES = 16
 MODULUS = 1 << 8 * DIGEST_BYTES
 
 
@@ -26,27 +25,19 @@ def hash_value(key: Key, version: int, code: bytes) -> int:
 
 
 class Digest:
-    """The digest of a changing set."""
+    """The sum of the hashes of a set of values."""
 
     __slots__ = ("_sum",)
 
     def __init__(self) -> None:
         self._sum = 0
 
-    def add(self, key: Key, version: int, code: bytes) -> None:
-        """A value joins the set."""
-        self._sum = (self._sum + hash_value(key, version, code)) % MODULUS
-
-    def discard(self, key: Key, version: int, code: bytes) -> None:
-        """A value that is in the set leaves it."""
-        self._sum = (self._sum - hash_value(key, version, code)) % MODULUS
-
-    def join(self, hashes: int) -> None:
-        """Values whose hashes have this sum join the set."""
+    def add(self, hashes: int) -> None:
+        """Add values whose hashes have this sum."""
         self._sum = (self._sum + hashes) % MODULUS
 
-    def leave(self, hashes: int) -> None:
-        """Values whose hashes have this sum leave the set."""
+    def discard(self, hashes: int) -> None:
+        """Remove values whose hashes have this sum."""
         self._sum = (self._sum - hashes) % MODULUS
 
     def bytes(self) -> bytes:

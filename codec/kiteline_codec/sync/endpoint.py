@@ -1,8 +1,8 @@
-"""The endpoint: keeps what two sides share in agreement over any link that loses, repeats or reorders packets.
+"""The endpoint: keeps what two sides share in agreement over a link that loses, repeats or reorders packets.
 
-The model is state synchronisation (K. Winstein, H. Balakrishnan, "Mosh: an interactive remote shell for mobile
-clients", 2012): a packet is filled, when it may be sent, with the most valuable values that the peer lacks, at their
-newest version. Nothing is queued, so nothing grows old in a queue. Packets are described in SPEC.md.
+State synchronisation (K. Winstein, H. Balakrishnan, "Mosh: an interactive remote shell for mobile clients", 2012): a
+packet is filled, when it may be sent, with the values of highest priority that the peer lacks, at their newest version.
+No message is queued. Packets are described in SPEC.md, states in `agreement`.
 """
 
 from __future__ import annotations
@@ -12,69 +12,63 @@ from collections.abc import Mapping
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.pacing.budget import SlidingBudget
-from kiteline_codec.pacing.congestion_window import Window
+from kiteline_codec.pacing.congestion_window import CongestionWindow
 from kiteline_codec.pacing.throughput import Throughput
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import PREDICTOR_KINDS, Key, WireError
-from kiteline_codec.sync import remembered
+from kiteline_codec.sync import resumption
+from kiteline_codec.sync.agreement import OwnState, OwnValues, PeerValues
 from kiteline_codec.sync.archive import Spill
-from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats, default_order
-from kiteline_codec.sync.entries import Order
-from kiteline_codec.sync.expand import grown
+from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats
 from kiteline_codec.sync.inbox import Inbox, Update
 from kiteline_codec.sync.outbox import Known, Outbox
 from kiteline_codec.sync.round_trip import RoundTrip
-from kiteline_codec.transport.packet import CRC_BYTES, MAX_KIND, Header, Item, VersionError, parse, seal, write_header
-
-__all__ = ["Endpoint", "SyncConfig", "SyncStats", "Update", "default_order"]
+from kiteline_codec.sync.send_queue import Order
+from kiteline_codec.transport.packet import (
+    CRC_BYTES,
+    MAX_KIND,
+    Header,
+    Item,
+    VersionError,
+    add_checksum,
+    parse,
+    write_header,
+)
 
 
 class Endpoint:
     """One end of a relation between two sessions. Pure: time and packets are handed in, packets are handed out."""
 
     def __init__(
-        self,
-        config: SyncConfig,
-        session: int,
-        name: str = "",
-        tightener: Tightener | None = None,
-        spill: Spill | None = None,
+        self, config: SyncConfig, session: int, coder: ResidualCoder | None = None, spill: Spill | None = None
     ) -> None:
-        """A session number must be above 0 and larger than that of any earlier endpoint in this place.
-
-        tightener: makes values shorter on the wire. Both ends of a relation have one, or none. spill: where values of
-        keyframes go beyond `resident_bytes`; without one those that the peer holds are forgotten, others given up.
+        """session: above 0, and higher than any earlier one of this side. coder: makes values shorter on the wire; both
+        ends have one, or none. spill: keeps values of keyframes beyond `resident_bytes`; without one, those that the
+        peer holds are forgotten and others dropped.
         """
         if not 0 < session < 1 << 56:
             raise ValueError(f"session is {session}, expected 1..2^56-1")
         self.config = config
         self.session = session
-        self.name = name
-        self._tightener = tightener
+        self._coder = coder
         self._out = Outbox(
-            config.order, config.oldest_every, self._shrink if tightener else None, PREDICTOR_KINDS, config.resident_bytes,
-            spill,
-        )  # fmt: skip
+            config.order, config.oldest_every, self._compress if coder else None, config.resident_bytes, spill
+        )
         self._spill = spill
         self._in = Inbox(config.resident_inbox_bytes, spill)
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
-        self._peer = 0
-        self._legacy: dict[Key, bytes] = {}
-        self._remembered: dict[Key, int] = {}  # what the peer says to know of earlier sessions of ours
-        self._peer_verified = -1  # our version that the peer found equal
-        self._verified = -1  # the peer's version that we found equal
-        self._resync = -1  # the peer's version that we found different
-        self._last_void = -1  # our version up to which all was voided
-        self._reset: tuple[int, int] | None = (
-            None  # the same while the peer must be told, and the first packet that does
-        )
-        self._overtaken = 0  # packets before this one have been overtaken by too many acknowledged ones
-        self._owed = 0  # packets to acknowledge, or news to tell
-        self._owed_since_ns = 0
-        self._told_ns = -(1 << 62)  # when a packet last left
-        self._digest_sent: tuple[int, int] = (-1, 0)  # version, when
+        self.peer_session: int | None = None  # None before the first packet of the peer
+        self._own_values = OwnValues()
+        self._peer_values = PeerValues()
+        self._earlier: dict[Key, bytes] = {}  # written by earlier sessions of the peer
+        self._resumable: dict[Key, int] = {}  # checksums of what the peer holds of earlier sessions of this side
+        self._overtaken_below = 0  # packets with lower numbers have been overtaken by enough acknowledged ones
+        self._unanswered = 0  # packets to acknowledge, and news to send
+        self._unanswered_since_ns = 0
+        self._sent_ns: int | None = None  # when the last packet left
+        self._digest_sent: tuple[int, int] | None = None  # version of the last digest, and when it left
         self._round_trip = RoundTrip(config)
-        self._window = Window(config.window_packets)
+        self._window = CongestionWindow(config.window_packets)
         self._throughput = Throughput()
         self.throughput_bytes_s: int | None = None  # what the link delivers; None while nothing has to wait
         self._bytes_sent = self._packets_sent = self._bytes_received = self._packets_received = 0
@@ -92,59 +86,52 @@ class Endpoint:
         self._out.put(key, code, self.config.order(key) if priority is None else priority)
 
     def remove(self, key: Key) -> None:
-        """Take a value back; unknown keys are ignored."""
+        """Remove a value; unknown keys are ignored."""
         self._out.remove(key)
 
     def arrived(self, key: Key) -> bool:
-        """Whether the peer is known to hold the newest version of a value of ours, or that there is none."""
+        """True if the peer is known to hold the newest version of an own value, or if there is none."""
         return self._out.arrived(key)
 
     def own_values(self) -> dict[Key, bytes]:
         """What this side shares, by key; a copy."""
-        return {key: code for key, code in self._out.codes().items() if key.kind != remembered.KIND}
+        return {key: code for key, code in self._out.codes().items() if key.kind != resumption.SUMMARY_KIND}
 
     def peer_values(self) -> dict[Key, bytes]:
         """What the peer's session wrote, by key; a copy."""
-        return {key: code for key, code in self._in.codes().items() if key.kind != remembered.KIND}
+        return {key: code for key, code in self._in.codes().items() if key.kind != resumption.SUMMARY_KIND}
 
     def own_value(self, key: Key) -> bytes | None:
-        """The code of a value that this side shares; None where there is none."""
+        """The code of a value that this side shares; None if there is none."""
         held = self._out.held(key)
         return None if held is None else held[1]
 
     def peer_value(self, key: Key) -> bytes | None:
-        """The code of a value that the peer's session wrote; None where there is none."""
+        """The code of a value that the peer's session wrote; None if there is none."""
         held = self._in.held(key)
         return None if held is None else held[1]
 
-    def legacy_values(self) -> dict[Key, bytes]:
+    def earlier_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
-        return dict(self._legacy)
+        return dict(self._earlier)
 
-    def remember(self, values: Mapping[Key, bytes]) -> None:
-        """What the peer wrote in earlier sessions, as it was kept somewhere: it need not send that again."""
-        self._legacy.update(values)
-
-    def forget_legacy(self) -> None:
-        """Drop the values of earlier sessions of the peer."""
-        self._legacy.clear()
+    def resume(self, values: Mapping[Key, bytes]) -> None:
+        """Take over values of earlier sessions of the peer from a store; the peer need not send them again."""
+        self._earlier.update(values)
 
     # ---- agreement
 
     @property
-    def peer_session(self) -> int:
-        """The peer's session, 0 while none has been heard."""
-        return self._peer
-
-    @property
     def quiet(self) -> bool:
-        """Whether the peer is known to hold all that was put, and no value has arrived in part."""
-        return bool(self._peer) and self._out.clean and not self._in.assembling and self._reset is None
+        """True if the peer is known to hold all that was put, and no value has arrived in part."""
+        state = self._own_values.state
+        return state in (OwnState.UNCOMPARED, OwnState.EQUAL) and self._out.clean and not self._in.assembling
 
     @property
     def digest_equal(self) -> bool:
-        """Whether, in both directions, the newest state has been compared and found equal."""
-        return self.quiet and self._peer_verified == self._out.newest and self._verified == self._in.newest
+        """True if, in both directions, the newest state has been compared and found equal."""
+        own, peer = self._own_values, self._peer_values
+        return self.quiet and own.equal_at == self._out.newest and peer.equal_at == self._in.newest
 
     @property
     def digests(self) -> tuple[bytes, bytes]:
@@ -155,24 +142,24 @@ class Endpoint:
     def stats(self) -> SyncStats:
         """A snapshot of the numbers."""
         reasons = tuple(sorted(self._reasons.items()))
-        out, flights = self._out, self._out.flights
+        out, packets = self._out, self._out.packets
         return SyncStats(
-            self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, flights.lost,
+            self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, packets.lost,
             self._duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
-            flights.in_flight, len(self._in), len(self._legacy), self._peer, self._restarts, self._mismatches,
-            self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped, self.throughput_bytes_s or 0,
-            self.config.budget_bytes,
+            packets.in_flight, len(self._in), len(self._earlier), self.peer_session, self._restarts,
+            self._mismatches, self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped,
+            self.throughput_bytes_s,
         )  # fmt: skip
 
     @property
     def backlog_bytes(self) -> int:
-        """Of values that the peer is not known to hold."""
+        """Bytes of own values that the peer is not known to hold."""
         return self._out.pending_bytes
 
     # ---- receiving
 
     def receive(self, packet: bytes, now_ns: int) -> list[Update]:
-        """Take in a packet. Returns the values that changed by it. Never raises: bad packets are counted."""
+        """Take in a packet. Returns the values that changed. Never raises: bad packets are counted."""
         self._bytes_received += len(packet) + self.config.overhead_bytes
         self._packets_received += 1
         try:
@@ -181,125 +168,124 @@ class Endpoint:
             return self._refuse(str(e))
         except WireError:
             return self._refuse("damaged or no packet of this protocol")
-        if header.session < self._peer:
+        if self.peer_session is not None and header.session < self.peer_session:
             return self._refuse("from an earlier session of the peer")
         if header.peer > self.session:
-            return self._refuse("the peer has heard a later session of this side: the stored session number went back")
-        if header.session > self._peer:
-            self._greet(header.session)
-            self._owe(now_ns)
+            return self._refuse("the peer knows a later session of this side: the stored session number went back")
+        if self.peer_session is None or header.session > self.peer_session:
+            self._begin_session(header.session)
+            self._owe_answer(now_ns)
         if header.peer != self.session:
-            # A greeting, or the peer has not yet noticed that this side restarted: let it know.
-            self._owe(now_ns)
+            # A greeting, or the peer has not noticed yet that this side restarted: answer, so that it learns.
+            self._owe_answer(now_ns)
             return self._refuse("for an earlier session of this side") if header.peer else []
         self._take_control(header, now_ns)
         updates = self._void(header.reset)
         if header.values is not None:
             number, watermark = header.values
-            if not self._in.is_new(number):
+            if not self._in.packets.is_new(number):
                 self._duplicates += 1
-                self._owe(now_ns)
+                self._owe_answer(now_ns)
                 return updates
             if not self._in.room_for(items, self.config.max_inbox_bytes, self.config.max_assembly_bytes):
                 self._refuse("no memory left for it")
                 return updates
             try:
-                items = self._grown(items)
+                items = self._expanded(items)
             except WireError as e:
                 return self._refuse(str(e))
-            self._in.mark(number)
-            self._owe(now_ns)
+            self._in.packets.mark(number)
+            self._owe_answer(now_ns)
             self._in.raise_watermark(watermark)
             for item in items:
                 update = self._in.apply(item)
                 if update is not None:
                     if update.key.kind in PREDICTOR_KINDS:
-                        self._out.basis_changed()
-                    if update.key.kind == remembered.KIND:
-                        self._hear(update)
+                        self._out.predictors_changed()
+                    if update.key.kind == resumption.SUMMARY_KIND:
+                        self._take_summary(update.code or b"")
                         continue
-                    self._legacy.pop(update.key, None)
+                    self._earlier.pop(update.key, None)
                     updates.append(update)
         self._compare(header, now_ns)
         return updates
 
-    def _shrink(self, key: Key, code: bytes, known: Known) -> bytes | None:
-        """A shorter form of a value of ours: the peer holds what it wrote itself, and what of ours is known to it."""
-        assert self._tightener is not None
-        form = remembered.form_of(key, code, self._remembered)
-        if form is not None:
-            return form
-        return self._tightener.shrink(key, code, lambda k: self._in.held(k) or known(k), self._out.held)
+    def _compress(self, key: Key, code: bytes, known: Known) -> bytes | None:
+        """A shorter form of an own value. The peer holds what it wrote, and what of ours is `known` to have arrived."""
+        assert self._coder is not None
+        reference = resumption.reference_to(key, code, self._resumable)
+        if reference is not None:
+            return reference
+        return self._coder.compress(key, code, lambda k: self._in.held(k) or known(k), self._out.held)
 
-    def _grown(self, items: list[Item]) -> list[Item]:
-        """The items with codes in place of tight forms. Raises WireError where a form builds upon what is not held."""
-        if not any(item.tight for item in items):
+    def _expanded(self, items: list[Item]) -> list[Item]:
+        """The items with codes in place of residual codes. Raises WireError if their predictors are not held."""
+        if not any(item.residual for item in items):
             return items
-        if self._tightener is None:
-            raise WireError("a tight form, which this side does not read")
-        return grown(items, self._tightener, lambda key: self._in.held(key) or self._out.held(key), self._legacy)
+        if self._coder is None:
+            raise WireError("a residual code, which this side does not read")
+        held = lambda key: self._in.held(key) or self._out.held(key)  # noqa: E731
+        return resumption.expand_items(items, self._coder, held, self._earlier)
 
-    def _hear(self, update: Update) -> None:
-        """The peer tells what it remembers."""
-        with contextlib.suppress(WireError):  # words that cannot be read say nothing
-            self._remembered.update(remembered.heard(update.code or b""))
-            self._out.basis_changed()
+    def _take_summary(self, code: bytes) -> None:
+        """Take in what the peer holds of earlier sessions of this side; a summary that cannot be read is ignored."""
+        with contextlib.suppress(WireError):
+            self._resumable.update(resumption.read_summary(code))
+            self._out.predictors_changed()
 
     def _refuse(self, reason: str) -> list[Update]:
         self._reasons[reason] = self._reasons.get(reason, 0) + 1
         return []
 
-    def _greet(self, session: int) -> None:
-        """A new session of the peer: it holds nothing of ours, and what its forerunner wrote becomes legacy."""
-        if self._peer:
+    def _begin_session(self, session: int) -> None:
+        """Begin with a new session of the peer, which holds nothing of ours; what the last one wrote stays readable."""
+        if self.peer_session is not None:
             self._restarts += 1
-        self._peer = session
-        self._legacy.update(self.peer_values())
+        self.peer_session = session
+        self._earlier.update(self.peer_values())
         self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
-        self._remembered.clear()
+        self._resumable.clear()
         self._out.restart()
-        if self._tightener is not None:
-            for key, code in remembered.told(self._legacy, session).items():
+        if self._coder is not None:
+            for key, code in resumption.summaries(self._earlier, session).items():
                 self._out.put(key, code, self.config.order(key))
-        self._peer_verified = self._verified = self._resync = -1
-        self._reset = None
-        self._digest_sent = (-1, 0)
-        self._round_trip.doublings = self._overtaken = 0
-        self._window = Window(self.config.window_packets)
+        self._own_values.new_session()
+        self._peer_values.new_session()
+        self._digest_sent = None
+        self._round_trip.doublings = self._overtaken_below = 0
+        self._window = CongestionWindow(self.config.window_packets)
 
-    def _owe(self, now_ns: int) -> None:
-        if not self._owed:
-            self._owed_since_ns = now_ns
-        self._owed += 1
+    def _owe_answer(self, now_ns: int) -> None:
+        """Note that a packet must leave soon."""
+        if not self._unanswered:
+            self._unanswered_since_ns = now_ns
+        self._unanswered += 1
 
     def _take_control(self, header: Header, now_ns: int) -> None:
+        """Take in acknowledgements, and how the peer's copy of our values compared."""
+        own, packets = self._own_values, self._out.packets
         if header.ack is not None:
-            before, on_way = self._out.flights.acked_bytes, self._out.flights.in_flight
-            sent_ns, number = self._out.acknowledge(*header.ack)
-            self._throughput.acked(self._out.flights.acked_bytes - before, now_ns)
-            if number:
-                self._round_trip.measured(now_ns - sent_ns)
-                self._window.measured(now_ns - sent_ns, on_way - self._out.flights.in_flight, on_way, now_ns)
-                self._overtaken = max(self._overtaken, number - self.config.reorder_packets)
-                if self._reset is not None and number >= self._reset[1]:
-                    self._reset = None
+            bytes_before, in_flight = packets.acked_bytes, packets.in_flight
+            acknowledged = self._out.acknowledge(*header.ack)
+            self._throughput.acked(packets.acked_bytes - bytes_before, now_ns)
+            if acknowledged is not None:
+                rtt_ns = now_ns - acknowledged.oldest_sent_ns
+                self._round_trip.measured(rtt_ns)
+                self._window.measured(rtt_ns, in_flight - packets.in_flight, in_flight, now_ns)
+                overtaken_below = acknowledged.newest - self.config.reorder_packets
+                self._overtaken_below = max(self._overtaken_below, overtaken_below)
+                own.acknowledged(acknowledged.newest)
         if header.verified is not None:
-            self._peer_verified = max(self._peer_verified, min(header.verified, self._out.newest))
-            if self._reset is not None and self._peer_verified >= self._reset[0]:
-                self._reset = None
-        if header.resync is not None and header.resync <= self._out.newest:
-            if header.resync > self._last_void:
-                self._last_void = self._out.renumber()
-                self._reset = (self._last_void, self._out.flights.next_number)
-                self._peer_verified = -1
+            own.found_equal(min(header.verified, self._out.newest))
+        if header.resync is not None and header.resync <= self._out.newest and own.must_void(header.resync):
+            own.found_different(self._out.renumber(), packets.next_number)
 
     def _void(self, reset: int | None) -> list[Update]:
-        """The peer voided its values up to a version, since the digests differed."""
+        """Drop what the peer voided because digests differed."""
         if reset is None:
             return []
-        if reset >= self._resync:
-            self._resync = -1
-        return [Update(key, None) for key in self._in.reset(reset)]
+        self._peer_values.voided(reset)
+        return [Update(key, None) for key in self._in.void(reset)]
 
     def _compare(self, header: Header, now_ns: int) -> None:
         """Compare the peer's digest with that of what has arrived, unless newer values have arrived since."""
@@ -308,79 +294,79 @@ class Endpoint:
         version, digest = header.digest
         if self._in.newest > version:
             return
-        if digest != self._in.digest.bytes():
-            if self._resync != version:
-                self._mismatches += 1
-            self._resync = version
-        else:
+        if digest == self._in.digest.bytes():
             self._in.raise_watermark(version)
             self._in.newest = version
-            self._verified = version
-        self._owe(now_ns)
+            self._peer_values.found_equal(version)
+        elif self._peer_values.found_different(version):
+            self._mismatches += 1
+        self._owe_answer(now_ns)
 
     # ---- sending
-
-    @property
-    def _most_packets(self) -> int:
-        """That may be on their way: a budget paces by itself."""
-        return self.config.window_packets if self.config.budget_bytes else self._window.packets
 
     def poll(self, now_ns: int) -> bytes | None:
         """The next packet to send now, or None. Call until None."""
         c = self.config
         self._throughput.busy(self._out.has_work(), now_ns)
         self.throughput_bytes_s = self._throughput.bytes_s(now_ns)
-        self._out.give_up(now_ns - self._round_trip.overdue_ns, self._overtaken)
+        self._out.give_up(now_ns - self._round_trip.overdue_ns, self._overtaken_below)
         if self._out.give_up(now_ns - self._round_trip.timeout_ns):
-            self._round_trip.missed()
+            self._round_trip.timed_out()
         left = self._budget.left(now_ns) - c.overhead_bytes
-        if (
-            self._peer
-            and self._out.flights.window_open(max(1, self._most_packets >> self._round_trip.doublings))
-            and self._out.has_work()
-        ):
+        unheard = self._own_values.state is OwnState.UNHEARD
+        if not unheard and self._window_open() and self._out.has_work():
             if left < c.filled_bytes:
                 return None
             return self._packet(now_ns, values=True, digest=False)
-        silent_ns = now_ns - self._told_ns
-        owed = self._owed and (self._owed >= c.ack_packets or now_ns - self._owed_since_ns >= c.ack_delay_ns)
+        answer = self._unanswered and (
+            self._unanswered >= c.ack_packets or now_ns - self._unanswered_since_ns >= c.ack_delay_ns
+        )
         digest = self._digest_due(now_ns)
-        if not (owed or digest or silent_ns >= (c.heartbeat_ns if self._peer else c.hello_ns)):
+        silence_ns = c.hello_ns if unheard else c.heartbeat_ns
+        if not (answer or digest or self._sent_ns is None or now_ns - self._sent_ns >= silence_ns):
             return None
         if left < MIN_PACKET_BYTES:
             return None
         return self._packet(now_ns, values=False, digest=digest)
 
+    def _window_open(self) -> bool:
+        """True if another packet may be in flight. A budget limits the rate by itself."""
+        budgeted = self.config.budget_bytes is not None
+        packets = self.config.window_packets if budgeted else self._window.packets
+        return self._out.packets.window_open(max(1, packets >> self._round_trip.doublings))
+
     def _digest_due(self, now_ns: int) -> bool:
-        """Whether all has arrived, the peer has not confirmed it, and it was not told so just now."""
+        """True if all has arrived, the peer has not found it equal, and no digest was sent just now."""
         out = self._out
-        if not self._peer or not out.clean or self._peer_verified == out.newest:
+        if self._own_values.state is OwnState.UNHEARD or not out.clean or self._own_values.equal_at == out.newest:
             return False
+        if self._digest_sent is None:
+            return True
         version, sent_ns = self._digest_sent
         return version != out.newest or now_ns - sent_ns >= self._round_trip.timeout_ns
 
     def _packet(self, now_ns: int, values: bool, digest: bool) -> bytes:
-        out = self._out
+        out, own = self._out, self._own_values
         watermark = out.watermark()
         header = Header(
             self.session,
-            self._peer,
-            self._in.acknowledgement() if self._peer else None,
+            self.peer_session or 0,
+            None if own.state is OwnState.UNHEARD else self._in.acknowledgement(),
             (out.newest, out.digest.bytes()) if digest else None,
-            self._verified if self._verified >= 0 else None,
-            self._resync if self._resync >= 0 else None,
-            self._reset[0] if self._reset is not None else None,
-            (out.flights.next_number, watermark) if values else None,
+            self._peer_values.equal_at,
+            self._peer_values.different_at,
+            own.void_up_to if own.state is OwnState.VOIDING else None,
+            (out.packets.next_number, watermark) if values else None,
         )
         data = Writer()
         write_header(data, header)
         if values:
             out.fill(data, self.config.filled_bytes - CRC_BYTES, watermark, now_ns)
-        packet = seal(data)
+        packet = add_checksum(data)
         if digest:
             self._digest_sent = (out.newest, now_ns)
-        self._owed = 0
-        self._told_ns = now_ns
+        self._unanswered = 0
+        self._sent_ns = now_ns
         self._budget.spend(now_ns, len(packet) + self.config.overhead_bytes)
         self._bytes_sent += len(packet) + self.config.overhead_bytes
         self._packets_sent += 1

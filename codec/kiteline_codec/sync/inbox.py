@@ -1,7 +1,6 @@
 """What one session of the peer wrote, as far as it has arrived.
 
-Memory is bounded where a bound and a place beside it are given: what the peer says of keyframes that it did not touch
-for long waits there, and comes back when it is asked for or replaced.
+With a limit and a spill, values of keyframes that were not used for long are archived until they are needed.
 """
 
 from __future__ import annotations
@@ -13,16 +12,16 @@ from kiteline_codec.schema import KEYFRAME_KINDS, Key
 from kiteline_codec.sync import ranges
 from kiteline_codec.sync.archive import Archive, Row, Spill
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
-from kiteline_codec.sync.resident import Resident
+from kiteline_codec.sync.resident import ResidentValues
 from kiteline_codec.transport.packet import MASK_BITS, Item
+from kiteline_codec.transport.sequence_window import SequenceWindow
 
-_MASK = (1 << MASK_BITS) - 1
-_VALUE_BYTES = 350  # of memory that a value takes beside its code, about
+_VALUE_BYTES = 350  # memory of a value beside its code, roughly
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """A value that the peer wrote, or took back (code None)."""
+    """A value that the peer wrote, or removed (code None)."""
 
     key: Key
     code: bytes | None
@@ -32,27 +31,26 @@ class Update:
 class _Assembly:
     version: int
     data: bytearray
-    got: ranges.Ranges
+    received: ranges.Ranges
 
 
 class Inbox:
     """Packet numbers, values, removals and unfinished values of one session of the peer."""
 
-    def __init__(self, resident_bytes: int = 0, spill: Spill | None = None) -> None:
-        """resident_bytes: of memory for what the peer says of keyframes, about; 0, or without a spill: any number."""
+    def __init__(self, resident_bytes: int | None = None, spill: Spill | None = None) -> None:
+        """resident_bytes: memory for values of keyframes, roughly; without it, or without a spill, unlimited."""
         self._values: dict[Key, tuple[int, bytes]] = {}
         self._archive = Archive(spill)
-        self._resident = Resident(0 if spill is None else resident_bytes, KEYFRAME_KINDS, _VALUE_BYTES)
+        self._resident = ResidentValues(None if spill is None else resident_bytes, _VALUE_BYTES)
         self.digest = Digest()
         self.value_bytes = 0
         self.assembly_bytes = 0
-        self.newest = 0  # highest version seen
+        self.newest = 0  # highest version seen; versions count from 1
         self.watermark = 0  # all versions up to it have arrived, or do not matter any more
         self._removed: dict[Key, int] = {}
         self._removed_order: list[tuple[int, Key]] = []
         self._assemblies: dict[Key, _Assembly] = {}
-        self._last = 0
-        self._seen = 0  # bit i: packet last - 1 - i has arrived
+        self.packets = SequenceWindow(MASK_BITS)
 
     def __len__(self) -> int:
         return len(self._values) + self._archive.values
@@ -73,43 +71,26 @@ class Inbox:
 
     @property
     def resident_bytes(self) -> int:
-        """Memory that takes what the peer says of keyframes, about; 0 where it is not bounded."""
+        """Memory of values of keyframes, roughly; 0 if it is not limited."""
         return self._resident.bytes + self._archive.resident_bytes
 
     @property
     def assembling(self) -> int:
-        """How many values have arrived in part."""
+        """The number of values that have arrived in part."""
         return len(self._assemblies)
 
     @property
     def tombstones(self) -> int:
-        """How many removals are remembered."""
+        """The number of removals that are remembered."""
         return len(self._removed)
 
     def acknowledgement(self) -> tuple[int, int] | None:
         """The last packet number and a mask of those missing before it; None when nothing has arrived."""
-        if not self._last:
-            return None
-        return self._last, ~self._seen & (1 << min(MASK_BITS, self._last - 1)) - 1
-
-    def is_new(self, number: int) -> bool:
-        """Whether a packet is neither a repetition nor older than an acknowledgement can tell."""
-        behind = self._last - number
-        return behind < 0 or (0 < behind <= MASK_BITS and not self._seen >> behind - 1 & 1)
-
-    def mark(self, number: int) -> None:
-        """A new packet has been taken in."""
-        ahead = number - self._last
-        if ahead > MASK_BITS:
-            self._last, self._seen = number, 0
-        elif ahead > 0:
-            self._seen = (self._seen << ahead | (1 << ahead - 1 if self._last else 0)) & _MASK
-            self._last = number
-        else:
-            self._seen |= 1 << -ahead - 1
+        last = self.packets.highest
+        return None if last is None else (last, self.packets.missing())
 
     def room_for(self, items: list[Item], max_values: int, max_assemblies: int) -> bool:
-        """Whether memory for the items is within the limits, in bytes."""
+        """True if memory for the items is within the limits, in bytes."""
         assemblies, values = self.assembly_bytes, self.value_bytes
         for item in items:
             if item.total is None:
@@ -120,7 +101,7 @@ class Inbox:
         return values <= max_values and assemblies <= max_assemblies
 
     def raise_watermark(self, version: int) -> None:
-        """The peer knows that all its versions up to this one have arrived: forget removals up to it."""
+        """Take in that all versions up to this one have arrived: removals up to it are forgotten."""
         if version <= self.watermark:
             return
         self.watermark = version
@@ -131,8 +112,8 @@ class Inbox:
         for key in [k for k, a in self._assemblies.items() if a.version <= version]:
             self._drop_assembly(key)
 
-    def reset(self, version: int) -> list[Key]:
-        """The peer voids its values up to a version. Returns their keys."""
+    def void(self, version: int) -> list[Key]:
+        """Drop all values up to a version. Returns their keys."""
         self._fetch_all()
         void = sorted(k for k, (v, _) in self._values.items() if v <= version)
         for key in void:
@@ -142,7 +123,7 @@ class Inbox:
         return void
 
     def apply(self, item: Item) -> Update | None:
-        """Take in an item. Returns what became known by it, if anything."""
+        """Take in an item. Returns the value that changed, if any."""
         key, version = item.key, item.version
         self.newest = max(self.newest, version)
         held = self.held(key)
@@ -163,12 +144,13 @@ class Inbox:
         self._removed.pop(key, None)
         self._values[key] = (version, data)
         self.value_bytes += len(data)
-        self.digest.add(key, version, data)
+        self.digest.add(hash_value(key, version, data))
         self._resident.count(key, len(data))
         self._make_room(key.id)
         return Update(key, data)
 
     def _assemble(self, item: Item) -> bytes | None:
+        """Take in a fragment. Returns the code once it is complete."""
         assert item.total is not None
         part = self._assemblies.get(item.key)
         if part is not None and (part.version > item.version or len(part.data) != item.total):
@@ -182,8 +164,8 @@ class Inbox:
             self.assembly_bytes += item.total
         stop = item.offset + len(item.data)
         part.data[item.offset : stop] = item.data
-        part.got = ranges.add(part.got, item.offset, stop)
-        return bytes(part.data) if part.got == ((0, item.total),) else None
+        part.received = ranges.add(part.received, item.offset, stop)
+        return bytes(part.data) if part.received == ((0, item.total),) else None
 
     def _drop_assembly(self, key: Key, up_to: int | None = None) -> None:
         part = self._assemblies.get(key)
@@ -194,22 +176,22 @@ class Inbox:
     def _drop_value(self, key: Key) -> None:
         held = self._values.pop(key, None)
         if held is not None:
-            self.digest.discard(key, *held)
+            self.digest.discard(hash_value(key, *held))
             self.value_bytes -= len(held[1])
             self._resident.uncount(key, len(held[1]))
 
     # ---- memory
 
-    def _make_room(self, wanted: int = -1) -> None:
-        """Beyond the bound, archive what was not touched for long, down to 3/4; never the id that is wanted now."""
+    def _make_room(self, needed: int | None = None) -> None:
+        """Above the limit, archive the least recently used ids, down to 3/4 of it; never the id needed now."""
         if not self._resident.full:
             return
         for id_ in self._resident.ids():
-            if self._resident.roomy or (id_ != wanted and not self._to_archive(id_)):
+            if self._resident.roomy or (id_ != needed and not self._to_archive(id_)):
                 return
 
     def _to_archive(self, id_: int) -> bool:
-        """Move the values of an id out of memory. False where they cannot be kept elsewhere: then all stay here."""
+        """Archive the values of an id. If the spill fails, all values stay in memory from now on: returns False."""
         keys = self._resident.keys(id_)
         rows, hashes = [], 0
         for key in keys:
@@ -219,7 +201,7 @@ class Inbox:
         self._archive.put(id_, rows, hashes % MODULUS)
         if not self._archive.readable(id_):
             self._archive.take(id_)
-            self._resident.unbound()
+            self._resident.remove_limit()
             return False
         for key in keys:
             self._resident.uncount(key, len(self._values.pop(key)[1]))
@@ -230,11 +212,11 @@ class Inbox:
             self._fetch(id_)
 
     def _fetch(self, id_: int) -> None:
-        """Take the values of an id back into memory. Where they are lost, digests differ, and the peer sends again."""
+        """Take the values of an id back into memory. If they are lost, digests differ, and the peer sends again."""
         hashes = self._archive.hashes(id_)
         rows = self._archive.take(id_)
         if any(row.code is None for row in rows):
-            self.digest.leave(hashes)
+            self.digest.discard(hashes)
             self.value_bytes -= sum(row.size for row in rows)
             return
         for row in rows:

@@ -8,7 +8,7 @@ NONE: Ranges = ()
 
 
 def add(ranges: Ranges, start: int, stop: int) -> Ranges:
-    """The union with [start, stop); neighbours that touch become one."""
+    """The union with [start, stop); ranges that touch are joined."""
     if start >= stop:
         return ranges
     out = []
@@ -22,7 +22,7 @@ def add(ranges: Ranges, start: int, stop: int) -> Ranges:
 
 
 def cut(ranges: Ranges, start: int, stop: int) -> Ranges:
-    """What remains without [start, stop)."""
+    """The difference to [start, stop)."""
     if start >= stop:
         return ranges
     out = []

@@ -1,4 +1,4 @@
-"""One packet: a header of numbered optional fields, then values. The layout is described in SPEC.md, "Packets"."""
+"""One packet: a header of optional fields, then values. See SPEC.md, "Packets"."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from zlib import crc32
 
 from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.schema import Key, WireError
-from kiteline_codec.sync.digest import DIGEST_BYTES
 
 PROTOCOL_VERSION = 3
 CRC_BYTES = 4
+DIGEST_BYTES = 16
 MASK_BITS = 64  # packets before the last one that an acknowledgement covers
 MAX_HEADER_BYTES = 64  # of a packet with values, checksum included
 MAX_KIND = 63
@@ -25,19 +25,19 @@ _FLAG_VALUES = 32
 _FLAGS = 63
 _FRAGMENT = 64
 _REMOVED = 128
-_TIGHT = _FRAGMENT | _REMOVED
+_RESIDUAL = _FRAGMENT | _REMOVED
 
 
 class VersionError(WireError):
-    """A sound packet of another protocol version."""
+    """An undamaged packet of another protocol version."""
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a packet says besides values. A field that is None is not in the packet."""
+    """The fields of a packet beside its values. A field that is None is not in the packet."""
 
     session: int  # of the sender, above 0
-    peer: int  # session of the receiver as the sender knows it; 0 when it knows none
+    peer: int  # session of the receiver as the sender knows it; 0: a greeting, sent while it knows none
     ack: tuple[int, int] | None = None  # last packet received, and bit i set where packet last - 1 - i was not
     digest: tuple[int, bytes] | None = None  # the sender's newest version, all of it acknowledged, and its digest
     verified: int | None = None  # the receiver's newest version whose digest the sender found equal
@@ -48,23 +48,23 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A value, a part of one (fragment), or a removal (total is None). tight: the data are a shorter form of it."""
+    """A value, a fragment of one, or a removal (total is None). residual: the data stand for the code in fewer bytes."""
 
     key: Key
     version: int
     total: int | None
     offset: int
     data: bytes
-    tight: bool = False
+    residual: bool = False
 
     @property
     def whole(self) -> bool:
-        """Whether all bytes of the value are in this item."""
+        """True if all bytes of the value are in this item."""
         return len(self.data) == self.total
 
 
 def write_header(out: Writer, header: Header) -> None:
-    """All of a packet before its items."""
+    """Append all of a packet before its items."""
     flags = (
         (_FLAG_ACK if header.ack is not None else 0)
         | (_FLAG_DIGEST if header.digest is not None else 0)
@@ -92,9 +92,9 @@ def write_header(out: Writer, header: Header) -> None:
 
 
 def write_item(out: Writer, item: Item, last_id: int, watermark: int) -> None:
-    """One item after an item of id `last_id` (0 for the first)."""
+    """Append an item that follows an item of id `last_id` (0 for the first)."""
     fragment = item.total is not None and not item.whole
-    form = _TIGHT if item.tight else (_FRAGMENT if fragment else 0) | (_REMOVED if item.total is None else 0)
+    form = _RESIDUAL if item.residual else (_FRAGMENT if fragment else 0) | (_REMOVED if item.total is None else 0)
     out.u8(item.key.kind | form)
     out.signed(item.key.id - last_id)
     out.varint(item.key.part)
@@ -107,14 +107,14 @@ def write_item(out: Writer, item: Item, last_id: int, watermark: int) -> None:
         out.raw(item.data)
 
 
-def seal(out: Writer) -> bytes:
+def add_checksum(out: Writer) -> bytes:
     """The finished packet: what was written, and its checksum."""
     data = out.bytes()
     return data + crc32(data).to_bytes(CRC_BYTES, "little")
 
 
 def parse(packet: bytes, max_value_bytes: int) -> tuple[Header, list[Item]]:
-    """The content of a packet. Raises WireError; VersionError for another protocol version."""
+    """Header and items of a packet. Raises WireError; VersionError for another protocol version."""
     if len(packet) < CRC_BYTES + 4:
         raise WireError(f"a packet of {len(packet)} bytes is too short")
     body = packet[:-CRC_BYTES]
@@ -162,11 +162,11 @@ def _read_item(source: Reader, last_id: int, watermark: int, max_value_bytes: in
         raise WireError(f"an id is not negative and fits 63 bits, found {id_}")
     key = Key(kind, id_, source.varint(0xFFFF))
     version = watermark + 1 + source.varint()
-    if tag & _TIGHT == _REMOVED:
+    if tag & _RESIDUAL == _REMOVED:
         return Item(key, version, None, 0, b"")
     length = source.varint(max_value_bytes)
-    if tag & _TIGHT == _TIGHT:
-        return Item(key, version, length, 0, source.raw(length), tight=True)
+    if tag & _RESIDUAL == _RESIDUAL:
+        return Item(key, version, length, 0, source.raw(length), residual=True)
     if not tag & _FRAGMENT:
         return Item(key, version, length, 0, source.raw(length))
     offset, total = source.varint(max_value_bytes), source.varint(max_value_bytes)

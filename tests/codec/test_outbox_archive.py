@@ -7,7 +7,8 @@ import random
 import pytest
 
 from kiteline_codec.schema import Key, KeyframeHeader, LivePose, NewLandmarks, Observations
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.packet import parse
 from tests.codec.spill_memory import Memory
 
@@ -19,7 +20,7 @@ LIVE = Key(LivePose.KIND, 0)
 class Line:
     """Agent (a) and base (b), and whether they hear each other."""
 
-    def __init__(self, spill: Memory | None, budget_bytes: int = 0) -> None:
+    def __init__(self, spill: Memory | None, budget_bytes: int | None = None) -> None:
         config = SyncConfig(resident_bytes=LIMIT, budget_bytes=budget_bytes)
         self.a, self.b = Endpoint(config, 1, spill=spill), Endpoint(SyncConfig(), 1)
         self.draw = random.Random(1)

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import Key, NewLandmarks, RefinedLandmarks, WireError
-from kiteline_codec.sync import remembered
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync import resumption
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_core.ids import keyframe_id, submap_id
 
 STEP_NS = 25_000_000
@@ -42,7 +43,7 @@ def talk(a: Endpoint, b: Endpoint, begin_ns: int, steps: int = 60, lose: float =
 
 
 def end(session: int) -> Endpoint:
-    return Endpoint(SyncConfig(budget_bytes=8000), session, tightener=Tightener())
+    return Endpoint(SyncConfig(budget_bytes=8000), session, coder=ResidualCoder())
 
 
 @pytest.mark.parametrize("lose", [0.0, 0.3])
@@ -54,7 +55,7 @@ def test_a_base_that_kept_everything_is_sent_checksums(lose: float) -> None:
     first = talk(agent, base, 0, 400, lose)
     assert base.peer_values() == mine
     second = end(2)
-    second.remember(mine)
+    second.resume(mine)
     again = talk(agent, second, 400 * STEP_NS, 400, lose, seed=1)
     assert second.peer_values() == mine
     assert agent.digest_equal and second.digest_equal
@@ -69,7 +70,7 @@ def test_only_what_is_missing_or_new_goes_whole() -> None:
     base = end(2)
     held = dict(list(mine.items())[:60])
     changed = next(iter(held))
-    base.remember({**held, changed: b"something else that was said before"})
+    base.resume({**held, changed: b"something else that was said before"})
     talk(agent, base, 0, 200)
     assert base.peer_values() == mine
     assert agent.digest_equal and base.digest_equal
@@ -90,26 +91,26 @@ def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> Non
 
 def test_another_boot_is_told_nothing() -> None:
     old = values(boot=4)
-    assert remembered.told(old, 5) and not remembered.told(old, 6)
+    assert resumption.summaries(old, 5) and not resumption.summaries(old, 6)
 
 
 @given(st.dictionaries(keys, st.binary(min_size=16, max_size=40), max_size=150))
 def test_what_is_told_is_heard(known: dict[Key, bytes]) -> None:
-    told = remembered.told(known, 1)
+    told = resumption.summaries(known, 1)
     heard: dict[Key, int] = {}
     for code in told.values():
-        heard.update(remembered.heard(code))
+        heard.update(resumption.read_summary(code))
     assert heard.keys() == known.keys()
     for key, code in known.items():
-        form = remembered.form_of(key, code, heard)
+        form = resumption.reference_to(key, code, heard)
         assert form is not None
-        assert remembered.code_of(form, code) == code
-        assert remembered.form_of(key, code + b"!", heard) is None
+        assert resumption.resolve(form, code) == code
+        assert resumption.reference_to(key, code + b"!", heard) is None
         with pytest.raises(WireError):
-            remembered.code_of(form, code + b"!")
+            resumption.resolve(form, code + b"!")
 
 
 @given(st.binary(max_size=60))
 def test_any_bytes_are_heard_or_refused(noise: bytes) -> None:
     with contextlib.suppress(WireError):
-        remembered.heard(noise)
+        resumption.read_summary(noise)

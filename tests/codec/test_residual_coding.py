@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, Writer
-from kiteline_codec.residuals import prediction_kernels as foresee_kernels
-from kiteline_codec.residuals import predictors as references
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals import prediction_kernels, predictors
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import (
     CameraIntrinsics,
     Key,
@@ -28,7 +27,8 @@ from kiteline_codec.schema import (
     WireError,
     messages,
 )
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
@@ -43,16 +43,16 @@ def test_tight_columns_come_back(seed: int, c: int, n: int, spread: float, shift
     rng = np.random.default_rng(seed)
     values = (rng.standard_cauchy((c, n)) * 10.0**spread).clip(-(1 << 25), 1 << 25).astype(np.int64) << shift
     out = Writer()
-    out.tight(values)
+    out.residual_columns(values)
     source = Reader(out.bytes())
-    assert np.array_equal(source.tight(c, n), values)
+    assert np.array_equal(source.residual_columns(c, n), values)
     source.end()
 
 
 @given(st.integers(1, 4), st.integers(1, 300), st.binary(max_size=80))
 def test_any_bytes_are_tight_columns_or_an_error(c: int, n: int, data: bytes) -> None:
     try:
-        values = Reader(data).tight(c, n)
+        values = Reader(data).residual_columns(c, n)
     except WireError:
         return
     assert np.abs(values).max() < 1 << 30
@@ -60,7 +60,7 @@ def test_any_bytes_are_tight_columns_or_an_error(c: int, n: int, data: bytes) ->
 
 def test_too_large_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="numbers below"):
-        Writer().tight(np.array([[1 << 30]]))
+        Writer().residual_columns(np.array([[1 << 30]]))
 
 
 def flight(seed: int, keyframes: int = 6, births: int = 60, narrow: bool = False) -> list[Record]:
@@ -122,12 +122,12 @@ def coded(records: list[Record]) -> Values:
 def test_forms_come_back_whatever_the_peer_lacks(seed: int, lacking: set[int]) -> None:
     values = coded(flight(seed, births=20))
     known = {key: value for i, (key, value) in enumerate(values.items()) if i not in lacking}
-    a, b = Tightener(), Tightener()
+    a, b = ResidualCoder(), ResidualCoder()
     for key, (_, code) in values.items():
-        form = a.shrink(key, code, known.get, values.get)
+        form = a.compress(key, code, known.get, values.get)
         if form is not None:
             assert len(form) < len(code)
-            assert b.grow(key, form, known.get) == code
+            assert b.expand(key, form, known.get) == code
 
 
 def test_a_sighting_is_a_few_bits_and_says_where_absolute() -> None:
@@ -137,10 +137,10 @@ def test_a_sighting_is_a_few_bits_and_says_where_absolute() -> None:
     step = 2 / quantise.PIXEL_STEPS
     last = replace(last, uv=(np.rint(last.uv / step) * step).astype(np.float32))
     key, code = messages.key(last), messages.encode(last)
-    form = Tightener().shrink(key, code, values.get, values.get)
+    form = ResidualCoder().compress(key, code, values.get, values.get)
     assert form is not None
     assert len(form) / len(last.index) < 3.0 < 5.5 < len(code) / len(last.index)
-    nothing = Tightener().shrink(key, code, {}.get, {}.get)
+    nothing = ResidualCoder().compress(key, code, {}.get, {}.get)
     assert nothing is None or len(nothing) > 1.5 * len(form)
 
 
@@ -149,7 +149,7 @@ def test_another_version_of_what_a_form_builds_upon_is_refused() -> None:
     values = coded(records)
     key = messages.key(records[-1])
     code = values[key][1]
-    form = Tightener().shrink(key, code, values.get, values.get)
+    form = ResidualCoder().compress(key, code, values.get, values.get)
     assert form is not None
     for other in [k for k in values if k.kind in (KeyframeHeader.KIND, NewLandmarks.KIND, CameraIntrinsics.KIND)]:
         changed = {**values, other: (99, values[other][1])}
@@ -157,7 +157,7 @@ def test_another_version_of_what_a_form_builds_upon_is_refused() -> None:
         refused = 0
         for held in (changed, missing):
             try:
-                assert Tightener().grow(key, form, held.get) == code
+                assert ResidualCoder().expand(key, form, held.get) == code
             except WireError:
                 refused += 1
         assert refused in (0, 2)  # 0: not one of those that it builds upon
@@ -175,19 +175,19 @@ def test_depths_build_upon_what_the_agent_saw() -> None:
         rng.normal(0, 0.2, (len(births.index), 2)).astype(np.float32),
     )  # fmt: skip
     key, code = messages.key(depths), messages.encode(depths)
-    form = Tightener().shrink(key, code, values.get, values.get)
+    form = ResidualCoder().compress(key, code, values.get, values.get)
     assert form is not None
-    assert Tightener().grow(key, form, values.get) == code
+    assert ResidualCoder().expand(key, form, values.get) == code
     assert len(form) < 0.85 * len(code)
     with pytest.raises(WireError, match="not held"):
-        Tightener().grow(key, form, {}.get)
+        ResidualCoder().expand(key, form, {}.get)
 
 
 @given(st.sampled_from([4, 5, 16, 17]), st.binary(max_size=120))
 def test_any_bytes_are_a_code_or_an_error(kind: int, data: bytes) -> None:
     key = Key(kind, keyframe_id(SUBMAP, 3), 0)
     with pytest.raises(WireError):
-        Tightener().grow(key, data, coded(flight(0, births=10)).get)
+        ResidualCoder().expand(key, data, coded(flight(0, births=10)).get)
 
 
 def test_births_are_picked_by_keypoint_and_part() -> None:
@@ -196,16 +196,16 @@ def test_births_are_picked_by_keypoint_and_part() -> None:
     births[4] = rng.integers(-1, 4, 1200)
     keypoint, mask = rng.integers(0, 2048, 300), 0b101
     out = np.full((4, 300), -7, np.int64)
-    foresee_kernels.pick(births, keypoint, mask, out)
+    prediction_kernels.select(births, keypoint, mask, out)
     whole = np.pad(births, ((0, 0), (0, 2048 - 1200)), constant_values=-1)
     named = np.isin(whole[4, keypoint], (0, 2))
     assert np.array_equal(out, np.where(named, whole[:4, keypoint], -7))
-    assert references.parts_at(births, keypoint) | {-1} == set(whole[4, keypoint].tolist()) | {-1}
+    assert predictors.parts_at(births, keypoint) | {-1} == set(whole[4, keypoint].tolist()) | {-1}
 
 
 def test_what_is_kept_decoded_of_a_keyframe_is_as_large_as_its_births() -> None:
     held = coded(flight(0, births=10)).get
-    versions, births = references.References().births(keyframe_id(SUBMAP, 0), held)
+    versions, births = predictors.Predictors().landmarks(keyframe_id(SUBMAP, 0), held)
     assert versions and births.nbytes <= 5 * 4 * (int(np.flatnonzero(births[4] >= 0).max()) + 1)
 
 
@@ -217,7 +217,7 @@ def test_foreseen_codes_are_those_of_plain_arithmetic() -> None:
     T = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.02, 0.1]))
     out = np.empty((3, n), np.int64)
     camera = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
-    foresee_kernels.foresee(np.stack([u, v, depth]), np.zeros(n, np.int64), T[None], camera, out)
+    prediction_kernels.predict(np.stack([u, v, depth]), np.zeros(n, np.int64), T[None], camera, out)
     uv, rho = quantise.pixels(np.stack([u, v])).astype(np.float64), quantise.inverse_depths(depth).astype(np.float64)
     ray = np.stack([(uv[:, 0] - CAMERA.cx) / CAMERA.fx, (uv[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(n)], 1)
     p = ray @ T[:3, :3].T + rho[:, None] * T[:3, 3]
@@ -239,14 +239,14 @@ def test_a_keyframe_is_made_tight_quickly() -> None:
     records = flight(4, keyframes=10, births=160)
     values = coded(records)
     last = [r for r in records if getattr(r, "keyframe", None) == keyframe_id(SUBMAP, 9)]
-    a, b = Tightener(), Tightener()
+    a, b = ResidualCoder(), ResidualCoder()
     best = 1e9
     for _ in range(4):
         start = time.process_time()
         for r in last:
             key, code = messages.key(r), values[messages.key(r)][1]
-            form = a.shrink(key, code, values.get, values.get)
-            assert form is None or b.grow(key, form, values.get) == code
+            form = a.compress(key, code, values.get, values.get)
+            assert form is None or b.expand(key, form, values.get) == code
         best = min(best, time.process_time() - start)
     assert best < 0.008  # typically 1.5 ms
 
@@ -255,8 +255,8 @@ def test_a_keyframe_is_made_tight_quickly() -> None:
 def test_endpoints_agree_whatever_is_lost(seed: int, loss: float) -> None:
     """Each keyframe's sections are put as it comes, over a link that loses and delays; both ends hold the same."""
     draw = random.Random(seed)
-    config = SyncConfig(packet_bytes=400, overhead_bytes=10, budget_bytes=draw.choice([0, 3000]))
-    a, b = (Endpoint(config, 1, tightener=Tightener()) for _ in range(2))
+    config = SyncConfig(packet_bytes=400, overhead_bytes=10, budget_bytes=draw.choice([None, 3000]))
+    a, b = (Endpoint(config, 1, coder=ResidualCoder()) for _ in range(2))
     wire: list[tuple[int, int, bytes]] = []
     now_ns, waiting = 0, flight(seed, births=24)
     while waiting or not (a.digest_equal and b.digest_equal):
@@ -281,7 +281,7 @@ def test_endpoints_agree_whatever_is_lost(seed: int, loss: float) -> None:
 def test_a_refused_form_is_followed_by_the_code_itself() -> None:
     """A receiver that lost what a form builds upon gets the plain code after the sender has noticed."""
     config = SyncConfig(overhead_bytes=0)
-    a, b = (Endpoint(config, 1, tightener=Tightener()) for _ in range(2))
+    a, b = (Endpoint(config, 1, coder=ResidualCoder()) for _ in range(2))
     records = flight(3)
     now_ns = 0
 

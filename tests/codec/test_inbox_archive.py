@@ -12,7 +12,8 @@ from kiteline_codec.schema import (
     RefinedLandmarks,
     RemovedObservations,
 )
-from kiteline_codec.sync.endpoint import Endpoint, SyncConfig
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
 from tests.codec.spill_memory import Memory
 
 TICK_NS = 50_000_000
@@ -78,7 +79,7 @@ def test_a_new_base_is_told_what_the_old_one_said() -> None:
     held = line.b.peer_values()
     line.a = Endpoint(SyncConfig(), 2)
     line.settle()
-    assert line.b.legacy_values() == held
+    assert line.b.earlier_values() == held
 
 
 def test_a_full_disk_loses_nothing() -> None:

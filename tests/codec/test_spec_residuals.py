@@ -14,7 +14,7 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from kiteline_codec.residuals.residual_coding import Tightener
+from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, Observations, messages
 
 
@@ -28,7 +28,7 @@ def load(name: str) -> ModuleType:
     return module
 
 
-SPEC, TIGHT = load("test_spec"), load("test_tight")
+SPEC, TIGHT = load("test_spec"), load("test_residual_coding")
 Rows = list[list[int]]
 
 
@@ -194,7 +194,7 @@ def test_sightings(held: Callable[[Key], bool]) -> None:
         if key.kind != Observations.KIND:
             continue
         known = {k: v for k, v in values.items() if held(k)}
-        form = Tightener().shrink(key, code, known.get, values.get)
+        form = ResidualCoder().compress(key, code, known.get, values.get)
         if form is None:
             continue
         columns, used, s = read_sightings(key, form, known)
@@ -216,7 +216,7 @@ def test_births() -> None:
     for key, (_, code) in values.items():
         if key.kind != NewLandmarks.KIND:
             continue
-        form = Tightener().shrink(key, code, {}.get, {}.get)
+        form = ResidualCoder().compress(key, code, {}.get, {}.get)
         assert form is not None
         s = SPEC.Source(form)
         head = s.varint()

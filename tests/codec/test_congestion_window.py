@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from kiteline_codec.pacing.congestion_window import Window
+from kiteline_codec.pacing.congestion_window import CongestionWindow
 
 MS = 1_000_000
 
 
 def test_it_grows_while_nothing_queues() -> None:
-    window = Window(64)
+    window = CongestionWindow(64)
     first = window.packets
     for i in range(20):
         window.measured(100 * MS + i * MS, 5, window.packets, i * 100 * MS)
@@ -16,7 +16,7 @@ def test_it_grows_while_nothing_queues() -> None:
 
 
 def test_it_does_not_grow_unused() -> None:
-    window = Window(64)
+    window = CongestionWindow(64)
     first = window.packets
     for i in range(20):
         window.measured(100 * MS, 1, 2, i * 100 * MS)
@@ -24,7 +24,7 @@ def test_it_does_not_grow_unused() -> None:
 
 
 def test_it_shrinks_once_a_round_trip_while_packets_queue() -> None:
-    window = Window(64)
+    window = CongestionWindow(64)
     for i in range(20):
         window.measured(100 * MS, 5, 60, i * 100 * MS)
     window.measured(1400 * MS, 5, 64, 10_000 * MS)
@@ -37,7 +37,7 @@ def test_it_shrinks_once_a_round_trip_while_packets_queue() -> None:
 
 
 def test_a_way_that_became_longer_is_believed_in_the_end() -> None:
-    window = Window(64)
+    window = CongestionWindow(64)
     window.measured(50 * MS, 1, 10, 0)
     for i in range(300):
         window.measured(800 * MS, 2, 64, i * 1000 * MS)

@@ -1,0 +1,104 @@
+"""Session resumption: values of earlier sessions that a side still holds are not sent again.
+
+After a restart of either side, each lists short checksums of what it holds of the peer, under `SUMMARY_KIND`. The peer
+then sends a checksum in place of such a code. See SPEC.md, "Session resumption".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from struct import pack
+from zlib import crc32
+
+from kiteline_codec.coding.packing import Reader, WireError, Writer
+from kiteline_codec.residuals.predictors import Held
+from kiteline_codec.residuals.residual_coding import ResidualCoder
+from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key
+from kiteline_codec.transport.packet import MAX_KIND, Item
+from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS
+
+SUMMARY_KIND = MAX_KIND  # of the values that hold the checksums; no record has it
+REFERENCE_BYTES = 4
+_MIN_CODE_BYTES = 16  # shorter codes are sent as they are
+_VALUES_PER_PART = 60  # fit a packet of a thin link in a few pieces
+_MAX_PARTS = 1 << 16
+_SHORT_CHECKSUM = 0xFFFFFF
+_FROM_AGENT = KEYFRAME_KINDS & AGENT_KINDS
+
+
+def summaries(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
+    """Summaries of the values held of earlier sessions, newest ids first, for a session of the peer.
+
+    Of an agent's keyframes only those of its present boot (its session is the boot, from 1): it holds no others.
+    """
+    keys = [key for key, code in values.items() if len(code) >= _MIN_CODE_BYTES and key.kind != SUMMARY_KIND]
+    keys = [key for key in keys if key.kind not in _FROM_AGENT or _boot(key.id) + 1 == session]
+    keys.sort(key=lambda key: (-key.id, key.kind, key.part))
+    out: dict[Key, bytes] = {}
+    for part, begin in enumerate(range(0, min(len(keys), _MAX_PARTS * _VALUES_PER_PART), _VALUES_PER_PART)):
+        writer, last_id = Writer(), 0
+        for key in keys[begin : begin + _VALUES_PER_PART]:
+            writer.signed(key.id - last_id)
+            last_id = key.id
+            writer.u8(key.kind)
+            writer.varint(key.part)
+            writer.raw((crc32(values[key]) & _SHORT_CHECKSUM).to_bytes(3, "little"))
+        out[Key(SUMMARY_KIND, 0, part)] = writer.bytes()
+    return out
+
+
+def _boot(keyframe: int) -> int:
+    return keyframe >> SEQUENCE_BITS + SUBMAP_BITS & (1 << BOOT_BITS) - 1
+
+
+def read_summary(code: bytes) -> dict[Key, int]:
+    """The short checksums of a summary, by key. Raises WireError."""
+    source, last_id = Reader(code), 0
+    out: dict[Key, int] = {}
+    while source.left:
+        last_id += source.signed(1 << 62)
+        key = Key(source.u8(), last_id, source.varint(0xFFFF))
+        if not 0 <= last_id < 1 << 62 or key.kind >= SUMMARY_KIND:
+            raise WireError(f"{key} cannot be resumed")
+        out[key] = int.from_bytes(source.raw(3), "little")
+    return out
+
+
+def reference_to(key: Key, code: bytes, held: Mapping[Key, int]) -> bytes | None:
+    """The checksum to send in place of a code that the peer holds by its summaries; None if it does not."""
+    if not held or key not in held:
+        return None
+    checksum = crc32(code)
+    return pack("<I", checksum) if held[key] == checksum & _SHORT_CHECKSUM else None
+
+
+def resolve(reference: bytes, code: bytes | None) -> bytes:
+    """The code that a reference means. Raises WireError if another one, or none, is held."""
+    if code is None or pack("<I", crc32(code)) != reference:
+        raise WireError("a reference to a code of an earlier session, which is not held here")
+    return code
+
+
+def expand_items(items: Sequence[Item], coder: ResidualCoder, held: Held, earlier: Mapping[Key, bytes]) -> list[Item]:
+    """Replace references and residual codes of a packet by codes. Raises WireError if what they need is not held.
+
+    held: version and code of values that both sides hold. earlier: codes of earlier sessions of the peer.
+    """
+    out: list[Item] = []
+    in_packet: dict[Key, tuple[int, bytes]] = {}
+
+    def known(key: Key) -> tuple[int, bytes] | None:
+        return in_packet.get(key) or held(key)
+
+    for item in items:
+        if item.residual:
+            if len(item.data) == REFERENCE_BYTES:
+                code = resolve(item.data, earlier.get(item.key) or (known(item.key) or (0, None))[1])
+            else:
+                code = coder.expand(item.key, item.data, known)
+            item = replace(item, data=code, total=len(code), residual=False)
+        if item.whole:
+            in_packet[item.key] = item.version, item.data
+        out.append(item)
+    return out
