@@ -1,0 +1,79 @@
+"""The documentation: links lead somewhere, files that it names exist, and no page is forgotten."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+ROOMS = ("core", "codec", "hw", "agent", "basestation", "lab", "bench", "cli", "docs", "tests", "examples", "systemd")
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), ROOT / "codec" / "SPEC.md"])
+MADE = {"reference/commands.md", "reference/messages.md", "index.md", "contributing.md", "changelog.md"}
+MADE |= {"explanation/architecture.md"}  # pages that docs/_site.py adds
+
+
+def text_of(page: Path) -> str:
+    return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings, as GitHub and mkdocs make them."""
+    headings = re.findall(r"^#+ (.*)$", text_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", text_of(page)):
+        if "://" in target:
+            continue
+        path = (page.parent / target).resolve() if target else page
+        if path.is_relative_to(ROOT / "docs") and str(path.relative_to(ROOT / "docs")) in MADE:
+            continue
+        assert path.exists(), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(path), f"{page.name}: {target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_that_are_named_exist(page: Path) -> None:
+    named = re.findall(rf"`((?:{'|'.join(ROOMS)})/[\w./-]+)`", text_of(page))
+    missing = [name for name in named if not (ROOT / name).exists()]
+    assert not missing, f"{page.name} names what does not exist: {missing}"
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+
+    def pages(entry: object) -> list[str]:
+        if isinstance(entry, dict):
+            return [p for value in entry.values() for p in pages(value)]
+        return [p for value in entry for p in pages(value)] if isinstance(entry, list) else [str(entry)]
+
+    listed = set(pages(config["nav"]))
+    present = {str(p.relative_to(ROOT / "docs")) for p in (ROOT / "docs").glob("**/*.md")} | MADE
+    decisions = {p for p in present if p.startswith("decisions/") and p != "decisions/README.md"}
+    assert listed == present - decisions
+    index = (ROOT / "docs/decisions/README.md").read_text(encoding="utf-8")
+    assert all(f"]({Path(p).name})" in index for p in decisions)
+
+
+def test_api_pages_name_modules_and_objects_that_exist() -> None:
+    names = [n for p in (ROOT / "docs/reference/api").glob("*.md") for n in re.findall(r"^::: (\S+)$", p.read_text(), re.M)]
+    assert len(names) > 10
+    for name in names:
+        module, _, attribute = name.rpartition(".")
+        if importlib.util.find_spec(module) is None or importlib.util.find_spec(name) is None:
+            assert attribute in vars(importlib.import_module(module)), name
+
+
+def test_every_glossary_entry_is_a_sentence_with_its_place_in_the_code() -> None:
+    rows = [line for line in (ROOT / "docs/glossary.md").read_text().splitlines() if line.startswith("| **")]
+    assert len(rows) > 60
+    for row in rows:
+        term, meaning, place = (cell.strip() for cell in row.strip("|").split("|"))
+        assert meaning.endswith("."), term
+        assert re.search(r"`[\w./-]+`", place), term
