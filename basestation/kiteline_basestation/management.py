@@ -1,6 +1,6 @@
 """Maps in the hands of people and other programs: list, get, name, merge, split, delete. JSON in, JSON out.
 
-A command is an input of the mapper's step like any other, logged and replayed with it; see docs/map-management.md.
+A command is an input of the mapper's step like any other, logged and replayed with it; see docs/how-to/manage-maps.md.
 A submap is called AGENT.BOOT.NUMBER; a map by its eldest submap, any other of its submaps, or its name.
 """
 
