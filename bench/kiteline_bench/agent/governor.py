@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
-from kiteline_bench.harness import ratios as bench_ratios
-from kiteline_bench.harness import trials
-from kiteline_bench.harness.clip import Clip, load
-from kiteline_bench.harness.governed import Governed, fly_clip
-from kiteline_bench.harness.plot_governor import plot_governor
+from kiteline_bench.agent.governor_plot import plot_governor
+from kiteline_bench.harness import processes
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
+from kiteline_bench.harness.recording import Recording, load
+from kiteline_bench.harness.starts import median_ratio
 from kiteline_hw.system.cpu import CpuQuota
 
 _SHARES = (1.0, 0.5, 0.25, 0.12)  # of the flight's own load without a governor
@@ -20,7 +20,7 @@ _REAL_FRAMES = 300  # of one that takes as long as it lasts
 _BEGINS = (0, 12, 24, 36, 48)  # frames of a recording before a flight: what a limit does to one error is a draw
 _REAL_BEGINS = (0, 12, 24)
 
-Fly = Callable[[float, bool], Governed]  # at a percentage of a core, with the governor or without
+Fly = Callable[[float, bool], LimitedFlight]  # at a percentage of a core, with the governor or without
 
 
 def bars(bench: Bench, others: Sequence[str] = ()) -> list[Bar]:
@@ -45,20 +45,20 @@ def bars(bench: Bench, others: Sequence[str] = ()) -> list[Bar]:
     return found
 
 
-def _modelled(clip: Clip) -> Fly:
-    return lambda percent, governor: fly_clip(clip, percent, governor=governor, real=False)
+def _modelled(recording: Recording) -> Fly:
+    return lambda percent, governor: fly_limited(recording, percent, governor=governor, real=False)
 
 
 def _limited(source: str, begin: int) -> Fly:
-    def flown(percent: float, governor: bool) -> Governed:
+    def flown(percent: float, governor: bool) -> LimitedFlight:
         frames = ["--begin", f"{begin}", "--frames", f"{_REAL_FRAMES}"]
         options = ["--percent", f"{percent}", *frames, *["--governor"] * governor]
-        return Governed(**trials.start("quota", source, *options))
+        return LimitedFlight(**processes.start("quota", source, *options))
 
     return flown
 
 
-def _flown(bench: Bench, what: str, flown: Fly) -> list[tuple[float, Governed]]:
+def _flown(bench: Bench, what: str, flown: Fly) -> list[tuple[float, LimitedFlight]]:
     """Each share with the governor and without it, below the flight that has no limit."""
     bench.say(f"flying {what}: no limit")
     free = flown(0.0, False)
@@ -71,7 +71,7 @@ def _flown(bench: Bench, what: str, flown: Fly) -> list[tuple[float, Governed]]:
     return rows
 
 
-def _bars(bench: Bench, what: str, rows: Sequence[tuple[float, Governed]], others: Sequence[Fly]) -> list[Bar]:
+def _bars(bench: Bench, what: str, rows: Sequence[tuple[float, LimitedFlight]], others: Sequence[Fly]) -> list[Bar]:
     """rows: of the first start. others: further starts, of which the ATE is asked as well."""
     free, found = rows[0][1], []
     bench.say(f"flying {what}: {len(others)} further starts")
@@ -84,17 +84,17 @@ def _bars(bench: Bench, what: str, rows: Sequence[tuple[float, Governed]], other
         if not flight.governor:
             continue
         name = f"governor, {what}, {100 * share:.0f} %"
-        found.append(at_most(f"{name}: dearest second, of the budget", flight.peak / flight.percent, 1.0, "", 2))
+        found.append(at_most(f"{name}: busiest second, of the budget", flight.peak / flight.percent, 1.0, "", 2))
         if share in _ATE_RATIO:
             both = [(flight.ate_m, free.ate_m), *pairs[share]]
-            found.append(bench_ratios.bar(bench, f"{name}: ATE over that without a limit", both, _ATE_RATIO[share]))
+            found.append(median_ratio(bench, f"{name}: ATE over that without a limit", both, _ATE_RATIO[share]))
         if share >= 0.25:
             lost = flight.lost + flight.submaps - 1
             found.append(at_most(f"{name}: lost frames and further submaps", lost, 0, "", 0))
         else:
             whole = flight.tracked + flight.lost + flight.dropped == flight.frames
             close = flight.ate_m <= _ATE_RATIO[0.25] * free.ate_m
-            found.append(is_true(f"{name}: honest", "frames accounted for; quality falls where errors grow",
+            found.append(is_true(f"{name}: all frames accounted for", "and quality falls where errors grow",
                                  whole and (close or flight.quality < free.quality),
                                  f"{flight.tracked} tracked, {flight.lost} lost, {flight.dropped} dropped of "
                                  f"{flight.frames}; ATE {1000 * flight.ate_m:.1f} mm, was {1000 * free.ate_m:.1f}; "
@@ -102,10 +102,10 @@ def _bars(bench: Bench, what: str, rows: Sequence[tuple[float, Governed]], other
     return found
 
 
-def governor_table(rows: Sequence[tuple[float, Governed]]) -> str:
+def governor_table(rows: Sequence[tuple[float, LimitedFlight]]) -> str:
     """Markdown of flights, each with its share of the load of the first, which has no limit."""
     heads = (
-        "share", "governor", "budget %", "load %", "dearest second %", "tracked", "lost", "dropped", "submaps",
+        "share", "governor", "budget %", "load %", "busiest second %", "tracked", "lost", "dropped", "submaps",
         "ATE mm", "relative mm", "quality",
     )  # fmt: skip
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
@@ -123,14 +123,14 @@ _INTRODUCTION = """# The CPU governor, measured
 
 Made by `kiteline bench agent/governor`. Each flight is flown without a limit first; then with a share of that load
 as its budget, with the governor and without it (the newest frame wins on a core that is too slow). A frame that is
-skipped has no pose and counts as dropped; errors are those of the frames that have one. The dearest second is the
+skipped has no pose and counts as dropped; errors are those of the frames that have one. The busiest second is the
 largest sum in any one-second window after the third second. How the rows of the ladder were put in order:
 [decisions/governor-ladder.md](decisions/governor-ladder.md). Tables and figures are of one start; in
 `docs/results.md` errors at a half and a quarter of the load are medians over several.
 """
 
 
-def _write(bench: Bench, flights: Sequence[tuple[str, Sequence[tuple[float, Governed]]]]) -> None:
+def _write(bench: Bench, flights: Sequence[tuple[str, Sequence[tuple[float, LimitedFlight]]]]) -> None:
     out = Path("docs") if Path("docs").is_dir() else bench.folder
     parts = [_INTRODUCTION]
     for k, (title, rows) in enumerate(flights):

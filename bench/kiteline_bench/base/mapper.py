@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
+from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
-from kiteline_bench.base import monocular as bench_one_eye
-from kiteline_bench.base import store as bench_store
-from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
-from kiteline_bench.harness import base_memory
-from kiteline_bench.harness import ratios as bench_ratios
+from kiteline_bench.base import memory, monocular, store
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.result import FlownProcesses
+from kiteline_bench.harness.simulated import rendered_paths
+from kiteline_bench.harness.starts import compared_with_monolith, cut, in_pieces, length_s, pieces
 from kiteline_core.geometry import se3
+from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
 from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle
 from kiteline_lab.evaluation import metrics, trajectories
-from kiteline_lab.flights import simulate
-from kiteline_lab.flights.fly import Options, fly
 from kiteline_lab.tools import logs
 
 F64 = NDArray[np.float64]
@@ -37,130 +37,92 @@ _AGENTS, _SECONDS = 20, 120  # of the modelled queue: one keyframe a second each
 
 
 def _recordings(bench: Bench) -> list[Bar]:
-    """The recordings, beside a flight without a codec; and what bundles and graphs cost."""
-    room = _fly(bench, [bench.source("room_flight.mcap")], "room")
-    kitti = _fly(bench, [bench.source("kitti_straight")], "kitti")
+    """The recordings, compared with a flight without a codec; and the CPU of bundles and graphs."""
+    room = bench.fly(bench.source("room_flight.mcap"), "room")
+    kitti = bench.fly(bench.source("kitti_straight"), "kitti")
     return [
-        at_most("room_flight: ATE base", _ate(room), 0.008, "m", 4),
-        at_most("kitti_straight: ATE base", _ate(kitti), 0.06, "m"),
-        *bench_ratios.beside_monolith(bench, partial(_flown_ate, bench)),
+        at_most("room_flight: ATE base", room.ate_m(), 0.008, "m", 4),
+        at_most("kitti_straight: ATE base", kitti.ate_m(), 0.06, "m"),
+        *compared_with_monolith(bench, partial(_flown_ate, bench)),
         *_work(bench, room),
     ]
 
 
 def _hall(bench: Bench) -> list[Bar]:
     """The beginnings of MH_01 and MH_03 in one hall: apart, together, one of them cut in three, and one with losses."""
-    both = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
-    apart = [_fly(bench, [str(source)], f"hall_{i}") for i, source in enumerate(both)]
-    together = _fly(bench, [str(source) for source in both], "hall_together")
-    pieces = bench_ratios.seams(bench, both[1], "hall", _PIECES, _CUT_OVERLAP)
-    cut = _fly(bench, [str(piece) for piece in pieces], "hall_cut")
-    uncut = [(name, source, _ate(report)) for name, source, report in zip(("MH_01", "MH_03"), both, apart)]
-    joint = bench_ratios.in_pieces(bench, uncut, _PIECES, _CUT_OVERLAP, partial(_flown_ate, bench))
-    lossy = _with_losses(bench, both[1])
-    lost = _fly(bench, [str(lossy)], "hall_losses")
-    agent = lost["agents"][0]
+    both = _hall_recordings(bench)
+    apart = [bench.fly(source, f"hall_{i}") for i, source in enumerate(both)]
+    together = bench.fly(both, "hall_together")
+    in_three = bench.fly(pieces(bench, both[1], "hall", _PIECES, _CUT_OVERLAP), "hall_cut")
+    uncut = [(name, source, flown.ate_m()) for name, source, flown in zip(("MH_01", "MH_03"), both, apart)]
+    joint = in_pieces(bench, uncut, _PIECES, _CUT_OVERLAP, partial(_flown_ate, bench))
+    lost = bench.fly(_with_losses(bench, both[1]), "hall_losses")
+    agent = lost.agent()
     return [
-        at_most("MH_01 in the hall: ATE base", _ate(apart[0]), 0.02, "m", 4),
-        at_most("MH_03 in the hall: ATE base", _ate(apart[1]), 0.02, "m", 4),
-        is_true("MH_01 and MH_03 as two agents", "merged", together["base"]["merges"] == 1,
-                f"{together['base']['merges']} merges"),
-        at_most("their joint ATE", _joint_ate(bench.folder / "hall_together", both), 0.025, "m", 4),
+        at_most("MH_01 in the hall: ATE base", apart[0].ate_m(), 0.02, "m", 4),
+        at_most("MH_03 in the hall: ATE base", apart[1].ate_m(), 0.02, "m", 4),
+        is_true("MH_01 and MH_03 as two agents", "merged", together.base["merges"] == 1,
+                f"{together.base['merges']} merges"),
+        at_most("their joint ATE", together.joint_ate_m(both), 0.025, "m", 4),
         is_true(f"MH_03 cut in {_PIECES} agents, overlaps of {_CUT_OVERLAP:.0%}", "one map",
-                cut["base"]["merges"] == _PIECES - 1, f"{cut['base']['merges']} merges"),
+                in_three.base["merges"] == _PIECES - 1, f"{in_three.base['merges']} merges"),
         joint,
-        at_most("MH_03 with three forced losses: ATE base of what is placed", _ate(lost), 0.05, "m", 4),
+        at_most("MH_03 with three forced losses: ATE base of what is placed", lost.ate_m(), 0.05, "m", 4),
         is_true("MH_03 with three forced losses: tracked", "all but 3 frames a loss", agent["lost"] <= 9,
-                f"{agent['lost']} lost, {agent['submaps']} submaps, {lost['base']['merges']} merged"),
+                f"{agent['lost']} lost, {agent['submaps']} submaps, {lost.base['merges']} merged"),
     ]  # fmt: skip
 
 
 def _street(bench: Bench) -> list[Bar]:
     """A loop of 1.2 km, and the memory that it takes."""
-    (source,) = _recorded(bench, "street", "street", ["KITTI_06.txt"])
-    report = _fly(bench, [str(source)], "street")
-    start = _fly(bench, [str(bench_ratios.cut(bench, source, "street_start", 0.0, 30.0))], "street_start")
+    source = _street_recording(bench)
+    flown = bench.fly(source, "street")
+    start = bench.fly(cut(bench, source, "street_start", 0.0, 30.0), "street_start")
     truth = trajectories.read(f"mcap:{source}").trajectory
-    estimate = trajectories.read(str(bench.folder / "street" / "base" / "agent0.tum")).trajectory
+    estimate = trajectories.read(str(flown.folder / "base" / "agent0.tum")).trajectory
     drift = metrics.kitti_drift(metrics.match(estimate, truth, metrics.TrajectoryAlignment.SE3))
     assert drift is not None
-    bench.say("weighing the base's parts")
-    weighed = base_memory.measured(bench.folder / "street" / "base" / "log.mcap")
-    peak = report["base"]["timing"]["rss_mib"]
+    bench.say("measuring the memory of the base's parts")
+    samples = memory.measured(flown.folder / "base" / "log.mcap")
+    peak = flown.base["timing"]["rss_mib"]
     bench.more.append(
         "What the base of the street holds, measured as it runs again from its log. Pages of code and of libraries, "
-        f"about 270 MiB, are there from the start; at the most it had {peak:.0f} MiB.\n\n{base_memory.table(weighed)}"
+        f"about 270 MiB, are there from the start; at the most it had {peak:.0f} MiB.\n\n{memory.table(samples)}"
     )
     return [
-        is_true("KITTI 06 in the street: loop", "closed", report["base"]["loops"] >= 1,
-                f"{report['base']['loops']} loops"),
-        at_most("KITTI 06 in the street: ATE base", _ate(report), 0.6, "m"),
+        is_true("KITTI 06 in the street: loop", "closed", flown.base["loops"] >= 1, f"{flown.base['loops']} loops"),
+        at_most("KITTI 06 in the street: ATE base", flown.ate_m(), 0.6, "m"),
         at_most("KITTI 06 in the street: t_rel", drift.t_rel_percent, 0.4, "%"),
         at_most("memory of the base for each keyframe after the first 30 s",
-                further_kb(start["base"], report["base"]), 100.0, "kB", 1),
+                further_kb(start.base, flown.base), 100.0, "kB", 1),
     ]  # fmt: skip
 
 
-def _one_eye(bench: Bench) -> list[Bar]:
-    """The loop in the street and the two flights in the hall, with one eye."""
-    (street,) = _recorded(bench, "street", "street", ["KITTI_06.txt"])
-    hall = _recorded(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
-    return bench_one_eye.bars(bench, _fly(bench, [str(street)], "street_one_eye", mono=True, imu=False), hall)
+def _monocular(bench: Bench) -> list[Bar]:
+    """The loop in the street and the two flights in the hall, monocular."""
+    street = bench.fly(_street_recording(bench), "street_monocular", mono=True, imu=False)
+    return monocular.bars(bench, street, _hall_recordings(bench))
 
 
-def _fly(bench: Bench, sources: Sequence[str], folder: str, **options: Any) -> dict[str, Any]:
-    bench.say(f"flying {folder}")
-    report, outcome = fly(Options(tuple(sources), bench.folder / folder, **options), quiet=True)
-    if outcome.failed:
-        raise RuntimeError(f"{folder}: {outcome.notes}")
-    return dict(report)
+def _street_recording(bench: Bench) -> Path:
+    return rendered_paths(bench, "street", "street", ["KITTI_06.txt"])[0]
 
 
-def _ate(report: dict[str, Any], agent: int = 0) -> float:
-    return float(report["agents"][agent]["accuracy"]["base"]["ate_m"])
+def _hall_recordings(bench: Bench) -> list[Path]:
+    return rendered_paths(bench, "hall", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _HALL_S)
 
 
 def _flown_ate(bench: Bench, sources: Sequence[Path], folder: str, mode: str) -> float:
     """The joint ATE of a flight of one agent or of several."""
-    _fly(bench, [str(source) for source in sources], folder, mode=mode)
-    return _joint_ate(bench.folder / folder, sources)
-
-
-def _joint_ate(folder: Path, sources: Sequence[Path]) -> float:
-    """All agents' refined trajectories, laid on the truth as one body; an agent without a place makes it infinite."""
-    ours, theirs = [], []
-    for i, source in enumerate(sources):
-        path = folder / "base" / f"agent{i}.tum"
-        if not path.exists() or not path.read_text().strip():
-            return float("inf")
-        estimate, truth = trajectories.read(str(path)).trajectory, trajectories.read(f"mcap:{source}").trajectory
-        found, true = metrics.truth_at(estimate.t_ns, truth)
-        ours.append(estimate.T_w_b[found, :3, 3])
-        theirs.append(true[:, :3, 3])
-    a, b = np.concatenate(ours), np.concatenate(theirs)
-    T, _ = metrics.umeyama(a, b)
-    return float(np.sqrt(np.mean(np.sum((se3.transform(T, a) - b) ** 2, axis=1))))
-
-
-def _recorded(bench: Bench, name: str, scene: str, paths: Sequence[str], seconds: float = 0.0) -> list[Path]:
-    """Simulated flights in one world, so many seconds of them (0: all); rendered once, if the folder is kept."""
-    out = [bench.folder / (f"{name}-{i}.mcap" if i else f"{name}.mcap") for i in range(len(paths))]
-    if not all(path.exists() for path in out):
-        bench.say(f"rendering {name}")
-        files = [bench.source(f"trajectories/{path}") for path in paths]
-        length = ["--seconds", f"{seconds:g}"] if seconds else []
-        also = ["--also", *files[1:]] if files[1:] else []
-        bench.folder.mkdir(parents=True, exist_ok=True)
-        simulate.main([scene, "--trajectory", files[0], "--out", str(out[0]), *length, *also])
-    return out
+    return bench.fly(sources, folder, mode=mode).joint_ate_m(sources)
 
 
 def _with_losses(bench: Bench, source: Path) -> Path:
     """The same flight with three holes of 6 s, after which the camera is somewhere else."""
-    length = bench_ratios.length_s(source)
+    length = length_s(source)
     holes = [length * part for part in (0.25, 0.5, 0.75)]
     begins, ends = [0.0, *(hole + 6.0 for hole in holes)], [*holes, length]
-    parts = [bench_ratios.cut(bench, source, f"part{i}", a, b) for i, (a, b) in enumerate(zip(begins, ends))]
+    parts = [cut(bench, source, f"part{i}", a, b) for i, (a, b) in enumerate(zip(begins, ends))]
     out = bench.folder / "losses.mcap"
     logs.main(["merge", "--force", str(out), *map(str, parts)])
     return out
@@ -169,13 +131,13 @@ def _with_losses(bench: Bench, source: Path) -> Path:
 # cost
 
 
-def _work(bench: Bench, room: dict[str, Any]) -> list[Bar]:
+def _work(bench: Bench, room: FlownProcesses) -> list[Bar]:
     bench.say("timing bundles and pose graphs")
     local = _least_ms(lambda: bundle(row_of_cameras(20, 1400, 10), BundleConfig()))
     whole = _least_ms(lambda: bundle(row_of_cameras(100, 10_000, 99), BundleConfig()))
     graph = ring_of_poses(1000, 20)
     posed = _least_ms(lambda: optimise(graph))
-    base = room["base"]
+    base = room.base
     cost_ms = base["timing"]["bundle_ms"]["mean"] + base["timing"]["step_ms"]["mean"]
     wait_s = queue_p95_s(np.full(_AGENTS, cost_ms / 1000.0))
     return [
@@ -273,9 +235,6 @@ def further_kb(short: dict[str, Any], long: dict[str, Any]) -> float:
 
 def map_bytes_a_keyframe(keyframes: int = 400, keypoints: int = 400) -> float:
     """Bytes by which the map grows with each keyframe of a usual size."""
-    from kiteline_basestation.map.sparse_map import SparseMap
-    from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
-
     sparse_map, submap = SparseMap(), submap_id(0, 0, 0)
     for k in range(keyframes):
         parent = NO_KEYFRAME if k == 0 else keyframe_id(submap, k - 1)
@@ -287,6 +246,6 @@ PARTS = {
     "recordings": ("The base's mapper", _recordings),
     "hall": (f"The base's mapper: a hall, two agents, losses (the first {_HALL_S:g} s of both flights)", _hall),
     "street": ("The base's mapper: a street, a loop", _street),
-    "one-eye": ("The base's mapper: one eye without IMU", _one_eye),
-    "store": ("The base's store", bench_store.run),
+    "monocular": ("The base's mapper: monocular without IMU", _monocular),
+    "store": ("The base's store", store.run),
 }

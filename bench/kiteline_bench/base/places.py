@@ -1,8 +1,8 @@
-"""Place recognition: how many revisits are found, how many impostors believed, and what a query costs.
+"""Place recognition: share of revisits found, false matches accepted, and the CPU of a query.
 
-Simulated flights along recorded drone paths, in worlds whose seeds the words were not trained on. Each frame asks for
-all frames of its own flight that are older than four seconds and for all frames of the other flights. A candidate is
-believed when P3P over its matches has enough inliers; it is right when that pose is the true one.
+Simulated flights along recorded drone paths, in worlds whose seeds the vocabulary was not trained on. Each frame
+queries all frames of its own flight that are older than four seconds and all frames of the other flights. A candidate
+is accepted when P3P over its matches has enough inliers; it is right when that pose is the true one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features
 from kiteline_agent.tracking.tracker import depth_at
-from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.imaging import matching
@@ -32,9 +32,9 @@ U8 = NDArray[np.uint8]
 
 FLIGHTS = (("room", "V1_02_medium.txt"), ("hall", "MH_03_medium.txt"), ("hall", "MH_01_easy.txt"))
 _EVERY = 20  # frames between two places: 1 s
-_OLD = 4  # places: what is younger is no revisit
-_NEAR_M, _ALIKE_RAD = 0.8, 0.44  # a revisit sees an old place from so near and nearly the same way
-_BELIEVED = 25  # inliers of P3P
+_OLD = 4  # places: a younger one is no revisit
+_NEAR_M, _NEAR_RAD = 0.8, 0.44  # distance and angle between the views of a revisit
+_ACCEPTED = 25  # inliers of P3P
 _RIGHT_M = 0.3
 _TRIED = 5  # candidates a query
 _PLACES = 1000
@@ -58,7 +58,7 @@ def run(bench: Bench) -> list[Bar]:
     for number, (scene, path) in enumerate(FLIGHTS):
         bench.say(f"rendering {scene} along {path}")
         flights.append(_places(number, scene, bench.source(f"trajectories/{path}")))
-    revisits = found = wrong = impostors = 0
+    revisits = found = wrong = false_candidates = 0
     for flight in flights:
         index, known = PlaceIndex(shipped_vocabulary()), {}
         for key, place in enumerate(p for other in flights if other is not flight for p in other):
@@ -70,15 +70,15 @@ def run(bench: Bench) -> list[Bar]:
                 index.add(key, flight[k - _OLD].descriptor)
                 known[key] = flight[k - _OLD]
             again = any(_near(place, old) for old in flight[: max(k - _OLD + 1, 0)])
-            verdicts = [_judge(place, known[c]) for c in index.query(place.descriptor, limit=_TRIED).keys.tolist()]
+            verdicts = [_verdict(place, known[c]) for c in index.query(place.descriptor, limit=_TRIED).keys.tolist()]
             revisits += again
             found += again and "right" in verdicts
             wrong += verdicts.count("wrong")
-            impostors += verdicts.count("refused") + verdicts.count("wrong")
+            false_candidates += verdicts.count("refused") + verdicts.count("wrong")
     share = found / max(revisits, 1)
     return [
         is_true("revisits found", ">= 70 % of >= 50", share >= 0.7 and revisits >= 50, f"{share:.0%} of {revisits}"),
-        is_true("impostors believed", "0 of >= 500", wrong == 0 and impostors >= 500, f"{wrong} of {impostors}"),
+        is_true("false candidates accepted", "0 of >= 500", wrong == 0 and false_candidates >= 500, f"{wrong} of {false_candidates}"),
         at_most("query among 1000 places, CPU", _query_ms(flights), 1.0, "ms"),
     ]
 
@@ -109,11 +109,11 @@ def _places(number: int, scene: str, path: str) -> list[_Place]:
 
 def _near(a: _Place, b: _Place) -> bool:
     T = se3.inverse(a.T_w_c) @ b.T_w_c
-    return bool(np.linalg.norm(T[:3, 3]) < _NEAR_M and T[2, 2] > np.cos(_ALIKE_RAD))
+    return bool(np.linalg.norm(T[:3, 3]) < _NEAR_M and T[2, 2] > np.cos(_NEAR_RAD))
 
 
-def _judge(place: _Place, old: _Place) -> str:
-    """refused, or believed and right or wrong."""
+def _verdict(place: _Place, old: _Place) -> str:
+    """"refused", or "right" or "wrong" if the candidate is accepted."""
     config = AgentConfig()
     has = np.flatnonzero(np.isfinite(old.xyz[:, 2]))
     matches = matching.match(old.descriptor[has], old.angle[has], place.descriptor, place.angle, config.matching)
@@ -122,7 +122,7 @@ def _judge(place: _Place, old: _Place) -> str:
     fit = solve_pnp(
         old.xyz[rows], np.zeros((len(rows), 3)), observed, place.octave[matches.b], place.camera, 1, config.ransac
     )
-    if fit is None or fit.inliers < _BELIEVED:
+    if fit is None or fit.inliers < _ACCEPTED:
         return "refused"
     error = fit.T_c_m @ se3.inverse(old.T_w_c) @ place.T_w_c
     right = place.flight == old.flight and np.linalg.norm(error[:3, 3]) < _RIGHT_M

@@ -1,4 +1,4 @@
-"""What may befall a camera, done to a clip: faults of single frames, losses of sight, another place all of a sudden."""
+"""Faults of cameras, put into a recording: single bad frames, image losses, jumps to another place."""
 
 from __future__ import annotations
 
@@ -8,102 +8,186 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_bench.harness.clip import Clip
-from kiteline_core.frame import Frame, ImuBatch, Trajectory
+from kiteline_agent.runtime.frame_reader import joined
+from kiteline_bench.harness.recording import Item, Recording
+from kiteline_core.frame import Frame, ImuBatch
 
 U8 = NDArray[np.uint8]
+Change = Callable[[Frame], Frame]
+Fault = Callable[[Recording], Recording]
 
-_GREY, _NOISE = 120.0, 1.2  # grey values of a blank wall, as a camera sees it
-_DARK = 8
-
-SECONDS = {
-    "black": 0.15, "half a pair": 0.5, "no depth": 0.5, "exposure jump": 0.5, "covered lens, 2 s": 2.0,
-    "no texture, 10 s": 10.0,
-}  # fmt: skip
-_OF_PAIRS = ("half a pair",)
-_OF_DEPTH = ("no depth",)
-FAULTS = ("dropped", "duplicated", "out of order", "frozen", *SECONDS)
+_WALL_GREY, _BLACK_GREY = 120.0, 6.0
+_NOISE_GREY = 1.3  # deviation of a camera's noise
 
 
-def fitting(clip: Clip) -> tuple[str, ...]:
-    """The faults that a clip's cameras can have."""
-    return tuple(
-        fault
-        for fault in FAULTS
-        if (fault not in _OF_PAIRS or clip.rig.right is not None) and (fault not in _OF_DEPTH or clip.rig.has_depth)
+# changes of one frame
+
+
+def images(change: Callable[[U8], NDArray[np.floating] | U8]) -> Change:
+    """Apply a change to the left and the right image; grey values are clipped to 0..255."""
+
+    def changed(image: U8) -> U8:
+        return np.clip(change(image), 0, 255).astype(np.uint8)
+
+    return lambda frame: replace(
+        frame, left=changed(frame.left), right=None if frame.right is None else changed(frame.right), encoded=()
     )
 
 
-def faulty(clip: Clip, fault: str) -> Clip:
-    """A clip with one fault that begins after its first quarter; stamps stay in order unless that is the fault."""
-    items, n = list(clip.items), len(clip.items) // 4
-    if fault in SECONDS:
-        for k in range(n, min(n + round(SECONDS[fault] * 1e9 / clip.period_ns), len(items) - 1)):
-            items[k] = (_CHANGES[fault](items[k][0]), items[k][1])
-    elif fault == "dropped":
-        del items[n : n + 5]
-    elif fault == "frozen":
-        for k in range(n, n + 5):
-            items[k] = (replace(items[n - 1][0], t_ns=items[k][0].t_ns), items[k][1])
-    elif fault == "duplicated":
-        items.insert(n, (items[n - 1][0], None))
-    elif fault == "out of order":
-        items[n], items[n + 1] = items[n + 1], items[n]
-    else:
-        raise ValueError(f"no fault {fault!r}; there are: {', '.join(FAULTS)}")
-    return replace(clip, items=tuple(items))
+def blank(grey: float) -> Change:
+    """Show a plain surface of one grey value, with the camera's noise."""
+
+    def change(frame: Frame) -> Frame:
+        rng = np.random.default_rng([frame.t_ns, 5])
+        return images(lambda image: grey + _NOISE_GREY * rng.standard_normal(image.shape))(frame)
+
+    return change
 
 
-def blind(clip: Clip, begin: int, end: int, *, black: bool = False) -> Clip:
-    """A clip whose frames begin..end show a blank wall, or nothing at all."""
-    items = list(clip.items)
-    for k in range(begin, end):
-        items[k] = (_dark(items[k][0]) if black else _wall(items[k][0]), items[k][1])
-    return replace(clip, items=tuple(items))
+def gain(factor: float, offset: float = 0.0) -> Change:
+    """Change exposure and contrast."""
+    return images(lambda image: image * factor + offset)
 
 
-def rearranged(clip: Clip, order: Sequence[int | None]) -> Clip:
-    """Frames of a clip in another order, at its own pace; None: a blank wall. No inertial samples: nobody flew that.
+wall, black = blank(_WALL_GREY), blank(_BLACK_GREY)
 
-    The true poses go along; while the wall is seen the camera is where it was before.
+
+def no_right(frame: Frame) -> Frame:
+    """The frame without its right image."""
+    return replace(frame, right=None)
+
+
+def no_depth(frame: Frame) -> Frame:
+    """The frame without any valid depth."""
+    return replace(frame, depth_m=None if frame.depth_m is None else np.zeros_like(frame.depth_m))
+
+
+# changes of a recording
+
+
+def changed(recording: Recording, begin: int, end: int, change: Change) -> Recording:
+    """Change frames begin..end."""
+    items = list(recording.items)
+    for k in range(begin, min(end, len(items))):
+        items[k] = replace(items[k], frame=change(items[k].frame))
+    return replace(recording, items=tuple(items))
+
+
+def stuck(recording: Recording, begin: int, end: int) -> Recording:
+    """Repeat the image before frame `begin` until frame `end`."""
+    last = recording.items[begin - 1].frame
+    return changed(
+        recording, begin, end,
+        lambda frame: replace(frame, left=last.left, right=last.right, depth_m=last.depth_m, encoded=()),
+    )  # fmt: skip
+
+
+def every_nth(recording: Recording, begin: int, end: int, n: int) -> Recording:
+    """Keep the last of every n frames in begin..end, with the inertial samples of all n."""
+    items = recording.items
+    kept = [replace(items[k + n - 1], imu=_joined_imu(items[k : k + n])) for k in range(begin, end, n)]
+    return replace(recording, items=(*items[:begin], *kept, *items[end:]))
+
+
+def rearranged(recording: Recording, order: Sequence[int | None]) -> Recording:
+    """Frames in another order, at the same rate; None: a blank wall. No inertial samples: nobody flew that path.
+
+    True poses go along; in front of the wall the camera stays where it was.
     """
-    assert clip.truth is not None
-    items: list[tuple[Frame, ImuBatch | None]] = []
-    stamps, poses, last = [], [], 0
+    items, last, first_ns = [], 0, recording.items[0].frame.t_ns
     for k, source in enumerate(order):
         last = last if source is None else source
-        frame = clip.items[last][0]
-        t_ns = clip.items[0][0].t_ns + k * clip.period_ns
-        items.append((replace(frame if source is not None else _wall(frame), t_ns=t_ns), None))
-        stamps.append(t_ns)
-        poses.append(clip.truth.T_w_b[int(np.argmin(np.abs(clip.truth.t_ns - frame.t_ns)))])
-    truth = Trajectory(np.array(stamps, np.int64), np.array(poses))
-    return replace(clip, imu=None, items=tuple(items), truth=truth)
+        item = recording.items[last]
+        frame = replace(item.frame, t_ns=first_ns + k * recording.period_ns)
+        items.append(Item(wall(frame) if source is None else frame, T_w_b=item.T_w_b))
+    return replace(recording, imu=None, items=tuple(items))
 
 
-def _both(frame: Frame, change: Callable[[U8], U8]) -> Frame:
-    right = None if frame.right is None else change(frame.right)
-    return replace(frame, left=change(frame.left), right=right, encoded=())
+def _joined_imu(items: Sequence[Item]) -> ImuBatch | None:
+    return joined([item.imu for item in items if item.imu is not None])
 
 
-def _dark(frame: Frame) -> Frame:
-    return _both(frame, lambda image: np.full_like(image, _DARK))
+# named faults
 
 
-def _wall(frame: Frame) -> Frame:
-    rng = np.random.default_rng(frame.t_ns % (1 << 32))
-    return _both(frame, lambda image: np.clip(rng.normal(_GREY, _NOISE, image.shape), 0, 255).astype(np.uint8))
+def _quarter(seconds: float, change: Change) -> Fault:
+    """Change frames for some time after the first quarter; the last frame is left as it is."""
+
+    def fault(recording: Recording) -> Recording:
+        begin, last = len(recording.items) // 4, len(recording.items) - 1
+        return changed(recording, begin, min(begin + round(seconds * 1e9 / recording.period_ns), last), change)
+
+    return fault
 
 
-def _bright(frame: Frame) -> Frame:
-    return _both(frame, lambda image: np.clip(image * 1.5, 0, 255).astype(np.uint8))
+def _reordered(order: Callable[[list[Item], int], list[Item]]) -> Fault:
+    """Change the list of items at the first quarter."""
+    return lambda recording: replace(
+        recording, items=tuple(order(list(recording.items), len(recording.items) // 4))
+    )  # fmt: skip
 
 
-_CHANGES: dict[str, Callable[[Frame], Frame]] = {
-    "black": _dark,
-    "covered lens, 2 s": _dark,
-    "half a pair": lambda frame: replace(frame, right=None),
-    "no depth": lambda frame: replace(frame, depth_m=None if frame.depth_m is None else np.zeros_like(frame.depth_m)),
-    "exposure jump": _bright,
-    "no texture, 10 s": _wall,
-}
+def _duplicated(items: list[Item], n: int) -> list[Item]:
+    return [*items[:n], replace(items[n - 1], imu=None), *items[n:]]
+
+
+CAMERA_FAULTS: dict[str, Fault] = {
+    "dropped": _reordered(lambda items, n: items[:n] + items[n + 5 :]),
+    "duplicated": _reordered(_duplicated),
+    "out of order": _reordered(lambda items, n: [*items[:n], items[n + 1], items[n], *items[n + 2 :]]),
+    "stuck": lambda r: stuck(r, len(r.items) // 4, len(r.items) // 4 + 5),
+    "black": _quarter(0.15, black),
+    "no right image": _quarter(0.5, no_right),
+    "no depth": _quarter(0.5, no_depth),
+    "exposure jump": _quarter(0.5, gain(1.5)),
+    "covered lens, 2 s": _quarter(2.0, black),
+    "no texture, 10 s": _quarter(10.0, wall),
+}  # after a quarter of the recording
+
+
+def camera_faults_of(recording: Recording) -> dict[str, Fault]:
+    """The faults that a recording's cameras can have."""
+    missing = set()
+    if recording.rig.right is None:
+        missing.add("no right image")
+    if not recording.rig.has_depth:
+        missing.add("no depth")
+    return {name: fault for name, fault in CAMERA_FAULTS.items() if name not in missing}
+
+
+def _middle(count: int, change: Change, first: int = 0) -> Fault:
+    """Change `count` frames that begin `first` frames after the middle."""
+
+    def fault(recording: Recording) -> Recording:
+        begin = len(recording.items) // 2 + first
+        return changed(recording, begin, begin + count, change)
+
+    return fault
+
+
+def _kidnapped(recording: Recording) -> Recording:
+    """A blank wall, then on at the place that is reached a second and a half later."""
+    n = len(recording.items) // 2
+    items = _middle(6, wall, -6)(recording).items
+    there = replace(recording.items[n + 30], imu=_joined_imu(recording.items[n : n + 31]))
+    return replace(recording, items=(*items[:n], there, *recording.items[n + 31 :]))
+
+
+def _middle_of(fault: Callable[[Recording, int, int], Recording], count: int) -> Fault:
+    return lambda recording: fault(recording, len(recording.items) // 2, len(recording.items) // 2 + count)
+
+
+FAULTS_IN_MID_FLIGHT: dict[str, Fault] = {
+    "none": lambda recording: recording,
+    "black, 0.3 s": _middle(6, black),
+    "black, 2 s": _middle(40, black),
+    "blank wall, 1.5 s": _middle(30, wall),
+    "no contrast, 1 s": _middle(20, gain(0.03, 100.0)),
+    "too bright, 1 s": _middle(20, gain(2.4)),
+    "too dark, 1 s": _middle(20, gain(0.15)),
+    "left image only, 1 s": _middle(20, no_right),
+    "stuck, 0.6 s": _middle_of(stuck, 12),
+    "four times as fast": _middle_of(lambda r, begin, end: every_nth(r, begin, end, 4), 32),
+    "out at another place": _kidnapped,
+    "two walls": lambda recording: _middle(14, wall, 28)(_middle(14, wall)(recording)),
+}  # in the middle of a flight at 20 Hz

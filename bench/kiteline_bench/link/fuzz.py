@@ -1,7 +1,8 @@
-"""Feeds decoders with random and mutated bytes: they may refuse them with WireError, and nothing else may happen."""
+"""Ten million random and mutated inputs for everything that reads bytes from a link: only WireError may come of it."""
 
 from __future__ import annotations
 
+import json
 import random
 import resource
 import time
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
+from kiteline_bench.harness.bars import Bar, Bench, at_most
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import RECORD_TYPES, Key, WireError, messages
 from kiteline_codec.sync.config import SyncConfig
@@ -17,6 +19,11 @@ from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import Deframer, frame
 from kiteline_codec.transport.packet import parse
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
+from kiteline_hw.ports import SourceError
+
+TITLE = "Fuzzing"
+INPUTS = 10_000_000
+_TESTS = Path(__file__).resolve().parents[3] / "tests" / "codec"
 
 _MAX_BYTES = 1400  # of an input
 _SLOW_S = 0.25  # s of CPU that one input may take; a hang would take more
@@ -178,3 +185,22 @@ def _one(target: Target, data: bytes, draw: random.Random) -> str:
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return ""
+
+
+def run(bench: Bench) -> list[Bar]:
+    """Feed all decoders in turn; the corpus is that of the tests."""
+    if not _TESTS.is_dir():
+        raise SourceError(f"no corpus in {_TESTS}: run this benchmark in a checkout of the sources")
+    entries = json.loads((_TESTS / "golden" / "records.json").read_text())
+    values = [(Key(*e["key"]), bytes.fromhex(e["code"])) for e in entries]
+    found = fuzz(
+        read_corpus(_TESTS / "corpus"), values, INPUTS, seed=1, say=lambda n: bench.say(f"fuzz: {n:,} of {INPUTS:,}")
+    )
+    for failure in found.failures:
+        bench.say(failure)
+    return [
+        at_most("inputs that did anything but be read or refused", len(found.failures), 0, "", 0),
+        at_most("memory grown", found.grown_mib, 64, "MiB", 1),
+        at_most("slowest input", found.slowest_s * 1e3, 1000, "ms", 1),
+        Bar("read and refused", f"{INPUTS:,} inputs", f"{found.accepted:,} read, {found.refused:,} refused", True),
+    ]

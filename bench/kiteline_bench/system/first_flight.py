@@ -1,4 +1,4 @@
-"""The first flight's bars: accuracy, cost, bytes, agreement, repetition, deaths and bad input, on real recordings."""
+"""The first flight's bars: accuracy, cost, bytes, agreement, repetition, killed processes, bad input; on recordings."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from typing import Any
 
-from kiteline_bench.benchmark import Bar, Bench, at_most, is_true
+import cv2
+import numpy as np
+
+from kiteline_bench.harness.bars import Bar, Bench, FlightFailed, at_most, is_true, run_command
+from kiteline_bench.harness.result import FlownProcesses
 from kiteline_lab.flights.flight_report import check_contract, without_timing
 from kiteline_lab.flights.fly import Options, fly
 from kiteline_lab.replay.replay import main as replay
@@ -27,9 +30,8 @@ _DEMO_S = 60.0
 def run(bench: Bench) -> list[Bar]:
     """All bars, in the order of the promise."""
     bars: list[Bar] = []
-    bench.say("compiling kernels, so that the flights measure flying")
-    _run([sys.executable, "-m", "kiteline_cli", "doctor", "--warm"], 10 * _DEMO_S)
-    for part in (_room, _others, _agreement, _deaths, _bad_input, _demo):
+    bench.warm()
+    for part in (_room, _others, _agreement, _kills, _bad_input, _demo):
         try:
             bars += part(bench)
         except FlightFailed as error:
@@ -37,50 +39,36 @@ def run(bench: Bench) -> list[Bar]:
     return bars
 
 
-class FlightFailed(Exception):
-    """A process of a flight ended on its own."""
-
-
-def _fly(bench: Bench, name: str, folder: str, **options: Any) -> dict[str, Any]:
-    bench.say(f"flying {name} ({folder})")
-    report, outcome = fly(Options((bench.source(name),), bench.folder / folder, **options), quiet=True)
-    if outcome.failed:
-        raise FlightFailed(f"{folder}: {outcome.notes}")
-    return dict(report)
-
-
-def _all_tracked(what: str, report: dict[str, Any]) -> Bar:
-    agent = report["agents"][0]
+def _all_tracked(what: str, flown: FlownProcesses) -> Bar:
+    agent = flown.agent()
     return is_true(f"{what}: every frame tracked", "all", agent["tracked"] == agent["frames"],
                    f"{agent['tracked']} of {agent['frames']}")  # fmt: skip
 
 
-def _contract(bench: Bench, folder: str) -> Bar:
-    breaches = check_contract(bench.folder / folder)
-    return is_true(f"contract of the folder of {folder}", "kept", not breaches, "; ".join(breaches) or "kept")
+def _contract(flown: FlownProcesses) -> Bar:
+    breaches = check_contract(flown.folder)
+    return is_true(f"contract of the folder of {flown.folder.name}", "kept", not breaches, "; ".join(breaches) or "kept")
 
 
 def _room(bench: Bench) -> list[Bar]:
     """room_flight, twice distributed and once alone: accuracy, cost, bytes, repetition, replay."""
-    report = _fly(bench, "room_flight.mcap", "room")
-    again = _fly(bench, "room_flight.mcap", "room_again")
-    alone = _fly(bench, "room_flight.mcap", "room_tracker", mode="tracker")
-    agent, base = report["agents"][0], report["base"]
+    source = bench.source("room_flight.mcap")
+    flown, again = bench.fly(source, "room"), bench.fly(source, "room_again")
+    alone = bench.fly(source, "room_tracker", mode="tracker")
+    agent, base = flown.agent(), flown.base
     cpu = agent["timing"]["cpu_ms_per_frame"]
     alike = all(
-        (bench.folder / "room" / name).read_bytes() == (bench.folder / "room_again" / name).read_bytes()
+        (flown.folder / name).read_bytes() == (again.folder / name).read_bytes()
         for name in ("agent0/live.tum", "agent0/odometry.tum", "base/agent0.tum")
     )
     bench.say("replaying both logs")
     with contextlib.redirect_stdout(io.StringIO()):
-        same = [
-            replay([str(bench.folder / "room" / half / "log.mcap"), "--verify"]) == 0 for half in ("agent0", "base")
-        ]
+        same = [replay([str(flown.folder / half / "log.mcap"), "--verify"]) == 0 for half in ("agent0", "base")]
     return [
-        _all_tracked("room_flight, distributed", report),
-        at_most("room_flight: ATE live", agent["accuracy"]["live"]["ate_m"], 0.06, "m", 4),
-        at_most("room_flight: ATE base", agent["accuracy"]["base"]["ate_m"], 0.03, "m", 4),
-        at_most("room_flight: ATE, tracker only", alone["agents"][0]["accuracy"]["live"]["ate_m"], 0.10, "m", 4),
+        _all_tracked("room_flight, distributed", flown),
+        at_most("room_flight: ATE live", flown.ate_m("live"), 0.06, "m", 4),
+        at_most("room_flight: ATE base", flown.ate_m(), 0.03, "m", 4),
+        at_most("room_flight: ATE, tracker only", alone.ate_m("live"), 0.10, "m", 4),
         at_most("agent: CPU a frame, mean", cpu["mean"], 10.0, "ms", 2),
         at_most("agent: CPU a frame, p95", cpu["p95"], 20.0, "ms", 2),
         at_most("agent: resident memory", agent["timing"]["rss_mib"], 250.0, "MiB", 0),
@@ -89,64 +77,66 @@ def _room(bench: Bench) -> list[Bar]:
         at_most("bytes a keyframe, up", agent["bytes_per_keyframe"] / 1000.0, 12.0, "kB", 2),
         is_true("digests at the end", "equal", base["digest_equal"] is True),
         is_true("two flights: trajectories", "byte-identical", alike),
-        is_true("two flights: reports but timing", "equal", without_timing(report) == without_timing(again)),
+        is_true("two flights: reports but timing", "equal",
+                without_timing(flown.report) == without_timing(again.report)),
         is_true("replay --verify of the agent's and the base's log", "bit for bit", all(same)),
-        _contract(bench, "room"),
-        _contract(bench, "room_tracker"),
-    ]
+        _contract(flown),
+        _contract(alone),
+    ]  # fmt: skip
 
 
 def _others(bench: Bench) -> list[Bar]:
     """The shorter recordings."""
-    kitti = _fly(bench, "kitti_straight", "kitti")
-    tum = _fly(bench, "tum_rgbd_xyz", "tum")
-    euroc = _fly(bench, "euroc_v101_start", "euroc")
-    k, t, e = (report["agents"][0]["accuracy"] for report in (kitti, tum, euroc))
+    kitti, tum, euroc = (
+        bench.fly(bench.source(name), folder)
+        for name, folder in (("kitti_straight", "kitti"), ("tum_rgbd_xyz", "tum"), ("euroc_v101_start", "euroc"))
+    )
+    k, t, e = (flown.accuracy("live") for flown in (kitti, tum, euroc))
     return [
         _all_tracked("kitti_straight", kitti),
-        at_most("kitti_straight: relative error a frame", k["live"]["rpe_mm"], 20.0, "mm", 2),
-        at_most("kitti_straight: relative rotation a frame", k["live"]["rpe_deg"], 0.07, "degrees", 4),
-        at_most("kitti_straight: ATE live", k["live"]["ate_m"], 0.20, "m"),
-        at_most("kitti_straight: ATE base", k["base"]["ate_m"], 0.12, "m"),
-        at_most("tum_rgbd_xyz: relative error a frame", t["live"]["rpe_mm"], 2.5, "mm", 2),
-        at_most("euroc_v101_start: largest deviation", 1000.0 * e["live"]["ate_max_m"], 4.0, "mm", 2),
-        *(_contract(bench, folder) for folder in ("kitti", "tum", "euroc")),
+        at_most("kitti_straight: relative error a frame", k["rpe_mm"], 20.0, "mm", 2),
+        at_most("kitti_straight: relative rotation a frame", k["rpe_deg"], 0.07, "degrees", 4),
+        at_most("kitti_straight: ATE live", k["ate_m"], 0.20, "m"),
+        at_most("kitti_straight: ATE base", kitti.ate_m(), 0.12, "m"),
+        at_most("tum_rgbd_xyz: relative error a frame", t["rpe_mm"], 2.5, "mm", 2),
+        at_most("euroc_v101_start: largest deviation", 1000.0 * e["ate_max_m"], 4.0, "mm", 2),
+        *(_contract(flown) for flown in (kitti, tum, euroc)),
     ]
 
 
 def _agreement(bench: Bench) -> list[Bar]:
     """20 % of the packets lost, doubled and reordered, both ways."""
-    report = _fly(bench, "room_flight.mcap", "room_lossy", loss=0.2)
-    equal = report["base"]["digest_equal"] is True
-    drained_s = report["drain"]["base"]["flight_ms"] / 1000.0
+    flown = bench.fly(bench.source("room_flight.mcap"), "room_lossy", loss=0.2)
+    equal = flown.base["digest_equal"] is True
+    drained_s = flown.report["drain"]["base"]["flight_ms"] / 1000.0
     return [
         is_true("20 % loss, duplication, reordering: digests at the end", "equal", equal,
                 f"{'equal' if equal else 'not equal'}, {drained_s:.1f} s of flight time after the last frame"),
-        _all_tracked("20 % loss", report),
-        at_most("20 % loss: ATE live", report["agents"][0]["accuracy"]["live"]["ate_m"], 0.06, "m", 4),
-        _contract(bench, "room_lossy"),
+        _all_tracked("20 % loss", flown),
+        at_most("20 % loss: ATE live", flown.ate_m("live"), 0.06, "m", 4),
+        _contract(flown),
     ]  # fmt: skip
 
 
-def _deaths(bench: Bench) -> list[Bar]:
+def _kills(bench: Bench) -> list[Bar]:
     """A base that is killed and started again; an agent that is killed beside another."""
-    base = _fly(bench, "room_flight.mcap", "room_base_killed", kill_base_at_s=6.0, restart_base_at_s=12.0)
+    room = bench.source("room_flight.mcap")
+    flown = bench.fly(room, "room_base_killed", kill_base_at_s=6.0, restart_base_at_s=12.0)
     bench.say("flying two agents, one of which is killed")
-    two = (bench.source("room_flight.mcap"),) * 2
-    killed, _ = fly(
-        Options(two, bench.folder / "room_agent_killed", seconds=10.0, kill_agent_at_s=5.0), quiet=True
-    )  # fmt: skip
-    held: dict[str, Any] = dict(killed)
-    caught_up, made = base["base"]["keyframes"], base["agents"][0]["keyframes"]
+    out = bench.folder / "room_agent_killed"
+    report, outcome = fly(Options((room, room), out, seconds=10.0, kill_agent_at_s=5.0), quiet=True)
+    killed = FlownProcesses(out, dict(report), outcome)
+    caught_up, made = flown.base["keyframes"], flown.agent()["keyframes"]
+    held = killed.base
     return [
-        _all_tracked("base killed at 6 s, started again at 12 s", base),
-        is_true("base started again: catches up, digests", "equal", base["base"]["digest_equal"] is True),
+        _all_tracked("base killed at 6 s, started again at 12 s", flown),
+        is_true("base started again: catches up, digests", "equal", flown.base["digest_equal"] is True),
         is_true("base started again: keyframes it holds", "all", caught_up == made, f"{caught_up} of {made}"),
         is_true("agent killed: the base keeps its map and reports it", "yes",
-                held["base"]["agents_lost"] == [0] and held["base"]["keyframes"] > held["agents"][1]["keyframes"],
-                f"{held['base']['keyframes']} keyframes, agent {held['base']['agents_lost']} reported"),
-        _contract(bench, "room_base_killed"),
-        _contract(bench, "room_agent_killed"),
+                held["agents_lost"] == [0] and held["keyframes"] > killed.agent(1)["keyframes"],
+                f"{held['keyframes']} keyframes, agent {held['agents_lost']} reported"),
+        _contract(flown),
+        _contract(killed),
     ]  # fmt: skip
 
 
@@ -158,18 +148,18 @@ def _bad_input(bench: Bench) -> list[Bar]:
         out = bench.folder / f"broken {name}"
         command = [sys.executable, "-m", "kiteline_cli", "fly", source, "--out", str(out)]
         try:
-            done = _run(command, _SPAWN_S)
+            done = run_command(command, _SPAWN_S)
         except subprocess.TimeoutExpired:
             bars.append(is_true(f"bad input: {name}", "clear error or counted skip", False, "hangs"))
             continue
         errors = done.stderr + "".join(path.read_text() for path in out.glob("*/stderr.log"))
-        told = [line for line in done.stderr.splitlines() if line.startswith("kiteline: error:")]
+        reported = [line for line in done.stderr.splitlines() if line.startswith("kiteline: error:")]
         skipped: dict[str, int] = {}
         if (out / "report.json").exists():
             skipped = json.loads((out / "report.json").read_text())["agents"][0].get("skipped", {})
-        handled = bool(told) if done.returncode else bool(skipped) or name == "truncated MCAP"
+        handled = bool(reported) if done.returncode else bool(skipped) or name == "truncated MCAP"
         fine = handled and "Traceback" not in errors
-        words = told[0].removeprefix("kiteline: error: ") if told else f"flown, skipped: {skipped or 'the rest'}"
+        words = reported[0].removeprefix("kiteline: error: ") if reported else f"flown, skipped: {skipped or 'the rest'}"
         words = words.replace(str(bench.folder), "…").replace("|", "/") if fine else errors[-200:]
         bars.append(is_true(f"bad input: {name}", "clear error or counted skip", fine, " ".join(words.split())[:140]))
     return bars
@@ -204,9 +194,6 @@ def _broken_sources(bench: Bench) -> Iterator[tuple[str, str]]:
             lines[30:60] = [line.split(",")[0] + ",nan,nan,nan,nan,nan,nan" for line in lines[30:60]]
             target.write_text("\n".join(lines) + "\n")
         elif name == "image of another size":
-            import cv2
-            import numpy as np
-
             cv2.imwrite(str(target), np.zeros((100, 100), np.uint8))
         else:
             target.write_text("this is no picture\n")
@@ -220,15 +207,9 @@ def _demo(bench: Bench) -> list[Bar]:
     shutil.rmtree(cache, ignore_errors=True)
     begin_s = time.monotonic()
     command = [sys.executable, "-m", "kiteline_lab.demo", "--out", str(bench.folder / "demo")]
-    done = _run(command, 10 * _DEMO_S, NUMBA_CACHE_DIR=str(cache))
+    done = run_command(command, 10 * _DEMO_S, NUMBA_CACHE_DIR=str(cache))
     took_s = time.monotonic() - begin_s
     return [
         is_true("demo, after installation", "ends with the table", done.returncode == 0, f"status {done.returncode}"),
         at_most("demo, kernel compilation included", took_s, _DEMO_S, "s", 1),
     ]
-
-
-def _run(command: list[str], timeout_s: float, **variables: str) -> subprocess.CompletedProcess[str]:
-    paths = os.pathsep.join(entry for entry in sys.path if entry)
-    environment = {**os.environ, "PYTHONPATH": paths, **variables}
-    return subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=timeout_s)

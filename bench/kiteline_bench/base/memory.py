@@ -1,6 +1,6 @@
-"""Where the memory of a base goes: runs a base again from its log, and weighs it and its parts as the map grows.
+"""Where the memory of a base goes: run a base again from its log, and measure it and its parts as the map grows.
 
-    python -m kiteline_bench.harness.base_memory FOLDER/base/log.mcap [--every KEYFRAMES] [--trace]
+    python -m kiteline_bench.base.memory FOLDER/base/log.mcap [--every KEYFRAMES] [--trace]
 
 prints a table of what each further keyframe takes. The process that measures does nothing else, since what it compiles
 or leaves behind would be counted; kernels have to be compiled before.
@@ -13,9 +13,8 @@ import gc
 import json
 import subprocess
 import sys
-import tomllib
 import tracemalloc
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, ModuleType
@@ -24,28 +23,23 @@ import cv2
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.job_kinds import run_job
-from kiteline_basestation.jobs import Job
-from kiteline_basestation.runtime import flight_log
 from kiteline_basestation.runtime.base_runtime import load_vocabulary
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.station import Station
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel
-from kiteline_core import config as configuration
-from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.system.memory import return_large_arrays, rss_mib
-from kiteline_lab.replay.replay import channel_of_log, spec_of_log, steps
+from kiteline_lab.replay.replay import replay_base
 
-_EVERY = 50  # keyframes between two looks
+_EVERY = 50  # keyframes between two samples
 _CODE = (type, ModuleType, FunctionType, BuiltinFunctionType)
-_WORTH_KB = 0.05  # a keyframe: smaller parts are not named
+_SMALLEST_KB = 0.05  # a keyframe: smaller parts are not listed
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A base at one moment. parts: bytes of what it holds, by name. traced: all that Python allocated, 0: not asked."""
+    """A base at one moment. parts: bytes of what it holds, by name. traced: bytes that Python allocated, 0: unknown."""
 
     keyframes: int
     rss_bytes: int
@@ -54,7 +48,7 @@ class Sample:
 
 
 def bytes_of(root: object, seen: set[int]) -> int:
-    """Bytes of an object and of all that hangs on it, code apart, but for what was seen before; marks it as seen."""
+    """Bytes of an object and of all that it refers to, without code and what is in `seen`; adds them to `seen`."""
     total, open_ = 0, [root]
     while open_:
         item = open_.pop()
@@ -70,7 +64,7 @@ def bytes_of(root: object, seen: set[int]) -> int:
 
 
 def parts_of(station: Station) -> dict[str, int]:
-    """Bytes of a station's parts; what several hold counts for the first."""
+    """Bytes of a station's parts; what several refer to counts for the first."""
     mapper = station.mapper
     ends = [channel.endpoint for channel in station.channels.values() if isinstance(channel, CodedChannel)]
     seen = {id(station), id(mapper), *map(id, ends)}
@@ -85,43 +79,39 @@ def parts_of(station: Station) -> dict[str, int]:
     return out
 
 
-def replayed(log: Path, every: int = _EVERY, trace: bool = False) -> Iterator[Sample]:
-    """Run a base again from its log; a sample whenever so many keyframes more have come, and at the end."""
+def measure(log: Path, report: Callable[[Sample], None], every: int = _EVERY, trace: bool = False) -> None:
+    """Run a base again from its log; report a sample whenever so many keyframes more have come, and at the end."""
     cv2.setNumThreads(1)
+    codec_warm.warm()
+    vocabulary = load_vocabulary()
+    warm(BaseConfig(), vocabulary)
+    if vocabulary is not None:
+        warm_graphs()
+    if trace:
+        tracemalloc.start()
+    due = every
+
+    def watch(station: Station) -> None:
+        nonlocal due
+        if len(station.mapper.map) >= due:
+            due += every
+            report(_sample(station))
+
     with LogReader(log) as reader:
-        spec = spec_of_log(reader)
-        config = configuration.apply(BaseConfig(), tomllib.loads(reader.metadata["config"]))
-        codec_warm.warm()
-        words = load_vocabulary()
-        warm(config, words)
-        if words is not None:
-            warm_graphs()
-        station = Station(config, lambda agent: channel_of_log(spec, spec["session"], spec["down_bytes_s"]), words)
-        jobs: dict[int, Job] = {}
-        due = every
-        if trace:
-            tracemalloc.start()
-        for step in steps(reader):
-            packets = {AgentId(int(a)): step.blobs(flight_log.packets_in(int(a))) for a in step.head["agents"]}
-            done = [run_job(jobs.pop(number)) for number in step.head["done"]]
-            output = station.step(packets, done, step.head["now_ns"])
-            jobs.update({job.id: job for job in output.jobs})
-            del done, output
-            if len(station.mapper.map) >= due:
-                due += every
-                yield _sample(station)
-        yield _sample(station)
+        station = replay_base(reader, watch=watch).station
+    assert station is not None
+    report(_sample(station))
 
 
 def _sample(station: Station) -> Sample:
-    rss_bytes = round(rss_mib() * 2**20)  # before it is weighed, which takes memory itself
+    rss_bytes = round(rss_mib() * 2**20)  # before the parts are measured, which takes memory itself
     traced = tracemalloc.get_traced_memory()[0] if tracemalloc.is_tracing() else 0
     return Sample(len(station.mapper.map), rss_bytes, traced, parts_of(station))
 
 
 def measured(log: Path) -> list[Sample]:
-    """The same by a process of its own. Raises subprocess.CalledProcessError."""
-    command = [sys.executable, "-m", "kiteline_bench.harness.base_memory", str(log), "--json"]
+    """The samples of `measure`, taken by a process of its own. Raises subprocess.CalledProcessError."""
+    command = [sys.executable, "-m", "kiteline_bench.base.memory", str(log), "--json"]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
     return [Sample(**json.loads(line)) for line in done.stdout.splitlines()]
 
@@ -134,9 +124,9 @@ def table(samples: Sequence[Sample]) -> str:
     def kb(a: int, b: int) -> str:
         return f"{(b - a) / more / 1000.0:.1f} kB"
 
-    grown = {name: last.parts[name] - first.parts.get(name, 0) for name in last.parts}
-    named = sorted((name for name in grown if grown[name] >= 1000.0 * _WORTH_KB * more), key=lambda name: -grown[name])
-    rows = [(name, kb(0, grown[name])) for name in named]
+    growth = {name: last.parts[name] - first.parts.get(name, 0) for name in last.parts}
+    named = sorted((name for name in growth if growth[name] >= 1000.0 * _SMALLEST_KB * more), key=lambda name: -growth[name])
+    rows = [(name, kb(0, growth[name])) for name in named]
     rows.append(("all parts", kb(sum(first.parts.values()), sum(last.parts.values()))))
     if last.traced:
         rows.append(("all that Python allocated", kb(first.traced, last.traced)))
@@ -148,21 +138,24 @@ def table(samples: Sequence[Sample]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table, or with --json one sample a line."""
     p = argparse.ArgumentParser(
-        prog="python -m kiteline_bench.harness.base_memory", description="Weigh a base and its parts."
+        prog="python -m kiteline_bench.base.memory", description="Measure the memory of a base and its parts."
     )
     p.add_argument("log", metavar="LOG", type=Path, help="base/log.mcap of a flight")
-    p.add_argument("--every", metavar="N", type=int, default=_EVERY, help="keyframes between two looks")
-    p.add_argument("--trace", action="store_true", help="ask Python, too, how much it allocated; three times slower")
+    p.add_argument("--every", metavar="N", type=int, default=_EVERY, help="keyframes between two samples")
+    p.add_argument("--trace", action="store_true", help="trace what Python allocates, too; three times slower")
     p.add_argument("--json", action="store_true", help=argparse.SUPPRESS)
     a = p.parse_args(argv)
     return_large_arrays()
     samples: list[Sample] = []
-    for sample in replayed(a.log, a.every, a.trace):
+
+    def report(sample: Sample) -> None:
         samples.append(sample)
         if a.json:
             print(json.dumps(asdict(sample)), flush=True)
         else:
             print(f"{sample.keyframes} keyframes: {sample.rss_bytes / 2**20:.1f} MiB", file=sys.stderr)
+
+    measure(a.log, report, a.every, a.trace)
     if not a.json:
         print(table(samples))
     return 0

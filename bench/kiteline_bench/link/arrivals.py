@@ -1,4 +1,4 @@
-"""What crossed a link, read from the logs of a flight: bytes in any second, how late headers and poses came."""
+"""Traffic of a link, from the logs of a flight: bytes in any second, delays of headers, gaps between poses."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kiteline_codec.schema import KeyframeHeader, LivePose, WireError, messages
 from kiteline_codec.transport.packet import parse
 from kiteline_hw.logs.mcap_log_read import LogReader
 from kiteline_hw.ports import SourceError
-from kiteline_lab.replay.replay import steps
+from kiteline_lab.replay.logged_steps import steps
 
 _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Watched:
-    """Of one direction, or of one agent's values on the base. Times in s, of flight."""
+class LinkUse:
+    """Traffic of one agent, upwards. Times in s of flight."""
 
     most_bytes_s: int  # in any one-second window, overhead included
-    head_delays_s: list[float]  # from capture to arrival of each keyframe's header, before the flight's last second
+    header_delays_s: list[float]  # from capture to arrival of each keyframe's header, before the flight's last second
     pose_gaps_s: list[float]  # between arrivals of live poses
 
 
@@ -44,7 +44,7 @@ def most_in_a_second(log: Path, topic: str, overhead_bytes: int) -> int:
 
 
 def live_shift_ns(agent_log_path: Path) -> int:
-    """Of a live flight: the stamp of a frame less the time on this machine's clock at which it was taken."""
+    """Stamp of a frame less the time on this machine's clock at which it was taken, of a live flight."""
     with LogReader(agent_log_path) as reader:
         frames = [(int(s.head["frame_ns"]), int(s.head["now_ns"])) for s in steps(reader) if s.head["frame_ns"]]
     if not frames:
@@ -53,8 +53,8 @@ def live_shift_ns(agent_log_path: Path) -> int:
 
 
 def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float], list[float]]:
-    """How late each header came, and the gaps between live poses, in s. shift_ns: stamps less the base's clock."""
-    heads: dict[int, float] = {}
+    """Delay of each header, and the gaps between live poses, in s. shift_ns: stamps less the base's clock."""
+    headers: dict[int, float] = {}
     poses_ns: list[int] = []
     with LogReader(base_folder / "log.mcap") as reader:
         for step in steps(reader):
@@ -69,15 +69,15 @@ def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float],
                         continue
                     record = messages.decode(item.key, item.data)
                     if isinstance(record, KeyframeHeader):
-                        heads.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
+                        headers.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
                     elif isinstance(record, LivePose):
                         poses_ns.append(now_ns)
     gaps = [(b - a) / 1e9 for a, b in pairwise(poses_ns)]
-    return list(heads.values()), gaps
+    return list(headers.values()), gaps
 
 
-def watch(folder: Path, agent: int, shift_ns: int, overhead_bytes: int) -> Watched:
-    """All of an agent's link, upwards. shift_ns: stamps of frames less the clock of the flight."""
+def link_use(folder: Path, agent: int, shift_ns: int, overhead_bytes: int) -> LinkUse:
+    """The traffic of an agent. shift_ns: stamps of frames less the clock of the flight."""
     delays, gaps = arrivals(folder / "base", agent, shift_ns)
     most = most_in_a_second(folder / f"agent{agent}" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
-    return Watched(most, delays, gaps)
+    return LinkUse(most, delays, gaps)

@@ -1,4 +1,4 @@
-"""A link that is down for long: an agent's end writes on, then the link comes back. Simulated time, real memory."""
+"""A long link outage: the agent's end goes on writing, then the link comes back. Simulated time, real memory."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _LIVE = Key(LivePose.KIND, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
-    """How it went."""
+class Outage:
+    """Memory and times of an outage."""
 
     backlog_mib: float  # codes that waited when the link came back
     most_mib: float  # of memory that values took, as the outbox counts it
-    grown_mib: float  # of the process from before the silence to its end, when the other end holds nothing new
+    grown_mib: float  # of the process during the outage, while the other end receives nothing
     synced_s: float  # from the link's return until both ends held the same
-    first_pose_s: float  # until a pose of after the silence was there
+    first_pose_s: float  # from the link's return until a newer pose arrived
 
 
-def silence(folder: Path, minutes: int) -> Silence:
-    """Ten minutes up, so many down, up again, at two keyframes a second; over Wi-Fi with 1 % of loss."""
+def fly_outage(folder: Path, minutes: int) -> Outage:
+    """Ten minutes up, some down, up again, at two keyframes a second; over Wi-Fi with 1 % of loss."""
     draw = random.Random(5)
     down_ns = _UP_MINUTES * _MINUTE_NS, (_UP_MINUTES + minutes) * _MINUTE_NS
     spill = SpillFile(folder)
@@ -54,7 +54,7 @@ def silence(folder: Path, minutes: int) -> Silence:
         if now_ns < down_ns[1]:
             agent.put(_LIVE, draw.randbytes(29))
             if tick % 10 == 0:
-                keyframe(agent, tick // 10, draw)
+                put_keyframe(agent, tick // 10, draw)
         for packet in up.deliver(now_ns):
             base.receive(packet, now_ns)
         for packet in down.deliver(now_ns):
@@ -72,10 +72,10 @@ def silence(folder: Path, minutes: int) -> Silence:
                 synced_s = since_s
                 break
     spill.close()
-    return Silence(backlog / 2**20, most / 2**20, after_mib - before_mib, synced_s, first_pose_s)
+    return Outage(backlog / 2**20, most / 2**20, after_mib - before_mib, synced_s, first_pose_s)
 
 
-def keyframe(agent: Endpoint, number: int, draw: random.Random) -> None:
+def put_keyframe(agent: Endpoint, number: int, draw: random.Random) -> None:
     """Share a keyframe of 8 kB."""
     agent.put(Key(KeyframeHeader.KIND, number), draw.randbytes(26))
     for part in range(7):

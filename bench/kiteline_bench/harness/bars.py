@@ -1,0 +1,101 @@
+"""Bars that a benchmark measures, and the folder, recordings and flights that it works with."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from kiteline_bench.harness.result import FlownProcesses
+from kiteline_hw.ports import SourceError
+from kiteline_lab.flights.fly import Options, fly
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """One promise. measured: in words, with units."""
+
+    name: str
+    wanted: str
+    measured: str
+    met: bool
+
+
+def at_most(name: str, value: float, limit: float, unit: str, digits: int = 3) -> Bar:
+    """A bar that wants a value no larger than a limit."""
+    space = f" {unit}" if unit else ""
+    return Bar(name, f"<= {limit:g}{space}", f"{value:.{digits}f}{space}", value <= limit)
+
+
+def is_true(name: str, wanted: str, met: bool, measured: str = "") -> Bar:
+    """A bar that wants a condition to hold."""
+    return Bar(name, wanted, measured or ("yes" if met else "no"), met)
+
+
+class FlightFailed(Exception):
+    """A process of a flight ended on its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What a benchmark reads and writes. say: reports progress. more: Markdown that stands below the bars."""
+
+    data: Path
+    folder: Path
+    say: Callable[[str], None]
+    more: list[str] = field(default_factory=list)
+
+    def source(self, name: str) -> str:
+        """The path of a recording. Raises SourceError when it is not there."""
+        path = self.data / name
+        if not path.exists():
+            raise SourceError(f"{path}: not there; set KITELINE_DATA to the folder that holds the recordings")
+        return str(path)
+
+    def fly(self, sources: str | Path | Sequence[str | Path], folder: str, **options: Any) -> FlownProcesses:
+        """Fly as `kiteline fly` does, into a folder of the bench; options: fields of its Options.
+
+        Raises FlightFailed when a process ended on its own.
+        """
+        several = [sources] if isinstance(sources, str | Path) else sources
+        self.say(f"flying {', '.join(Path(source).name for source in several)} ({folder})")
+        out = self.folder / folder
+        report, outcome = fly(Options(tuple(str(source) for source in several), out, **options), quiet=True)
+        if outcome.failed:
+            raise FlightFailed(f"{folder}: {outcome.notes}")
+        return FlownProcesses(out, dict(report), outcome)
+
+    def warm(self) -> None:
+        """Compile all kernels, so that flights measure flying."""
+        self.say("compiling kernels")
+        run_command([sys.executable, "-m", "kiteline_cli", "doctor", "--warm"], 600.0)
+
+
+Run = Callable[[Bench], list[Bar]]
+
+
+def in_turn(*runs: Run, warm: bool = False) -> Run:
+    """A benchmark that runs others in turn."""
+
+    def run(bench: Bench) -> list[Bar]:
+        if warm:
+            bench.warm()
+        return [bar for part in runs for bar in part(bench)]
+
+    return run
+
+
+def run_command(command: Sequence[str], timeout_s: float, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a command with this process's modules. Raises subprocess.TimeoutExpired."""
+    return subprocess.run(
+        command, check=False, env=environment(**variables), capture_output=True, text=True, timeout=timeout_s
+    )  # fmt: skip
+
+
+def environment(**variables: str) -> dict[str, str]:
+    """Environment of a child process that imports what this one imports."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry), **variables}

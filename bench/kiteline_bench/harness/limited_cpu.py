@@ -1,0 +1,76 @@
+"""Flights on a core of which the agent may use a share: modelled, or limited by the kernel; governor on or off."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import cost_ns
+from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_bench.harness.recording import Recording
+from kiteline_bench.harness.run import FlyingAgent
+from kiteline_hw.system.cpu import process_cpu_ns
+
+_SETTLED_NS = 3_000_000_000  # after the start, from when on the budget has to hold
+
+
+@dataclass(frozen=True, slots=True)
+class LimitedFlight:
+    """One flight. percent: of one core, 0 without a limit. load, peak: percent of one core, over the whole flight and
+    in the busiest one-second window after 3 s. quality: mean of the tracked frames.
+    """
+
+    percent: float
+    governor: bool
+    real: bool
+    frames: int
+    tracked: int
+    lost: int
+    dropped: int
+    submaps: int
+    load: float
+    peak: float
+    ate_m: float
+    rpe_mm: float
+    quality: float
+
+
+def fly_limited(recording: Recording, percent: float, *, governor: bool, real: bool) -> LimitedFlight:
+    """Fly on `percent` of a core. real: paced by the clock, under a limit set elsewhere; else on the modelled core."""
+    config = AgentConfig()
+    if governor and percent > 0.0:
+        config = replace(config, governor=replace(config.governor, cpu_percent=percent))
+    agent = FlyingAgent(recording.rig, recording.imu, config, vocabulary=False)
+    core, period_ns = VirtualCpu(percent), recording.period_ns
+    begin_ns, start_ns = time.monotonic_ns(), recording.items[0].frame.t_ns
+    spent_ns = 0
+    for item in recording.items:
+        t_ns = item.frame.t_ns
+        if real:
+            late_ns = time.monotonic_ns() - begin_ns - (t_ns - start_ns)
+            passed_over = late_ns >= period_ns
+            time.sleep(0.0 if passed_over else max(-late_ns, 0) / 1e9)
+        else:
+            passed_over = core.newest_wins(t_ns, period_ns)
+        if passed_over:
+            agent.drop(item)
+            continue
+        cpu_ns = process_cpu_ns()
+        agent.step(item, cpu_ns=spent_ns)
+        spent_ns = process_cpu_ns() - cpu_ns if real else cost_ns(agent.box.work)
+        core.spend(spent_ns, t_ns)
+        agent.run.cpu_ns[-1] = spent_ns
+    run = agent.run
+    errors = run.evaluate(run.tracked)
+    ate_m = rpe_mm = float("nan")
+    if errors is not None:
+        ate_m = errors.ate_m.rmse
+        rpe_mm = float("nan") if errors.rpe_frame is None else 1000.0 * errors.rpe_frame.translation_m.rmse
+    return LimitedFlight(
+        percent, governor, real, len(run.estimates), len(run.tracked), run.lost, run.dropped, run.submaps,
+        run.load_percent(period_ns), run.peak_percent(_SETTLED_NS), ate_m, rpe_mm,
+        float(np.mean([e.quality for e in run.tracked])) if run.tracked else 0.0,
+    )  # fmt: skip
