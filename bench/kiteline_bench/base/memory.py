@@ -125,7 +125,9 @@ def table(samples: Sequence[Sample]) -> str:
         return f"{(b - a) / more / 1000.0:.1f} kB"
 
     growth = {name: last.parts[name] - first.parts.get(name, 0) for name in last.parts}
-    named = sorted((name for name in growth if growth[name] >= 1000.0 * _SMALLEST_KB * more), key=lambda name: -growth[name])
+    named = sorted(
+        (name for name in growth if growth[name] >= 1000.0 * _SMALLEST_KB * more), key=lambda name: -growth[name]
+    )
     rows = [(name, kb(0, growth[name])) for name in named]
     rows.append(("all parts", kb(sum(first.parts.values()), sum(last.parts.values()))))
     if last.traced:

@@ -78,7 +78,12 @@ def run(bench: Bench) -> list[Bar]:
     share = found / max(revisits, 1)
     return [
         is_true("revisits found", ">= 70 % of >= 50", share >= 0.7 and revisits >= 50, f"{share:.0%} of {revisits}"),
-        is_true("false candidates accepted", "0 of >= 500", wrong == 0 and false_candidates >= 500, f"{wrong} of {false_candidates}"),
+        is_true(
+            "false candidates accepted",
+            "0 of >= 500",
+            wrong == 0 and false_candidates >= 500,
+            f"{wrong} of {false_candidates}",
+        ),
         at_most("query among 1000 places, CPU", _query_ms(flights), 1.0, "ms"),
     ]
 
@@ -113,7 +118,7 @@ def _near(a: _Place, b: _Place) -> bool:
 
 
 def _verdict(place: _Place, old: _Place) -> str:
-    """"refused", or "right" or "wrong" if the candidate is accepted."""
+    """ "refused", or "right" or "wrong" if the candidate is accepted."""
     config = AgentConfig()
     has = np.flatnonzero(np.isfinite(old.xyz[:, 2]))
     matches = matching.match(old.descriptor[has], old.angle[has], place.descriptor, place.angle, config.matching)

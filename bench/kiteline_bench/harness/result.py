@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,7 @@ class AgentRun:
         found = self.found
         return max(
             float(np.linalg.norm(b.T_o_b[:3, 3] - a.T_o_b[:3, 3])) / max((b.t_ns - a.t_ns) / period_ns, 1.0)
-            for a, b in zip(found[:-1], found[1:], strict=True)
+            for a, b in pairwise(found)
         )
 
     def errors(self) -> list[PoseError]:

@@ -63,9 +63,7 @@ def render(bench: Bench, name: str, command: Sequence[str], agents: int = 1) -> 
     return out
 
 
-def rendered_paths(
-    bench: Bench, name: str, scene: str, paths: Sequence[str], seconds: float = 0.0
-) -> list[Path]:
+def rendered_paths(bench: Bench, name: str, scene: str, paths: Sequence[str], seconds: float = 0.0) -> list[Path]:
     """Recordings of agents that fly these paths in one world. seconds: 0 is the whole path."""
     files = [bench.source(f"trajectories/{path}") for path in paths]
     part = ["--seconds", f"{seconds:g}"] if seconds else []
@@ -135,6 +133,10 @@ def _write_path(file: Path, rng: np.random.Generator, seconds: float, size_m: tu
     T_c_b = se3.inverse(make_rig().T_b_c)
     lines = []
     for i in range(len(t)):
-        r = se3.so3_exp(np.array([0.0, 0.0, yaw[i]])) @ se3.so3_exp(np.array([roll[i], 0.06 + pitch[i], 0.0])) @ _LOOKS_AHEAD
+        r = (
+            se3.so3_exp(np.array([0.0, 0.0, yaw[i]]))
+            @ se3.so3_exp(np.array([roll[i], 0.06 + pitch[i], 0.0]))
+            @ _LOOKS_AHEAD
+        )
         lines.append(tum.line(round(t[i] * 1e9), se3.from_rt(r, p[i]) @ T_c_b))
     file.write_text("".join(lines))

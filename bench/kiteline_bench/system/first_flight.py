@@ -47,7 +47,9 @@ def _all_tracked(what: str, flown: FlownProcesses) -> Bar:
 
 def _contract(flown: FlownProcesses) -> Bar:
     breaches = check_contract(flown.folder)
-    return is_true(f"contract of the folder of {flown.folder.name}", "kept", not breaches, "; ".join(breaches) or "kept")
+    return is_true(
+        f"contract of the folder of {flown.folder.name}", "kept", not breaches, "; ".join(breaches) or "kept"
+    )
 
 
 def _room(bench: Bench) -> list[Bar]:
@@ -159,7 +161,9 @@ def _bad_input(bench: Bench) -> list[Bar]:
             skipped = json.loads((out / "report.json").read_text())["agents"][0].get("skipped", {})
         handled = bool(reported) if done.returncode else bool(skipped) or name == "truncated MCAP"
         fine = handled and "Traceback" not in errors
-        words = reported[0].removeprefix("kiteline: error: ") if reported else f"flown, skipped: {skipped or 'the rest'}"
+        words = (
+            reported[0].removeprefix("kiteline: error: ") if reported else f"flown, skipped: {skipped or 'the rest'}"
+        )
         words = words.replace(str(bench.folder), "…").replace("|", "/") if fine else errors[-200:]
         bars.append(is_true(f"bad input: {name}", "clear error or counted skip", fine, " ".join(words.split())[:140]))
     return bars

@@ -1,4 +1,4 @@
-"""What the parts of a base weigh."""
+"""Memory of the parts of a base."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Station
-from kiteline_bench.harness.base_memory import Sample, bytes_of, parts_of, table
+from kiteline_bench.base.memory import Sample, bytes_of, parts_of, table
 from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
 
-def test_what_hangs_on_an_object_is_weighed_once_and_code_never() -> None:
+def test_referenced_objects_are_counted_once_and_code_never() -> None:
     array = np.zeros(10_000)
     seen: set[int] = set()
     assert 80_000 < bytes_of({"a": array, "part of a": array[:10], "code": bytes_of}, seen) < 82_000
@@ -33,7 +33,7 @@ def test_parts_of_a_base_grow_with_its_map() -> None:
     assert not others
 
 
-def test_the_table_tells_what_a_keyframe_more_takes() -> None:
+def test_the_table_lists_what_a_further_keyframe_takes() -> None:
     samples = [
         Sample(100, 200_000_000, 0, {"grid": 1_000_000, "rest": 500}),
         Sample(300, 210_000_000, 0, {"grid": 2_000_000, "rest": 700}),

@@ -1,4 +1,4 @@
-"""The results file: sections are replaced, bars tell whether they are met."""
+"""The results file: sections are replaced, bars are met or not, the summary stands on top."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from kiteline_bench import benchmark
-from kiteline_bench.benchmark import Bench, at_most, data_folder, is_true, main, replace_section, section
+from kiteline_bench.benchmark import data_folder, main
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.results_page import HEADLINES, replace_section, section
 from kiteline_hw.ports import SourceError
 
 
@@ -26,9 +28,21 @@ def test_a_section_replaces_its_older_self_only() -> None:
     assert "**no**" in text
     newer = section("a", "One", [at_most("x", 1.5, 2.0, "m")])
     text = replace_section(text, "One", newer)
-    assert text.count("## ") == 2
+    assert text.count("\n## ") == 3  # the summary stands above them
     assert "1.500 m" in text and "1.000 m" not in text
-    assert text.index("## One") < text.index("## Two")
+    assert text.index("## Summary") < text.index("## One") < text.index("## Two")
+
+
+def test_the_summary_counts_bars_and_lists_headlines() -> None:
+    (title, name), *_ = HEADLINES
+    met = section("a", title, [at_most(name, 1.5, 2.0, "m"), at_most("z", 1.0, 2.0, "m")], ["### Deeper\n\n## no"])
+    unmet = section("b/part", "Two", [at_most("y", 3.0, 2.0, "m")])
+    text = replace_section(replace_section("", title, met), "Two", unmet)
+    summary = text[text.index("## Summary") : text.index(f"## {title}")]
+    assert f"| {title} | `kiteline bench a` | 2 of 2 |" in summary
+    assert "| Two | `kiteline bench b/part` | **0 of 1** |" in summary
+    assert f"| {name} | 1.500 m | <= 2 m |" in summary
+    assert replace_section(text, "Two", unmet) == text
 
 
 def test_the_command_writes_what_it_measured_and_tells_of_a_bar_that_is_not_met(
@@ -51,7 +65,7 @@ class FakeBench:
     TITLE = "Fake"
 
     @staticmethod
-    def run(bench: Bench) -> list[benchmark.Bar]:
+    def run(bench: Bench) -> list[Bar]:
         with pytest.raises(SourceError, match="KITELINE_DATA"):
             bench.source("missing.mcap")
         return [at_most("speed", 2.0, 1.0, "ms")]

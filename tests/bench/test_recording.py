@@ -1,0 +1,167 @@
+"""Recordings, camera faults, flights under a CPU limit, and the trials in processes of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiteline_bench.agent import flights as bench_agent
+from kiteline_bench.agent.governor import governor_table
+from kiteline_bench.agent.governor_plot import plot_governor
+from kiteline_bench.benchmark import BENCHMARKS
+from kiteline_bench.harness import processes
+from kiteline_bench.harness.faults import CAMERA_FAULTS, black, camera_faults_of, changed, rearranged, wall
+from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
+from kiteline_bench.harness.recording import Recording, load
+from kiteline_bench.harness.result import busiest_window
+from kiteline_bench.harness.run import fly_alone
+from kiteline_hw.system.cpu import CpuQuota
+
+
+@pytest.fixture(scope="module")
+def flight(recording: Path) -> Recording:
+    return load(str(recording))
+
+
+def test_benchmark_is_registered() -> None:
+    assert BENCHMARKS["agent"] == bench_agent.__name__
+
+
+def test_clip_goes_to_and_fro_without_a_jump(flight: Recording) -> None:
+    n = len(flight.items)
+    frames = [item.frame for item in flight.to_and_fro(3 * n)]
+    stamps = np.array([frame.t_ns for frame in frames])
+    assert (np.diff(stamps) == flight.period_ns).all()
+    assert frames[n].left is flight.items[n - 2].frame.left and frames[2 * n - 2].left is flight.items[0].frame.left
+    order = [next(k for k, item in enumerate(flight.items) if item.frame.left is frame.left) for frame in frames]
+    assert (np.abs(np.diff(order)) == 1).all()
+
+
+def test_busiest_window_is_that_of_a_plain_loop() -> None:
+    rng = np.random.default_rng(3)
+    t_ns = np.cumsum(rng.integers(20_000_000, 200_000_000, 80))
+    spent = np.column_stack([t_ns, rng.integers(0, 30_000_000, 80)])
+    plain = max(spent[(t_ns > t - 1_000_000_000) & (t_ns <= t), 1].sum() for t in t_ns[t_ns >= t_ns[0] + 3_000_000_000])
+    assert busiest_window(spent[:, 0], spent[:, 1], 3_000_000_000) == pytest.approx(plain / 1e9)
+
+
+def test_governed_flight_keeps_its_budget_and_accounts_for_every_frame(flight: Recording) -> None:
+    free = fly_limited(flight, 0.0, governor=False, real=False)
+    assert free.tracked == free.frames == len(flight.items) and free.ate_m < 0.01
+    for governor in (True, False):
+        found = fly_limited(flight, 0.4 * free.load, governor=governor, real=False)
+        assert found.tracked + found.lost + found.dropped == found.frames == len(flight.items)
+        assert found.load < free.load
+    assert fly_limited(flight, 0.4 * free.load, governor=True, real=False) == fly_limited(
+        flight, 0.4 * free.load, governor=True, real=False
+    )
+
+
+def test_a_flight_backward_turns_the_other_way(data_dir: Path) -> None:
+    flight = load(str(data_dir / "euroc_v101_start"), frames=12)
+    there_and_back = list(flight.to_and_fro(23))
+    stamps = np.concatenate([imu.t_ns for item in there_and_back if (imu := item.imu) is not None])
+    assert (np.diff(stamps) > 0).all()
+    turn = sum(float(imu.gyro.sum()) for item in there_and_back if (imu := item.imu) is not None)
+    once = sum(float(imu.gyro.sum()) for item in flight.items[1:] if (imu := item.imu) is not None)
+    assert abs(turn) < 0.2 * abs(once)
+    for item in there_and_back[1:]:
+        assert item.imu is not None and abs(int(item.imu.t_ns[-1]) - item.frame.t_ns) <= 5_000_000
+    force = np.concatenate([imu.accel for item in there_and_back if (imu := item.imu) is not None])
+    assert abs(np.linalg.norm(force.mean(axis=0)) - 9.8) < 0.3
+
+
+def test_calm_part_begins_and_ends_at_rest(data_dir: Path) -> None:
+    flight = load(str(data_dir / "room_flight.mcap"), frames=120)
+    calm = flight.between_rests()
+    assert 60 <= len(calm.items) <= 120
+    assert calm.items[0].frame.t_ns >= flight.items[0].frame.t_ns
+    assert calm.items[-1].frame.t_ns <= flight.items[-1].frame.t_ns
+
+
+def test_saved_clip_is_read_again(flight: Recording, tmp_path: Path) -> None:
+    again = load(str(flight.save(tmp_path / "flight.mcap")))
+    assert [item.frame.t_ns for item in again.items] == [item.frame.t_ns for item in flight.items]
+    assert np.abs(again.items[3].frame.left.astype(int) - flight.items[3].frame.left).mean() < 4.0
+    assert again.truth is not None and len(again.truth.t_ns) == len(flight.items)
+
+
+@pytest.mark.parametrize("name", CAMERA_FAULTS)
+def test_faults_change_a_recording_and_no_agent_breaks_on_them(flight: Recording, name: str) -> None:
+    if name not in camera_faults_of(flight):
+        assert name == "no depth"
+        return
+    broken = CAMERA_FAULTS[name](flight)
+    before, after = (
+        [(item.frame.t_ns, item.frame.left.tobytes(), item.frame.right is None) for item in r.items]
+        for r in (flight, broken)
+    )
+    assert before != after
+    run = fly_alone(broken, vocabulary=False)
+    assert len(run.found) == len(broken.items) > 0
+    assert all(np.isfinite(e.T_o_b).all() for e in run.found)
+
+
+def test_images_are_blank_for_the_frames_that_were_named(flight: Recording) -> None:
+    for change in (wall, black):
+        spread = [float(item.frame.left.std()) for item in changed(flight, 2, 4, change).items]
+        assert [k for k, s in enumerate(spread) if s < 3.0] == [2, 3]
+
+
+def test_rearranged_recording_goes_on_in_time_with_the_truth_of_what_is_seen(flight: Recording) -> None:
+    found = rearranged(flight, [0, 1, None, None, 5, 4])
+    assert (np.diff([item.frame.t_ns for item in found.items]) == flight.period_ns).all()
+    assert found.items[4].frame.left is flight.items[5].frame.left and found.items[2].frame.left.std() < 3.0
+    assert found.truth is not None and flight.truth is not None and found.imu is None
+    assert np.array_equal(found.truth.T_w_b, flight.truth.T_w_b[[0, 1, 1, 1, 5, 4]])
+
+
+def test_errors_of_a_flight_are_small_and_counted_from_its_start(flight: Recording) -> None:
+    run = fly_alone(flight, vocabulary=False)
+    errors = run.errors()
+    assert len(errors) == len(flight.items) and not errors[0].odometry.any()
+    assert max(error.position_m for error in errors) < 0.05 and run.ate_m() < 0.01
+    n = len(flight.items)
+    assert run.drift_m(1, n) == pytest.approx(float(np.linalg.norm(errors[-1].odometry[:3])), abs=1e-6)
+
+
+def test_table_and_figure_of_flights(flight: Recording, tmp_path: Path) -> None:
+    free = fly_limited(flight, 0.0, governor=False, real=False)
+    rows: list[tuple[float, LimitedFlight]] = [(1.0, free)]
+    rows += [(share, replace(free, percent=share * free.load, governor=True)) for share in (0.5, 1.0)]
+    lines = governor_table(rows).splitlines()
+    assert len(lines) == 2 + len(rows) and len({line.count("|") for line in lines}) == 1
+    plot_governor(tmp_path / "governor.png", [flight for _, flight in rows], "wall")
+    assert (tmp_path / "governor.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_start_to_first_pose_is_measured(recording: Path) -> None:
+    assert 0.05 < processes.start("first-pose", str(recording))["seconds"] < 60.0
+
+
+@pytest.mark.parametrize("options", [[], ["--link"]])
+def test_memory_is_measured_over_minutes(recording: Path, options: list[str]) -> None:
+    found = processes.start("soak", str(recording), "--minutes", "0.1", *options)
+    assert found["rss_mib"] == [] and found["lost"] == 0  # not one whole minute
+
+
+def test_trial_that_fails_says_why(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="first-pose"):
+        processes.start("first-pose", str(tmp_path / "nothing"))
+
+
+@pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
+def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
+    found = LimitedFlight(**processes.start("quota", str(recording), "--percent", "20", "--governor"))
+    assert found.real and found.tracked + found.lost + found.dropped == found.frames and found.tracked > 0
+
+
+@pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
+def test_governor_keeps_a_real_flight_within_the_kernel_s_limit(data_dir: Path) -> None:
+    source = str(data_dir / "room_flight.mcap")
+    found = LimitedFlight(**processes.start("quota", source, "--percent", "3.5", "--governor", "--frames", "140"))
+    assert found.peak <= 3.5 * 1.02 and found.lost == 0 and found.submaps == 1
+    assert found.tracked > 30 and found.ate_m < 0.02
