@@ -134,7 +134,7 @@ def test_where_the_imu_knows_the_place_the_map_goes_on(data_dir: Path) -> None:
             imu = item
             continue
         if len(found) == 66:
-            agent.map.forget(agent.submap)
+            agent.map.drop_submap(agent.submap)
         estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
         assert estimate is not None
         found.append(estimate)

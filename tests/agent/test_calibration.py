@@ -32,18 +32,18 @@ def test_measured_depths_follow_and_others_stay() -> None:
     one = np.array([1], np.uint16)
     held.apply(RefinedLandmarks(FIRST, one, np.array([0.2], np.float32), np.zeros((1, 2), np.float32)))
     bearing = float(held.rho[0, 2])
-    held.calibrate(CONSTANT)
+    held.set_disparity_offset(CONSTANT)
     assert np.allclose(held.rho[0, :3], [9.9 / CAMERA.bf, 0.2, bearing], atol=1e-7)
-    held.calibrate(-0.5 * CONSTANT)  # an offset takes the place of the one before, it does not add to it
+    held.set_disparity_offset(-0.5 * CONSTANT)  # an offset takes the place of the one before, it does not add to it
     assert np.isclose(held.rho[0, 0], 10.05 / CAMERA.bf)
-    held.calibrate(0.0 * CONSTANT)
+    held.set_disparity_offset(0.0 * CONSTANT)
     assert np.isclose(held.rho[0, 0], 10.0 / CAMERA.bf)
 
 
 def test_an_offset_differs_over_the_image() -> None:
     held = held_map([10.0])
     rolled = np.array([0.02, 0.0, 0.35, 0.0, 0.0])
-    held.calibrate(rolled)
+    held.set_disparity_offset(rolled)
     y = (200.0 - CAMERA.cy) / CAMERA.fy
     assert np.isclose(held.rho[0, 0], (10.0 - 0.02 - 0.35 * y) / CAMERA.bf)
     assert np.allclose(held.offset_px(np.array([[0.0, CAMERA.cy], [9.0, CAMERA.cy + 45.0]])), [0.02, 0.055])
@@ -51,5 +51,5 @@ def test_an_offset_differs_over_the_image() -> None:
 
 def test_far_points_stay_in_front() -> None:
     held = held_map([0.02])
-    held.calibrate(3.0 * CONSTANT)
+    held.set_disparity_offset(3.0 * CONSTANT)
     assert held.rho[0, 0] > 0.0

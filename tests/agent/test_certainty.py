@@ -13,7 +13,7 @@ from kiteline_agent.covariance import calibration_error_kernels as certainty_ker
 from kiteline_agent.covariance.pose_covariance import Certainty, adjoint, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
-from kiteline_agent.tracking.tracker import Track
+from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import KeyframeHeader
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera

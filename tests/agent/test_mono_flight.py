@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
-from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
+from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.step import Estimate, Identity, StepInput
-from kiteline_agent.tracking.tracker import FrameImages
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import NewLandmarks
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
@@ -77,6 +79,10 @@ def path(k: float) -> F64:
 @cache
 def frame(k: int) -> Frame:
     return Frame(k * 50_000_000, room(path(k))[0])
+
+
+def context(k: int, images: FrameImages) -> FrameContext:
+    return FrameContext(k, k, 0.0, None, images, np.eye(4), False, AgentConfig())
 
 
 def agent() -> Agent:
@@ -164,20 +170,20 @@ def test_points_too_far_for_stereo_get_their_depth_from_motion() -> None:
 
 def test_standing_and_turning_begin_nothing() -> None:
     for turns in (False, True):
-        start = TwoViewStart(Rectifier(RIG).camera, AgentConfig())
+        start = TwoViewStart(Rectifier(RIG).camera, AgentConfig(), Work())
         for k in range(14):
             turn = se3.so3_exp(np.array([0.0, 0.015 * k if turns else 0.0, 0.0]))
             view = FrameImages(build_pyramid(room(se3.from_rt(turn, np.zeros(3)))[0], 4), None, None)
-            assert start.step(view, k) is None
+            assert start.add(context(k, view)) is None
 
 
 def test_a_second_start_takes_on_the_scale_of_the_first() -> None:
-    start = TwoViewStart(Rectifier(RIG).camera, AgentConfig())
-    start.tracked(np.array([6.0, 7.0, 9.0]))
+    start = TwoViewStart(Rectifier(RIG).camera, AgentConfig(), Work())
+    start.note_depths(np.array([6.0, 7.0, 9.0]))
     start.rescale(2.0)
     opening = None
     for k in range(3, 20):
-        opening = opening or start.step(FrameImages(build_pyramid(frame(k).left, 4), None, None), k)
+        opening = opening or start.add(context(k, FrameImages(build_pyramid(frame(k).left, 4), None, None)))
     assert opening is not None and opening.median_depth_m == 14.0
     depths = Rectifier(RIG).camera.bf / opening.points.disparity
     assert np.median(depths) == pytest.approx(14.0, rel=0.1)
@@ -235,7 +241,7 @@ def test_deviation_of_a_meeting_is_that_of_moved_pixels() -> None:
         return np.asarray(FOCAL * p[:, :2] / p[:, 2:])
 
     slope = np.linalg.norm(pixel(rho + 1e-6) - pixel(rho - 1e-6), axis=1) / 2e-6
-    np.testing.assert_allclose(sigma_of_meeting(bearing, rho, T_c_k, FOCAL, np.array([0.5, 1.0])), [0.5, 1.0] / slope)
+    np.testing.assert_allclose(triangulated_sigma(bearing, rho, T_c_k, FOCAL, np.array([0.5, 1.0])), [0.5, 1.0] / slope)
 
 
 def test_a_street_is_followed_with_one_eye(data_dir: Path) -> None:

@@ -27,7 +27,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
 )
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
-from kiteline_agent.tracking.tracker import Track
+from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 

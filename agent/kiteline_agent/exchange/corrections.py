@@ -38,9 +38,9 @@ _GUESSED_M = 0.5  # by which a base that has only the odometry's word differs fr
 class Corrections:
     """Takes records to where they belong, and knows the world as far as the base told of it."""
 
-    def __init__(self, local_map: LocalMap, window: MapCache, smoothing: SmoothingConfig) -> None:
+    def __init__(self, local_map: LocalMap, cache: MapCache, smoothing: SmoothingConfig) -> None:
         self._map = local_map
-        self._window = window
+        self._cache = cache
         self._smoothing = Smoothing(smoothing)
         self._S_w_m: dict[SubmapId, F64] = {}
         self._guessed: dict[SubmapId, F64] = {}  # where the odometry, and then a base, had submaps begin: T_first_m
@@ -49,9 +49,9 @@ class Corrections:
         self._placed: set[SubmapId] = set()  # those that a base has put where nobody had guessed them
         self.tiles: dict[tuple[int, int], GridTile] = {}
 
-    def take(self, records: Sequence[Record], removed: Sequence[Key], events: list[str]) -> bool:
-        """Swap in what came, and drop what the base took back. Whether the local map moved."""
-        touched = False
+    def take(self, records: Sequence[Record], removed: Sequence[Key]) -> tuple[bool, list[str]]:
+        """Apply records, and drop what the base removed. Returns whether the local map moved, and events."""
+        touched, events = False, list[str]()
         for record in records:
             if isinstance(
                 record, KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
@@ -61,22 +61,22 @@ class Corrections:
                 self._S_w_m[record.submap] = record.S_w_m
                 self._heard = True
             elif isinstance(record, CachedKeyframe | CachedLandmarks):
-                self._window.take(record)
+                self._cache.store(record)
             elif isinstance(record, DisparityCalibration) and self._map.camera.stereo:
-                self._map.calibrate(record.disparity_px)
+                self._map.set_disparity_offset(record.disparity_px)
                 events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
             elif isinstance(record, GridTile):
                 self.tiles[record.column, record.row] = record
         if self._heard:
             self._compare()
-        self._window.take_back(removed)
+        self._cache.remove(removed)
         for key in removed:
             if key.kind == SubmapPlacement.KIND:  # the map was taken out of a larger one, and has no place any more
                 self._S_w_m.pop(SubmapId(key.id), None)
                 self._placed.discard(SubmapId(key.id))
         if touched:
-            self._map.settle()
-        return touched
+            self._map.compose_unplaced()
+        return touched, events
 
     def begins(self, submap: SubmapId, T_first_m: F64) -> None:
         """A submap begins, which lies at T_first_m (4,4) in the flight's first by odometry."""

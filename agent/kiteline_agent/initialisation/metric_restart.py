@@ -1,6 +1,6 @@
-"""A map in metres out of one in a unit of its own: what is tracked at this moment is born anew.
+"""Restarts a monocular map in metres: the landmarks tracked now become new landmarks of a new submap.
 
-What was shared keeps its unit, so a scale that becomes known begins a new submap instead of changing the old one.
+Shared values keep their unit, so a scale found late begins a new submap instead of rescaling the old one.
 """
 
 from __future__ import annotations
@@ -12,43 +12,44 @@ from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.feature_kernels import BORDER
-from kiteline_agent.keyframes.policy import NewPoints
+from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import FrameImages, Track
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
 from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[np.float64]
 
-_LEAST_SIGMA_PX = 0.06  # virtual disparity error, of depths that many frames have sharpened
+_MIN_SIGMA_PX = 0.06  # px of virtual disparity, of depths that many frames have sharpened
 
 
 @dataclass(frozen=True, slots=True)
 class MetricPoints:
-    """Births of the first keyframe in metres, in the order in which they are shared. sigma_rho: (n,) 1/m."""
+    """New landmarks of the first keyframe in metres, in the order in which they are shared. sigma_rho: (n,) 1/m."""
 
     points: NewPoints
     sigma_rho: F64
 
-    def sharpen(self, local_map: LocalMap, keyframe: KeyframeId) -> None:
-        """Say in the local map how well they are known."""
+    def set_sigma(self, local_map: LocalMap, keyframe: KeyframeId) -> None:
+        """Write the deviations of their depths into the local map."""
         slot = local_map.slot_of(keyframe)
         n = int(local_map.counts[slot])
         local_map.sigma_rho[slot, :n] = self.sigma_rho[:n]
 
 
-def metric_points(view: FrameImages, track: Track, local_map: LocalMap, metres: float, cell_px: int) -> MetricPoints:
-    """The points of a track as births of its frame. metres: in one unit of the map. cell_px: of the detector."""
+def metric_points(ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: float) -> MetricPoints:
+    """The inliers of a track as new landmarks of its frame. unit_m: metres in one unit of the old map."""
     camera = local_map.camera
     octave = local_map.octave[track.rows]
     uv = track.observed[:, :2]
     margin = (BORDER + 1.0) * (1 << octave.astype(np.int64))[:, None]
     inside = (uv >= margin).all(axis=1) & (uv < np.array([camera.width, camera.height]) - margin).all(axis=1)
     keep = np.flatnonzero(track.inlier & inside)
-    blur = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]  # relative deviation of depth
-    keep = keep[np.argsort(blur, kind="stable")[: local_map.births]]
-    keep = keep[np.lexsort((uv[keep, 0], uv[keep, 1] // cell_px))]
-    rho = 1.0 / (metres * track.depth_m[keep])
-    blur = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]
-    angle, descriptor = features.describe(view.left, uv[keep], octave[keep])
+    relative = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]  # deviation of depth over depth
+    keep = keep[np.argsort(relative, kind="stable")[: local_map.births]]
+    keep = keep[np.lexsort((uv[keep, 0], uv[keep, 1] // ctx.config.detector.cell_px))]
+    rho = 1.0 / (unit_m * track.depth_m[keep])
+    relative = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]
+    angle, descriptor = features.describe(ctx.images.left, uv[keep], octave[keep])
     points = NewPoints(uv[keep], camera.bf * rho, octave[keep], angle, descriptor)
-    return MetricPoints(points, np.maximum(blur * rho, _LEAST_SIGMA_PX / camera.bf))
+    return MetricPoints(points, np.maximum(relative * rho, _MIN_SIGMA_PX / camera.bf))

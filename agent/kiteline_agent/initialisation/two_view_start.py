@@ -1,6 +1,6 @@
-"""The beginning of a map with one eye: corners of a first frame are followed until two views give motion and depth.
+"""Starts a monocular map: follows corners of a first frame until two views give motion and depth.
 
-One eye knows no scale: the median depth of the first points is set to a convention, and the map keeps that scale.
+The scale is free: the median depth of the first landmarks is set to a convention, and the map keeps that scale.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.initialisation.two_view import two_view
-from kiteline_agent.keyframes.depth_from_motion import sigma_of_meeting
-from kiteline_agent.keyframes.policy import NewPoints
+from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
+from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import FrameImages
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
@@ -27,13 +29,13 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class TwoViewMap:
-    """The first keyframe of a map, seen from the second.
+    """The first keyframe of a map, triangulated from a second view.
 
-    view, t_ns: of the first frame. frames: from there to the second. T_a_b: (4,4) the second camera in the first.
-    points: what is born in the first frame. median_depth_m: theirs. flat: the scene was taken for a plane.
+    images, t_ns: of the first frame. frames: from there to the second one. T_a_b: (4,4) second camera in the first.
+    points: new landmarks in the first frame. median_depth_m: theirs. flat: the scene was taken for a plane.
     """
 
-    view: FrameImages
+    images: FrameImages
     t_ns: int
     frames: int
     T_a_b: F64
@@ -41,23 +43,24 @@ class TwoViewMap:
     median_depth_m: float
     flat: bool
 
-    def sharpen(self, local_map: LocalMap, keyframe: KeyframeId, sigma_px: float) -> None:
-        """Say in the local map how well the two views measured what was born in the first one."""
+    def set_sigma(self, local_map: LocalMap, keyframe: KeyframeId, sigma_px: float) -> None:
+        """Write the deviations of the triangulated depths into the local map. sigma_px: of a pixel at octave 0."""
         slot = local_map.slot_of(keyframe)
         n = int(local_map.counts[slot])
         octave = local_map.octave[slot * local_map.births : slot * local_map.births + n]
-        local_map.sigma_rho[slot, :n] = sigma_of_meeting(
+        local_map.sigma_rho[slot, :n] = triangulated_sigma(
             local_map.bearing[slot, :n], local_map.rho[slot, :n], se3.inverse(self.T_a_b),
             local_map.camera.fx, sigma_px * np.exp2(octave.astype(np.float64)),
         )  # fmt: skip
 
 
 class TwoViewStart:
-    """Follows corners of a first frame through those that come after it."""
+    """Follows the corners of a first frame through the frames after it."""
 
-    def __init__(self, camera: RectifiedCamera, config: AgentConfig) -> None:
+    def __init__(self, camera: RectifiedCamera, config: AgentConfig, work: Work) -> None:
         self._camera = camera
         self._config = config
+        self._work = work
         self._detector = replace(
             config.detector, cell_px=config.mono_start.cell_px, max_corners=config.mono_start.corners
         )
@@ -73,8 +76,8 @@ class TwoViewStart:
         self._uv = np.zeros((0, 2))
         self._index = np.zeros(0, np.int64)  # template of each corner that is still followed
 
-    def tracked(self, depth_m: F64) -> None:
-        """A map is being tracked, at these depths (n,): a later start takes on their scale, and begins anew."""
+    def note_depths(self, depth_m: F64) -> None:
+        """A map is tracked, at these depths (n,): a later start takes on their scale, from a new first frame."""
         self._first = None
         if len(depth_m):
             self._median_depth_m = float(np.median(depth_m))
@@ -83,37 +86,40 @@ class TwoViewStart:
         """Change the unit of length: all lengths grow by `factor`."""
         self._median_depth_m *= factor
 
-    def step(self, view: FrameImages, t_ns: int) -> TwoViewMap | None:
-        """Take in a frame. Returns the opening of a map when this frame and the first one give at least 100 points."""
+    def add(self, ctx: FrameContext) -> TwoViewMap | None:
+        """Take in a frame. Returns a map once this frame and the first one give enough landmarks."""
+        self._work.searches += 1
         config = self._config.mono_start
         if self._first is None:
-            self._begin(view, t_ns)
+            self._begin(ctx)
             return None
-        self._follow(view)
+        self._follow(ctx.images)
         self._frames += 1
-        moved = np.linalg.norm(self._uv - self._uv0, axis=1)
-        opening = None
-        if len(moved) >= config.two_view.min_points and np.median(moved) > config.min_flow * self._camera.fx:
-            opening = self._try(view)
+        flow = np.linalg.norm(self._uv - self._uv0, axis=1)
+        start = None
+        if len(flow) >= config.two_view.min_points and np.median(flow) > config.min_flow * self._camera.fx:
+            start = self._reconstruct(self._first, ctx.images)
         few = len(self._uv) < max(config.two_view.min_points, config.min_share * len(self._templates))
-        if opening is not None:
+        if start is not None:
             self._first = None
         elif few or self._frames >= config.max_frames:
-            self._begin(view, t_ns)
-        return opening
+            self._begin(ctx)
+        return start
 
-    def _begin(self, view: FrameImages, t_ns: int) -> None:
-        corners = features.detect(view.left, np.zeros((0, 2)), self._detector)
-        self._first, self._first_t_ns, self._frames = replace(view, right=None), t_ns, 0
-        self._last = view.left[0]
+    def _begin(self, ctx: FrameContext) -> None:
+        """Make this frame the first one."""
+        images = ctx.images
+        corners = features.detect(images.left, np.zeros((0, 2)), self._detector)
+        self._first, self._first_t_ns, self._frames = replace(images, right=None), ctx.t_ns, 0
+        self._last = images.left[0]
         self._uv0, self._uv, self._octave = corners.uv, corners.uv.copy(), corners.octave
         self._templates = np.empty((len(corners.uv), *self._templates.shape[1:]), np.uint8)
         self._index = np.arange(len(corners.uv))
-        alignment_kernels.cut_templates(view.left, corners.uv, corners.octave, self._templates)
+        alignment_kernels.cut_templates(images.left, corners.uv, corners.octave, self._templates)
 
-    def _follow(self, view: FrameImages) -> None:
-        """Pyramidal flow from the last frame, forth and back."""
-        image, window = view.left[0], self._config.mono_start.window_px
+    def _follow(self, images: FrameImages) -> None:
+        """Follow the corners by pyramidal optical flow from the last frame, checked backwards."""
+        image, window = images.left[0], self._config.mono_start.window_px
         if len(self._uv):
             before = self._uv.astype(np.float32)
             size = {"winSize": (window, window), "maxLevel": 3}
@@ -126,32 +132,30 @@ class TwoViewStart:
             self._octave, self._index = self._octave[keep], self._index[keep]
         self._last = image
 
-    def _try(self, view: FrameImages) -> TwoViewMap | None:
-        """Sharpen the pixels on the first frame's templates, and ask the two views."""
+    def _reconstruct(self, first: FrameImages, images: FrameImages) -> TwoViewMap | None:
+        """Align the corners with their templates, and solve for motion and depth."""
         align, config = self._config.align, self._config.mono_start
         uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
         warp = np.tile(self._mean_warp(), (len(uv), 1, 1))
         alignment_kernels.align(
-            view.left, self._templates, self._index, self._octave, warp, uv, 0, 0,
+            images.left, self._templates, self._index, self._octave, warp, uv, 0, 0,
             align.iterations, align.fine_step_px, align.min_ncc, found, ncc,
         )  # fmt: skip
         uv[~found] = self._uv[~found]
         seen = two_view(self._uv0, uv, self._intrinsics, config.two_view, self._frames)
-        if seen is None or self._first is None:
+        if seen is None:
             return None
         factor = self._median_depth_m / float(np.median(seen.points[seen.good, 2]))
         T_a_b = se3.inverse(seen.T_b_a)
         T_a_b[:3, 3] *= factor
         rows = np.flatnonzero(seen.good)[: self._config.local_map.births]
         place, octave = self._uv0[rows], self._octave[rows]
-        angle, descriptor = features.describe(self._first.left, place, octave)
+        angle, descriptor = features.describe(first.left, place, octave)
         disparity = self._camera.bf / (seen.points[rows, 2] * factor)
         points = NewPoints(place, disparity, octave, angle, descriptor)
-        return TwoViewMap(
-            self._first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m, seen.flat
-        )  # fmt: skip
+        return TwoViewMap(first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m, seen.flat)
 
     def _mean_warp(self) -> F64:
-        """The linear part (2,2) of the affine map that brings the first frame's corners nearest to the last ones."""
+        """Linear part (2,2) of the affine map that fits the corners of the first frame to those of the last."""
         a = np.column_stack([self._uv0, np.ones(len(self._uv0))])
         return np.ascontiguousarray(np.linalg.lstsq(a, self._uv, rcond=None)[0][:2].T)

@@ -1,8 +1,7 @@
-"""Depth of points that were born as mere bearings: each frame looks for them on their epipolar segments.
+"""Depth of landmarks without one (seeds): each tracked frame searches them along their epipolar segments.
 
-The depth is the least-squares meeting point of the two rays, as in "Monocular EKF-SLAM with delayed landmark
-initialisation"; successive ones are averaged as inverse depths with their variances, which makes that least squares
-over all rays (C. Forster et al., "SVO", 2014, section V). A point enters the map once its depth says more than nothing.
+Two rays are intersected by least squares; successive inverse depths are averaged by their variances (C. Forster et al.,
+"SVO", 2014, section V). A seed becomes a landmark of the map once its depth is known well enough.
 """
 
 from __future__ import annotations
@@ -15,7 +14,9 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
-from kiteline_agent.tracking.tracker import FrameImages, Track
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.frame_images import FrameImages
+from kiteline_agent.tracking.track import Track
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -25,44 +26,51 @@ _MARGIN_PX = 8.0
 
 
 class DepthFromMotion:
-    """Searches the bearings of a local map in every tracked frame."""
+    """Updates depths of a local map from each tracked frame, and searches its seeds there."""
 
     def __init__(self, local_map: LocalMap, config: AgentConfig, work: Work) -> None:
         self._map = local_map
         self._config = config
         self._work = work
 
-    def update(self, view: FrameImages, track: Track) -> int:
-        """Look for bearings in a frame whose pose is known. Returns how many became points of the map."""
+    def update_landmarks(self, ctx: FrameContext, track: Track) -> None:
+        """Count tries and hits of the tracked landmarks, and update their depths."""
+        self._map.note_tracking(track.rows, track.inlier, ctx.number)
+        self._map.update_depths(
+            track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, ctx.config.depth_filter.inflation
+        )
+
+    def search_seeds(self, images: FrameImages, track: Track) -> int:
+        """Search seeds in a tracked frame, and update their depths. Returns how many became landmarks."""
         config = self._config.motion
         near = 1.0 / track.depth_m[track.inlier]
         if len(near) < self._config.pose.min_inliers:
             return 0
         typical, steepest = np.quantile(near, [0.5, 0.95])
         ceiling = float(steepest) * config.nearer
-        self._map.plant(float(typical), float(ceiling))
+        self._map.initialise_seeds(float(typical), float(ceiling))
         seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, self._config.align.max_scale, seeds=True)
-        chosen = self._choose(seeds, view.first)
+        chosen = self._choose(seeds, images.first)
         if len(chosen) == 0:
             return 0
         self._work.bearings += len(chosen)
         rows, warp = seeds.rows[chosen], seeds.warp[chosen]
         bearing, rho, sigma = self._state(rows)
-        # The point is (turned + moved * rho) / rho in the camera: pixels for any inverse depth.
-        turned, moved = self._from_anchor(track.T_c_m, rows, bearing)
+        # The landmark is (direction + centre * rho) / rho in the camera: gives its pixel for any inverse depth.
+        direction, centre = self._rays(track.T_c_m, rows, bearing)
         reach = config.reach * sigma
-        start = self._pixels(turned, moved, np.maximum(rho - reach, 1e-6))
-        end = self._pixels(turned, moved, np.minimum(rho + reach, ceiling))
-        uv, found = self._look(view, rows, warp, start, end)
-        measured, variance, off_line = self._meet(turned, moved, uv, rows)
+        start = self._pixels(direction, centre, np.maximum(rho - reach, 1e-6))
+        end = self._pixels(direction, centre, np.minimum(rho + reach, ceiling))
+        uv, found = self._search(images, rows, warp, start, end)
+        measured, variance, off_line = self._intersect(direction, centre, uv, rows)
         agree = np.square(measured - rho) < config.gate**2 * (variance + sigma**2)
         scale = (1 << self._map.octave[rows]).astype(np.float64)
         hit = (found == 1) & agree & (off_line < config.off_line_px * scale) & np.isfinite(variance)
-        self._note(rows, hit, failed=(found == 0) | ((found == 1) & ~hit))
+        self._count(rows, hit, failed=(found == 0) | ((found == 1) & ~hit))
         return self._fuse(rows[hit], measured[hit], variance[hit], float(typical))
 
     def _choose(self, seeds: Candidates, first: int) -> I64:
-        """Bearings of this frame: those nearest to a depth first, then the newest. first: finest level there is."""
+        """The seeds to search in this frame: most hits first, then the newest. first: finest pyramid level."""
         limit = self._config.motion.per_frame_stereo if self._map.camera.stereo else self._config.motion.per_frame
         order = np.lexsort((-seeds.rows, self._map.tried[seeds.rows], -self._map.hits[seeds.rows]))
         order = order[self._map.octave[seeds.rows[order]] >= first]
@@ -72,57 +80,57 @@ class DepthFromMotion:
         flat = self._map.bearing.reshape(-1, 2), self._map.rho.reshape(-1), self._map.sigma_rho.reshape(-1)
         return flat[0][rows], flat[1][rows], flat[2][rows]
 
-    def _from_anchor(self, T_c_m: F64, rows: I64, bearing: F64) -> tuple[F64, F64]:
-        """Directions (n,3) of bearings in the camera, and the anchors' centres (n,3) in it."""
+    def _rays(self, T_c_m: F64, rows: I64, bearing: F64) -> tuple[F64, F64]:
+        """Directions (n,3) of the seeds, and centres (n,3) of their keyframes, in the camera."""
         T_c_k = T_c_m @ self._map.T_m_k[rows // self._map.births]
         ray = np.column_stack([bearing, np.ones(len(rows))])
         return np.einsum("nij,nj->ni", T_c_k[:, :3, :3], ray), T_c_k[:, :3, 3]
 
-    def _pixels(self, turned: F64, moved: F64, rho: F64) -> F64:
-        """Pixels (n,2) of inverse depths; a point that would lie behind is taken far out on its side."""
-        p = turned + moved * rho[:, None]
+    def _pixels(self, direction: F64, centre: F64, rho: F64) -> F64:
+        """Pixels (n,2) at inverse depths (n,); one behind the camera is taken far out on its side."""
+        p = direction + centre * rho[:, None]
         z = np.maximum(p[:, 2], 0.05)
         f, c = self._map.intrinsics[:2], self._map.intrinsics[2:4]
         return np.asarray(p[:, :2] / z[:, None] * f + c)
 
-    def _look(self, view: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
-        """Where the templates lie: correlation along the segment, then alignment in the plane."""
+    def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
+        """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,): 1 found, 0 not."""
         config, align = self._config.motion, self._config.align
         octave = self._map.octave[rows]
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
         search_segments(
-            view.left, self._map.templates, rows, octave, warp, start, end, config.step_px, config.max_steps,
+            images.left, self._map.templates, rows, octave, warp, start, end, config.step_px, config.max_steps,
             config.min_search_ncc, config.distinct, uv, found,
         )  # fmt: skip
         seen = np.flatnonzero(found == 1)
         place, aligned, ncc = uv[seen], np.zeros(len(seen), np.bool_), np.zeros(len(seen))
         alignment_kernels.align(
-            view.left, self._map.templates, rows[seen], octave[seen], warp[seen], place, 1, 0,
+            images.left, self._map.templates, rows[seen], octave[seen], warp[seen], place, 1, 0,
             align.iterations, align.fine_step_px, align.min_ncc, aligned, ncc,
         )  # fmt: skip
         uv[seen] = place
         found[seen[~aligned]] = 0
         return uv, found
 
-    def _meet(self, turned: F64, moved: F64, uv: F64, rows: I64) -> tuple[F64, F64, F64]:
-        """Inverse depths (n,) where rays through uv come nearest to the bearings, variances, and px off the line."""
+    def _intersect(self, direction: F64, centre: F64, uv: F64, rows: I64) -> tuple[F64, F64, F64]:
+        """Inverse depths (n,) nearest to the rays through uv, their variances, and px off the epipolar line."""
         f, c = self._map.intrinsics[:2], self._map.intrinsics[2:4]
         across = (uv - c) / f
-        gain = moved[:, :2] - across * moved[:, 2:]
-        want = across * turned[:, 2:] - turned[:, :2]
+        gain = centre[:, :2] - across * centre[:, 2:]
+        want = across * direction[:, 2:] - direction[:, :2]
         power = np.einsum("ni,ni->n", gain, gain)
         rho = np.einsum("ni,ni->n", gain, want) / np.maximum(power, 1e-18)
-        p = turned + moved * rho[:, None]
+        p = direction + centre * rho[:, None]
         z = np.maximum(p[:, 2], 1e-3)
-        slope = f * (moved[:, :2] - p[:, :2] / z[:, None] * moved[:, 2:]) / z[:, None]  # px per 1/m
+        slope = f * (centre[:, :2] - p[:, :2] / z[:, None] * centre[:, 2:]) / z[:, None]  # px per 1/m
         sigma = self._config.motion.sigma_px * (1 << self._map.octave[rows])
         with np.errstate(divide="ignore"):
             variance = np.where(p[:, 2] > 0.05, sigma**2 / np.einsum("ni,ni->n", slope, slope), np.inf)
         off = np.linalg.norm(p[:, :2] / z[:, None] * f + c - uv, axis=1)
         return rho, variance, off
 
-    def _note(self, rows: I64, hit: Bool, failed: Bool) -> None:
-        """Count tries and hits; what keeps failing, or never gets a depth, is given up."""
+    def _count(self, rows: I64, hit: Bool, failed: Bool) -> None:
+        """Count tries and hits; drop seeds that keep failing or never get a depth."""
         config = self._config.motion
         self._map.tried[rows] += 1
         self._map.hits[rows[hit]] += 1
@@ -130,10 +138,10 @@ class DepthFromMotion:
         hopeless = (self._map.misses[rows] >= config.max_misses) | (self._map.tried[rows] >= config.max_tries)
         gone = rows[hopeless & ~hit]
         self._map.seed.reshape(-1)[gone] = False
-        self._map.tried[gone] = 0  # as if never looked for: the base may still place it
+        self._map.tried[gone] = 0  # reads as never searched: the base may still give it a depth
 
     def _fuse(self, rows: I64, measured: F64, variance: F64, typical: float) -> int:
-        """Average inverse depths; those known well enough become points."""
+        """Average inverse depths. Returns how many seeds are known well enough and became landmarks."""
         config = self._config.motion
         rho, sigma = self._map.rho.reshape(-1), self._map.sigma_rho.reshape(-1)
         variance = variance * config.inflation
@@ -143,12 +151,12 @@ class DepthFromMotion:
         known = (sigma[rows] < config.known * np.maximum(rho[rows], config.far_share * typical)) & (
             self._map.hits[rows] >= config.min_hits
         )
-        self._map.ripen(rows[known])
+        self._map.promote(rows[known])
         return int(np.count_nonzero(known))
 
 
-def sigma_of_meeting(bearing: F64, rho: F64, T_c_k: F64, f_px: float, sigma_px: F64) -> F64:
-    """One deviation (n,) of inverse depths that a second view at T_c_k (4,4) measured. bearing: (n,2) x/z, y/z."""
+def triangulated_sigma(bearing: F64, rho: F64, T_c_k: F64, f_px: float, sigma_px: F64) -> F64:
+    """Standard deviation (n,) of inverse depths triangulated by a second view at T_c_k (4,4). bearing: (n,2) x/z, y/z."""
     p = np.column_stack([bearing, np.ones(len(rho))]) @ T_c_k[:3, :3].T + T_c_k[:3, 3] * rho[:, None]
     z = np.maximum(p[:, 2], 1e-3)
     slope = f_px * (T_c_k[:2, 3] - p[:, :2] / z[:, None] * T_c_k[2, 3]) / z[:, None]

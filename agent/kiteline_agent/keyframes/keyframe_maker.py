@@ -1,171 +1,147 @@
-"""Making a keyframe: sightings of tracked points, births of new ones, shared and remembered as their codes' values."""
+"""Makes a keyframe of a frame: shares its records with the base, and adds it to the local map as the base decodes it."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
-from kiteline_agent.keyframes.policy import NewPoints, new_points
+from kiteline_agent.keyframes.new_landmarks import NewPoints, new_points
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import FrameImages, Track
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[np.float64]
 
-_LEAST_RHO = 1e-4  # 1/m; farther is nowhere
+_MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
+_DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
 
 
 class KeyframeMaker:
-    """Turns a tracked frame into records for the base and into a slot of the local map."""
+    """Turns a frame into records for the base and a slot of the local map."""
 
-    def __init__(
-        self, local_map: LocalMap, camera: RectifiedCamera, config: AgentConfig, channel: RecordChannel, work: Work
-    ) -> None:
+    def __init__(self, local_map: LocalMap, channel: RecordChannel, work: Work) -> None:
         self._map = local_map
-        self._camera = camera
-        self._config = config
+        self._camera = local_map.camera
         self._channel = channel
         self._work = work
-        self._fresh: NewPoints | None = None  # found by `enough`, for the keyframe that follows at once
 
-    def configure(self, config: AgentConfig) -> None:
-        """From now on so much effort."""
-        self._config = config
+    def first_points(self, ctx: FrameContext) -> NewPoints | None:
+        """New landmarks for a keyframe without a track; None if too few of them have a depth."""
+        points = new_points(ctx.images, np.zeros((0, 2)), self._camera, ctx.config)
+        enough = int(np.count_nonzero(points.disparity > 0.0)) >= ctx.config.local_map.first_points
+        return points if enough else None
 
-    def enough(self, view: FrameImages, points: int) -> bool:
-        """Whether a view by itself gives at least so many points with depth."""
-        fresh = new_points(view, np.zeros((0, 2)), self._camera, self._config)
-        enough = int(np.count_nonzero(fresh.disparity > 0.0)) >= points
-        self._fresh = fresh if enough else None
-        return enough
+    def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
+        """New landmarks where a tracked frame has none."""
+        return new_points(ctx.images, self._inliers(track)[1][:, :2], self._camera, ctx.config)
 
-    def look(self, view: FrameImages, track: Track) -> NewPoints:
-        """What would be born in a keyframe of a tracked frame."""
-        return new_points(view, self._seen(track)[1][:, :2], self._camera, self._config)
+    def make(
+        self, ctx: FrameContext, track: Track | None, points: NewPoints, keyframe: KeyframeId, parent: KeyframeId,
+        T_p_k: F64,
+    ) -> F64:  # fmt: skip
+        """Share and store a keyframe. Returns its pose T_m_k (4,4) as both sides hold it, after quantisation.
 
-    def _seen(self, track: Track) -> tuple[NDArray[np.int64], F64]:
-        """Rows (n,) and places (n,3) of the inliers, in order of point."""
+        track: None for a keyframe without observations of older landmarks.
+        """
+        rows, seen = (np.zeros(0, np.int64), np.zeros((0, 3))) if track is None else self._inliers(track)
+        # New landmarks first, in the order of image rows: neighbours code shortest.
+        band = points.uv[:, 1] // ctx.config.detector.cell_px
+        profile = self._channel.profile
+        order = np.lexsort((points.uv[:, 0], band, np.arange(len(band)) >= profile.landmarks))
+        landmarks, strength = self._new_landmarks(keyframe, points, order)
+        shared = self._map.is_shared(rows)
+        observations = self._observations(keyframe, rows[shared], seen[shared], min(len(order), profile.landmarks))
+        sections = profile.choose(landmarks, strength, observations)
+        n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
+        self._count(ctx, len(landmarks.index), len(observations.index))
+        header = self._channel.put(KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, n_keypoints))
+        assert isinstance(header, KeyframeHeader)
+        uv, rho = landmarks.uv.astype(np.float64), landmarks.inv_depth.astype(np.float64)
+        for part in sections[0]:
+            decoded = self._channel.put(part)
+            assert isinstance(decoded, NewLandmarks)
+            uv[decoded.index], rho[decoded.index] = decoded.uv, decoded.inv_depth
+        for section in sections[1]:
+            self._channel.put(section)
+        rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
+        T_m_k = self._pose_of(header)
+        cached_rho = np.zeros(len(order)) if points.cached_rho is None else points.cached_rho[order]
+        self._store(ctx, header, T_m_k, uv, rho, cached_rho, landmarks)
+        self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
+        return T_m_k
+
+    def _inliers(self, track: Track) -> tuple[NDArray[np.int64], F64]:
+        """Rows (n,) and observations (n,3) of the inliers, by landmark id."""
         keep = np.flatnonzero(track.inlier)
         keep = keep[np.argsort(self._map.point_ids(track.rows[keep]), kind="stable")]
         return track.rows[keep], track.observed[keep]
 
-    def begin_with(self, points: NewPoints) -> None:
-        """What is born in the keyframe that follows at once."""
-        self._fresh = points
-
-    def make(
-        self, view: FrameImages, track: Track | None, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
-        frame_number: int,
-    ) -> F64:  # fmt: skip
-        """Share and remember a keyframe; its pose T_m_k (4,4) as both sides hold it. Without a track, a map begins."""
-        if track is None:
-            rows, seen = np.zeros(0, np.int64), np.zeros((0, 3))
-        else:
-            rows, seen = self._seen(track)
-        fresh, self._fresh = self._fresh, None
-        if fresh is None:
-            fresh = new_points(view, seen[:, :2], self._camera, self._config)
-        # Births first, in the order of image rows: neighbours code shortest.
-        band = fresh.uv[:, 1] // self._config.detector.cell_px
-        profile = self._channel.profile
-        order = np.lexsort((fresh.uv[:, 0], band, np.arange(len(band)) >= profile.landmarks))
-        births, strength = self._births(keyframe, fresh, order)
-        shared = self._map.is_shared(rows)
-        sightings = self._sightings(keyframe, rows[shared], seen[shared], min(len(order), profile.landmarks))
-        sections = profile.choose(births, strength, sightings)
-        n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
-        head = KeyframeHeader(keyframe, t_ns, parent, T_p_k, n_keypoints)
+    def _count(self, ctx: FrameContext, landmarks: int, observations: int) -> None:
         self._work.keyframes += 1
-        self._work.detected_px += view.left[max(view.first, self._config.detector.first)].size
-        self._work.births += len(births.index)
-        self._work.sightings += len(sightings.index)
-        shared_head = self._channel.put(head)
-        assert isinstance(shared_head, KeyframeHeader)
-        uv, rho = births.uv.astype(np.float64), births.inv_depth.astype(np.float64)
-        for part in sections[0]:
-            agreed = self._channel.put(part)
-            assert isinstance(agreed, NewLandmarks)
-            uv[agreed.index], rho[agreed.index] = agreed.uv, agreed.inv_depth
-        for section in sections[1]:
-            self._channel.put(section)
-        rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _LEAST_RHO), 0.0)
-        T_m_k = self._placed(shared_head)
-        lent_rho = np.zeros(len(order)) if fresh.lent_rho is None else fresh.lent_rho[order]
-        self._remember(view, shared_head, T_m_k, uv, rho, lent_rho, births, frame_number)
-        self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
-        return T_m_k
+        self._work.detected_px += ctx.images.left[max(ctx.images.first, ctx.config.detector.first)].size
+        self._work.births += landmarks
+        self._work.sightings += observations
 
-    def _births(self, keyframe: KeyframeId, fresh: NewPoints, order: NDArray[np.int64]) -> tuple[NewLandmarks, F64]:
-        disparity = fresh.disparity[order]
+    def _new_landmarks(
+        self, keyframe: KeyframeId, points: NewPoints, order: NDArray[np.int64]
+    ) -> tuple[NewLandmarks, F64]:
+        """The record of all new landmarks, and their strengths (n,)."""
+        disparity = points.disparity[order]
         n = len(order)
-        births = NewLandmarks(
+        landmarks = NewLandmarks(
             keyframe,
             0,
             np.arange(n, dtype=np.uint16),
-            fresh.uv[order].astype(np.float32),
-            self._as_measured(disparity, fresh.uv[order]),
-            fresh.octave[order],
-            fresh.angle[order],
-            fresh.descriptor[order],
+            points.uv[order].astype(np.float32),
+            self._measured_rho(disparity, points.uv[order]),
+            points.octave[order],
+            points.angle[order],
+            points.descriptor[order],
         )
-        return births, np.where(disparity > 0.0, 1.0, 0.0) - order / (2.0 * max(n, 1))
+        return landmarks, np.where(disparity > 0.0, 1.0, 0.0) - order / (2.0 * max(n, 1))
 
-    def _sightings(self, keyframe: KeyframeId, rows: NDArray[np.int64], seen: F64, first: int) -> Observations:
+    def _observations(self, keyframe: KeyframeId, rows: NDArray[np.int64], seen: F64, first: int) -> Observations:
         return Observations(
             keyframe,
             0,
             np.arange(first, first + len(rows), dtype=np.uint16),
             seen[:, :2].astype(np.float32),
-            self._as_measured(seen[:, 2], seen[:, :2]),
+            self._measured_rho(seen[:, 2], seen[:, :2]),
             self._map.octave[rows],
             self._map.point_ids(rows),
         )
 
-    def _as_measured(self, disparity: F64, uv: F64) -> NDArray[np.float32]:
-        """Inverse depths (n,) 1/m to be shared, 0 for none: as the pair measures, for the base to judge its offset."""
+    def _measured_rho(self, disparity: F64, uv: F64) -> NDArray[np.float32]:
+        """Inverse depths (n,) 1/m to share, 0 for none: with the stereo offset, which the base estimates."""
         raw = disparity + self._map.offset_px(uv)
         return np.where((disparity > 0.0) & (raw > 0.0), raw / self._camera.bf, 0.0).astype(np.float32)
 
-    def _placed(self, head: KeyframeHeader) -> F64:
-        if head.parent == NO_KEYFRAME:
-            return head.T_p_k
-        return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(head.parent)] @ head.T_p_k)
+    def _pose_of(self, header: KeyframeHeader) -> F64:
+        if header.parent == NO_KEYFRAME:
+            return header.T_p_k
+        return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(header.parent)] @ header.T_p_k)
 
-    def _remember(
-        self,
-        view: FrameImages,
-        head: KeyframeHeader,
-        T_m_k: F64,
-        uv: F64,
-        rho: F64,
-        lent_rho: F64,
-        births: NewLandmarks,
-        frame_number: int,
-    ) -> None:
-        octave = births.octave
-        templates = np.empty(
-            (len(uv), alignment_kernels.TEMPLATE_LEVELS, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE),
-            np.uint8,
-        )
-        alignment_kernels.cut_templates(view.left, uv, octave, templates)
-        sigma = self._config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
-        if view.depth_m is not None and not self._camera.stereo:
-            sigma = np.maximum(sigma, _depth_camera_sigma(rho))
-        lent = lent_rho > 0.0
-        rho = np.where(lent, lent_rho, rho)
-        sigma[lent] = np.minimum(sigma[lent], self._config.window.sigma_px / self._camera.bf)
+    def _store(
+        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, cached_rho: F64,
+        landmarks: NewLandmarks,
+    ) -> None:  # fmt: skip
+        """Cut the templates, and add the keyframe to the local map."""
+        octave, config = landmarks.octave, ctx.config
+        side = alignment_kernels.TEMPLATE
+        templates = np.empty((len(uv), alignment_kernels.TEMPLATE_LEVELS, side, side), np.uint8)
+        alignment_kernels.cut_templates(ctx.images.left, uv, octave, templates)
+        sigma = config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
+        if ctx.images.depth_m is not None and not self._camera.stereo:
+            sigma = np.maximum(sigma, _DEPTH_CAMERA_SIGMA_RHO)
+        cached = cached_rho > 0.0
+        rho = np.where(cached, cached_rho, rho)
+        sigma[cached] = np.minimum(sigma[cached], config.window.sigma_px / self._camera.bf)
         self._map.add(
-            head, T_m_k, uv, rho, sigma, octave, births.angle, births.descriptor, templates, frame_number
+            header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number
         )  # fmt: skip
-
-
-def _depth_camera_sigma(rho: F64) -> F64:
-    """Deviation of inverse depth (n,) 1/m of a structured-light camera: constant (K. Khoshelham, S. Elberink, 2012)."""
-    return np.full(len(rho), 2.85e-3)

@@ -1,86 +1,80 @@
-"""The reference keyframe, relative to which the pose is told, and when the next keyframe takes its place."""
+"""The reference keyframe: the newest one, or the one at which the camera was relocalised."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import AgentConfig
-from kiteline_agent.keyframes import policy
-from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.keyframes.policy import KeyframeNeed, keyframe_need, situation
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.tracking.tracker import FrameImages, Track
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id
 
 F64 = NDArray[np.float64]
 
 
 class ReferenceKeyframe:
-    """The newest keyframe, or the one where an old map was found again. T_k_c: (4,4) the camera in it."""
+    """The keyframe relative to which the pose is reported. T_k_c: (4,4) camera in it."""
 
-    def __init__(self, local_map: LocalMap, camera: RectifiedCamera, maker: KeyframeMaker) -> None:
+    def __init__(self, local_map: LocalMap) -> None:
         self._map = local_map
-        self._camera = camera
-        self._maker = maker
-        self._sequence: dict[SubmapId, int] = {}  # how many keyframes after the first each submap has
-        self._inliers = 0  # of the first frame that was tracked after it
+        self._last_sequence: dict[SubmapId, int] = {}  # of the newest keyframe in each submap
+        self._inliers = 0  # of the first frame that was tracked after the newest keyframe
         self._t_ns = 0  # of the newest keyframe
-        self._frame = 0
+        self._frame_number = 0
         self.keyframe: KeyframeId = NO_KEYFRAME
         self.T_k_c: F64 = np.eye(4)
 
     @property
     def T_m_k(self) -> F64 | None:
-        """(4,4) as the local map has it now; None where it has forgotten the keyframe."""
+        """(4,4) in the local map; None if the keyframe was evicted."""
         slot = self._map.slot_of(self.keyframe)
         return self._map.T_m_k[slot] if slot >= 0 else None
 
-    def refresh(self, T_m_c: F64) -> None:
-        """The camera is at T_m_c (4,4)."""
+    def set_camera(self, T_m_c: F64) -> None:
+        """Update T_k_c from the camera's pose (4,4)."""
         T_m_k = self.T_m_k
         if T_m_k is not None:
             self.T_k_c = se3.inverse(T_m_k) @ T_m_c
 
-    def asks(self, track: Track, t_ns: int, frame: int, config: AgentConfig, gap_ns: int) -> policy.Wish | None:
-        """Whether a tracked frame should become a keyframe. gap_ns: between keyframes, that the link can carry."""
-        if frame - self._frame == 1:
+    def keyframe_need(self, ctx: FrameContext, track: Track) -> KeyframeNeed | None:
+        """Why a tracked frame should become a keyframe; None if it need not."""
+        frames = ctx.number - self._frame_number
+        if frames == 1:
             self._inliers = track.inliers
         T_m_k = self.T_m_k
         assert T_m_k is not None
-        what = policy.situation(
-            track, self._camera, T_m_k, frame - self._frame, (t_ns - self._t_ns) * 1e-9, self._inliers
-        )
-        why = policy.why_keyframe(what, config.keyframe)
-        if why is None:
-            return None
-        waits = t_ns - self._t_ns < gap_ns and policy.may_wait(what, config.keyframe)
-        thin = track.inliers < config.keyframe.thin * config.pose.min_inliers
-        return policy.Wish(why, urgent=thin, waits=waits)
+        now = situation(track, self._map.camera, T_m_k, frames, self.age_ns(ctx.t_ns) * 1e-9, self._inliers)
+        return keyframe_need(now, ctx.config.keyframe)
 
-    def add(self, view: FrameImages, track: Track | None, t_ns: int, frame: int, submap: SubmapId, T_m_c: F64) -> None:
-        """Make a keyframe of this frame. Without a track it sees nothing again; a submap's first one begins it."""
-        begins = submap not in self._sequence
-        parent, T_p_k = (NO_KEYFRAME, T_m_c) if begins else (self.keyframe, self.T_k_c)
-        sequence = 0 if begins else self._sequence[submap] + 1
-        self._sequence[submap] = sequence
-        keyframe = keyframe_id(submap, sequence)
-        T_m_k = self._maker.make(view, track, keyframe, t_ns, parent, T_p_k, frame)
-        # The keyframe lies where its code says, a rounding away from the camera.
-        self.keyframe, self.T_k_c = keyframe, se3.inverse(T_m_k) @ T_m_c
-        self._t_ns, self._frame = t_ns, frame
+    def age_ns(self, t_ns: int) -> int:
+        """Time since the newest keyframe."""
+        return t_ns - self._t_ns
 
-    def is_of(self, frame: int) -> bool:
-        """Whether the newest keyframe was made of this frame."""
-        return self._frame == frame
+    def next_keyframe(self, submap: SubmapId, T_m_c: F64) -> tuple[KeyframeId, KeyframeId, F64]:
+        """Id, parent and T_p_k (4,4) of the next keyframe; the first of a submap has no parent, and its pose is T_m_c."""
+        if submap not in self._last_sequence:
+            return keyframe_id(submap, 0), NO_KEYFRAME, T_m_c
+        return keyframe_id(submap, self._last_sequence[submap] + 1), self.keyframe, self.T_k_c
 
-    def move_to(self, keyframe: KeyframeId, inliers: int, frame: int) -> None:
-        """Go on from a keyframe where the old map was found; `refresh` says where the camera is in it."""
+    def set_new(self, keyframe: KeyframeId, submap: SubmapId, T_k_c: F64, t_ns: int, frame_number: int) -> None:
+        """A keyframe was made. T_k_c: (4,4), not exactly the identity, since the keyframe's pose is quantised."""
+        self._last_sequence[submap] = self._last_sequence.get(submap, -1) + 1
+        self.keyframe, self.T_k_c = keyframe, T_k_c
+        self._t_ns, self._frame_number = t_ns, frame_number
+
+    def is_of(self, frame_number: int) -> bool:
+        """True if the newest keyframe was made of this frame."""
+        return self._frame_number == frame_number
+
+    def return_to(self, keyframe: KeyframeId, inliers: int, frame_number: int) -> None:
+        """Use an older keyframe after a relocalisation; `set_camera` follows."""
         self.keyframe = keyframe
         self._inliers = inliers
-        self._map.last_seen[self._map.slot_of(keyframe)] = frame
+        self._map.last_seen[self._map.slot_of(keyframe)] = frame_number
 
-    def fewer_points(self, before: int, now: int) -> None:
-        """Frames try so many points now: what the reference saw is judged alike."""
-        self._inliers = self._inliers * now // before
+    def scale_inliers(self, points_before: int, points_now: int) -> None:
+        """Frames track another number of landmarks from now on: keep the reference comparable."""
+        self._inliers = self._inliers * points_now // points_before

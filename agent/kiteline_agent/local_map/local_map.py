@@ -185,7 +185,7 @@ class LocalMap:
         order = np.argsort(-self.last_seen[slots], kind="stable")[: self.searched]
         return np.asarray(np.sort(slots[order]))
 
-    def sharpen(
+    def update_depths(
         self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float
     ) -> None:
         """Mend the inverse depths of rows by where they were seen from T_c_m."""
@@ -207,18 +207,18 @@ class LocalMap:
 
     # bearings without depth
 
-    def plant(self, rho: float, sigma_rho: float) -> None:
+    def initialise_seeds(self, rho: float, sigma_rho: float) -> None:
         """Give bearings that are new a rough inverse depth in 1/m, to look around."""
         new = self.seed & (self.sigma_rho == 0.0)
         self.rho[new], self.sigma_rho[new] = rho, sigma_rho
 
-    def ripen(self, rows: I64) -> None:
+    def promote(self, rows: I64) -> None:
         """Bearings (n,) that have a depth now become points."""
         self.seed.reshape(-1)[rows] = False
         self.usable.reshape(-1)[rows] = True
         self.tried[rows], self.hits[rows] = 0, 0
 
-    def forget(self, submap: SubmapId) -> None:
+    def drop_submap(self, submap: SubmapId) -> None:
         """Drop the keyframes of a submap."""
         slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == submap)
         self.keyframe[slots] = NO_KEYFRAME
@@ -255,13 +255,13 @@ class LocalMap:
         self.measured[slot, index] = False
         self.sigma_rho[slot, index] = self._filtering.refined_sigma_px / self.camera.bf
         self.bearing[slot, index] = self._bearings(self.uv[slot, index] + record.offset[keep])
-        self.ripen(slot * self.births + index[fresh])  # points that only the base could place
+        self.promote(slot * self.births + index[fresh])  # points that only the base could place
 
     def offset_px(self, uv: F64) -> F64:
         """What the pair's disparities at pixels (n,2) are too large by (n,)."""
         return np.asarray(disparity_offset.terms(self._bearings(uv)) @ self.disparity_offset)
 
-    def calibrate(self, offset: F64) -> None:
+    def set_disparity_offset(self, offset: F64) -> None:
         """The pair's disparities are too large by an offset (5,) px (`disparity_offset`): depths it measured follow."""
         at = disparity_offset.terms(self.bearing[self.measured])
         change = at @ (offset - self.disparity_offset) / self.camera.bf
@@ -276,7 +276,7 @@ class LocalMap:
                 self.usable[slot, index] = point == point_id(KeyframeId(int(self.keyframe[slot])), index)
                 self.seed[slot, index] &= self.usable[slot, index]
 
-    def settle(self) -> None:
+    def compose_unplaced(self) -> None:
         """Compose keyframes that the base has not placed from their parents, oldest first."""
         for slot in np.argsort(self.keyframe, kind="stable"):
             if self.keyframe[slot] == NO_KEYFRAME or self.from_base[slot] or self.parent[slot] == NO_KEYFRAME:

@@ -12,7 +12,7 @@ from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_tracker import InertialConfig, InertialTracker
 from kiteline_agent.motion.odometer import Odometer, OdometerConfig
 from kiteline_agent.tracking.pose_state import PoseState
-from kiteline_agent.tracking.tracker import Track
+from kiteline_agent.tracking.track import Track
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera

@@ -1,8 +1,7 @@
-"""What the base lends: copies of keyframes that others saw or that this agent forgot, for the place where it is.
+"""Cache of keyframes sent by the base: seen by other agents, or evicted here.
 
-A copy has points and descriptors but no image, so nothing can be aligned with it. Its points are met by the corners of
-a frame instead: of a lost one, which is thereby found again, and of each new keyframe, whose points then take over the
-copy's depth, and which moves a little towards where the copies say that it is. So the agent flies in the lent map.
+They have landmarks and descriptors but no image, so they are matched by descriptor: to relocalise, and to initialise
+depths in new keyframes, which are then moved a little towards the cached map.
 """
 
 from __future__ import annotations
@@ -14,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import MapCacheConfig
-from kiteline_agent.keyframes.policy import NewPoints
-from kiteline_agent.local_map import projection_kernels as kernels
+from kiteline_agent.keyframes.new_landmarks import NewPoints
+from kiteline_agent.local_map import projection_kernels
+from kiteline_agent.relocalisation.frame_features import FrameFeatures
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -30,25 +30,16 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
-_MARGIN_PX = 4.0  # beyond the border: a point that is just out of view has no corner
-
-
-@dataclass(frozen=True, slots=True)
-class FrameFeatures:
-    """Corners of a frame. uv: (n,2) px. disparity: (n,) px, < 0 none. octave, angle: (n,). descriptor: (n,32)."""
-
-    uv: F64
-    disparity: F64
-    octave: U8
-    angle: U8
-    descriptor: U8
+_MARGIN_PX = 4.0  # px beyond the border: landmarks just out of view have no corner
+_NO_SUBMAP = -1  # in the array of submaps: the keyframe's pose has not arrived
 
 
 @dataclass(frozen=True, slots=True)
 class CacheMatches:
-    """Lent points that corners met. T_c_m: (4,4) by them alone. corner: (n,) indices of corners. depth_m: (n,) in the
-    camera. xyz, ray, observed, sigma_px: (n,3), (n,3), (n,3), (n,) as in `optimise_pose`. foreseen: how many points
-    should have been in view.
+    """Cached landmarks matched with corners of a frame, and the pose from them alone.
+
+    T_c_m: (4,4). corner: (n,) indices of corners. depth_m: (n,) in the camera. xyz, ray, observed, sigma_px: (n,3),
+    (n,3), (n,3), (n,) as in `optimise_pose`. in_view: number of cached landmarks that should be in view.
     """
 
     T_c_m: F64
@@ -58,12 +49,12 @@ class CacheMatches:
     ray: F64
     observed: F64
     sigma_px: F64
-    foreseen: int
+    in_view: int
 
 
 @dataclass(frozen=True, slots=True)
-class _Around:
-    """Lent points foreseen in a view: rows, pixels, octaves as they should look, and where they are."""
+class _Projections:
+    """Cached landmarks projected into a camera. rows: (n,). uv: (n,2) px. octave: (n,), predicted. xyz, ray: (n,3) m."""
 
     rows: I64
     uv: F64
@@ -73,11 +64,11 @@ class _Around:
 
 
 class MapCache:
-    """The copies, bounded in number: slot k holds a keyframe, row k * points + i one of its points."""
+    """Cached keyframes, bounded in number: slot k holds a keyframe, row k * points + i one of its landmarks."""
 
     def __init__(
         self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig, ransac: RansacConfig,
-        words: Vocabulary | None,
+        vocabulary: Vocabulary | None,
     ) -> None:  # fmt: skip
         k, p = config.copies, config.points
         self._camera = camera
@@ -86,14 +77,14 @@ class MapCache:
         self._config = config
         self._matching = matching
         self._ransac = ransac
-        self._words = words
-        self._index: PlaceIndex | None = None  # made when something is looked for
+        self._vocabulary = vocabulary
+        self._index: PlaceIndex | None = None  # filled at the first search
         self._indexed: set[int] = set()
         self.keyframe = np.full(k, NO_KEYFRAME, np.int64)
-        self._submap = np.full(k, -1, np.int64)  # in which the pose stands; -1: none has come
+        self._submap = np.full(k, _NO_SUBMAP, np.int64)  # to which the pose refers
         self._T_m_k = np.tile(np.eye(4), (k, 1, 1))
         self._counts = np.zeros(k, np.int64)
-        self._touched = np.zeros(k, np.int64)  # when a copy last came or was told of
+        self._touched = np.zeros(k, np.int64)  # value of _clock at the last record
         self._clock = 0
         self._parts: list[dict[int, CachedLandmarks]] = [{} for _ in range(k)]
         self._usable = np.zeros((k, p), np.bool_)
@@ -112,14 +103,12 @@ class MapCache:
     def __len__(self) -> int:
         return int(np.count_nonzero(self.keyframe != NO_KEYFRAME))
 
-    def lies_in(self, submap: SubmapId) -> bool:
-        """Whether any copy can be used in a submap."""
+    def covers(self, submap: SubmapId) -> bool:
+        """True if any cached keyframe has a pose in a submap."""
         return bool((self._submap == submap).any())
 
-    # what the base sends
-
-    def take(self, record: CachedKeyframe | CachedLandmarks) -> None:
-        """A copy's pose, or some of its points."""
+    def store(self, record: CachedKeyframe | CachedLandmarks) -> None:
+        """Take over the pose of a cached keyframe, or some of its landmarks."""
         slot = self._slot(record.keyframe)
         self._clock += 1
         self._touched[slot] = self._clock
@@ -130,8 +119,8 @@ class MapCache:
         self._parts[slot][record.part] = record
         self._fill(slot)
 
-    def take_back(self, keys: Sequence[Key]) -> None:
-        """Copies that the base wants back."""
+    def remove(self, keys: Sequence[Key]) -> None:
+        """Drop the cached keyframes that the base removed."""
         for key in keys:
             if key.kind == CachedKeyframe.KIND:
                 for slot in np.flatnonzero(self.keyframe == key.id).tolist():
@@ -148,15 +137,15 @@ class MapCache:
         return slot
 
     def _clear(self, slot: int) -> None:
-        self._forget_place(slot)
+        self._remove_from_index(slot)
         self.keyframe[slot] = NO_KEYFRAME
-        self._submap[slot] = -1
+        self._submap[slot] = _NO_SUBMAP
         self._counts[slot] = 0
         self._parts[slot].clear()
 
     def _fill(self, slot: int) -> None:
-        """The points of all parts that came, as far as there is room."""
-        self._forget_place(slot)
+        """Store the landmarks of all parts that arrived, up to the capacity."""
+        self._remove_from_index(slot)
         parts = [self._parts[slot][k] for k in sorted(self._parts[slot])]
         keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[: self._config.points]
         n, c = len(keep), self._camera
@@ -172,25 +161,27 @@ class MapCache:
         self._angle[rows] = np.concatenate([part.angle for part in parts])[keep]
         self._descriptor[rows] = np.concatenate([part.descriptor for part in parts])[keep]
 
-    # meeting them
-
-    def meet(self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures, radius_px: float) -> CacheMatches | None:
-        """Lent points of a submap that corners of a frame at about T_c_m (4,4) show; None where too few agree."""
-        around = self._around(T_c_m, submap, _MARGIN_PX)
-        if len(around.rows) < self._config.min_met or len(seen.uv) < self._config.min_met:
+    def match_landmarks(
+        self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures, radius_px: float
+    ) -> CacheMatches | None:
+        """Match cached landmarks of a submap with a frame at about T_c_m (4,4); None if too few agree on a pose."""
+        projected = self._project(T_c_m, submap, _MARGIN_PX)
+        if len(projected.rows) < self._config.min_met or len(seen.uv) < self._config.min_met:
             return None
-        offered, wanted = comparable(seen.descriptor, self._descriptor[around.rows])
+        offered, wanted = comparable(seen.descriptor, self._descriptor[projected.rows])
         found = match_near(
-            around.uv, np.full(len(around.rows), radius_px), around.octave, wanted, seen.uv, seen.octave, offered,
+            projected.uv, np.full(len(projected.rows), radius_px), projected.octave, wanted, seen.uv, seen.octave, offered,
             (self._camera.width, self._camera.height), self._config.octave_gap, self._matching,
         )  # fmt: skip
-        return self._agreed(T_c_m, around, found, seen)
+        return self._consistent(T_c_m, projected, found, seen)
 
-    def _agreed(self, T_c_m: F64, around: _Around, found: Matches, seen: FrameFeatures) -> CacheMatches | None:
-        """What of the matches one pose explains."""
+    def _consistent(
+        self, T_c_m: F64, projected: _Projections, found: Matches, seen: FrameFeatures
+    ) -> CacheMatches | None:
+        """The matches that agree with one pose."""
         if len(found.a) < self._config.min_met:
             return None
-        xyz, ray = around.xyz[found.a], around.ray[found.a]
+        xyz, ray = projected.xyz[found.a], projected.ray[found.a]
         observed = np.column_stack([seen.uv[found.b], seen.disparity[found.b]])
         sigma_px = self._config.corner_px * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
         T, inlier = T_c_m.copy(), np.ones(len(found.a), np.bool_)
@@ -204,45 +195,44 @@ class MapCache:
         depth = se3.transform(T, xyz[inlier])[:, 2]
         return CacheMatches(
             T, found.b[inlier].astype(np.int64), depth, xyz[inlier], ray[inlier], observed[inlier], sigma_px[inlier],
-            len(around.rows),
+            len(projected.rows),
         )  # fmt: skip
 
-    def yields(self, T_c_m: F64, met: CacheMatches) -> F64 | None:
-        """T_c_m (4,4) as far towards where the copies say that it is as they know better than the track does; None
-        where they are few, or far from it.
+    def corrected_pose(self, T_c_m: F64, matches: CacheMatches) -> F64 | None:
+        """The tracked pose T_c_m (4,4) moved towards the cached map, weighted by both uncertainties.
+
+        None if the matches are few, or the correction is too large to be drift.
         """
-        config, n = self._config, len(met.corner)
+        config, n = self._config, len(matches.corner)
         if n < config.min_hold:
             return None
-        doubt = np.repeat([config.doubt_depth * float(np.median(met.depth_m)), config.doubt_rad], 3)
+        sigma = np.repeat([config.doubt_depth * float(np.median(matches.depth_m)), config.doubt_rad], 3)
         T = T_c_m.copy()
         optimise_pose(
-            T, met.xyz, met.ray, met.observed, met.sigma_px, self._intrinsics, T_c_m, doubt**-2.0, 1, 4,
+            T, matches.xyz, matches.ray, matches.observed, matches.sigma_px, self._intrinsics, T_c_m, sigma**-2.0, 1, 4,
             self._ransac.chi2, np.ones(n, np.bool_), np.zeros((6, 6)),
         )  # fmt: skip
-        before, after = (se3.transform(pose, met.xyz) for pose in (T_c_m, T))
+        before, after = (se3.transform(pose, matches.xyz) for pose in (T_c_m, T))
         if not np.isfinite(T).all() or after[:, 2].min() <= 0.0:
             return None
         moved_px = self._camera.fx * np.linalg.norm(after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:], axis=1)
         return se3.orthonormalise(T) if float(np.median(moved_px)) <= config.hold_px else None
 
-    def _around(self, T_c_m: F64, submap: SubmapId, margin_px: float) -> _Around:
+    def _project(self, T_c_m: F64, submap: SubmapId, margin_px: float) -> _Projections:
         slots = np.flatnonzero(self._submap == submap)
         row, uv, warp, xyz, ray, depth = self._out
-        n = kernels.project(
+        n = projection_kernels.project(
             T_c_m, self._intrinsics, self._size, margin_px, self._config.max_scale, slots, self._T_m_k, self._counts,
             self._usable, self._bearing, self._rho, self._sigma_rho, row, uv, warp, xyz, ray, depth,
         )  # fmt: skip
         rows = row[:n].copy()
         nearer = np.log2(1.0 / (self._rho.reshape(-1)[rows] * depth[:n]))
         octave = self._octave[rows].astype(np.float64) + nearer
-        return _Around(rows, uv[:n].copy(), octave, xyz[:n].copy(), ray[:n].copy())
-
-    # a lost frame
+        return _Projections(rows, uv[:n].copy(), octave, xyz[:n].copy(), ray[:n].copy())
 
     def find(self, seen: FrameFeatures, submaps: set[int], frame_number: int) -> tuple[SubmapId, CacheMatches] | None:
-        """Where a frame was taken, in one of some submaps, by the lent keyframes that look most alike."""
-        if self._words is None or not np.isin(self._submap, sorted(submaps)).any():
+        """Relocalise a frame in one of some submaps by the most similar cached keyframes."""
+        if self._vocabulary is None or not np.isin(self._submap, sorted(submaps)).any():
             return None
         self._fill_index()
         assert self._index is not None
@@ -250,54 +240,49 @@ class MapCache:
         for key in self._index.query(seen.descriptor, out, self._config.candidates).keys.tolist():
             slot = int(np.flatnonzero(self.keyframe == key)[0])
             submap = SubmapId(int(self._submap[slot]))
-            T_c_m = self._pose_by(slot, submap, seen, frame_number)
-            met = None if T_c_m is None else self.meet(T_c_m, submap, seen, self._config.radius_px)
-            if met is not None and len(met.corner) >= max(
-                self._config.min_found, self._config.min_share * met.foreseen
+            T_c_m = self._pose_from(slot, submap, seen, frame_number)
+            matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen, self._config.radius_px)
+            if matches is not None and len(matches.corner) >= max(
+                self._config.min_found, self._config.min_share * matches.in_view
             ):
-                return submap, met
+                return submap, matches
         return None
 
-    def _pose_by(self, slot: int, submap: SubmapId, seen: FrameFeatures, frame_number: int) -> F64 | None:
-        """Match with all that a lent keyframe should see, and solve for the pose."""
-        around = self._around(se3.inverse(self._T_m_k[slot]), submap, -self._config.beyond_px)
-        wanted, offered = comparable(self._descriptor[around.rows], seen.descriptor)
-        found = match(wanted, self._angle[around.rows], offered, seen.angle, self._matching)
+    def _pose_from(self, slot: int, submap: SubmapId, seen: FrameFeatures, frame_number: int) -> F64 | None:
+        """P3P on matches with the landmarks in view of a cached keyframe, or a little beyond its border."""
+        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._config.beyond_px)
+        wanted, offered = comparable(self._descriptor[projected.rows], seen.descriptor)
+        found = match(wanted, self._angle[projected.rows], offered, seen.angle, self._matching)
         if len(found.a) < self._config.min_met:
             return None
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         fit = solve_pnp(
-            around.xyz[found.a], around.ray[found.a], observed, seen.octave[found.b], self._intrinsics, frame_number,
+            projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics, frame_number,
             self._ransac,
         )  # fmt: skip
         return None if fit is None or fit.inliers < self._config.min_met else fit.T_c_m
 
     def _fill_index(self) -> None:
-        """Enter the copies that came since the last search: most flights never search."""
-        assert self._words is not None
+        """Index the cached keyframes that arrived since the last search; most flights never search."""
+        assert self._vocabulary is not None
         if self._index is None:
-            self._index = PlaceIndex(self._words)
-        for slot in np.flatnonzero(self._submap >= 0).tolist():
+            self._index = PlaceIndex(self._vocabulary)
+        for slot in np.flatnonzero(self._submap != _NO_SUBMAP).tolist():
             key = int(self.keyframe[slot])
             if key not in self._indexed:
-                around = self._around(se3.inverse(self._T_m_k[slot]), SubmapId(int(self._submap[slot])), 0.0)
-                self._index.add(key, self._descriptor[around.rows])
+                projected = self._project(se3.inverse(self._T_m_k[slot]), SubmapId(int(self._submap[slot])), 0.0)
+                self._index.add(key, self._descriptor[projected.rows])
                 self._indexed.add(key)
 
-    def _forget_place(self, slot: int) -> None:
+    def _remove_from_index(self, slot: int) -> None:
         key = int(self.keyframe[slot])
         if key in self._indexed and self._index is not None:
             self._index.remove(key)
             self._indexed.discard(key)
 
 
-def corners_of(points: NewPoints) -> FrameFeatures:
-    """The corners of a keyframe that is being made."""
-    return FrameFeatures(points.uv, points.disparity, points.octave, points.angle, points.descriptor)
-
-
-def with_depths(points: NewPoints, met: CacheMatches) -> NewPoints:
-    """The same points; those that met lent ones know their depths."""
+def with_depths(points: NewPoints, matches: CacheMatches) -> NewPoints:
+    """The same new landmarks, those that were matched with the depths of the cached ones."""
     rho = np.zeros(len(points.uv))
-    rho[met.corner] = 1.0 / met.depth_m
-    return replace(points, lent_rho=rho)
+    rho[matches.corner] = 1.0 / matches.depth_m
+    return replace(points, cached_rho=rho)

@@ -1,42 +1,32 @@
-"""What is rectified of a pair: the left image, the right where somebody looks; at half size if need be."""
+"""Image pyramids of one frame: the left image rectified, the right one only where it is read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import StereoConfig
+from kiteline_agent.config import PyramidConfig, StereoConfig
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
+from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.imaging import stereo_kernels
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 
-_RECTIFIED = np.zeros((0, 0, 2), np.float32)  # no way back to a raw image is needed
-
-
-def rectified(image: U8, rectifier: Rectifier, eye: int, levels: int, first: int) -> Pyramid:
-    """The pyramid of the rectified image of an eye (0 left, 1 right). first: its finest level, 0 or 1.
-
-    With 1 the work is a third; level 0 is then blank, so that nothing is found on it.
-    """
-    if first == 0 or not rectifier.bends:
-        return build_pyramid(rectifier.rectify(eye, image), levels)
-    return (rectifier.blank, *build_pyramid(rectifier.half(eye, image), levels - 1))
+_NO_GRID = np.zeros((0, 0, 2), np.float32)  # the image needs no rectification
 
 
 class RightImage:
-    """One right image (h, w) uint8, as the lens made it. Raises CalibrationError when its size is not the left's.
-
-    offset_px: what disparities at pixels (n,2) are measured too large by (n,), as far as is known; it is taken off.
-    """
+    """One right image (h, w) uint8, not rectified. Raises CalibrationError when its size is not the left's."""
 
     def __init__(
         self, image: U8, rectifier: Rectifier, levels: int, offset_px: Callable[[F64], F64] | None = None
-    ) -> None:  # fmt: skip
+    ) -> None:
+        """offset_px: known error (n,) of measured disparities at pixels (n,2); it is subtracted."""
         rectifier.check_size(image)
         self._image = image
         self._rectifier = rectifier
@@ -45,10 +35,15 @@ class RightImage:
         self._raw: Pyramid | None = None
         self._coarse: Pyramid | None = None
 
+    @property
+    def needs_rectification(self) -> bool:
+        """True if the rectified image differs from the raw one."""
+        return self._rectifier.bends
+
     def coarse(self) -> Pyramid:
-        """The pyramid of the rectified image, in which level 0 may be blank."""
+        """Pyramid of the rectified image; level 0 is blank if the camera needs rectification."""
         if self._coarse is None:
-            raw = self._pyramid()
+            raw = self._raw_pyramid()
             self._coarse = raw
             if self._rectifier.bends:
                 half = self._rectifier.halved(1, raw[1])
@@ -59,19 +54,54 @@ class RightImage:
         self, left: Pyramid, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig, search_px: float,
         disparity: F64, found: NDArray[np.bool_],
     ) -> None:  # fmt: skip
-        """stereo_kernels.refine_rows, of true disparities; only what is looked at is rectified."""
+        """Measure disparities to sub-pixel (stereo_kernels.refine_rows); rectifies only the patches that it reads."""
         grid = self._rectifier.right_grid
         wanted = disparity >= 0.0
-        off = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
-        disparity[wanted] = np.maximum(disparity[wanted] + off[wanted], 0.0)
+        offset = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
+        disparity[wanted] = np.maximum(disparity[wanted] + offset[wanted], 0.0)
         stereo_kernels.refine_rows(
-            left, self._pyramid(), _RECTIFIED if grid is None else grid, uv, octave, sure, config.iterations, search_px,
-            config.min_ncc, disparity, found,
+            left, self._raw_pyramid(), _NO_GRID if grid is None else grid, uv, octave, sure, config.iterations,
+            search_px, config.min_ncc, disparity, found,
         )  # fmt: skip
-        disparity[wanted] = np.maximum(disparity[wanted] - off[wanted], 0.0)
+        disparity[wanted] = np.maximum(disparity[wanted] - offset[wanted], 0.0)
 
-    def _pyramid(self) -> Pyramid:
-        """Of the image as the lens made it."""
+    def _raw_pyramid(self) -> Pyramid:
         if self._raw is None:
             self._raw = build_pyramid(self._image, self._levels)
         return self._raw
+
+
+@dataclass(frozen=True, slots=True)
+class FrameImages:
+    """Pyramids of one frame. depth_m: (h,w) float32 aligned with left, or None. first: finest level not blank."""
+
+    left: Pyramid
+    right: RightImage | None
+    depth_m: NDArray[np.float32] | None
+    first: int = 0
+
+
+def frame_images(
+    frame: Frame, rectifier: Rectifier, config: PyramidConfig, first: int, offset_px: Callable[[F64], F64]
+) -> FrameImages:
+    """Rectify a frame. first: finest level wanted, 0 or 1; with 1 it costs a third, and level 0 is blank.
+
+    offset_px: see RightImage. Raises CalibrationError for an image of the wrong size.
+    """
+    right = None if frame.right is None else RightImage(frame.right, rectifier, config.levels, offset_px)
+    depth_m = None if frame.depth_m is None else rectifier.depth(frame.depth_m)
+    if first == 0 or not rectifier.bends:
+        return FrameImages(build_pyramid(rectifier.rectify(0, frame.left), config.levels), right, depth_m)
+    half = rectifier.half(0, frame.left)
+    return FrameImages((rectifier.blank, *build_pyramid(half, config.levels - 1)), right, depth_m, first)
+
+
+def depth_at(depth_m: NDArray[np.float32], uv: F64) -> F64:
+    """Depth (n,) in m at pixels (n,2); 0 where unknown or where the 3x3 neighbourhood is an edge (spread above 5 %)."""
+    h, w = depth_m.shape
+    x = np.clip(np.round(uv[:, 0]).astype(np.int64), 1, w - 2)
+    y = np.clip(np.round(uv[:, 1]).astype(np.int64), 1, h - 2)
+    around = np.stack([depth_m[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]).astype(np.float64)
+    low, high = around.min(axis=0), around.max(axis=0)
+    sure = (low > 0.0) & (high - low < 0.05 * low)
+    return np.where(sure, np.median(around, axis=0), 0.0)

@@ -1,7 +1,7 @@
-"""Where to look when the motion model was wrong: how far a small blurred image has shifted since the last pose.
+"""Corrects a bad prediction by the shift of a small blurred image since the last tracked frame.
 
 After G. Klein and D. Murray, "Improving the agility of keyframe-based SLAM" (2008), with phase correlation in place of
-their alignment: a quick turn moves everything alike, and a tenth of a millisecond finds shifts that templates cannot.
+their alignment. It finds the large shifts of a quick rotation, which template alignment cannot.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 
-_LEVEL = 3  # 94x60 px for 752x480: a shift of half the image is still found
-_LEAST_RESPONSE = 0.05  # of the correlation's peak: below it the two images have nothing in common
+_LEVEL = 3  # 94x60 px for 752x480: shifts of up to half the image are found
+_MIN_RESPONSE = 0.05  # height of the correlation peak; below it the two images have nothing in common
 
 
 class ImageShift:
-    """Keeps the small image of the last tracked frame, with its pose."""
+    """The small image of the last tracked frame, with its pose."""
 
     def __init__(self, camera: RectifiedCamera) -> None:
         self._camera = camera
         self._image: NDArray[np.uint8] | None = None
         self._T_c_m = np.eye(4)
-        self._window: NDArray[np.float32] | None = None
+        self._hanning: NDArray[np.float32] | None = None
 
     def remember(self, left: Pyramid, T_c_m: F64) -> None:
-        """A frame was tracked at T_c_m (4,4)."""
+        """Keep the image of a frame that was tracked at T_c_m (4,4)."""
         self._image, self._T_c_m = left[min(_LEVEL, len(left) - 1)], T_c_m
 
-    def guess(self, left: Pyramid) -> F64 | None:
-        """T_c_m (4,4) of a frame, as if all that moved in the image had been a turn; None where nothing matches."""
+    def rotated_pose(self, left: Pyramid) -> F64 | None:
+        """T_c_m (4,4) of a frame if its image shift is a pure rotation; None if the images do not match."""
         level = min(_LEVEL, len(left) - 1)
         if self._image is None or self._image.shape != left[level].shape:
             return None
-        if self._window is None:
+        if self._hanning is None:
             h, w = self._image.shape
-            self._window = np.asarray(cv2.createHanningWindow((w, h), cv2.CV_32F), np.float32)
+            self._hanning = np.asarray(cv2.createHanningWindow((w, h), cv2.CV_32F), np.float32)
         before, now = self._image.astype(np.float32), left[level].astype(np.float32)
-        (dx, dy), response = cv2.phaseCorrelate(before - before.mean(), now - now.mean(), self._window)
-        if response < _LEAST_RESPONSE:
+        (dx, dy), response = cv2.phaseCorrelate(before - before.mean(), now - now.mean(), self._hanning)
+        if response < _MIN_RESPONSE:
             return None
         scale = float(1 << level)
-        turn = se3.so3_exp(np.array([-dy * scale / self._camera.fy, dx * scale / self._camera.fx, 0.0]))
-        return se3.from_rt(turn, np.zeros(3)) @ self._T_c_m
+        rotation = se3.so3_exp(np.array([-dy * scale / self._camera.fy, dx * scale / self._camera.fx, 0.0]))
+        return se3.from_rt(rotation, np.zeros(3)) @ self._T_c_m

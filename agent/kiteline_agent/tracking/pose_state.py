@@ -1,4 +1,4 @@
-"""Where the camera is, in the submap and in the odometry frame, and how it moves."""
+"""Pose of the camera in the submap and in the odometry frame, and its constant-velocity motion."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 
-_UNEVEN = 0.2  # relative; frames whose distance in time differs less are taken as even
+_EVEN_SPACING = 0.2  # relative; frame intervals that differ by less count as equal
 
 
 class PoseState:
-    """The pose and the motion model; whatever moves the map leaves the odometry frame still.
+    """Camera pose and velocity. Whatever moves the map leaves the odometry frame still.
 
     T_m_c: (4,4) camera in the active submap. T_o_m: (4,4) submap in the odometry frame. velocity: (3,) m/s in m.
+    moves: True if the velocity was measured.
     """
 
     def __init__(self) -> None:
@@ -24,7 +25,7 @@ class PoseState:
         self.velocity: F64 = np.zeros(3)
         self.moves = False
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame
-        self._step_s = 0.0  # that the last motion took; 0: not known
+        self._step_s: float | None = None  # duration of that motion; None: not known
 
     @property
     def T_c_m(self) -> F64:
@@ -34,31 +35,31 @@ class PoseState:
     def predict(self, dt_s: float) -> F64:
         """T_m_c (4,4) after dt_s at constant velocity."""
         step = self._step_T
-        if self._step_s > 0.0 and abs(dt_s / self._step_s - 1.0) > _UNEVEN:  # frames are missing in between
+        if self._step_s is not None and abs(dt_s / self._step_s - 1.0) > _EVEN_SPACING:  # frames were skipped
             step = se3.exp(dt_s / self._step_s * se3.log(step))
         return se3.orthonormalise(self.T_m_c @ step)
 
     def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
-        """The camera moved to T_m_c (4,4) within dt_s. repeated: by an old image, that says nothing of motion."""
+        """Set a measured pose (4,4). dt_s: since the last one. repeated: from an old image, no motion is derived."""
         before, self.T_m_c = self.T_m_c, T_m_c
         if repeated:
             return
         self._step_T = se3.orthonormalise(se3.inverse(before) @ T_m_c)
-        self._step_s = dt_s
+        self._step_s = dt_s if dt_s > 0.0 else None
         if dt_s > 0.0:
             self.velocity = (T_m_c[:3, 3] - before[:3, 3]) / dt_s
             self.moves = True
 
-    def stand(self) -> None:
-        """Nothing is known of the motion: the next frame is looked for where this one was."""
+    def reset_motion(self) -> None:
+        """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
 
-    def go_on(self, step_T: F64, velocity: F64) -> None:
-        """The motion is known otherwise. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
+    def set_motion(self, step_T: F64, velocity: F64) -> None:
+        """Set the motion. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
         self._step_T, self.velocity, self.moves = step_T, velocity, True
 
     def move_map(self, T_m_c: F64) -> None:
-        """The map moved under the camera: its pose in m is T_m_c (4,4) now, that in o stays."""
+        """The map moved under the camera: set its pose in m to T_m_c (4,4), keep that in o."""
         T_o_c = self.T_o_m @ self.T_m_c
         change = T_m_c[:3, :3] @ self.T_m_c[:3, :3].T
         self.velocity = change @ self.velocity
@@ -66,21 +67,19 @@ class PoseState:
         self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
 
     def enter_submap(self) -> None:
-        """A new submap begins here; its axes are those of the odometry frame."""
+        """Begin a new submap here; its axes are those of the odometry frame."""
         self.T_m_c = self.T_o_m @ self.T_m_c
         self.T_o_m = np.eye(4)
 
     def rescale(self, metres: float) -> F64:
-        """A submap in metres begins where the camera is, one unit of the old one being so many. T_new_old (4,4), with
-        the old one's lengths in metres.
-        """
-        T_m_c = longer(self.T_m_c, metres)
+        """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""
+        T_m_c = scaled(self.T_m_c, metres)
         self.enter_submap()
         T_n_m = se3.orthonormalise(self.T_m_c @ se3.inverse(T_m_c))
-        self._step_T, self.velocity = longer(self._step_T, metres), metres * T_n_m[:3, :3] @ self.velocity
+        self._step_T, self.velocity = scaled(self._step_T, metres), metres * T_n_m[:3, :3] @ self.velocity
         return T_n_m
 
 
-def longer(T: F64, factor: float) -> F64:
+def scaled(T: F64, factor: float) -> F64:
     """T (4,4) with its translation multiplied by `factor`."""
     return se3.from_rt(T[:3, :3], T[:3, 3] * factor)

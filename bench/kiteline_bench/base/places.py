@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features
-from kiteline_agent.tracking.tracker import depth_at
+from kiteline_agent.tracking.frame_images import depth_at
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier

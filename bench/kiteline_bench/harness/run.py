@@ -64,7 +64,7 @@ class FlyingAgent:
         run.estimates.append(output.estimate)
         run.truth.append(item.T_w_b)
         run.events.append(output.events)
-        run.cached_keyframes = max(run.cached_keyframes, len(self.box.window))
+        run.cached_keyframes = max(run.cached_keyframes, len(self.box.map_cache))
         run.metric_submap = int(self.box.submap) if self.box.metric else None
         return output.packets
 

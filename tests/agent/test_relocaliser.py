@@ -254,7 +254,7 @@ def copy_map(agent: Agent, shift_m: np.ndarray) -> None:
             m.sigma_rho[slot, :n].copy(), m.octave[rows].copy(), m.angle[rows].copy(), m.descriptor[rows].copy(),
             m.templates[rows].copy(), 0,
         )  # fmt: skip
-        agent._recovery.remember(copy)
+        agent._relocaliser.add_keyframe(copy)
 
 
 def test_a_place_that_nothing_can_have_flown_to_is_not_believed(room: Recording, words: Vocabulary) -> None:

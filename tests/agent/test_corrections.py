@@ -37,7 +37,7 @@ def say(base: Corrections, T_w_first: NDArray[np.float64], T_first_young: NDArra
     records = [SubmapPlacement(FIRST, T_w_first)]
     if T_first_young is not None:
         records = [SubmapPlacement(YOUNG, T_w_first @ T_first_young), *records]
-    base.take(records, [], [])
+    base.take(records, [])
     return base.has_placed(YOUNG)
 
 
@@ -53,5 +53,5 @@ def test_a_base_that_takes_the_odometrys_word_has_placed_nothing(base: Correctio
 def test_a_submap_that_had_no_place_is_placed_where_it_is_recognised(base: Corrections) -> None:
     assert not say(base, np.eye(4), None)
     assert say(base, np.eye(4), FOUND)
-    base.take([], [Key(SubmapPlacement.KIND, int(YOUNG), 0)], [])
+    base.take([], [Key(SubmapPlacement.KIND, int(YOUNG), 0)])
     assert not base.has_placed(YOUNG)

@@ -1,0 +1,61 @@
+"""Corners that become the new landmarks of a keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.imaging import features
+from kiteline_agent.tracking.frame_images import FrameImages, depth_at
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.imaging import stereo_kernels
+
+F64 = NDArray[np.float64]
+
+_SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse search, whose step is 2 px
+
+
+@dataclass(frozen=True, slots=True)
+class NewPoints:
+    """New landmarks of a keyframe, strongest first.
+
+    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32).
+    cached_rho: (n,) 1/m, inverse depths of matched landmarks of the map cache, 0 none; or None.
+    """
+
+    uv: F64
+    disparity: F64
+    octave: NDArray[np.uint8]
+    angle: NDArray[np.uint8]
+    descriptor: NDArray[np.uint8]
+    cached_rho: F64 | None = None
+
+
+def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:
+    """Detect corners away from pixels `taken` (n,2); depth from the right image or the depth image where measurable."""
+    detector = config.detector
+    if images.first > detector.first:
+        detector = replace(detector, first=images.first)
+    corners = features.detect(images.left, taken, detector)
+    disparity = np.full(len(corners.uv), -1.0)
+    if images.right is not None:
+        stereo = config.stereo
+        widest = min(camera.bf / stereo.min_depth_m, 0.45 * camera.width)
+        stereo_kernels.search_rows(
+            images.left, images.right.coarse(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
+        )
+        found = np.zeros(len(disparity), np.bool_)
+        images.right.refine(images.left, corners.uv, corners.octave, found.copy(), stereo, _SEARCH_PX, disparity, found)
+        disparity[~found] = -1.0
+        disparity[disparity < camera.fx / config.local_map.max_far_ratio] = -1.0
+    elif images.depth_m is not None:
+        depth = depth_at(images.depth_m, corners.uv)
+        disparity = np.where(depth > 0.0, camera.bf / np.maximum(depth, 1e-3), -1.0)
+    # Corners with depth first: only they are tracked at once.
+    order = np.argsort(disparity < 0.0, kind="stable")[: config.local_map.births]
+    uv, octave = corners.uv[order], corners.octave[order]
+    angle, descriptor = features.describe(images.left, uv, octave)
+    return NewPoints(uv, disparity[order], octave, angle, descriptor)

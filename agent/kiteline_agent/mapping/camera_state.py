@@ -1,0 +1,159 @@
+"""Where the camera is: pose, motion, covariance, reference keyframe and submap, which change together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.covariance.pose_covariance import Certainty
+from kiteline_agent.inertial.gravity_alignment import Levelling
+from kiteline_agent.keyframes.reference import ReferenceKeyframe
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.mapping.submaps import Submaps
+from kiteline_agent.motion.motion_model import Inertia
+from kiteline_agent.relocalisation.relocaliser import Relocalisation
+from kiteline_agent.step import Identity
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.pose_state import PoseState
+from kiteline_agent.tracking.track import Track
+from kiteline_codec.schema import GravityAlignment
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraRig
+from kiteline_core.ids import SubmapId
+
+F64 = NDArray[np.float64]
+
+
+class CameraState:
+    """Owner of all that is known of the camera's pose. Each method is one event of a flight.
+
+    T_c_b: (4,4) body in the camera. T_o_first: (4,4) first submap in the odometry frame, as the camera left it last.
+    """
+
+    def __init__(
+        self, rig: CameraRig, imu: ImuCalibration | None, config: AgentConfig, identity: Identity, local_map: LocalMap
+    ) -> None:
+        camera = local_map.camera
+        has_depth = rig.right is not None or rig.has_depth
+        self._map = local_map
+        self.T_c_b = se3.inverse(camera.T_b_c)
+        self.T_o_first: F64 = np.eye(4)
+        self.pose = PoseState()
+        self.motion = Inertia(camera, imu, config.inertial, config.odometer, self.pose, metric=has_depth)
+        self.covariance = Certainty(
+            local_map, camera.T_b_c, config.certainty, has_body=rig.has_body, has_depth=has_depth
+        )  # fmt: skip
+        self.gravity = Levelling(
+            camera, self.motion.tracker, config.inertial.askew_rad, config.inertial.level_patience_s
+        )
+        self.reference = ReferenceKeyframe(local_map)
+        self.submaps = Submaps(identity)
+
+    @property
+    def T_m_b(self) -> F64:
+        """(4,4) body in the active submap."""
+        return self.pose.T_m_c @ self.T_c_b
+
+    # frames
+
+    def predict(self, t_ns: int, dt_s: float, imu: ImuBatch | None) -> F64:
+        """T_m_c (4,4) of the next frame: from the IMU, else an odometer, else the last motion."""
+        predicted = self.motion.predict(t_ns, imu, dt_s)
+        self.covariance.guide(self.motion.running)
+        return predicted
+
+    def is_consistent(self, ctx: FrameContext, T_c_m: F64, submap: SubmapId, *, relocalised: bool) -> bool:
+        """True if the camera can be at T_c_m (4,4) in a submap, by the motion since it was last measured there."""
+        return self.covariance.believes(
+            T_c_m, submap, ctx.T_m_c, self.pose, self.T_c_b, self.submaps.active, found=relocalised
+        )
+
+    def fuse(self, ctx: FrameContext, track: Track) -> tuple[Track, list[str]]:
+        """The track with the pose that images, IMU and odometer give together, and events."""
+        fused = self.motion.fuse(track, ctx.t_ns)
+        if self.motion.tracker is not None:
+            self.covariance.fused(track.T_c_m, fused.T_c_m)
+        return fused, self.motion.news()
+
+    def resume_after_loss(self, ctx: FrameContext, track: Track) -> None:
+        """Tracked again after a loss: the map moves by the error of the prediction, the odometry frame stays."""
+        self.pose.T_m_c = ctx.T_m_c
+        self.leave_map()
+        self.pose.move_map(track.T_m_c)
+
+    def set_measured(self, track: Track, dt_s: float, *, repeated: bool) -> None:
+        """Take over a measured pose. repeated: the image was an old one."""
+        self.pose.measured(track.T_m_c, dt_s, repeated=repeated)
+        self.covariance.measured(track)
+        self.reference.set_camera(self.pose.T_m_c)
+
+    def dead_reckon(self, ctx: FrameContext) -> bool:
+        """Take over the predicted pose of a frame without a measured one. True while IMU or odometer can be trusted."""
+        reckoned = self.motion.coast(ctx.T_m_c, ctx.t_ns)
+        self.pose.T_m_c = reckoned.T_m_c
+        self.reference.set_camera(self.pose.T_m_c)
+        self.covariance.blind(ctx.dt_s, reckoned.cov, moves=self.pose.moves)
+        return reckoned.trusted
+
+    def align_gravity(self, t_ns: int) -> GravityAlignment | None:
+        """Estimate the vertical; a record, once, if the first submap is tilted because it began in motion."""
+        return self.gravity.look(
+            t_ns, self.T_m_b, self.pose.T_o_m[:3, :3], self.submaps.active, first=self.submaps.opened == 1
+        )
+
+    # changes of the map under the camera; the odometry frame stays still
+
+    def leave_map(self) -> None:
+        """Carry the covariance over to the odometry frame, before the map changes under the camera."""
+        if self.submaps.active == self.submaps.first:
+            self.T_o_first = self.pose.T_o_m
+        self.covariance.carry(self.pose, self.T_c_b, self.submaps.active)
+
+    def move_map(self, T_m_c: F64) -> None:
+        """The map moved: the camera is at T_m_c (4,4) in it now."""
+        before = self.pose.T_m_c
+        self.pose.move_map(T_m_c)
+        self.motion.shift(se3.orthonormalise(self.pose.T_m_c @ se3.inverse(before)))
+        self.reference.set_camera(self.pose.T_m_c)
+
+    def follow_corrections(self) -> None:
+        """The base moved keyframes of the local map: move with the reference keyframe."""
+        T_m_k = self.reference.T_m_k
+        if T_m_k is not None:
+            self.move_map(T_m_k @ self.reference.T_k_c)
+            self.covariance.corrected(self.pose)
+
+    def return_to(self, found: Relocalisation, frame_number: int) -> None:
+        """Continue in the submap in which the frame was relocalised."""
+        self.leave_map()
+        self.submaps.return_to(found.submap)
+        self._map.activate(found.submap)
+        self.reference.return_to(found.keyframe, found.track.inliers, frame_number)
+        self.pose.move_map(se3.inverse(found.T_c_m))
+        self.reference.set_camera(self.pose.T_m_c)
+        self._map.note_tracking(found.track.rows, found.track.inlier, frame_number)
+        if found.from_cache:
+            self.covariance.met(found.keyframe, found.T_c_m, found.track.inliers)
+        else:
+            self.covariance.measured(found.track)
+        self.covariance.returned()
+
+    # new submaps
+
+    def set_first_pose(self, imu: ImuBatch | None) -> None:
+        """Set the camera where the flight begins: body at the origin, z up."""
+        self.pose.T_m_c = self.gravity.first_pose(imu)
+
+    def leave_submap(self) -> None:
+        """Leave the active submap for a new one that begins here."""
+        self.leave_map()
+        self.pose.enter_submap()
+
+    def open_submap(self) -> SubmapId:
+        """Open a submap at the present pose."""
+        self.covariance.begin(self.T_m_b)
+        submap = self.submaps.open_next()
+        self._map.activate(submap)
+        return submap

@@ -1,0 +1,102 @@
+"""Makes keyframes of frames, and enters them in all that reads keyframes."""
+
+from __future__ import annotations
+
+from numpy import float64
+from numpy.typing import NDArray
+
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.governor.governor import Extra, Governor
+from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.keyframes.new_landmarks import NewPoints
+from kiteline_agent.mapping.camera_state import CameraState
+from kiteline_agent.relocalisation.frame_features import features_of
+from kiteline_agent.relocalisation.map_cache import MapCache, with_depths
+from kiteline_agent.relocalisation.relocaliser import Relocaliser
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
+from kiteline_codec.channel import RecordChannel
+from kiteline_core.geometry import se3
+from kiteline_core.ids import KeyframeId
+
+F64 = NDArray[float64]
+
+
+class KeyframeStage:
+    """Keyframe policy, with what the link carries and CPU time allows, and the making of keyframes."""
+
+    def __init__(
+        self, camera: CameraState, maker: KeyframeMaker, cache: MapCache, relocaliser: Relocaliser, governor: Governor,
+        channel: RecordChannel, work: Work,
+    ) -> None:  # fmt: skip
+        self._camera = camera
+        self._maker = maker
+        self._cache = cache
+        self._relocaliser = relocaliser
+        self._governor = governor
+        self._channel = channel
+        self._work = work
+
+    def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Make a keyframe if the policy needs one, and link and CPU time allow it. Returns events."""
+        need = self._camera.reference.keyframe_need(ctx, track)
+        if need is None:
+            return []
+        urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
+        if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
+            return ["governor: keyframe put off"]
+        if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
+            return []
+        self.add(ctx, track)
+        return [f"keyframe: {need.rule}"]
+
+    def add(self, ctx: FrameContext, track: Track) -> None:
+        """Make a keyframe of a tracked frame, with new landmarks where the image has room."""
+        points = self._maker.points_beside(ctx, track)
+        if self._cache.covers(self._camera.submaps.active):
+            points = self._match_cached_landmarks(ctx, points)
+        self.make(ctx, track, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
+
+    def extend_map_by_dead_reckoning(self, ctx: FrameContext) -> tuple[bool, list[str]]:
+        """Make a keyframe without observations, where dead reckoning says that the camera is.
+
+        Returns whether the map goes on there, also if the keyframe has to wait for CPU time, and events.
+        """
+        limits = ctx.config.recovery
+        if not self._camera.covariance.blind_within(limits.carried_m, limits.carried_rad):
+            return False, []
+        if not self._governor.may(Extra.KEYFRAME, urgent=True):
+            return True, ["governor: keyframe put off"]
+        points = self._maker.first_points(ctx)
+        if points is None:
+            return False, []
+        self._camera.covariance.bridge(self._camera.T_m_b)
+        self.make(ctx, None, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
+        return True, ["keyframe: carried by the IMU"]
+
+    def make(self, ctx: FrameContext, track: Track | None, points: NewPoints, T_m_c: F64, kind: Extra) -> KeyframeId:
+        """Make a keyframe of a frame with the camera at T_m_c (4,4); it becomes the reference. track: see KeyframeMaker."""
+        reference, submap = self._camera.reference, self._camera.submaps.active
+        keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
+        T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k)
+        reference.set_new(keyframe, submap, se3.inverse(T_m_k) @ T_m_c, ctx.t_ns, ctx.number)
+        self._governor.note(kind)
+        self._relocaliser.add_keyframe(keyframe)
+        self._camera.covariance.remember(keyframe)
+        if ctx.images.right is not None and ctx.images.right.needs_rectification:
+            self._work.rectified_px += ctx.images.left[1].size
+        return keyframe
+
+    def _match_cached_landmarks(self, ctx: FrameContext, points: NewPoints) -> NewPoints:
+        """Give corners that match cached landmarks their depths, and move the map a little towards the cached one."""
+        pose, limits = self._camera.pose, ctx.config.window
+        matches = self._cache.match_landmarks(
+            pose.T_c_m, self._camera.submaps.active, features_of(points), limits.hold_radius_px
+        )
+        self._work.projected += len(self._cache) * limits.points
+        if matches is None:
+            return points
+        T_c_m = self._cache.corrected_pose(pose.T_c_m, matches)
+        if T_c_m is not None:
+            self._camera.move_map(se3.inverse(T_c_m))
+        return with_depths(points, matches)

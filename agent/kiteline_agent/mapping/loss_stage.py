@@ -1,0 +1,92 @@
+"""Handles a frame that was not tracked: dead reckoning, relocalisation, or a new submap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kiteline_agent.governor.governor import Extra, Governor
+from kiteline_agent.mapping.camera_state import CameraState
+from kiteline_agent.mapping.keyframe_stage import KeyframeStage
+from kiteline_agent.mapping.submap_stage import SubmapStage
+from kiteline_agent.relocalisation.relocaliser import Relocaliser
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
+
+
+@dataclass(frozen=True, slots=True)
+class FrameOutcome:
+    """How a frame was placed. tracked: it has a pose. bridged: by dead reckoning alone. inliers: of the images."""
+
+    tracked: bool
+    bridged: bool
+    inliers: int
+    events: list[str]
+
+
+class LossStage:
+    """Search for the map after a loss. failed_searches: since then, in frames with texture."""
+
+    def __init__(
+        self, camera: CameraState, keyframes: KeyframeStage, submaps: SubmapStage, relocaliser: Relocaliser,
+        governor: Governor, *, monocular: bool,
+    ) -> None:  # fmt: skip
+        self._camera = camera
+        self._keyframes = keyframes
+        self._submaps = submaps
+        self._relocaliser = relocaliser
+        self._governor = governor
+        self._monocular = monocular
+        self.failed_searches = 0
+
+    def end(self) -> None:
+        """A frame was tracked."""
+        self.failed_searches = 0
+
+    def handle(self, ctx: FrameContext, *, stuck: bool) -> FrameOutcome:
+        """Place a frame that was not tracked. stuck: its image is an old one."""
+        events: list[str] = []
+        # a. Dead reckoning places the camera, and extends the map while its covariance is small.
+        bridged = self._camera.dead_reckon(ctx)
+        if stuck:
+            return FrameOutcome(bridged, bridged, 0, events)
+        if bridged and not self._monocular:
+            extended, events = self._keyframes.extend_map_by_dead_reckoning(ctx)
+            if extended:
+                return FrameOutcome(True, True, 0, events)
+        # b. Relocalise in the remembered map.
+        track = self._relocalise(ctx, events)
+        placed = track is not None
+        # c. Open a new submap.
+        if not placed and self._submaps.may_open(ctx, self.failed_searches):
+            opened = self._submaps.open(ctx)
+            if opened is not None:
+                self.failed_searches = 0
+                placed = opened.placed
+                events += opened.events
+        if placed:
+            self._camera.motion.restart(ctx.t_ns)
+            bridged = False
+        return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events)
+
+    def _relocalise(self, ctx: FrameContext, events: list[str]) -> Track | None:
+        """Search the remembered map; if the frame is found, continue there, with a keyframe. Adds to `events`."""
+        camera = self._camera
+        if not camera.submaps.any:
+            return None
+        if not self._governor.may(Extra.SEARCH):
+            events.append("governor: search put off")
+            self.failed_searches = max(self.failed_searches, 1)
+            return None
+        found = self._relocaliser.relocalise(ctx, camera.reference.keyframe)
+        if found is None:
+            self.failed_searches += self._relocaliser.has_texture
+            return None
+        camera.return_to(found, ctx.number)
+        camera.pose.reset_motion()
+        self.failed_searches = 0
+        events.append("recovered by copies" if found.from_cache else "recovered")
+        if found.from_cache:  # none of its landmarks is in the local map yet
+            self._keyframes.add(ctx, found.track)
+        else:
+            events += self._keyframes.add_if_needed(ctx, found.track)
+        return found.track

@@ -1,0 +1,163 @@
+"""Opens submaps, joins new ones to older ones, and restarts monocular ones in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kiteline_agent.exchange.corrections import Corrections
+from kiteline_agent.governor.governor import Extra, Governor
+from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
+from kiteline_agent.initialisation.two_view_start import TwoViewStart
+from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
+from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.mapping.camera_state import CameraState
+from kiteline_agent.mapping.keyframe_stage import KeyframeStage
+from kiteline_agent.relocalisation.relocaliser import Relocaliser
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
+from kiteline_agent.tracking.tracker import Tracker
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import SubmapScale
+from kiteline_core.geometry import se3
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedSubmap:
+    """A new submap. placed: the frame has a pose in it."""
+
+    placed: bool
+    events: list[str]
+
+
+class SubmapStage:
+    """Changes of the active submap. two_view_start: None with stereo or a depth camera."""
+
+    def __init__(
+        self, camera: CameraState, local_map: LocalMap, tracker: Tracker, maker: KeyframeMaker,
+        keyframes: KeyframeStage, relocaliser: Relocaliser, depth: DepthFromMotion, two_view_start: TwoViewStart | None,
+        corrections: Corrections, governor: Governor, channel: RecordChannel,
+    ) -> None:  # fmt: skip
+        self._camera = camera
+        self._map = local_map
+        self._tracker = tracker
+        self._maker = maker
+        self._keyframes = keyframes
+        self._relocaliser = relocaliser
+        self._depth = depth
+        self._two_view_start = two_view_start
+        self._corrections = corrections
+        self._governor = governor
+        self._channel = channel
+
+    def may_open(self, ctx: FrameContext, failed_searches: int) -> bool:
+        """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
+        submaps = self._camera.submaps
+        if not submaps.any:
+            return True
+        tried = failed_searches >= ctx.config.recovery.failures
+        return tried and submaps.room and self._governor.may(Extra.SUBMAP)
+
+    def open(self, ctx: FrameContext) -> OpenedSubmap | None:
+        """Begin a submap with this frame; None if it shows too little."""
+        if self._two_view_start is not None:
+            return self._open_from_two_views(ctx, self._two_view_start)
+        points = self._maker.first_points(ctx)
+        if points is None:
+            return None
+        camera = self._camera
+        first = not camera.submaps.any
+        if first:
+            camera.set_first_pose(ctx.imu)
+        else:
+            camera.leave_submap()
+            self._relocaliser.start_joining(ctx.number)
+        submap = camera.open_submap()
+        camera.pose.reset_motion()
+        self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)
+        if not first:
+            self._corrections.begins(submap, se3.inverse(camera.T_o_first))
+        return OpenedSubmap(True, ["submap: opened"])
+
+    def _open_from_two_views(self, ctx: FrameContext, start: TwoViewStart) -> OpenedSubmap | None:
+        """Begin a monocular submap: its first keyframe is an earlier frame, the second one this frame.
+
+        It is not joined to older ones, since their scales differ.
+        """
+        camera = self._camera
+        if ctx.number == 1:
+            camera.set_first_pose(ctx.imu)  # the camera moves from here on
+        two_views = start.add(ctx)
+        if two_views is None:
+            return None
+        if camera.submaps.any:
+            camera.leave_submap()
+        events = [
+            "submap: opened",
+            f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m",
+        ]
+        camera.motion.forget_unit()
+        camera.open_submap()
+        camera.pose.reset_motion()
+        # The second view stays where the camera was predicted, which places the first one.
+        T_m_a = camera.pose.T_m_c @ se3.inverse(two_views.T_a_b)
+        before = replace(ctx, images=two_views.images, t_ns=two_views.t_ns)
+        keyframe = self._keyframes.make(before, None, two_views.points, T_m_a, Extra.SUBMAP)
+        camera.reference.set_camera(camera.pose.T_m_c)
+        two_views.set_sigma(self._map, keyframe, ctx.config.align.sigma_px)
+        track = self._tracker.track(ctx, camera.pose.T_c_m)
+        if track.inliers < ctx.config.pose.min_inliers:
+            return OpenedSubmap(False, events)
+        camera.set_measured(track, 0.0, repeated=ctx.repeated)
+        start.note_depths(track.depth_m[track.inlier])
+        self._depth.update_landmarks(ctx, track)
+        dt_s = (ctx.t_ns - two_views.t_ns) * 1e-9
+        velocity = (camera.pose.T_m_c[:3, 3] - T_m_a[:3, 3]) / dt_s if dt_s > 0.0 else np.zeros(3)
+        camera.pose.set_motion(se3.exp(se3.log(two_views.T_a_b) / two_views.frames), velocity)
+        self._keyframes.add(ctx, track)
+        return OpenedSubmap(True, events)
+
+    def join_older(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Search the older submaps beside a new one; if one is found, make a keyframe in both and continue in the old.
+
+        Returns events.
+        """
+        found = self._relocaliser.find_older_submap(ctx, self._camera.pose.T_m_c)
+        if found is None:
+            return []
+        self._map.note_tracking(found.track.rows, found.track.inlier, ctx.number)
+        if not self._camera.reference.is_of(ctx.number):
+            self._keyframes.add(ctx, track)
+        self._camera.return_to(found, ctx.number)
+        self._camera.motion.restart(ctx.t_ns)
+        self._keyframes.add(ctx, found.track)
+        return ["submap: joined to an older one"]
+
+    def restart_in_metres(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Continue a monocular map in a new submap in metres, once IMU or odometer tell its scale. Returns events."""
+        limits, camera = ctx.config.mono_start, self._camera
+        if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
+            return []
+        unit_m = camera.motion.unit_m(limits.scale_sigma)
+        if unit_m is None:
+            return []
+        metric = metric_points(ctx, track, self._map, unit_m)
+        if len(metric.sigma_rho) < ctx.config.local_map.first_points:
+            return []
+        self._restart(ctx, unit_m, metric)
+        self._two_view_start.rescale(unit_m)
+        return [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
+
+    def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> None:
+        camera = self._camera
+        camera.leave_map()
+        self._channel.put(SubmapScale(camera.submaps.active, unit_m))
+        T_new_old = camera.pose.rescale(unit_m)
+        self._map.drop_submap(camera.submaps.active)
+        submap = camera.open_submap()
+        keyframe = self._keyframes.make(ctx, None, metric.points, camera.pose.T_m_c, Extra.SUBMAP)
+        metric.set_sigma(self._map, keyframe)
+        self._channel.put(SubmapScale(submap, 1.0))
+        camera.motion.begin_metres(unit_m, T_new_old)

@@ -1,0 +1,43 @@
+"""Corners and descriptors of a whole frame, to match it with keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.imaging import features
+from kiteline_agent.imaging.features import DetectorConfig
+from kiteline_agent.keyframes.new_landmarks import NewPoints
+from kiteline_agent.tracking.frame_images import FrameImages
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFeatures:
+    """Corners of a frame. uv: (n,2) px. disparity: (n,) px, < 0 none. octave, angle: (n,). descriptor: (n,32)."""
+
+    uv: F64
+    disparity: F64
+    octave: U8
+    angle: U8
+    descriptor: U8
+
+
+def frame_features(images: FrameImages, detector: DetectorConfig, min_corners: int) -> FrameFeatures | None:
+    """Detect and describe corners; None if the image has too few."""
+    corners = features.detect(
+        images.left, np.zeros((0, 2)), replace(detector, first=max(detector.first, images.first))
+    )  # fmt: skip
+    if len(corners.uv) < min_corners:
+        return None
+    angle, descriptor = features.describe(images.left, corners.uv, corners.octave)
+    return FrameFeatures(corners.uv, np.full(len(corners.uv), -1.0), corners.octave, angle, descriptor)
+
+
+def features_of(points: NewPoints) -> FrameFeatures:
+    """The corners of a keyframe that is being made."""
+    return FrameFeatures(points.uv, points.disparity, points.octave, points.angle, points.descriptor)
