@@ -1,45 +1,45 @@
-"""Maps in the hands of people and other programs: list, get, name, merge, split, delete. JSON in, JSON out.
+"""Commands of users and other programs on maps: list, get, name, merge, split, delete. JSON in, JSON out.
 
-A command is an input of the mapper's step like any other, logged and replayed with it; see docs/how-to/manage-maps.md.
-A submap is called AGENT.BOOT.NUMBER; a map by its eldest submap, any other of its submaps, or its name.
+A command is an input of the mapper's step, logged and replayed with it; see docs/how-to/manage-maps.md. A submap is named
+AGENT.BOOT.NUMBER; a map by any of its submaps, or by a name that a user gave it.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kiteline_basestation.store.state import matrix, similarity_of
+from kiteline_basestation.intake.intake import Intake
+from kiteline_basestation.map.matrices import numbers_of, similarity_from
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.map_merger import MapMerger
+from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import (
     BOOT_BITS,
     KEYPOINT_BITS,
     SEQUENCE_BITS,
     SUBMAP_BITS,
-    KeyframeId,
     SubmapId,
-    agent_of_keyframe,
     agent_of_submap,
     submap_id,
+    submap_of_keyframe,
 )
 
-if TYPE_CHECKING:
-    from kiteline_basestation.mapper import Mapper
-    from kiteline_basestation.merging.map_merger import MapMerger
-
 _NAME_CHARS = 64
-_FLIES_NS = 10_000_000_000  # ns after its last word that an agent counts as flying: its map is not deleted
+_FLYING_NS = 10_000_000_000  # ns after its last contact during which an agent counts as flying
 
 Json = Any
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One question or order. id: chosen by whoever asks. verb: one of VERBS. text: a JSON object."""
+    """A command. id: chosen by the sender. verb: one of VERBS. text: a JSON object with its arguments."""
 
     id: int
     verb: str
@@ -48,7 +48,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of it. text: a JSON object; where the command could not be carried out, {"error": …}."""
+    """The answer to a command. text: a JSON object; {"error": ...} if it was refused."""
 
     id: int
     ok: bool
@@ -59,146 +59,192 @@ class _Refused(Exception):
     """A command that cannot be carried out."""
 
 
-def answer(mapper: Mapper, command: Command, now_ns: int) -> Answer:
-    """Carry a command out, or say why not."""
-    try:
-        verb = VERBS.get(command.verb)
-        if verb is None:
-            raise _Refused(f"no command {command.verb!r}; there are: {', '.join(VERBS)}")
-        try:
-            given = json.loads(command.text or "{}")
-        except ValueError as error:
-            raise _Refused(f"{command.text[:80]!r} is no JSON") from error
-        if not isinstance(given, dict):
-            raise _Refused("expected a JSON object")
-        allowed = _KEYS[command.verb]
-        if unknown := sorted(given.keys() - set(allowed)):
-            raise _Refused(f"unknown key {unknown[0]!r}; {command.verb} takes: {', '.join(allowed) or 'nothing'}")
-        return Answer(command.id, True, json.dumps(verb(mapper, given, now_ns)))
-    except _Refused as error:
-        return Answer(command.id, False, json.dumps({"error": str(error)}))
-
-
-def called(submap: SubmapId) -> str:
-    """A submap's name for people: AGENT.BOOT.NUMBER."""
+def submap_name(submap: SubmapId) -> str:
+    """AGENT.BOOT.NUMBER of a submap."""
     boot, number = submap >> SUBMAP_BITS & (1 << BOOT_BITS) - 1, submap & (1 << SUBMAP_BITS) - 1
     return f"{agent_of_submap(submap)}.{boot}.{number}"
 
 
-# -- verbs -------------------------------------------------------------------------------------------------------------
+class MapManager:
+    """Answers commands. names, placements: those of the mapper. delete: drops submaps from all of the mapper."""
 
+    def __init__(
+        self, sparse_map: SparseMap, names: dict[SubmapId, str], placements: Mapping[SubmapId, NDArray[np.float64]],
+        intake: Intake, merger: MapMerger | None, delete: Callable[[Collection[SubmapId]], None],
+    ) -> None:  # fmt: skip
+        self._map = sparse_map
+        self._names = names
+        self._placements = placements
+        self._intake = intake
+        self._merger = merger
+        self._delete_submaps = delete
 
-def _list(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    points = _points(mapper)
-    return {"maps": [_overview(mapper, map_id, points) for map_id in _map_ids(mapper)]}
+    def answer(self, command: Command, now_ns: int) -> tuple[Answer, MergeResult]:
+        """Carry a command out, or refuse it with a reason. Returns what it changed in whole maps as well."""
+        try:
+            if command.verb not in VERBS:
+                raise _Refused(f"no command {command.verb!r}; there are: {', '.join(VERBS)}")
+            verb, allowed = VERBS[command.verb]
+            try:
+                given = json.loads(command.text or "{}")
+            except ValueError as error:
+                raise _Refused(f"{command.text[:80]!r} is no JSON") from error
+            if not isinstance(given, dict):
+                raise _Refused("expected a JSON object")
+            if unknown := sorted(given.keys() - set(allowed)):
+                raise _Refused(f"unknown key {unknown[0]!r}; {command.verb} takes: {', '.join(allowed) or 'nothing'}")
+            out, changes = verb(self, given, now_ns)
+            return Answer(command.id, True, json.dumps(out)), changes
+        except _Refused as error:
+            return Answer(command.id, False, json.dumps({"error": str(error)})), NOTHING
 
+    # -- verbs: arguments and the time in ns -> JSON value, changes ----------------------------------------------------
 
-def _get(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    map_id = _map(mapper, given, "map")
-    out = _overview(mapper, map_id, _points(mapper))
-    for submap, told in zip(mapper.map.submaps_of_map(map_id), out["submaps"], strict=True):
-        told["T_map_m"] = matrix(sim3.inverse(mapper.map.submap_pose(map_id)) @ mapper.map.submap_pose(submap))
-        told["poses"] = [
-            {"id": int(k), "t_ns": int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]), "T_m_k": matrix(pose)}
-            for k in mapper.map.submaps[submap]
-            if (pose := mapper.map.pose(k)) is not None
-        ]
-    return out
+    def _list(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
+        points = self._landmark_counts()
+        maps = sorted({self._map.map_id(s) for s in self._map.submaps if s not in self._intake.deleted})
+        return {"maps": [self._overview(map_id, points) for map_id in maps]}, NOTHING
 
+    def _get(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
+        map_id = self._named_map(given, "map")
+        out = self._overview(map_id, self._landmark_counts())
+        for submap, entry in zip(self._map.submaps_of_map(map_id), out["submaps"], strict=True):
+            entry["T_map_m"] = numbers_of(sim3.inverse(self._map.submap_pose(map_id)) @ self._map.submap_pose(submap))
+            entry["poses"] = [
+                {"id": int(k), "t_ns": int(self._map.keyframes.t_ns[self._map.rows[k]]), "T_m_k": numbers_of(pose)}
+                for k in self._map.submaps[submap]
+                if (pose := self._map.pose(k)) is not None
+            ]
+        return out, NOTHING
 
-def _name(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    map_id, name = _map(mapper, given, "map"), given.get("name")
-    if not isinstance(name, str) or not name.isprintable() or len(name) > _NAME_CHARS:
-        raise _Refused(f'"name" is a text of at most {_NAME_CHARS} printable characters; "" takes it back')
-    others = {text for s, text in mapper.names.items() if s != map_id}
-    if name in others or _parsed(name) is not None:
-        raise _Refused(f"{name!r} is taken: names and ids of maps are told apart")
-    mapper.names.pop(map_id, None)
-    if name:
-        mapper.names[map_id] = name
-    return _overview(mapper, map_id, _points(mapper))
+    def _name(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
+        map_id, name = self._named_map(given, "map"), given.get("name")
+        if not isinstance(name, str) or not name.isprintable() or len(name) > _NAME_CHARS:
+            raise _Refused(f'"name" is a text of at most {_NAME_CHARS} printable characters; "" removes the name')
+        others = {text for s, text in self._names.items() if s != map_id}
+        if name in others or _parsed(name) is not None:
+            raise _Refused(f"{name!r} is taken: no two maps have one name, and no name looks like an id")
+        self._names.pop(map_id, None)
+        if name:
+            self._names[map_id] = name
+        return self._overview(map_id, self._landmark_counts()), NOTHING
 
+    def _merge(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
+        merger = self._required_merger()
+        into, other = self._named_map(given, "into"), self._named_map(given, "map")
+        if into == other:
+            raise _Refused("these are one map already")
+        if merger.is_busy(into) or merger.is_busy(other):
+            raise _Refused("one of the two is being corrected; try again in a moment")
+        if "T_into_map" not in given:
+            merger.search_overlap(other, into)
+            count = sum(len(self._map.submaps[s]) for s in self._map.submaps_of_map(other))
+            return {"merged": False, "looking": count}, NOTHING
+        try:
+            S = similarity_from(given["T_into_map"])
+        except (TypeError, ValueError) as error:
+            raise _Refused(
+                '"T_into_map" is a rigid motion, or a similarity for a monocular map: 16 numbers, rows of a 4x4 matrix'
+            ) from error
+        if sim3.scale_of(S) != 1.0 and not self._map.is_up_to_scale(other):
+            raise _Refused(f"{submap_name(other)} is in metres: it is merged without a scale")
+        into_pose, other_pose = self._map.submap_pose(into), self._map.submap_pose(other)
+        changes = merger.merge(other, into, sim3.normalise(into_pose @ S @ sim3.inverse(other_pose)))
+        return {"merged": True, **self._overview(into, self._landmark_counts())}, changes
 
-def _merge(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    merger = _merger(mapper)
-    into, other = _map(mapper, given, "into"), _map(mapper, given, "map")
-    if into == other:
-        raise _Refused("these are one map already")
-    if merger.busy_with(into) or merger.busy_with(other):
-        raise _Refused("one of the two is being corrected just now; ask again in a moment")
-    if "T_into_map" not in given:
-        merger.look_for(other, into)
+    def _split(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
+        merger = self._required_merger()
+        submap = self._named_submap(given, "map")
+        map_id = self._map.map_id(submap)
+        changes = merger.split(submap)
+        if changes is None:
+            raise _Refused(f"{submap_name(submap)} was not merged into another map: there is nothing to be undone")
+        points = self._landmark_counts()
+        return {"maps": [self._overview(m, points) for m in (map_id, self._map.map_id(submap))]}, changes
+
+    def _delete(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
+        submaps = self._map.submaps_of_map(self._named_map(given, "map"))
+        for submap in submaps:
+            agent = agent_of_submap(submap)
+            live = self._intake.live.get(agent)
+            inside = live is not None and submap_of_keyframe(live.keyframe) == submap
+            contact_ns = self._intake.last_contact_ns.get(agent) if inside else None
+            if contact_ns is not None and now_ns - contact_ns < _FLYING_NS:
+                raise _Refused(f"agent {agent} flies in {submap_name(submap)} now; land it first")
+        self._delete_submaps(submaps)
+        return {"deleted": [submap_name(s) for s in submaps]}, NOTHING
+
+    # -- arguments and overviews ---------------------------------------------------------------------------------------
+
+    def _required_merger(self) -> MapMerger:
+        if self._merger is None:
+            raise _Refused("this base merges no maps: gtsam is not installed, or [base.loops] enabled is false")
+        return self._merger
+
+    def _named_submap(self, given: Mapping[str, Json], key: str) -> SubmapId:
+        text = given.get(key)
+        if not isinstance(text, str):
+            raise _Refused(f'"{key}" is missing: the id or the name of a map')
+        found = _parsed(text)
+        if found is None:
+            found = next((s for s, name in self._names.items() if name == text), None)
+        if found is None or found not in self._map.submaps or found in self._intake.deleted:
+            raise _Refused(f"no map {text!r}; `list` names all maps")
+        return found
+
+    def _named_map(self, given: Mapping[str, Json], key: str) -> SubmapId:
+        return self._map.map_id(self._named_submap(given, key))
+
+    def _landmark_counts(self) -> dict[int, int]:
+        """Number of live landmarks by submap."""
+        anchors = self._map.landmark_ids(self._map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS)
+        submaps, counts = np.unique(anchors, return_counts=True)
+        return dict(zip(submaps.tolist(), counts.tolist(), strict=True))
+
+    def _overview(self, map_id: SubmapId, points: Mapping[int, int]) -> Json:
+        submaps: list[dict[str, Json]] = []
+        for submap in self._map.submaps_of_map(map_id):
+            keyframes = self._map.submaps[submap]
+            stamps = [int(self._map.keyframes.t_ns[self._map.rows[k]]) for k in keyframes]
+            submaps.append(
+                {
+                    "id": submap_name(submap),
+                    "agent": int(agent_of_submap(submap)),
+                    "keyframes": len(keyframes),
+                    "points": points.get(submap, 0),
+                    "first_t_ns": min(stamps),
+                    "last_t_ns": max(stamps),
+                    "unit": "own" if self._map.is_up_to_scale(submap) else "metre",
+                    "scale": self._map.scale(submap),
+                    "T_w_m": numbers_of(self._placements.get(submap)),
+                }
+            )
         return {
-            "merged": False,
-            "looking": len([k for s in mapper.map.submaps_of_map(other) for k in mapper.map.submaps[s]]),
+            "id": submap_name(map_id),
+            "name": self._names.get(map_id, ""),
+            "placed": map_id in self._placements,
+            "unit": "own" if self._map.is_up_to_scale(map_id) else "metre",
+            "agents": sorted({s["agent"] for s in submaps}),
+            "keyframes": sum(s["keyframes"] for s in submaps),
+            "points": sum(s["points"] for s in submaps),
+            "submaps": submaps,
         }
-    try:
-        S = similarity_of(given["T_into_map"])
-    except (TypeError, ValueError) as error:
-        raise _Refused(
-            '"T_into_map" is a rigid motion, or with a scale where one eye mapped: 16 numbers, the rows of a 4x4 matrix'
-        ) from error
-    if sim3.scale_of(S) != 1.0 and not mapper.map.is_up_to_scale(other):
-        raise _Refused(f"{called(other)} is in metres: it is laid into another map as long as it is")
-    frames = mapper.map.submap_pose(into), mapper.map.submap_pose(other)
-    merger.join(other, into, sim3.normalise(frames[0] @ S @ sim3.inverse(frames[1])))
-    return {"merged": True, **_overview(mapper, into, _points(mapper))}
 
 
-def _split(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    merger = _merger(mapper)
-    submap = _submap(mapper, given, "map")
-    map_id = mapper.map.map_id(submap)
-    if not merger.split(submap):
-        raise _Refused(f"{called(submap)} was not merged into another map: there is nothing to be undone")
-    apart = mapper.map.map_id(submap)
-    points = _points(mapper)
-    return {"maps": [_overview(mapper, s, points) for s in (map_id, apart)]}
-
-
-def _delete(mapper: Mapper, given: Mapping[str, Json], now_ns: int) -> Json:
-    map_id = _map(mapper, given, "map")
-    submaps = mapper.map.submaps_of_map(map_id)
-    for submap in submaps:
-        last_contact_ns = mapper.last_contact_ns(submap)
-        if last_contact_ns is not None and now_ns - last_contact_ns < _FLIES_NS:
-            raise _Refused(f"agent {agent_of_submap(submap)} flies in {called(submap)} now; land it first")
-    mapper.delete(submaps)
-    return {"deleted": [called(s) for s in submaps]}
-
-
-VERBS: dict[str, Callable[[Mapper, Mapping[str, Json], int], Json]] = {
-    "list": _list,
-    "get": _get,
-    "name": _name,
-    "merge": _merge,
-    "split": _split,
-    "delete": _delete,
+_Verb = Callable[[MapManager, Mapping[str, Json], int], tuple[Json, MergeResult]]
+# Verbs, and the keys that each takes.
+VERBS: dict[str, tuple[_Verb, tuple[str, ...]]] = {
+    "list": (MapManager._list, ()),
+    "get": (MapManager._get, ("map",)),
+    "name": (MapManager._name, ("map", "name")),
+    "merge": (MapManager._merge, ("map", "into", "T_into_map")),
+    "split": (MapManager._split, ("map",)),
+    "delete": (MapManager._delete, ("map",)),
 }
-_KEYS: dict[str, tuple[str, ...]] = {
-    "list": (),
-    "get": ("map",),
-    "name": ("map", "name"),
-    "merge": ("map", "into", "T_into_map"),
-    "split": ("map",),
-    "delete": ("map",),
-}
-
-
-# -- what they share ---------------------------------------------------------------------------------------------------
-
-
-def _map_ids(mapper: Mapper) -> list[SubmapId]:
-    return sorted({mapper.map.map_id(s) for s in mapper.map.submaps if s not in mapper.deleted})
-
-
-def _merger(mapper: Mapper) -> MapMerger:
-    if mapper.merger is None:
-        raise _Refused("this base joins no maps: gtsam is not installed, or [base.loops] enabled is false")
-    return mapper.merger
 
 
 def _parsed(text: str) -> SubmapId | None:
+    """The submap of AGENT.BOOT.NUMBER; None for any other text."""
     parts = text.split(".")
     if len(parts) != 3 or not all(part.isdecimal() for part in parts):
         return None
@@ -206,57 +252,3 @@ def _parsed(text: str) -> SubmapId | None:
         return submap_id(*(int(part) for part in parts))
     except ValueError:
         return None
-
-
-def _submap(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
-    text = given.get(key)
-    if not isinstance(text, str):
-        raise _Refused(f'"{key}" is missing: the id or the name of a map')
-    found = _parsed(text)
-    if found is None:
-        found = next((s for s, name in mapper.names.items() if name == text), None)
-    if found is None or found not in mapper.map.submaps or found in mapper.deleted:
-        raise _Refused(f"no map {text!r}; `list` tells what there is")
-    return found
-
-
-def _map(mapper: Mapper, given: Mapping[str, Json], key: str) -> SubmapId:
-    return mapper.map.map_id(_submap(mapper, given, key))
-
-
-def _points(mapper: Mapper) -> dict[int, int]:
-    """How many live points each submap has."""
-    born = mapper.map.landmark_ids(mapper.map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS)
-    submaps, counts = np.unique(born, return_counts=True)
-    return dict(zip(submaps.tolist(), counts.tolist(), strict=True))
-
-
-def _overview(mapper: Mapper, map_id: SubmapId, points: Mapping[int, int]) -> Json:
-    submaps = mapper.map.submaps_of_map(map_id)
-    told: list[dict[str, Json]] = []
-    for submap in submaps:
-        keyframes = mapper.map.submaps[submap]
-        stamps = [int(mapper.map.keyframes.t_ns[mapper.map.rows[k]]) for k in keyframes]
-        told.append(
-            {
-                "id": called(submap),
-                "agent": int(agent_of_keyframe(KeyframeId(keyframes[0]))),
-                "keyframes": len(keyframes),
-                "points": points.get(submap, 0),
-                "first_t_ns": min(stamps),
-                "last_t_ns": max(stamps),
-                "unit": "own" if mapper.map.is_up_to_scale(submap) else "metre",
-                "scale": mapper.map.scale(submap),
-                "T_w_m": matrix(mapper.placements.get(submap)),
-            }
-        )
-    return {
-        "id": called(map_id),
-        "name": mapper.names.get(map_id, ""),
-        "placed": map_id in mapper.placements,
-        "unit": "own" if mapper.map.is_up_to_scale(map_id) else "metre",
-        "agents": sorted({s["agent"] for s in told}),
-        "keyframes": sum(s["keyframes"] for s in told),
-        "points": sum(s["points"] for s in told),
-        "submaps": told,
-    }

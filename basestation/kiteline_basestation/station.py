@@ -1,4 +1,4 @@
-"""The mapper with one channel to each agent: packets in, packets out."""
+"""The station: the mapper with one channel to each agent. Packets enter, packets leave."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kiteline_core.places.place_index import Vocabulary
 
 @dataclass(frozen=True, slots=True)
 class Import:
-    """Values of an agent that came by another way than the link: out of its log."""
+    """Values of an agent that were read from its log instead of received."""
 
     agent: AgentId
     codes: tuple[tuple[Key, bytes], ...]
@@ -26,7 +26,7 @@ class Import:
 
 @dataclass(frozen=True, slots=True)
 class StationOutput:
-    """Packets for each agent, in order of agent id, the work to be done elsewhere, and answers to commands."""
+    """Packets for each agent, in order of agent id, jobs to be run, and answers to commands."""
 
     packets: tuple[tuple[AgentId, tuple[bytes, ...]], ...]
     jobs: tuple[Job, ...]
@@ -34,16 +34,16 @@ class StationOutput:
 
 
 class Station:
-    """The base as a state machine over packets. `open_channel` makes our end of the channel to an agent."""
+    """The base as a state machine over packets. `open_channel` makes the base's end of the channel to an agent."""
 
     def __init__(
-        self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], words: Vocabulary | None = None
+        self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], vocabulary: Vocabulary | None = None
     ) -> None:  # fmt: skip
-        self.mapper = Mapper(config, words)
+        self.mapper = Mapper(config, vocabulary)
         self.supply = MapCachePlanner(config.supply, config.loops, self.mapper.map)
         self.channels: dict[AgentId, RecordChannel] = {}
-        self.touched: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `note_changes`
-        self.unreadable = 0  # imported values whose code was no valid record
+        self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
+        self.unreadable = 0  # imported values whose code is no valid record
         self._open_channel = open_channel
 
     def join(self, agent: AgentId) -> RecordChannel:
@@ -52,11 +52,12 @@ class Station:
             self.channels[agent] = self._open_channel(agent)
         return self.channels[agent]
 
-    def note_changes(self) -> None:
-        """From here on note in `touched` which values change: (agent, whether it is ours, key); with its code where no
-        channel holds it.
+    def track_changes(self) -> None:
+        """From now on collect in `changed` which values change: (agent, True if the base wrote it, key).
+
+        The code is None where a channel holds it.
         """
-        self.touched = {}
+        self.changed = {}
 
     def step(
         self,
@@ -65,7 +66,7 @@ class Station:
         now_ns: int,
         orders: Sequence[Import | Command] = (),
     ) -> StationOutput:
-        """Take in packets, finished jobs and orders; every agent that ever joined is served, in order of id."""
+        """Take in packets, finished jobs and orders; serve every agent that ever joined, in order of id."""
         for agent in sorted(packets):
             self.join(agent)
         arrivals = [
@@ -73,31 +74,31 @@ class Station:
             for agent, channel in sorted(self.channels.items())
         ]
         for agent, records in arrivals:
-            self._note(agent, False, records)
+            self._track(agent, False, records)
         arrivals += [(order.agent, self._imported(order)) for order in orders if isinstance(order, Import)]
         commands = tuple(order for order in orders if isinstance(order, Command))
         output = self.mapper.step(MapperInput(tuple(arrivals), tuple(done), commands), now_ns)
         for agent, records in output.publish:
             channel = self.join(agent)
             for record in records:
-                self.mapper.adopt(channel.put(record))  # from here on we compute with what the agent will hold
-            self._note(agent, True, records)
+                self.mapper.adopt(channel.put(record))  # the base computes on with what the agent will hold
+            self._track(agent, True, records)
         for agent, key in output.withdrawn:
             self.join(agent).remove(key)
-            if self.touched is not None:
-                self.touched[agent, True, key] = None
+            if self.changed is not None:
+                self.changed[agent, True, key] = None
         for agent, channel in sorted(self.channels.items()):
             self.supply.serve(agent, self.mapper.live(agent), channel, now_ns)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))
         return StationOutput(sent, output.jobs, output.answers)
 
-    def _note(self, agent: AgentId, ours: bool, records: Sequence[Record]) -> None:
-        if self.touched is not None:
+    def _track(self, agent: AgentId, own: bool, records: Sequence[Record]) -> None:
+        if self.changed is not None:
             for record in records:
-                self.touched[agent, ours, messages.key(record)] = None
+                self.changed[agent, own, messages.key(record)] = None
 
     def _imported(self, order: Import) -> tuple[Record, ...]:
-        """The records that are not here yet."""
+        """The records of an import that are not here yet."""
         channel = self.join(order.agent)
         records = []
         for key, code in order.codes:
@@ -108,6 +109,6 @@ class Station:
             except WireError:
                 self.unreadable += 1
                 continue
-            if self.touched is not None:
-                self.touched[order.agent, False, key] = code
+            if self.changed is not None:
+                self.changed[order.agent, False, key] = code
         return tuple(records)

@@ -13,7 +13,7 @@ import pytest
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store import keeper as keeper_module
-from kiteline_basestation.store.keeper import KEEP_NS, Keeper
+from kiteline_basestation.store.keeper import WRITE_NS, Keeper
 from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.store import Batch, Store, StoreError, read
 from kiteline_codec.channel import CodedChannel
@@ -34,8 +34,8 @@ class FlightSummary:
 
     def step(self, n: int) -> None:
         codes = tuple((messages.key(r), messages.encode(r)) for r in self.flight.records[n])
-        self.station.step({}, (), n * KEEP_NS, [Import(self.flight.agent, codes)])
-        self.keeper.keep_at_times(self.station, n * KEEP_NS)
+        self.station.step({}, (), n * WRITE_NS, [Import(self.flight.agent, codes)])
+        self.keeper.write_changes(self.station, n * WRITE_NS)
 
 
 def kept_heads(folder: Path) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.loop_verification import View, _one_unit
+from kiteline_basestation.merging.loop_verification import KeyframeObservations, same_unit
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
 
@@ -24,9 +24,9 @@ def test_depths_in_both_maps_tell_the_unit(unit: float, known: int, one: bool) -
     sparse_map.keyframes.T_w_k[sparse_map.rows[keyframe]] = T_w_k
     local = random.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 6.0], (50, 3))
     n, small = np.arange(50, dtype=np.int32), np.zeros(50, np.uint8)
-    mine = View(
+    mine = KeyframeObservations(
         n, n, np.zeros((50, 2)), np.full(50, -1.0), small, small, np.zeros((50, 32), np.uint8),
         se3.transform(T_w_k, local), np.arange(50) < known,
     )  # fmt: skip
     depth = unit * local[:, 2] * random.uniform(0.97, 1.03, 50)
-    assert _one_unit(sparse_map, keyframe, mine, n, depth) == one
+    assert same_unit(sparse_map, keyframe, mine, n, depth) == one

@@ -105,7 +105,7 @@ def test_windows_that_repeat_along_a_corridor_close_no_loop(
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [flight])
     assert mapper.merger is not None
-    assert mapper.merger.detector.proofs > 0  # they do look alike
+    assert mapper.merger.detector.verified > 0  # they do look alike
     assert mapper.summary()["loops"] == 0
     assert np.max(errors_m(mapper, flight)) < 0.3
 

@@ -12,7 +12,7 @@ import pytest
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
-from kiteline_basestation.management import VERBS, Answer, Command, called
+from kiteline_basestation.management import VERBS, Answer, Command, submap_name
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record
@@ -139,7 +139,7 @@ def test_maps_that_a_person_says_to_overlap_are_looked_at_again(make_flight: Mak
     base.fly([a, b])
     if len(ids(base.ask("list"))) == 1:
         base.ask("split", map="1.1.0")
-        base.mapper.merger.detector.apart.clear()  # type: ignore[union-attr]
+        base.mapper.merger.detector.kept_apart.clear()  # type: ignore[union-attr]
     assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 24}
     base.rest()
     assert ids(base.ask("list")) == ["0.1.0"]
@@ -192,5 +192,5 @@ def test_what_cannot_be_done_is_explained(make_flight: MakeFlight, verb: str, te
 
 
 def test_ids_are_read_as_they_are_written() -> None:
-    assert called(SubmapId(submap_id(3, 17, 4))) == "3.17.4"
+    assert submap_name(SubmapId(submap_id(3, 17, 4))) == "3.17.4"
     assert set(VERBS) == {"list", "get", "name", "merge", "split", "delete"}

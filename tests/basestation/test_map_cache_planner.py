@@ -15,7 +15,7 @@ from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
-from kiteline_basestation.store.saved_map import Codes, SavedMap
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_codec.channel import CodedChannel, plain_pair
 from kiteline_codec.pacing.profiles import RADIO
 from kiteline_codec.schema import (
@@ -171,7 +171,7 @@ def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: M
     own = {messages.key(r): messages.encode(r) for r in [SubmapPlacement(submap, np.eye(4)), *lent]}
     station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 2))
     received = {messages.key(r): messages.encode(r) for r in flight.records[0]}
-    restore(station, SavedMap({flight.agent: Codes(received, own)}), 0)
+    restore(station, SavedMap({flight.agent: SavedValues(received, own)}), 0)
     channel = station.channels[flight.agent]
     assert isinstance(channel, CodedChannel)
     assert list(channel.endpoint.own_values()) == [messages.key(SubmapPlacement(submap, np.eye(4)))]

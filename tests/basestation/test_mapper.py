@@ -17,7 +17,6 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.store.state import Scribe
 from kiteline_codec.schema import (
     CameraIntrinsics,
     CulledLandmarks,
@@ -293,7 +292,7 @@ def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFligh
     own = {messages.key(r): r for r in published}
     second = Mapper()
     second.restore(flight.agent, received, tuple(own[key] for key in sorted(own)), 0)
-    second.recall({name: text for name, text in Scribe().changes(first.memory()).items() if text is not None})
+    second.restore_state(first.state())
     assert second.idle
     assert not second.step(MapperInput(()), 0).publish
     assert np.array_equal(

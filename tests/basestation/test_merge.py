@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
@@ -82,7 +83,7 @@ def test_two_rooms_with_one_wallpaper_stay_two(
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [a, b])
     assert mapper.merger is not None
-    assert mapper.merger.detector.proofs > 0  # single walls do look alike
+    assert mapper.merger.detector.verified > 0  # single walls do look alike
     assert mapper.summary()["merges"] == 0
     assert mapper.summary()["maps"] == 2
 
@@ -130,8 +131,7 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     feed(mapper, [a, b], [0, 30])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
-    assert mapper.merger is not None
-    mapper.merger.undo(mapper.merger.merges[0])
+    output = mapper.step(MapperInput(((a.agent, ()),), (), (Command(1, "split", '{"map": "0.1.1"}'),)), 10**12)
     table, sparse_map = mapper.map.keypoints, mapper.map
     slots = np.flatnonzero(table.root[: sparse_map.slots] >= 0)
     here = sparse_map.keyframes.id[table.row[slots]] >> 20
@@ -139,7 +139,6 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     assert np.array_equal(here, there)  # no point of one is seen from the other
     assert mapper.summary()["maps"] == 2
     young = submap_of_keyframe(b.keyframes[0])
-    output = mapper.step(MapperInput(((a.agent, ()),)), 10**12)
     assert output.withdrawn == ((a.agent, Key(SubmapPlacement.KIND, young, 0)),)  # its place was the merge's
     assert young not in mapper.placements and submap_of_keyframe(a.keyframes[0]) in mapper.placements
     assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
@@ -162,8 +161,7 @@ def test_an_agent_hears_that_its_map_has_no_place_any_more(make_flight: MakeFlig
                 theirs[flight.agent].put(record)
         done = tuple(run_job(job) for job in station.step({a.agent: (), b.agent: ()}, done, n * STEP_NS).jobs)
     assert any(isinstance(r, SubmapPlacement) and r.submap == young for r in theirs[b.agent].receive((), 0))
-    assert station.mapper.merger is not None
-    assert station.mapper.merger.split(young)
-    station.step({}, (), 100 * STEP_NS)
+    (answer,) = station.step({}, (), 100 * STEP_NS, [Command(1, "split", '{"map": "1.1.0"}')]).answers
+    assert answer.ok
     assert theirs[b.agent].take_removed() == [Key(SubmapPlacement.KIND, young, 0)]
     assert not any(isinstance(r, SubmapPlacement) for r in theirs[b.agent].receive((), 0))

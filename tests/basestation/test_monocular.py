@@ -16,10 +16,11 @@ from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
 from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
-from kiteline_basestation.management import _list
+from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.merging.loop_edges import similarity
-from kiteline_basestation.merging.loop_verification import LoopMatch, depth_scale
+from kiteline_basestation.merging.loop_consistency import within_drift
+from kiteline_basestation.merging.loop_edges import LoopEdge, similarity
+from kiteline_basestation.merging.loop_verification import depth_scale
 from kiteline_basestation.refinement.bundle_job import BundleInputs
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
@@ -163,7 +164,8 @@ def test_one_eye_takes_on_the_metre_of_a_pair(make_flight: MakeFlight, words: An
         assert np.array_equal(S_w_m, mapper.placements[submap])
         assert (sim3.scale_of(S_w_m) == 1.0) == of[submap].camera.stereo
     assert abs(sim3.scale_of(last[submap_of_keyframe(eye.keyframes[0])]) * 0.37 - 1.0) < 0.05
-    told = _list(mapper, {}, 0)["maps"]
+    (answer,) = mapper.step(MapperInput((), (), (Command(1, "list", "{}"),)), 10**12).answers
+    told = json.loads(answer.text)["maps"]
     assert [m["unit"] for m in told] == ["metre"]
     assert {s["unit"] for s in told[0]["submaps"]} == {"own", "metre"}
     poses = keyframe_poses(mapper)
@@ -184,8 +186,7 @@ def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: Ma
     young = submap_of_keyframe(b.keyframes[0])
     assert abs(mapper.map.scale(young) * 0.37 / 2.0 - 1.0) < 0.1
     assert mapper.merger is not None
-    mapper.merger.undo(mapper.merger.merges[0])
-    mapper.step(MapperInput(((a.agent, ()),)), 10**12)
+    mapper.step(MapperInput((), (), (Command(1, "split", '{"map": "1.1.0"}'),)), 10**12)
     assert abs(mapper.map.scale(young) - 1.0) < 0.01  # as long as it was when it was laid into the other
     assert young not in mapper.placements
     assert contradictions(mapper) == []
@@ -257,10 +258,8 @@ def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight,
         at = similarity(mapper.map, new)[:3, 3]
         X = sim3.of(scale, se3.from_rt(np.eye(3), at - scale * at + [shift_m, 0.0, 0.0]))  # about where the camera is
         S = sim3.inverse(similarity(mapper.map, old)) @ X @ similarity(mapper.map, new)
-        none = np.zeros(0, np.int32)
-        vote = LoopMatch(new, old, sim3.rigid(S), 90, none, none, 3.0, sim3.scale_of(S))
-        assert mapper.merger is not None
-        return mapper.merger.detector._drift_explains(vote)
+        edge = LoopEdge(new, old, sim3.rigid(S), 90, 3.0, sim3.scale_of(S))
+        return within_drift(mapper.map, edge, mapper.config.loops)
 
     # 50 m on, a place that looks the same stands 6 m aside: no drift of the unit, and so no drift of the way either.
     assert not explained(6.0, 1.0)
@@ -290,7 +289,7 @@ def test_what_a_base_remembers_of_units_is_known_to_the_next(make_flight: MakeFl
     for flight in (eye, pair):
         own = [r for r in published if agent_of_record(r) == flight.agent]
         again.restore(flight.agent, tuple(flight.all_records()), tuple(own), 0)
-    again.recall({name: json.dumps(entry.make()) for name, entry in mapper.memory().items()})
+    again.restore_state(mapper.state())
     for flight in (eye, pair):
         assert np.allclose(placed(again, flight), placed(mapper, flight), atol=1e-9)
         for k in flight.keyframes:
@@ -299,7 +298,7 @@ def test_what_a_base_remembers_of_units_is_known_to_the_next(make_flight: MakeFl
     here, there = mapper.map.find_landmarks(points), again.map.find_landmarks(points)
     assert np.allclose(mapper.map.positions(here)[0], again.map.positions(there)[0], atol=1e-6)
     assert again.merger is not None and mapper.merger is not None
-    assert [v.scale for v in again.merger._edges] == [v.scale for v in mapper.merger._edges]
+    assert [v.scale for v in again.merger.edges] == [v.scale for v in mapper.merger.edges]
     assert sorted(again.merger.merges[0].moved) == sorted(mapper.merger.merges[0].moved)
 
 

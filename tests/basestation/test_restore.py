@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +15,11 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.combine import combine
-from kiteline_basestation.store.integrity import contradictions, sound
+from kiteline_basestation.store.integrity import check, contradictions
 from kiteline_basestation.store.keeper import Keeper, snapshot
 from kiteline_basestation.store.restore import restore
-from kiteline_basestation.store.saved_map import Codes, SavedMap
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.state_texts import state_of
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import (
@@ -34,7 +34,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
-from kiteline_core.ids import AgentId, KeyframeId, keyframe_id, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, agent_of_submap, keyframe_id, submap_of_keyframe
 
 STEP_NS = 100_000_000
 ELSEWHERE = se3.exp(np.array([0.5, -0.3, 0.2, 0.1, 0.4, -1.1]))
@@ -98,8 +98,8 @@ def whole(station: Station) -> dict[str, Any]:
     out["placements"] = [(int(s), T.tobytes()) for s, T in station.mapper.placements.items()]
     out["islands"] = sorted(sparse_map.root_submaps.items())
     out["offsets"] = sorted((int(a), offset.tolist()) for a, offset in sparse_map.disparity_offset_px.items())
-    out["memory"] = {
-        n: t for n, t in snapshot(station, SavedMap()).memory.items() if n.partition("/")[0] in ("edge", "merge")
+    out["loops and merges"] = {
+        n: t for n, t in snapshot(station, SavedMap()).texts.items() if ".edges/" in n or ".merges/" in n
     }
     return out
 
@@ -124,7 +124,7 @@ def test_a_restored_map_is_the_map_to_the_last_bit(joined: tuple[Agents, Station
     restored = restore(second, kept, 0)
     assert (restored.faults, restored.awaited, restored.keyframes) == ((), 0, 68)
     assert whole(second) == whole(first)
-    assert snapshot(second, restored.kept) == kept
+    assert snapshot(second, restored.saved) == kept
     for channel, before in zip(second.channels.values(), first.channels.values(), strict=True):
         assert isinstance(channel, CodedChannel) and isinstance(before, CodedChannel)
         assert channel.endpoint.own_values() == before.endpoint.own_values()
@@ -138,10 +138,10 @@ def test_each_base_goes_on_from_what_the_last_one_kept(make_flight: MakeFlight, 
         held = keeper.load()
         restored = restore(station, held, agents.now_ns)
         assert restored.faults == ()
-        keeper.begin(station, restored.kept, held)
-        agents.fly(station, at, until, each=lambda: keeper.keep_at_times(station, agents.now_ns))  # noqa: B023
+        keeper.begin(station, restored.saved, held)
+        agents.fly(station, at, until, each=lambda: keeper.write_changes(station, agents.now_ns))  # noqa: B023
         keeper.close(station)
-        assert read(tmp_path) == snapshot(station, restored.kept)  # batch by batch, and all at once
+        assert read(tmp_path) == snapshot(station, restored.saved)  # batch by batch, and all at once
         agents.base_died()
         at = until
     assert station.mapper.idle
@@ -163,7 +163,9 @@ def spoilt(
 ) -> SavedMap:
     codes = kept.agents[AgentId(agent)]
     mine = {key: code for key, code in codes.received.items() if key != drop}
-    return SavedMap({**kept.agents, AgentId(agent): Codes({**mine, **received}, {**codes.own, **own})}, kept.memory)
+    return SavedMap(
+        {**kept.agents, AgentId(agent): SavedValues({**mine, **received}, {**codes.own, **own})}, kept.texts
+    )
 
 
 def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, Station], words: Any) -> None:
@@ -179,19 +181,19 @@ def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, St
     head = kept.agents[AgentId(0)].received[Key(KeyframeHeader.KIND, keyframe)]
     cases = {
         "cannot be read": ({Key(KeyframeHeader.KIND, keyframe): head + b"!"}, {}),
-        "tells of a keyframe that is not there": ({}, _coded(KeyframePose(nowhere, np.eye(4)))),
-        "names points of a keyframe that is not there": ({}, _coded(FusedLandmarks(keyframe, index, ids))),
-        "tells of keypoint 2000": ({}, _coded(FusedLandmarks(keyframe, far, ids))),
+        "is of a keyframe that is not there": ({}, _coded(KeyframePose(nowhere, np.eye(4)))),
+        "names landmarks of a keyframe that is not there": ({}, _coded(FusedLandmarks(keyframe, index, ids))),
+        "is of keypoint 2000": ({}, _coded(FusedLandmarks(keyframe, far, ids))),
         "places a submap without keyframes": ({}, _coded(nowhere_map)),
     }
     for words_told, (received, own) in cases.items():
-        checked = sound(spoilt(kept, 0, received, own, None))
+        checked = check(spoilt(kept, 0, received, own, None))
         assert any(words_told in fault for fault in checked.faults), (words_told, checked.faults)
         station = new_station(words, session=3)
         restored = restore(station, spoilt(kept, 0, received, own, None), 0)
         assert restored.faults == checked.faults
         assert contradictions(station.mapper) == []
-        again = restore(new_station(words, session=4), restored.kept, 0)
+        again = restore(new_station(words, session=4), restored.saved, 0)
         assert again.faults == ()
 
 
@@ -203,33 +205,38 @@ def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station
     _, first = joined
     kept = snapshot(first, SavedMap())
     alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == KeyframeHeader.KIND)[3]
-    bare = SavedMap({AgentId(2): Codes(kept.agents[AgentId(2)].received, {})})
-    checked = sound(spoilt(bare, 2, {}, {}, alone))
+    bare = SavedMap({AgentId(2): SavedValues(kept.agents[AgentId(2)].received, {})})
+    checked = check(spoilt(bare, 2, {}, {}, alone))
     assert checked.faults == ()
     assert checked.awaited > 1  # its child, and its own sections
-    restored = restore(new_station(words, session=2), checked.kept, 0)
+    restored = restore(new_station(words, session=2), checked.saved, 0)
     assert restored.keyframes == 7
 
 
 def test_a_joined_map_whose_other_half_is_gone_stands_alone(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     kept = snapshot(first, SavedMap())
-    (joined_to,) = {json.loads(t)["island"] for n, t in kept.memory.items() if n.startswith("submap/")} - {None}
-    eldest = 0 if joined_to >> 26 == 0 else 1
-    half = SavedMap({a: c for a, c in kept.agents.items() if a != eldest}, kept.memory)
+    (root,) = set(state_of(kept.texts).map.root_submaps.values())
+    lost = agent_of_submap(root)
+    half = SavedMap({a: c for a, c in kept.agents.items() if a != lost}, kept.texts)
     station = new_station(words, session=2)
     restored = restore(station, half, 0)
-    assert any("is joined to" in fault for fault in restored.faults)
+    assert any("is merged with" in fault for fault in restored.faults)
     assert contradictions(station.mapper) == []
     assert station.mapper.summary()["maps"] == 2
 
 
-def test_memory_that_is_no_memory_is_told(joined: tuple[Agents, Station], words: Any) -> None:
+def test_an_unreadable_state_is_refused(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     kept = snapshot(first, SavedMap())
-    for name, text in (("base", "{}"), ("base", "nonsense"), ("submap/5", "[]")):
-        with pytest.raises(WireError, match="memory"):
-            restore(new_station(words, session=2), SavedMap(kept.agents, {**kept.memory, name: text}), 0)
+    for name, text in (
+        ("mapper", "{}"),
+        ("mapper", "nonsense"),
+        ("mapper.merger", "[]"),
+        ("mapper.merger.edges/0", "{}"),
+    ):
+        with pytest.raises(WireError, match="state"):
+            restore(new_station(words, session=2), SavedMap(kept.agents, {**kept.texts, name: text}), 0)
 
 
 def test_contradictions_in_the_tables_are_seen(make_flight: MakeFlight, words: Any) -> None:
@@ -296,7 +303,7 @@ def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFli
         records[:] = []
     agents.fly(station, 0, 20)
     assert len(station.mapper.map) == 13
-    station.note_changes()
+    station.track_changes()
     done: list[JobDone] = []
     for n in range(30):
         orders = [Import(flight.agent, tuple(codes[n * 20 : n * 20 + 20]))]
@@ -304,8 +311,8 @@ def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFli
     assert len(station.mapper.map) == 20
     assert all(station.mapper.map.pose(k) is not None for k in flight.keyframes)
     assert contradictions(station.mapper) == []
-    assert station.touched is not None
-    heads = {KeyframeId(key.id) for _, ours, key in station.touched if not ours and key.kind == KeyframeHeader.KIND}
+    assert station.changed is not None
+    heads = {KeyframeId(key.id) for _, ours, key in station.changed if not ours and key.kind == KeyframeHeader.KIND}
     assert heads == set(flight.keyframes[5:12])  # the others were here
 
 

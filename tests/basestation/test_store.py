@@ -13,21 +13,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_basestation.store.saved_map import Codes, SavedMap, pack, unpack
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
 
 keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
 values = st.dictionaries(keys, st.binary(max_size=30), max_size=4)
-codes = st.builds(Codes, values, values)
+codes = st.builds(SavedValues, values, values)
 memory = st.dictionaries(st.text("abc/01", min_size=1, max_size=5), st.text(max_size=20), max_size=3)
 maps = st.builds(SavedMap, st.dictionaries(st.integers(0, 63).map(AgentId), codes, max_size=3), memory)
 
 
 def without_nothing(kept: SavedMap) -> SavedMap:
     """A store does not know agents of which it holds no value."""
-    return SavedMap({a: c for a, c in kept.agents.items() if c.received or c.own}, kept.memory)
+    return SavedMap({a: c for a, c in kept.agents.items() if c.received or c.own}, kept.texts)
 
 
 @given(maps)
@@ -42,7 +42,7 @@ def test_any_other_bytes_are_refused(noise: bytes) -> None:
 
 
 def test_a_flipped_bit_is_found() -> None:
-    content = bytearray(pack(SavedMap({AgentId(1): Codes({Key(3, 5): b"head"}, {})})))
+    content = bytearray(pack(SavedMap({AgentId(1): SavedValues({Key(3, 5): b"head"}, {})})))
     content[12] ^= 1
     with pytest.raises(WireError, match="damaged"):
         unpack(bytes(content))
@@ -69,7 +69,7 @@ def test_nothing_is_left_of_a_deleted_submap(tmp_path: Path) -> None:
     received |= {Key(GravityAlignment.KIND, s): b"level" for s in (doomed, other)}
     own = {Key(RefinedLandmarks.KIND, s << SEQUENCE_BITS | 5): b"depths" for s in (doomed, other)}
     store = Store(tmp_path)
-    store.write(batch_of(SavedMap({AgentId(3): Codes(received, own)}), SavedMap()))
+    store.write(batch_of(SavedMap({AgentId(3): SavedValues(received, own)}), SavedMap()))
     store.write(Batch(deleted=[doomed]))
     left = store.load().agents[AgentId(3)]
     store.close()
@@ -109,7 +109,7 @@ def test_another_version_is_told(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / FILE) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(StoreError, match="version 99, expected version 2"):
+    with pytest.raises(StoreError, match="version 99, expected version 3"):
         Store(tmp_path)
 
 
@@ -131,13 +131,13 @@ def write_for_ever(folder: str) -> None:
     while True:
         number += 1
         text = str(number)
-        store.write(Batch(rows=[(1, 0, 3, i, 0, text.encode()) for i in range(300)], memory={"a": text, "b": text}))
+        store.write(Batch(rows=[(1, 0, 3, i, 0, text.encode()) for i in range(300)], texts={"a": text, "b": text}))
 
 
 def begun(folder: Path) -> bool:
     """Whether a batch stands in a store."""
     try:
-        return bool(read(folder).memory)
+        return bool(read(folder).texts)
     except StoreError:
         return False
 
@@ -157,6 +157,6 @@ def test_a_kill_leaves_a_whole_batch(tmp_path: Path, delay_s: float) -> None:
     store = Store(tmp_path)
     kept = store.load()
     store.close()
-    written = {code.decode() for code in kept.agents[AgentId(1)].received.values()} | set(kept.memory.values())
+    written = {code.decode() for code in kept.agents[AgentId(1)].received.values()} | set(kept.texts.values())
     assert len(written) == 1
     assert len(kept.agents[AgentId(1)].received) == 300

@@ -11,6 +11,7 @@ import numpy as np
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
@@ -68,9 +69,7 @@ def test_agents_merges_and_the_state_are_told_once_each(make_flight: MakeFlight,
         r"1 agent here; \d+ keyframes and \d+ points in 1 map; 0 loops, 1 merge; \d+\.\d kB/s up", status[0]
     )
     assert status[0].endswith("230 MiB at most; all in the store")
-    merger = station.mapper.merger
-    assert merger is not None
-    merger.undo(merger.merges[0])
+    station.step({}, (), 10**12, [Command(1, "split", '{"map": "1.1.0"}')])
     assert [w.split("s  ", 1)[1] for w in narrator.lines((), 0, 0.0, None)][-1] == (
         "map 1.1.0 is taken out of the map that it was laid into"
     )

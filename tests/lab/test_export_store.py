@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 
+from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.store.saved_map import Codes, SavedMap
+from kiteline_basestation.mapper_state import MapperState
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.state_texts import texts_of
 from kiteline_basestation.store.store import FILE, Store, StoreError, batch_of
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement, messages
 from kiteline_core.geometry import se3
@@ -90,23 +92,9 @@ def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.Ca
     codes = {messages.key(r): messages.encode(r) for r in records(0)}
     placed = SubmapPlacement(submap_id(0, 1, 0), np.eye(4))
     own = {messages.key(placed): messages.encode(placed)}
-    placed_at = {"frame": None, "island": None, "T_w_m": np.eye(4).ravel().tolist(), "name": None}
-    memory = {
-        f"submap/{submap_id(0, 1, 0)}": json.dumps({**placed_at, "last": None, "tracked_ns": None}),
-        "base": json.dumps(
-            {
-                "counts": {},
-                "placed": [submap_id(0, 1, 0)],
-                "stale": [],
-                "unused": [],
-                "bundled": [],
-                "carried": [],
-                "deleted": [],
-            }
-        ),
-    }
+    state = MapperState(placements=PlacementState({submap_id(0, 1, 0): np.eye(4)}))
     store = Store(tmp_path)
-    store.write(batch_of(SavedMap({AgentId(0): Codes(codes, own)}, memory), SavedMap()))
+    store.write(batch_of(SavedMap({AgentId(0): SavedValues(codes, own)}, texts_of(state)), SavedMap()))
     store.close()
     assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")

@@ -18,7 +18,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from kiteline_basestation.store.integrity import sound
+from kiteline_basestation.store.integrity import check
 from kiteline_basestation.store.store import FILE, StoreError, read
 from kiteline_codec.schema import KeyframeHeader, record_log
 from kiteline_core.frame import EncodedImage
@@ -230,7 +230,7 @@ def test_a_second_base_takes_over_with_a_copy_of_the_store_or_with_none(
         assert made > held >= 2
         kept = read(second)
         assert said <= kept.agents[AgentId(0)].received.keys()
-        assert not sound(kept).faults
+        assert not check(kept).faults
 
 
 def stretched(source: Path, out: Path, times: int) -> None:

@@ -1,12 +1,14 @@
-"""Where submaps lie in the world w: the first one of all is the world, and what is one map with it follows.
+"""Placements of submaps in the world w.
 
-A place is a similarity S_w_m: one eye's submap may have another unit of length than w. The world keeps the unit in
-which it began, until a map in metres becomes one with its first submap, or an agent says how long that unit is.
+The first submap of all defines w; submaps merged with it follow. A placement is a similarity S_w_m: a monocular submap
+may have another unit of length than w. w keeps the unit in which it began until a map in metres is merged with its
+first submap, or an agent reports how long that unit is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,148 +17,157 @@ from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
+from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 
 
-class World:
-    """The places of submaps; agents are told of each change."""
+@dataclass(frozen=True, slots=True)
+class PlacementState:
+    """State of `SubmapPlacements` that outlives the process, in order of placing."""
+
+    S_w_m: Mapping[SubmapId, F64] = field(default_factory=dict)
+    unmerged: Mapping[SubmapId, F64] = field(default_factory=dict)
+
+
+class SubmapPlacements:
+    """S_w_m of all placed submaps; every change is published to the agent of the submap."""
 
     def __init__(self, config: IntakeConfig, sparse_map: SparseMap, intake: Intake, publisher: Publisher) -> None:
         self._config = config
         self._map = sparse_map
         self._intake = intake
         self._publisher = publisher
-        self.placements: dict[SubmapId, F64] = {}  # S_w_m of placed submaps, the first one of all first
-        self.carried: dict[SubmapId, F64] = {}  # S_w_m of those that have a place by themselves
-        self._withdrawn: list[tuple[AgentId, Key]] = []
+        self.S_w_m: dict[SubmapId, F64] = {}  # the first submap of all comes first
+        self.unmerged: dict[SubmapId, F64] = {}  # S_w_m of submaps that have a placement without a merge
 
     @property
     def first(self) -> SubmapId | None:
-        """The submap that is the world."""
-        return next(iter(self.placements), None)
+        """The submap that defines w."""
+        return next(iter(self.S_w_m), None)
 
-    def withdrawn(self) -> tuple[tuple[AgentId, Key], ...]:
-        """Places that were said and are true no more, since the last call."""
-        gone = tuple((agent, key) for agent, key in self._withdrawn if key.id not in self.placements)
-        self._withdrawn.clear()
-        return gone
-
-    def set_upright(self) -> bool:
-        """Turn the world when the agent of its first submap says which way is up; all that is placed moves along.
-        Returns whether it did.
-        """
+    def align_with_gravity(self) -> bool:
+        """Rotate w, and all that is placed in it, when the first submap's gravity is known. Returns True if it moved."""
         first = self.first
-        level = None if first is None else self._intake.levels.get(first)
-        if first is None or level is None:
+        gravity = None if first is None else self._intake.gravity.get(first)
+        if first is None or gravity is None:
             return False
-        if np.allclose(level.T_l_m[:3, :3], sim3.rigid(self.placements[first])[:3, :3], 0.0, 1e-9):
+        if np.allclose(gravity.T_l_m[:3, :3], sim3.rigid(self.S_w_m[first])[:3, :3], 0.0, 1e-9):
             return False
-        unit = sim3.scale_of(self.placements[first])
-        self._move_world(sim3.of(unit, level.T_l_m) @ sim3.inverse(self.placements[first]))
+        scale = sim3.scale_of(self.S_w_m[first])
+        self._move_world(sim3.of(scale, gravity.T_l_m) @ sim3.inverse(self.S_w_m[first]))
         return True
 
-    def set_metric(self) -> bool:
-        """Stretch the world when the agent of its first submap says how long a unit of it is, which nobody knew.
-        Returns whether it did.
-        """
+    def make_metric(self) -> bool:
+        """Rescale w to metres when the agent of the first submap reports its scale. Returns True if it changed."""
         first = self.first
-        metres = None if first is None else self._intake.units.get(first)
+        metres = None if first is None else self._intake.metres_per_unit.get(first)
         if first is None or metres is None or not self._map.is_up_to_scale(self._map.map_id(first)):
             return False
-        if sim3.scale_of(self.placements[first]) != 1.0 or metres == 1.0:
+        if sim3.scale_of(self.S_w_m[first]) != 1.0 or metres == 1.0:
             return False
         self._move_world(sim3.of(metres, np.eye(4)))
         return True
 
-    def begin(self, keyframe: KeyframeId) -> None:
-        """The first submap of all is the world. A later one of the same flight begins where the last was left."""
+    def place_new(self, keyframe: KeyframeId) -> None:
+        """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left."""
         submap = submap_of_keyframe(keyframe)
-        if submap in self.placements:
+        if submap in self.S_w_m:
             return
-        if not self.placements:
-            level = self._intake.levels.get(submap)
-            S_w_m = np.eye(4) if level is None else level.T_l_m
+        if not self.S_w_m:
+            gravity = self._intake.gravity.get(submap)
+            S_w_m = np.eye(4) if gravity is None else gravity.T_l_m
         else:
             before = SubmapId(submap - 1)
-            live, S_w_before = self._intake.last_of.get(before), self.placements.get(before)
+            live, S_w_before = self._intake.last_pose.get(before), self.S_w_m.get(before)
             first = self._map.submaps[submap][0]
-            begin = self._map.pose(first)
-            left = self._map.pose(live.keyframe) if live else None
-            if live is None or S_w_before is None or left is None or begin is None:
+            T_m_first = self._map.pose(first)
+            T_before_k = self._map.pose(live.keyframe) if live else None
+            if live is None or S_w_before is None or T_before_k is None or T_m_first is None:
                 return
             tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
             if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > self._config.carry_s * 1e9:
-                return  # a place that it reached unseen: it is found when it is recognised
-            there = sim3.place(S_w_before, left @ live.T_k_c)
-            unit = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
-            S_w_m = sim3.normalise(sim3.of(unit, there) @ se3.inverse(begin))
-        self.carried[submap] = S_w_m
+                return  # too long without images: a loop closure has to place it
+            T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
+            scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
+            S_w_m = sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first))
+        self.unmerged[submap] = S_w_m
         self._set(submap, S_w_m)
 
-    def grow(self, units: Mapping[SubmapId, float]) -> None:
-        """Units of submaps have grown in their maps: these stay as long in the world as they were."""
-        for submap, more in units.items():
-            begin = self._map.first_pose(submap)
-            if submap in self.placements:
-                self._set(submap, sim3.grown(self.placements[submap], more, begin))
-            if submap in self.carried:
-                self.carried[submap] = sim3.grown(self.carried[submap], more, begin)
+    def rescale(self, factors: Mapping[SubmapId, float]) -> None:
+        """Scale placements of submaps whose units grew in their maps, about their first keyframes."""
+        for submap, factor in factors.items():
+            first = self._map.first_pose(submap)
+            if submap in self.S_w_m:
+                self._set(submap, sim3.grown(self.S_w_m[submap], factor, first))
+            if submap in self.unmerged:
+                self.unmerged[submap] = sim3.grown(self.unmerged[submap], factor, first)
 
-    def part(self, parted: set[SubmapId]) -> None:
-        """Submaps that were taken out of a map lie where they lay by themselves, or nowhere; their agents are told."""
-        first = self.first
-        for submap in sorted(parted & self.placements.keys() - {first}):
-            if submap in self.carried:
-                self._set(submap, self.carried[submap])
+    def separate(self, split: Collection[SubmapId]) -> list[SubmapId]:
+        """Move submaps that were split from a map back to where they lay before. Returns those without placement."""
+        withdrawn = []
+        for submap in sorted(set(split) & self.S_w_m.keys() - {self.first}):
+            if submap in self.unmerged:
+                self._set(submap, self.unmerged[submap])
             else:
-                del self.placements[submap]
+                self.delete(submap)
                 self._publisher.withdraw_placement(submap)
-                self._withdrawn.append((agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0)))
+                withdrawn.append(submap)
+        return withdrawn
 
-    def lay_out(self, map_id: SubmapId) -> None:
-        """Submaps of one map lie in the world as they lie to each other, as soon as one of them has a place. A map in
-        metres keeps them: where the world had another unit, it takes on this one.
+    def delete(self, submap: SubmapId) -> None:
+        """Drop the placement of a submap."""
+        self.S_w_m.pop(submap, None)
+
+    def update_map(self, map_id: SubmapId) -> None:
+        """Place all submaps of a map as they lie to each other, if one of them is placed.
+
+        A map in metres keeps its unit: if w had another unit, w is rescaled.
         """
         submaps = self._map.submaps_of_map(map_id)
-        eldest = self._map.map_id(map_id)
+        root = self._map.map_id(map_id)
         first = self.first
-        anchor = next((s for s in [first, eldest, *submaps] if s in self.placements and s in submaps), None)
+        anchor = next((s for s in [first, root, *submaps] if s in self.S_w_m and s in submaps), None)
         if first is None or anchor is None:
             return
-        S_w_i = sim3.normalise(self.placements[anchor] @ sim3.inverse(self._map.submap_pose(anchor)))
-        unit = sim3.scale_of(S_w_i)
-        if unit != 1.0 and not self._map.is_up_to_scale(eldest):
-            at = self.placements[anchor][:3, 3]
-            stretch = sim3.of(1.0 / unit, se3.from_rt(np.eye(3), at - at / unit))
+        S_w_map = sim3.normalise(self.S_w_m[anchor] @ sim3.inverse(self._map.submap_pose(anchor)))
+        scale = sim3.scale_of(S_w_map)
+        if scale != 1.0 and not self._map.is_up_to_scale(root):
+            at = self.S_w_m[anchor][:3, 3]
+            rescale = sim3.of(1.0 / scale, se3.from_rt(np.eye(3), at - at / scale))
             if anchor == first or self._map.is_up_to_scale(self._map.map_id(first)):
-                self._move_world(stretch, submaps)
-            S_w_i = sim3.normalise(stretch @ S_w_i)
+                self._move_world(rescale, submaps)
+            S_w_map = sim3.normalise(rescale @ S_w_map)
         for submap in submaps:
-            S_w_m = sim3.normalise(S_w_i @ self._map.submap_pose(submap))
-            held = self.placements.get(submap)
+            S_w_m = sim3.normalise(S_w_map @ self._map.submap_pose(submap))
+            held = self.S_w_m.get(submap)
             if held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
                 self._set(submap, S_w_m)
 
-    # -- inside ------------------------------------------------------------------------------------------------------
+    def state(self) -> PlacementState:
+        """State to be saved."""
+        return PlacementState(dict(self.S_w_m), dict(self.unmerged))
+
+    def restore(self, state: PlacementState) -> None:
+        """Continue from a saved state; nothing is published."""
+        self.S_w_m.update(state.S_w_m)
+        self.unmerged = dict(state.unmerged)
 
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
-        self.placements[submap] = S_w_m
+        self.S_w_m[submap] = S_w_m
         self._publisher.publish_placement(submap, S_w_m)
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
-        """Turn or stretch the world with all that is placed in it, but for some; metres stay metres."""
-        self.carried = {s: self._moved(s, S_new_old, S) for s, S in self.carried.items()}
-        for submap, S_w_m in self.placements.items():
+        """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale."""
+        self.unmerged = {s: self._moved(s, S_new_old, S) for s, S in self.unmerged.items()}
+        for submap, S_w_m in self.S_w_m.items():
             if submap not in but:
                 self._set(submap, self._moved(submap, S_new_old, S_w_m))
 
     def _moved(self, submap: SubmapId, S_new_old: F64, S_w_m: F64) -> F64:
-        """Where a submap lies in a world that moved: where its first keyframe does, as long as it is in metres."""
+        """Placement of a submap in a moved world; one in metres moves rigidly with its first keyframe."""
         if sim3.scale_of(S_new_old) == 1.0 or self._map.is_up_to_scale(submap):
             return sim3.normalise(S_new_old @ S_w_m)
-        begin = self._map.first_pose(submap)
-        return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, begin)) @ se3.inverse(begin))
+        first = self._map.first_pose(submap)
+        return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, first)) @ se3.inverse(first))

@@ -1,4 +1,4 @@
-"""Moves whole maps: what a pose graph or a full bundle found goes into the map, and what came meanwhile moves along."""
+"""Corrections of whole maps: pose graphs and full bundle windows, and how keyframes take on their results."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
-from kiteline_basestation.merging.loop_edges import depth_of, edge_of
-from kiteline_basestation.merging.loop_verification import LoopMatch
+from kiteline_basestation.merging.loop_edges import LoopEdge, depth_of, graph_edge_of
 from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window
 from kiteline_codec.schema import KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3, sim3
@@ -22,7 +21,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyfr
 
 F64 = NDArray[np.float64]
 
-_SAME = 1e-4  # relative: what lengths may grow by before it is worth saying, a fifth of an inverse depth's code
+_SAME = 1e-4  # relative change of depths that is not sent: a fifth of the code of an inverse depth
 
 
 def keyframes_of(sparse_map: SparseMap, map_id: SubmapId) -> list[KeyframeId]:
@@ -31,10 +30,10 @@ def keyframes_of(sparse_map: SparseMap, map_id: SubmapId) -> list[KeyframeId]:
     return [k for k in keyframes if sparse_map.pose(k) is not None]
 
 
-def graph_of(
-    sparse_map: SparseMap, map_id: SubmapId, loops: tuple[LoopMatch, ...], config: GraphConfig
+def essential_graph_of(
+    sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopEdge], config: GraphConfig
 ) -> GraphInputs | None:  # fmt: skip
-    """The essential graph of a map. Its eldest submap's first keyframe holds it in place."""
+    """The essential graph of a map, fixed at the first keyframe of its root submap; None with fewer than two."""
     keyframes = keyframes_of(sparse_map, map_id)
     if len(keyframes) < 2:
         return None
@@ -52,12 +51,12 @@ def graph_of(
     between = np.linalg.inv(poses[edges[:, 0]]) @ poses[edges[:, 1]]
     length = np.linalg.norm(between[:, :3, 3], axis=1)
     sigma = np.column_stack([config.sigma_m + config.sigma_path * length, np.full(len(edges), config.sigma_rad)])
-    inside = [v for v in loops if v.old in number and v.new in number]
-    edged = [edge_of(sparse_map, v) for v in inside]
-    far = np.array([[number[v.old], number[v.new]] for v in inside], np.int64).reshape(-1, 2)
-    measured = np.array([T for T, _ in edged]).reshape(-1, 4, 4)
-    doubt = np.array(
-        [[config.sigma_m + config.loop_sigma_depth * depth_of(sparse_map, v), config.loop_sigma_rad] for v in inside]
+    inside = [e for e in loops if e.old in number and e.new in number]
+    loop_edges = [graph_edge_of(sparse_map, e) for e in inside]
+    loop_pairs = np.array([[number[e.old], number[e.new]] for e in inside], np.int64).reshape(-1, 2)
+    measured = np.array([T for T, _ in loop_edges]).reshape(-1, 4, 4)
+    loop_sigma = np.array(
+        [[config.sigma_m + config.loop_sigma_depth * depth_of(sparse_map, e), config.loop_sigma_rad] for e in inside]
     ).reshape(-1, 2)  # fmt: skip
     held = np.zeros(len(keyframes), np.bool_)
     held[number[KeyframeId(sparse_map.submaps[sparse_map.map_id(map_id)][0])]] = True
@@ -66,27 +65,26 @@ def graph_of(
     if own:
         free = np.array([submap_of_keyframe(k) in own for k in keyframes])
         scaled = Scaled(
-            free, np.concatenate([np.ones(len(edges)), [scale for _, scale in edged]]),
-            np.repeat([config.sigma_scale, config.loop_sigma_scale], [len(edges), len(far)]),
+            free, np.concatenate([np.ones(len(edges)), [scale for _, scale in loop_edges]]),
+            np.repeat([config.sigma_scale, config.loop_sigma_scale], [len(edges), len(loop_pairs)]),
         )  # fmt: skip
     return GraphInputs(
-        np.array(keyframes, np.int64), poses, held, np.concatenate([edges, far]), np.concatenate([between, measured]),
-        np.concatenate([np.round(sigma, 4), np.round(doubt, 4)]),
-        np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(far), np.bool_)]), config, scaled,
+        np.array(keyframes, np.int64), poses, held, np.concatenate([edges, loop_pairs]), np.concatenate([between, measured]),
+        np.concatenate([np.round(sigma, 4), np.round(loop_sigma, 4)]),
+        np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(loop_pairs), np.bool_)]), config, scaled,
     )  # fmt: skip
 
 
 def move_keyframes(
     sparse_map: SparseMap, map_id: SubmapId, targets: Mapping[KeyframeId, F64], publisher: Publisher,
     publish: PublishConfig,
-) -> float:  # fmt: skip
-    """Bring keyframes to T_w_k (4,4); those that came after the work began follow the nearest one before them.
+) -> None:  # fmt: skip
+    """Move keyframes to T_w_k (4,4); keyframes without a target move with their parent.
 
-    A submap's first keyframe stays in its own m: the submap moves instead. Returns the largest motion in m.
+    The first keyframe of a submap keeps its pose in m: the submap is moved instead.
     """
     keyframes = keyframes_of(sparse_map, map_id)
     goal: dict[KeyframeId, F64] = {}
-    largest = 0.0
     for keyframe in keyframes:  # in order of id: parents first
         old = sparse_map.world_pose(keyframe)
         assert old is not None
@@ -99,12 +97,11 @@ def move_keyframes(
                 goal[keyframe] = old
             else:
                 goal[keyframe] = se3.orthonormalise(goal[parent] @ se3.inverse(above) @ old)
-        largest = max(largest, float(np.linalg.norm(goal[keyframe][:3, 3] - old[:3, 3])))
     for submap in sparse_map.submaps_of_map(map_id):
         first = sparse_map.submaps[submap][0]
         T_m_k = sparse_map.pose(first)
-        stays = submap == sparse_map.map_id(map_id) and not sparse_map.is_up_to_scale(submap)
-        if T_m_k is not None and not stays:
+        fixed = submap == sparse_map.map_id(map_id) and not sparse_map.is_up_to_scale(submap)
+        if T_m_k is not None and not fixed:
             unit = sparse_map.scale(submap)
             sparse_map.move_submap(submap, sim3.normalise(sim3.of(unit, goal[first]) @ se3.inverse(T_m_k)))
     firsts = {sparse_map.submaps[s][0] for s in sparse_map.submaps_of_map(map_id)}
@@ -115,20 +112,20 @@ def move_keyframes(
         assert now is not None
         change = se3.inverse(now) @ goal[keyframe]
         moved = float(np.linalg.norm(change[:3, 3]))
-        turned = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)
-        if moved > publish.pose_m or turned > publish.pose_rad:
+        rotated = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)
+        if moved > publish.pose_m or rotated > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, goal[keyframe])
             publisher.mark_changed(KeyframePose.KIND, keyframe)
-    return largest
 
 
-def rescale(
+def apply_scales(
     sparse_map: SparseMap, map_id: SubmapId, growth: Mapping[KeyframeId, float], publisher: Publisher
 ) -> tuple[dict[SubmapId, float], dict[KeyframeId, float]]:  # fmt: skip
-    """Lengths before keyframes grow in w by `growth`; where one eye flew, its submap's unit grows as they do before the
-    newest keyframe, so that nothing changes where the agent is. Points hang on their keyframes: those of older ones
-    take on the rest. Where the keyframes lie is for `move_keyframes`. Returns by what units grew, and lengths in the
-    submaps.
+    """Multiply lengths near keyframes in w by `growth`.
+
+    The unit of a monocular submap grows by the factor of its newest keyframe, so that nothing changes for the agent
+    there; depths of older keyframes take on the rest. Keyframes are not moved. Returns the factors of the units of
+    submaps, and the remaining factors by keyframe.
     """
     units: dict[SubmapId, float] = {}
     left: dict[KeyframeId, float] = {}
@@ -144,12 +141,12 @@ def rescale(
             more = growth[keyframe] / newest
             if abs(more - 1.0) > _SAME:
                 left[keyframe] = more
-                _grow(sparse_map, keyframe, more, publisher)
+                _scale_depths(sparse_map, keyframe, more, publisher)
     return units, left
 
 
-def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher: Publisher) -> None:
-    """The points born in a keyframe lie so many times as far away."""
+def _scale_depths(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher: Publisher) -> None:
+    """Multiply the depths of the landmarks anchored in a keyframe."""
     table, slots = sparse_map.keypoints, sparse_map.slots_of(keyframe)
     offset = table.offset[slots]
     inverse = sparse_map.inverse_depths(slots)
@@ -159,18 +156,18 @@ def _grow(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher:
         publisher.mark_changed(RefinedLandmarks.KIND, keyframe)
 
 
-def whole_window(
-    sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopMatch], base: BaseConfig
+def full_bundle_window(
+    sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopEdge], base: BaseConfig
 ) -> BundleWindow | None:  # fmt: skip
-    """The problem of a whole map, or of the part around its newest loop when it is too large."""
+    """Bundle window of a whole map, or of the part around its newest loop if the map is too large."""
     config = base.graph
     keyframes = [k for k in keyframes_of(sparse_map, map_id) if not sparse_map.keyframes.culled[sparse_map.rows[k]]]
     first = sparse_map.submaps[sparse_map.map_id(map_id)][0]
     if len(keyframes) > config.max_full:
-        newest = next((v for v in reversed(loops) if v.new in keyframes), None)
-        spots = [newest.new, newest.old] if newest is not None else keyframes[-1:]
+        newest = next((e for e in reversed(loops) if e.new in keyframes), None)
+        around = [newest.new, newest.old] if newest is not None else keyframes[-1:]
         near = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
-        centres = np.stack([sparse_map.keyframes.T_w_k[sparse_map.rows[k], :3, 3] for k in spots])
+        centres = np.stack([sparse_map.keyframes.T_w_k[sparse_map.rows[k], :3, 3] for k in around])
         distance = np.linalg.norm(near[:, None] - centres, axis=2).min(axis=1)
         keep = np.sort(np.argsort(distance, kind="stable")[: config.max_full])
         keyframes = [keyframes[i] for i in keep.tolist()]

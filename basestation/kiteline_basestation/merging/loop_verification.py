@@ -1,7 +1,7 @@
-"""Proves that a keyframe looks at what older keyframes saw: by the points that both see, and by where they lie.
+"""Verifies geometrically that a keyframe shows the same place as an older keyframe.
 
-Guided matching, absolute pose by RANSAC, then the neighbours' points, as in ORB-SLAM2 section III-E; what looks alike
-must also fill the image, stand in several depths, and be found where it is foreseen.
+Descriptor matching, absolute pose by RANSAC, then guided matching of the neighbours' landmarks, as in ORB-SLAM2,
+section III-E. The matched landmarks must also be spread over the image and make up most of those expected in view.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.loop_edges import LoopMatch
 from kiteline_basestation.refinement.landmark_matching import predict_projections
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
@@ -28,16 +29,16 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
 
-_UNIT_RATIO = 1.15  # of depths: what drifts of one eye leave; another unit is farther off
-_UNIT_POINTS = 8  # with depth in both maps; fewer say nothing
+_UNIT_RATIO = 1.15  # of depths in two maps: monocular scale drift stays below it
+_UNIT_POINTS = 8  # with depth in both maps; fewer are not tested
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """What a keyframe sees, one row an observation.
+class KeyframeObservations:
+    """Observations of a keyframe, one row each.
 
-    slots, points: (n,) observations and roots. uv: (n,2) px. disparity: (n,) px, -1 none. octave, angle: (n,).
-    descriptor: (n,32). xyz: (n,3) m in w. known: (n,) whether xyz means something.
+    slots, points: (n,) observations and their root landmarks. uv: (n,2) px. disparity: (n,) px, -1 none. octave, angle:
+    (n,). descriptor: (n,32). xyz: (n,3) m in w. known: (n,) True where the landmark has a depth.
     """
 
     slots: I32
@@ -51,54 +52,37 @@ class View:
     known: Bools
 
 
-@dataclass(frozen=True, slots=True)
-class LoopMatch:
-    """A keyframe `new` that proved to see what `old` saw. T_old_new: (4,4). inliers: points that agree.
-
-    mine, theirs: (k,) slots of points of the new and of the old that are one. depth_m: median depth of them. Lengths
-    are in units of the old one's submap. scale: how many of these one unit of the new one's is, where the two stand.
-    """
-
-    new: KeyframeId
-    old: KeyframeId
-    T_old_new: F64
-    inliers: int
-    mine: I32
-    theirs: I32
-    depth_m: float
-    scale: float = 1.0
-
-
-def view_of(sparse_map: SparseMap, keyframe: KeyframeId) -> View:
-    """All that a keyframe sees; what was born elsewhere is described by its birth, turned as the keyframe sees it."""
+def observations_of(sparse_map: SparseMap, keyframe: KeyframeId) -> KeyframeObservations:
+    """Observations of a keyframe, with descriptors of the root landmarks rotated to the keyframe's roll."""
     table = sparse_map.keypoints
     row = sparse_map.rows[keyframe]
     slots = sparse_map.observations_of(keyframe)
     points = table.root[slots]
-    from_birth = np.where(table.kind[slots] == LANDMARK, slots, points)
+    described_by = np.where(table.kind[slots] == LANDMARK, slots, points)
     T = sparse_map.keyframes.T_w_k
-    turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[from_birth], :3, :3])
+    turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[described_by], :3, :3])
     roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
-    angle = (table.angle[from_birth].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
+    angle = (table.angle[described_by].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
     xyz, known = sparse_map.positions(points)
     bf = sparse_map.keyframes.camera[row, 4]
     ranged = (table.inv_depth[slots] > 0) & (bf > 0) & (not sparse_map.is_up_to_scale(submap_of_keyframe(keyframe)))
     measured = np.where(ranged, bf * table.inv_depth[slots].astype(np.float64), -1.0)
-    return View(
+    return KeyframeObservations(
         slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle.astype(np.uint8),
-        table.descriptor[from_birth], xyz, known,
+        table.descriptor[described_by], xyz, known,
     )  # fmt: skip
 
 
 def verify_loop(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig, view: View | None = None
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig, view: KeyframeObservations | None = None
 ) -> LoopMatch | None:  # fmt: skip
-    """Whether `new` sees what `old` and its neighbours saw, and how the two then lie; None without proof.
+    """Match `new` against `old` and its covisible neighbours; None if the match cannot be verified.
 
-    The poses of both are taken from their own maps; how these lie to each other is not used. view: of `new`, if known.
+    Poses are taken within the map of each keyframe; the current alignment of the two maps is not used. view: the
+    observations of `new`, if already gathered.
     """
-    mine = view_of(sparse_map, new) if view is None else view
-    theirs = view_of(sparse_map, old)
+    mine = observations_of(sparse_map, new) if view is None else view
+    theirs = observations_of(sparse_map, old)
     wanted, offered = comparable(mine.descriptor, theirs.descriptor)
     pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
     a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
@@ -106,13 +90,13 @@ def verify_loop(
         return None
     free = any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (new, old))
     if free:
-        mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # of another metre than the old map's
-    start = _with_scale(sparse_map, new, old, mine, theirs, a, b, config) if free else None
-    start = start or _by_pixels(sparse_map, new, old, mine, theirs, a, b, config)
+        mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # in another unit than the old map
+    start = _solve_similarity(sparse_map, new, old, mine, theirs, a, b, config) if free else None
+    start = start or _solve_pnp(sparse_map, new, old, mine, theirs, a, b, config)
     if start is None:
         return None
     observed = np.column_stack([mine.uv, mine.disparity])
-    found = _with_neighbours(sparse_map, new, old, mine, observed, start[0], start[1] if free else 1.0, config)
+    found = _match_neighbours(sparse_map, new, old, mine, observed, start[0], start[1] if free else 1.0, config)
     if found is None:
         return None
     T_c_w, which, points, share = found
@@ -123,27 +107,26 @@ def verify_loop(
     xyz, _ = sparse_map.positions(points)
     depth = se3.transform(T_c_w, xyz)[:, 2]
     T_old_new = se3.orthonormalise(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[old]]) @ se3.inverse(T_c_w))
+    ids = sparse_map.landmark_ids(mine.points[which]), sparse_map.landmark_ids(points)
     if not free:
-        if not _one_unit(sparse_map, new, mine, which, depth):
+        if not same_unit(sparse_map, new, mine, which, depth):
             return None
-        return LoopMatch(new, old, T_old_new, len(which), mine.points[which], points, float(np.median(depth)))
-    scale = depth_scale(_own_depth(sparse_map, new, mine, which), depth[mine.known[which]], config)
+        return LoopMatch(new, old, T_old_new, len(which), float(np.median(depth)), 1.0, *ids)
+    scale = depth_scale(_depths_in_own_map(sparse_map, new, mine, which), depth[mine.known[which]], config)
     if scale is None:
         return None
     unit_new, unit_old = (float(sparse_map.keyframes.unit[sparse_map.rows[k]]) for k in (new, old))
     return LoopMatch(
-        new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), mine.points[which], points,
-        float(np.median(depth)) / unit_old, scale * unit_new / unit_old,
+        new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), float(np.median(depth)) / unit_old,
+        scale * unit_new / unit_old, *ids,
     )  # fmt: skip
 
 
-def _by_pixels(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
+def _solve_pnp(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations, theirs: KeyframeObservations, a: I32, b: I32,
     config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
-    """T_c_w (4,4) of the new camera in the old map, by the old map's points, and how much longer that map has what the
-    new one's has, roughly.
-    """
+    """T_c_w (4,4) of the new camera in the old map by RANSAC PnP, and a rough scale of the old over the new map."""
     rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
     observed = np.column_stack([mine.uv, mine.disparity])
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
@@ -152,17 +135,17 @@ def _by_pixels(
         return None
     a, b = a[fit.inlier], b[fit.inlier]
     other = se3.transform(fit.T_c_m, theirs.xyz[b])[mine.known[a], 2]
-    ratio = other / np.maximum(_own_depth(sparse_map, new, mine, a), 1e-3)
+    ratio = other / np.maximum(_depths_in_own_map(sparse_map, new, mine, a), 1e-3)
     return fit.T_c_m, float(np.median(ratio)) if len(ratio) else 1.0
 
 
-def _with_scale(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, theirs: View, a: I32, b: I32,
+def _solve_similarity(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations, theirs: KeyframeObservations, a: I32, b: I32,
     config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
-    """T_c_w (4,4) of the new camera in the old map, and how much longer that map has what the new one's has: by points
-    that both maps have, in either's image (B. Horn, 1987, in RANSAC, as ORB-SLAM does for one eye). Where too few are
-    known to both, pixels say the pose, and the scale follows from what the neighbours know.
+    """T_c_w (4,4) of the new camera in the old map, and the scale of the old over the new map.
+
+    Aligns landmarks known in both maps (B. Horn, 1987, in RANSAC, as monocular ORB-SLAM does). None with too few.
     """
     both = mine.known[a]
     a, b = a[both], b[both]
@@ -185,43 +168,41 @@ def _seed(new: KeyframeId, old: KeyframeId) -> int:
     return int(new) ^ (int(old) << 1)
 
 
-def _own_depth(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32) -> F64:
-    """Depths (k,) in the new camera, by its own map in w, of those rows of its view that have one."""
+def _depths_in_own_map(sparse_map: SparseMap, new: KeyframeId, mine: KeyframeObservations, which: I32) -> F64:
+    """Depths (k,) in w, in the new camera by its own map, of the rows `which` that have one."""
     xyz = mine.xyz[which[mine.known[which]]]
     return se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[new]]), xyz)[:, 2]
 
 
 def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
-    """How much longer one map has what another has, by the depths (n,) of the same points in both; None where these do
-    not say one thing, well enough.
-    """
+    """Scale of the other map over its own, from depths (n,) of the same points; None if it is too uncertain."""
     if len(own) < config.scale_points:
         return None
     ratio = np.log(np.maximum(other, 1e-3) / np.maximum(own, 1e-3))
     middle = float(np.median(ratio))
     apart = np.abs(ratio - middle)
     close = apart < config.scale_spread
-    sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # of a median
+    sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # standard error of a median
     if float(np.mean(close)) < config.scale_share or sigma > config.scale_sigma:
         return None
     return float(np.exp(middle))
 
 
-def _one_unit(sparse_map: SparseMap, new: KeyframeId, mine: View, which: I32, depth: F64) -> bool:
-    """Whether the new keyframe's map has the unit of length of the other, by the depths (k,) m of points seen in both.
+def same_unit(sparse_map: SparseMap, new: KeyframeId, mine: KeyframeObservations, which: I32, depth: F64) -> bool:
+    """True if both maps have the same unit of length, by depths (k,) m of landmarks observed in both.
 
-    One eye alone has a unit of its own in each submap; a pose from points cannot tell.
+    A monocular submap has a unit of its own, which a pose by PnP cannot show.
     """
     known = mine.known[which]
     if np.count_nonzero(known) < _UNIT_POINTS:
         return True
-    own = _own_depth(sparse_map, new, mine, which)
+    own = _depths_in_own_map(sparse_map, new, mine, which)
     ratio = float(np.median(depth[known] / np.maximum(own, 1e-3)))
     return 1.0 / _UNIT_RATIO < ratio < _UNIT_RATIO
 
 
 def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: LoopConfig) -> bool:
-    """Whether pixels (n,2) lie in enough parts of the image: a poster that hangs twice fills only one."""
+    """True if pixels (n,2) lie in enough cells of the image: a poster that hangs twice fills few."""
     camera = sparse_map.cameras[agent_of_keyframe(keyframe)]
     column = np.clip(uv[:, 0] * (config.columns / camera.width), 0, config.columns - 1).astype(np.int64)
     row = np.clip(uv[:, 1] * (config.rows / camera.height), 0, config.rows - 1).astype(np.int64)
@@ -229,14 +210,14 @@ def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: Loo
     return int(np.count_nonzero(filled >= config.cell_points)) >= config.min_cells
 
 
-def _with_neighbours(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: View, observed: F64, T_c_w: F64, scale: float,
+def _match_neighbours(
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations, observed: F64, T_c_w: F64, scale: float,
     config: LoopConfig,
 ) -> tuple[F64, I32, I32, float] | None:  # fmt: skip
-    """Look for all that the old keyframe and its neighbours saw, twice, the second time closer.
+    """Match all landmarks of the old keyframe and its neighbours, twice, the second time within half the radius.
 
-    scale: how much longer the old map has what the new one's has. Returns the pose, rows of `mine` and points
-    (k,) that agree, and the share of what should be seen that is.
+    scale: of the old over the new map. Returns the pose, rows of `mine` and landmark slots (k,) that agree, and their
+    share of the landmarks expected in view.
     """
     around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.neighbours]]
     points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
@@ -267,16 +248,20 @@ def _with_neighbours(
         )  # fmt: skip
         if not np.isfinite(T).all():
             return None
-    # Of what the new keyframe measured with depth inside the old views, how much is one with what they saw?
     first, unique = np.unique(a[inlier], return_index=True)
-    share = len(first) / max(1, min(len(seen), _inside(sparse_map, mine, T, scale, new, around)))
+    share = len(first) / max(1, min(len(seen), _expected_in_view(sparse_map, mine, T, scale, new, around)))
     return T, first.astype(np.int32), np.asarray(b[inlier][unique]), share
 
 
-def _inside(
-    sparse_map: SparseMap, mine: View, T_c_w: F64, scale: float, new: KeyframeId, around: list[KeyframeId]
+def _expected_in_view(
+    sparse_map: SparseMap,
+    mine: KeyframeObservations,
+    T_c_w: F64,
+    scale: float,
+    new: KeyframeId,
+    around: list[KeyframeId],
 ) -> int:
-    """How many points of the new keyframe should lie inside the image of one of the old keyframes."""
+    """Number of landmarks of the new keyframe that project into the image of one of the old keyframes."""
     row = sparse_map.rows[new]
     local = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[row]), mine.xyz)
     xyz = se3.transform(se3.inverse(T_c_w), scale * local)[mine.known]
@@ -293,7 +278,7 @@ def _inside(
 
 
 def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig) -> F64:
-    """One deviation (n,3) m of points along the rays on which they hang."""
+    """One standard deviation (n,3) m of landmarks along their viewing rays."""
     rows = sparse_map.keypoints.row[points]
     pose = sparse_map.keyframes.T_w_k[rows]
     ray = xyz - pose[:, :3, 3]

@@ -16,13 +16,14 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.flight_log import RESTORED, metadata_of, station_of, write_step
 from kiteline_basestation.runtime.flight_summary import FlightSummary, counts, flight_summary, timings
+from kiteline_basestation.runtime.imports import read_imports
 from kiteline_basestation.runtime.map_files import map_files
 from kiteline_basestation.runtime.options import BaseOptions, base_config
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store.combine import combine
-from kiteline_basestation.store.keeper import Keeper, read_imports
+from kiteline_basestation.store.keeper import Keeper
 from kiteline_basestation.store.restore import Restored, restore
 from kiteline_basestation.store.saved_map import SavedMap, pack
 from kiteline_codec import warm as codec_warm
@@ -110,7 +111,7 @@ class BaseRuntime:
             if self._log is not None:
                 self._log.blob(RESTORED, now_ns + self.options.start_ns, pack(saved))
             restored = restore(self.station, saved, now_ns)
-            saved = restored.kept
+            saved = restored.saved
         if self.keeper is not None:
             self.keeper.begin(self.station, saved, stored)
         return restored
@@ -159,7 +160,7 @@ class BaseRuntime:
         if self._log is not None:
             write_step(self._log, arrived, done, output, now_ns, now_ns + self.options.start_ns, orders)
         if self.keeper is not None:
-            self.keeper.keep_at_times(self.station, now_ns)
+            self.keeper.write_changes(self.station, now_ns)
         for agent, out in output.packets:
             self._links.send(agent, out, now_ns)
         self._step_ms.append((time.process_time_ns() - begin_ns) / 1e6)

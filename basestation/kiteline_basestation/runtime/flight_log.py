@@ -20,7 +20,7 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.station import Import, Station, StationOutput
-from kiteline_basestation.store.saved_map import Codes, SavedMap, pack, unpack
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
@@ -97,7 +97,7 @@ def write_step(
             log.blob(packets_in(agent), log_ns, packet)
     for order in orders:
         if isinstance(order, Import):
-            log.blob(IMPORT, log_ns, pack(SavedMap({order.agent: Codes(dict(order.codes), {})})))
+            log.blob(IMPORT, log_ns, pack(SavedMap({order.agent: SavedValues(dict(order.codes), {})})))
         else:
             log.json(COMMAND, log_ns, {"id": order.id, "verb": order.verb, "text": order.text})
     for job in done:

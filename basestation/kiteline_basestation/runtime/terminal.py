@@ -6,9 +6,9 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from kiteline_basestation.management import called
-from kiteline_basestation.merging.loop_verification import LoopMatch
-from kiteline_basestation.merging.merge import Merge
+from kiteline_basestation.management import submap_name
+from kiteline_basestation.merging.loop_edges import LoopEdge
+from kiteline_basestation.merging.merges import MapMerge
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_core.geometry import se3
@@ -30,7 +30,7 @@ class TerminalReporter:
         merger = station.mapper.merger
         self._loops = 0 if merger is None else merger.loops
         self._undone = 0 if merger is None else merger.undone
-        self._proofs = 0 if merger is None else len(merger.proved)
+        self._proofs = 0 if merger is None else len(merger.edges)
         self._merges = [] if merger is None else list(merger.merges)
         self._summary_ns = _EVERY_NS
         self._bytes_down = self._bytes_up = 0
@@ -77,7 +77,7 @@ class TerminalReporter:
         merger = mapper.merger
         if merger is None:
             return out
-        proved, self._proofs = merger.proved[self._proofs :], len(merger.proved)
+        proved, self._proofs = merger.edges[self._proofs :], len(merger.edges)
         if merger.loops > self._loops:
             self._loops = merger.loops
             out.append(f"loop closed, the {_nth(self._loops)}: {self._loop(proved)}")
@@ -86,12 +86,12 @@ class TerminalReporter:
         if merger.undone > self._undone:
             self._undone = merger.undone
             gone = [m for m in self._merges if not any(m is kept for kept in merger.merges)]
-            names = ", ".join(_name(m.eldest, mapper.names) for m in gone)
+            names = ", ".join(_name(m.map_id, mapper.names) for m in gone)
             out.append(f"map {names} is taken out of the map that it was laid into")
         self._merges = list(merger.merges)
         return out
 
-    def _loop(self, proved: Sequence[LoopMatch]) -> str:
+    def _loop(self, proved: Sequence[LoopEdge]) -> str:
         """How long a loop is, and how far its ends were apart."""
         sparse_map = self._station.mapper.map
         vote = max(proved, key=lambda v: v.inliers, default=None)
@@ -111,10 +111,10 @@ class TerminalReporter:
         at = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in between], :3, 3]
         return float(np.linalg.norm(np.diff(at, axis=0), axis=1).sum())
 
-    def _joined(self, merge: Merge) -> str:
+    def _joined(self, merge: MapMerge) -> str:
         mapper = self._station.mapper
         keyframes = sum(len(mapper.map.submaps.get(submap, ())) for submap in merge.moved)
-        newer, older = _name(merge.eldest, mapper.names), _name(merge.into, mapper.names)
+        newer, older = _name(merge.map_id, mapper.names), _name(merge.into, mapper.names)
         return f"map {newer} ({keyframes} keyframes) joined to map {older}"
 
     def summary(self) -> str:
@@ -146,7 +146,7 @@ class TerminalReporter:
 
 
 def _name(submap: SubmapId, names: dict[SubmapId, str]) -> str:
-    return f'{called(submap)} "{names[submap]}"' if submap in names else called(submap)
+    return f'{submap_name(submap)} "{names[submap]}"' if submap in names else submap_name(submap)
 
 
 def _count(number: int, noun: str) -> str:

@@ -1,76 +1,85 @@
-"""Two finished maps in one store. Where the second lies in the first is not known: it is found by its places."""
+"""Combines two saved maps. Where the second lies in the first is unknown: loop closures find it."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from dataclasses import replace
 
-from kiteline_basestation.store.saved_map import Codes, SavedMap
-from kiteline_codec.schema import WORLD_KINDS, Key, KeyframeHeader, WireError
-from kiteline_core.ids import AgentId
-
-_NUMBERED = ("edge", "merge")
+from kiteline_basestation.intake.placements import PlacementState
+from kiteline_basestation.mapper_state import MapperState
+from kiteline_basestation.merging.loop_detector import DetectorState
+from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.state_texts import state_of, texts_of
+from kiteline_codec.schema import GridTile, Key, KeyframeHeader, SubmapPlacement, WireError
+from kiteline_core.ids import AgentId, KeyframeId
 
 
 def combine(first: SavedMap, second: SavedMap) -> SavedMap:
-    """Both maps; the first one's world. What the second has of the same keyframes as the first is passed over.
+    """Both maps, in the world of the first. Of keyframes in both, the first map's values are taken.
 
-    Raises WireError where both have other keyframes under the same ids.
+    Raises WireError if the maps hold different keyframes under the same ids.
     """
     if first.empty:
         return second
-    agents: dict[AgentId, Codes] = dict(first.agents)
-    new: list[int] = []
-    for agent, codes in sorted(second.agents.items()):
-        here = agents.get(agent, Codes({}, {}))
-        heads = {key for key in codes.received if key.kind == KeyframeHeader.KIND}
-        for key in heads:
-            if here.received.get(key, codes.received[key]) != codes.received[key]:
+    agents: dict[AgentId, SavedValues] = dict(first.agents)
+    new: list[KeyframeId] = []
+    for agent, values in sorted(second.agents.items()):
+        here = agents.get(agent, SavedValues({}, {}))
+        headers = {key for key in values.received if key.kind == KeyframeHeader.KIND}
+        for key in headers:
+            if here.received.get(key, values.received[key]) != values.received[key]:
                 raise WireError(
                     f"both maps hold keyframe {key.id} of agent {agent}, and not the same: another agent with this "
                     "number? Give each its own --agent, and keep its --log folder, where its starts are counted"
                 )
-        new += sorted(key.id for key in heads if key not in here.received)
-        known = {key.id for key in heads if key in here.received}
-        agents[agent] = Codes(
-            {**codes.received, **here.received},
-            {**{key: code for key, code in codes.own.items() if _is_news(key, known)}, **here.own},
-        )
-    return SavedMap(agents, _combined(first.memory, second.memory, new))
+        new += sorted(KeyframeId(key.id) for key in headers if key not in here.received)
+        known = {key.id for key in headers if key in here.received}
+        own = {key: code for key, code in values.own.items() if _is_taken(key, known)}
+        agents[agent] = SavedValues({**values.received, **here.received}, {**own, **here.own})
+    if not second.texts:
+        return SavedMap(agents, first.texts)
+    ours, theirs = state_of(first.texts), state_of(second.texts)
+    if not first.texts:  # the second map's state, but nothing of it is placed
+        ours = replace(theirs, placements=PlacementState({}, theirs.placements.unmerged), merger=MergerState())
+    return SavedMap(agents, texts_of(_combined(ours, theirs, new)))
 
 
-def _is_news(key: Key, known: set[int]) -> bool:
-    return key.kind not in WORLD_KINDS and key.id not in known
+def _is_taken(key: Key, known: set[int]) -> bool:
+    """True if a value of the second map is taken: no placement or tile, and of no keyframe in both maps."""
+    return key.kind not in (SubmapPlacement.KIND, GridTile.KIND) and key.id not in known
 
 
-def _combined(first: Mapping[str, str], second: Mapping[str, str], new: list[int]) -> dict[str, str]:
-    out = dict(first)
-    for folder in _NUMBERED:
-        width = 6 if folder == "edge" else 4
-        at = sum(name.startswith(folder + "/") for name in first)
-        for name in sorted(name for name in second if name.startswith(folder + "/")):
-            out[f"{folder}/{at:0{width}d}"] = second[name]
-            at += 1
-    for name in second:
-        if name.startswith("submap/") and name not in first:
-            out[name] = json.dumps({**json.loads(second[name]), "T_w_m": None})
-        elif name.startswith(("agent/", "votes/")):
-            out.setdefault(name, second[name])
-    if "atlas" in second:
-        ours = json.loads(first["atlas"]) if "atlas" in first else None
-        theirs = json.loads(second["atlas"])
-        merged = {**theirs, "revisit": []} if ours is None else ours
-        merged["loops"] = theirs["loops"] + (ours["loops"] if ours else 0)
-        merged["revisit"] = sorted({*merged["revisit"], *new})
-        out["atlas"] = json.dumps(merged)
-    if "finder" in second:
-        ours = (
-            json.loads(first["finder"]) if "finder" in first else {"doubts": [], "born": [], "apart": [], "asked": []}
-        )
-        theirs = json.loads(second["finder"])
-        born = list(dict.fromkeys([*ours["born"], *theirs["born"]]))
-        apart = [*ours["apart"], *(pair for pair in theirs["apart"] if pair not in ours["apart"])]
-        out["finder"] = json.dumps({**ours, "born": born, "apart": apart})
-    if "base" not in out and "base" in second:
-        out["base"] = json.dumps({**json.loads(second["base"]), "placed": []})
-    return out
+def _combined(ours: MapperState, theirs: MapperState, new: list[KeyframeId]) -> MapperState:
+    """Our state, with the submaps, calibrations, loop edges and merges of the other map."""
+    a, b = ours.map, theirs.map
+    sparse_map = replace(
+        a,
+        root_submaps={**b.root_submaps, **a.root_submaps},
+        submap_poses={**b.submap_poses, **a.submap_poses},
+        disparity_offset_px={**b.disparity_offset_px, **a.disparity_offset_px},
+        disparity_calibrated=a.disparity_calibrated | b.disparity_calibrated,
+    )
+    intake = replace(
+        ours.intake,
+        last_pose={**theirs.intake.last_pose, **ours.intake.last_pose},
+        tracked_ns={**theirs.intake.tracked_ns, **ours.intake.tracked_ns},
+    )
+    m, n = ours.merger, theirs.merger
+    merger = replace(
+        m,
+        loops=m.loops + n.loops,
+        requery=tuple(sorted({*m.requery, *new})),
+        edges=m.edges + n.edges,
+        merges=m.merges + n.merges,
+        detector=_combined_detector(m.detector, n.detector),
+    )
+    return replace(ours, names={**theirs.names, **ours.names}, map=sparse_map, intake=intake, merger=merger)
+
+
+def _combined_detector(a: DetectorState, b: DetectorState) -> DetectorState:
+    return replace(
+        a,
+        matches={**b.matches, **a.matches},
+        first_seen=tuple(dict.fromkeys([*a.first_seen, *b.first_seen])),
+        kept_apart=a.kept_apart + tuple(pair for pair in b.kept_apart if pair not in a.kept_apart),
+    )

@@ -1,4 +1,4 @@
-"""A kept map becomes a station's map again."""
+"""Restores a station from a saved map."""
 
 from __future__ import annotations
 
@@ -6,48 +6,50 @@ from dataclasses import dataclass
 
 from kiteline_basestation.exchange.map_cache_planner import is_copy
 from kiteline_basestation.station import Station
-from kiteline_basestation.store.integrity import Checked, contradictions, sound
+from kiteline_basestation.store.integrity import Checked, check, contradictions
 from kiteline_basestation.store.saved_map import SavedMap
+from kiteline_basestation.store.state_texts import state_of
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError, messages
 
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """How it went. kept: what was taken. keyframes: in the map. faults: what was taken out. awaited: values that agents
-    are to send again.
+    """What was restored. saved: the values taken. keyframes: in the map. faults: values left out. awaited: values that
+    agents have to send again.
     """
 
-    kept: SavedMap
+    saved: SavedMap
     keyframes: int
     faults: tuple[str, ...]
     awaited: int
 
 
-def restore(station: Station, kept: SavedMap, now_ns: int) -> Restored:
-    """Put a map into a station that begins, and share with the agents again what is ours. What an agent still holds
-    comes again and replaces what it told the earlier base. Raises WireError where what is left contradicts itself.
+def restore(station: Station, saved: SavedMap, now_ns: int) -> Restored:
+    """Put a saved map into a new station, and share the base's values with the agents again.
+
+    Values that an agent sends again replace the saved ones. Raises WireError if what is left is inconsistent.
     """
     try:
-        return _restore(station, sound(kept), now_ns)
+        return _restore(station, check(saved), now_ns)
     except (KeyError, TypeError, ValueError) as error:
-        raise WireError(f"the kept map's memory cannot be read ({error!r}); begin an empty store") from error
+        raise WireError(f"the saved map's state cannot be read ({error!r}); begin an empty store") from error
 
 
 def _restore(station: Station, checked: Checked, now_ns: int) -> Restored:
-    mapper = station.mapper
-    for agent, codes in sorted(checked.kept.agents.items()):
+    mapper, saved = station.mapper, checked.saved
+    for agent, values in sorted(saved.agents.items()):
         channel = station.join(agent)
         if isinstance(channel, CodedChannel):
-            channel.endpoint.resume(codes.received)  # so that its agent need not send it again
-        received = tuple(messages.decode(key, codes.received[key]) for key in sorted(codes.received))
+            channel.endpoint.resume(values.received)  # so that its agent need not send them again
+        received = tuple(messages.decode(key, values.received[key]) for key in sorted(values.received))
         mapper.restore(agent, received, (), now_ns)
-    for agent, codes in sorted(checked.kept.agents.items()):  # what is ours may tell of points of several agents
+    for agent, values in sorted(saved.agents.items()):  # after all received: fused landmarks may be of several agents
         channel = station.join(agent)
-        ours = [key for key in sorted(codes.own) if not is_copy(key)]  # what was lent is lent anew
-        mapper.restore(agent, (), tuple(channel.put(messages.decode(key, codes.own[key])) for key in ours), now_ns)
-    mapper.recall(checked.kept.memory)
+        own = [key for key in sorted(values.own) if not is_copy(key)]  # the map cache is planned anew
+        mapper.restore(agent, (), tuple(channel.put(messages.decode(key, values.own[key])) for key in own), now_ns)
+    mapper.restore_state(state_of(saved.texts))
     wrong = contradictions(mapper)
     if wrong:
-        raise WireError(f"the kept map contradicts itself: {'; '.join(wrong[:5])}; begin an empty store")
-    return Restored(checked.kept, len(mapper.map), checked.faults, checked.awaited)
+        raise WireError(f"the saved map contradicts itself: {'; '.join(wrong[:5])}; begin an empty store")
+    return Restored(saved, len(mapper.map), checked.faults, checked.awaited)

@@ -1,8 +1,7 @@
-"""All that a base keeps for the next: the codes of both sides by agent, and what else it made of them. Pure.
+"""A map at rest: the codes that both sides wrote, by agent, and the base's state as texts. Pure.
 
-Packed (for a base's log): 8 bytes magic; then for each agent a header (agent, how many received, how many own) and its
-entries (kind, id, part, length, code); then the texts of its memory (length of name, of text; both); at the end a
-BLAKE2b digest of all before it.
+Packed for a base's log: 8 bytes magic; for each agent a header (agent, number of received and of own values) and the
+values (kind, id, part, length, code); the texts (lengths of name and text, both); a BLAKE2b digest of all before it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import dataclass, field
 from kiteline_codec.schema import Key, WireError
 from kiteline_core.ids import AgentId
 
-_MAGIC = b"KLSTORE2"
+_MAGIC = b"KLSTORE3"
 _AGENTS = struct.Struct("<B")
 _AGENT = struct.Struct("<BII")
 _ENTRY = struct.Struct("<BqHI")
@@ -24,7 +23,7 @@ _DIGEST_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Codes:
+class SavedValues:
     """The values shared with one agent. received: what it wrote. own: what the base wrote."""
 
     received: Mapping[Key, bytes]
@@ -33,40 +32,40 @@ class Codes:
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """A map at rest. memory: JSON texts by name, see `memory`."""
+    """A map at rest. texts: state of the mapper by name, see `state_texts`."""
 
-    agents: Mapping[AgentId, Codes] = field(default_factory=dict)
-    memory: Mapping[str, str] = field(default_factory=dict)
+    agents: Mapping[AgentId, SavedValues] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def empty(self) -> bool:
-        """Whether there is no map."""
+        """True if there is no map."""
         return not any(codes.received or codes.own for codes in self.agents.values())
 
 
-def pack(kept: SavedMap) -> bytes:
-    """As bytes."""
-    out = [_MAGIC, _AGENTS.pack(len(kept.agents))]
-    for agent in sorted(kept.agents):
-        codes = kept.agents[agent]
+def pack(saved: SavedMap) -> bytes:
+    """Pack a map into bytes."""
+    out = [_MAGIC, _AGENTS.pack(len(saved.agents))]
+    for agent in sorted(saved.agents):
+        codes = saved.agents[agent]
         out.append(_AGENT.pack(agent, len(codes.received), len(codes.own)))
         for values in (codes.received, codes.own):
             for key in sorted(values):
                 out.append(_ENTRY.pack(key.kind, key.id, key.part, len(values[key])))
                 out.append(values[key])
-    for name in sorted(kept.memory):
-        words = name.encode(), kept.memory[name].encode()
-        out += [_TEXT.pack(len(words[0]), len(words[1])), *words]
+    for name in sorted(saved.texts):
+        pair = name.encode(), saved.texts[name].encode()
+        out += [_TEXT.pack(len(pair[0]), len(pair[1])), *pair]
     body = b"".join(out)
     return body + hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest()
 
 
 def unpack(content: bytes) -> SavedMap:
-    """What `pack` was given. Raises WireError on anything else."""
+    """Unpack a map. Raises WireError on anything else."""
     body, digest = content[:-_DIGEST_BYTES], content[-_DIGEST_BYTES:]
     if not body.startswith(_MAGIC) or hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest() != digest:
-        raise WireError(f"a kept map of {len(content)} bytes is damaged, or of another version")
-    agents: dict[AgentId, Codes] = {}
+        raise WireError(f"a saved map of {len(content)} bytes is damaged, or of another version")
+    agents: dict[AgentId, SavedValues] = {}
     (count,) = _AGENTS.unpack_from(body, len(_MAGIC))
     at = len(_MAGIC) + _AGENTS.size
     for _ in range(count):
@@ -79,11 +78,11 @@ def unpack(content: bytes) -> SavedMap:
                 at += _ENTRY.size
                 values[Key(kind, number, part)] = body[at : at + length]
                 at += length
-        agents[AgentId(agent)] = Codes(*parts)
-    memory: dict[str, str] = {}
+        agents[AgentId(agent)] = SavedValues(*parts)
+    texts: dict[str, str] = {}
     while at < len(body):
         name, text = _TEXT.unpack_from(body, at)
         at += _TEXT.size
-        memory[body[at : at + name].decode()] = body[at + name : at + name + text].decode()
+        texts[body[at : at + name].decode()] = body[at + name : at + name + text].decode()
         at += name + text
-    return SavedMap(agents, memory)
+    return SavedMap(agents, texts)

@@ -1,8 +1,8 @@
 """The map on disk: one SQLite file in a folder, written a batch at a time, safe against a kill at any instant.
 
 Tables: code (agent, own, kind, id, part, code), every value that an agent (own 0) or the base (own 1) wrote, as it is
-shared; memory (name, text), what else the base knows (see `memory`). A batch is one transaction, so that what is read
-back is the base as it stood between two of its steps.
+shared; state (name, text), the mapper's state (see `state_texts`). A batch is one transaction, so that what is read back
+is the base between two of its steps.
 
 Write-ahead logging with synchronous=NORMAL: a commit is one write to the log without waiting for the disk. A process
 that dies loses nothing that was committed, for the kernel holds it; a power cut may lose the last seconds but never
@@ -19,26 +19,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from kiteline_basestation.store.saved_map import Codes, SavedMap
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_codec.schema import KEYFRAME_KINDS, SUBMAP_KINDS, Key
 from kiteline_core.errors import KitelineError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
 _APPLICATION = 0x6B6C6D70  # "klmp"
-_VERSION = 2  # of the tables; a store of another version is refused
+_VERSION = 3  # of the tables; a store of another version is refused
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
 _TABLES = """
 CREATE TABLE code (
   agent INTEGER NOT NULL, own INTEGER NOT NULL, kind INTEGER NOT NULL, id INTEGER NOT NULL, part INTEGER NOT NULL,
   code BLOB NOT NULL, PRIMARY KEY (agent, own, kind, id, part)
 );
-CREATE TABLE memory (name TEXT PRIMARY KEY, text TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE state (name TEXT PRIMARY KEY, text TEXT NOT NULL) WITHOUT ROWID;
 """
 
 
 def submap_of(key: Key) -> SubmapId | None:
-    """The submap of which a value tells; None where it tells of none."""
+    """The submap that a value concerns; None if it concerns no submap."""
     if key.kind in KEYFRAME_KINDS:
         return SubmapId(key.id >> SEQUENCE_BITS)
     return SubmapId(key.id) if key.kind in SUBMAP_KINDS else None
@@ -53,22 +53,22 @@ class StoreError(KitelineError):
 
 @dataclass(slots=True)
 class Batch:
-    """What changed since the last batch. memory: None takes a text back. deleted: submaps of which nothing is kept."""
+    """Changes since the last batch. texts: None removes a text. deleted: submaps whose values are removed."""
 
     rows: list[Row] = field(default_factory=list)
     gone: list[tuple[int, int, int, int, int]] = field(default_factory=list)  # rows without their codes
-    memory: dict[str, str | None] = field(default_factory=dict)
+    texts: dict[str, str | None] = field(default_factory=dict)
     deleted: list[SubmapId] = field(default_factory=list)
 
     def __bool__(self) -> bool:
-        return bool(self.rows or self.gone or self.memory or self.deleted)
+        return bool(self.rows or self.gone or self.texts or self.deleted)
 
 
-def batch_of(kept: SavedMap, held: SavedMap) -> Batch:
-    """What has to be written so that a store that holds `held` holds `kept`, and nothing else."""
+def batch_of(saved: SavedMap, held: SavedMap) -> Batch:
+    """The changes that turn a store that holds `held` into one that holds `saved`."""
     out = Batch()
-    for agent in sorted(kept.agents.keys() | held.agents.keys()):
-        codes, before = (side.agents.get(agent, Codes({}, {})) for side in (kept, held))
+    for agent in sorted(saved.agents.keys() | held.agents.keys()):
+        codes, before = (side.agents.get(agent, SavedValues({}, {})) for side in (saved, held))
         for own, (new, old) in enumerate(((codes.received, before.received), (codes.own, before.own))):
             out.gone += [(int(agent), own, key.kind, key.id, key.part) for key in sorted(old.keys() - new.keys())]
             out.rows += [
@@ -76,8 +76,8 @@ def batch_of(kept: SavedMap, held: SavedMap) -> Batch:
                 for key in sorted(new)
                 if old.get(key) != new[key]
             ]
-    out.memory.update({name: text for name, text in kept.memory.items() if held.memory.get(name) != text})
-    out.memory.update(dict.fromkeys(held.memory.keys() - kept.memory.keys()))
+    out.texts.update({name: text for name, text in saved.texts.items() if held.texts.get(name) != text})
+    out.texts.update(dict.fromkeys(held.texts.keys() - saved.texts.keys()))
     return out
 
 
@@ -94,13 +94,13 @@ class Store:
             raise
 
     def load(self) -> SavedMap:
-        """All that is kept."""
-        with _told(self.path):
+        """Read the whole store."""
+        with _explained(self.path):
             return _read(self._db)
 
     def write(self, batch: Batch) -> None:
         """Write a batch, all of it or nothing."""
-        with _told(self.path), self._db:
+        with _explained(self.path), self._db:
             self._db.execute("BEGIN IMMEDIATE")
             for submap in batch.deleted:
                 self._delete(submap)
@@ -108,10 +108,10 @@ class Store:
                 "DELETE FROM code WHERE agent = ? AND own = ? AND kind = ? AND id = ? AND part = ?", batch.gone
             )
             self._db.executemany("INSERT OR REPLACE INTO code VALUES (?, ?, ?, ?, ?, ?)", batch.rows)
-            texts = [(name, text) for name, text in batch.memory.items() if text is not None]
-            self._db.executemany("INSERT OR REPLACE INTO memory VALUES (?, ?)", texts)
-            gone = [(name,) for name, text in batch.memory.items() if text is None]
-            self._db.executemany("DELETE FROM memory WHERE name = ?", gone)
+            written = [(name, text) for name, text in batch.texts.items() if text is not None]
+            self._db.executemany("INSERT OR REPLACE INTO state VALUES (?, ?)", written)
+            gone = [(name,) for name, text in batch.texts.items() if text is None]
+            self._db.executemany("DELETE FROM state WHERE name = ?", gone)
 
     def _delete(self, submap: SubmapId) -> None:
         agent, first, end = agent_of_submap(submap), submap << SEQUENCE_BITS, (submap + 1) << SEQUENCE_BITS
@@ -128,27 +128,27 @@ class Store:
                 )
 
     def close(self) -> None:
-        """Give the folder back; the log is folded into the file."""
+        """Close the database and unlock the folder."""
         with contextlib.suppress(sqlite3.Error):
             self._db.close()
         self._lock.close()
 
 
 def read(path: Path) -> SavedMap:
-    """The content of a store, also while its base runs. path: its folder, or the file in it. Raises StoreError."""
+    """Read a store, also while its base runs. path: its folder, or the file in it. Raises StoreError."""
     file = path / FILE if path.is_dir() else path
     if not file.is_file():
         raise StoreError(f"{file}: no such file; expected what `kiteline base --store DIR` keeps in DIR")
     db = _open(file, make=False)
     try:
-        with _told(file):
+        with _explained(file):
             return _read(db)
     finally:
         db.close()
 
 
 def _take(folder: Path) -> IO[bytes]:
-    """The folder for this process alone, until the file is closed or the process ends in any way."""
+    """Lock a folder for this process, until the file is closed or the process ends."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / "lock").open("wb")
@@ -163,7 +163,7 @@ def _take(folder: Path) -> IO[bytes]:
 
 
 def _open(path: Path, make: bool) -> sqlite3.Connection:
-    with _told(path):
+    with _explained(path):
         db = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
         try:
             tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
@@ -198,15 +198,15 @@ def _read(db: sqlite3.Connection) -> SavedMap:
     try:
         for agent, own, kind, number, part, code in db.execute("SELECT agent, own, kind, id, part, code FROM code"):
             agents.setdefault(AgentId(agent), ({}, {}))[own][Key(kind, number, part)] = code
-        memory: Mapping[str, str] = dict(db.execute("SELECT name, text FROM memory"))
+        texts: Mapping[str, str] = dict(db.execute("SELECT name, text FROM state"))
     finally:
         db.execute("COMMIT")
-    return SavedMap({agent: Codes(*agents[agent]) for agent in sorted(agents)}, memory)
+    return SavedMap({agent: SavedValues(*agents[agent]) for agent in sorted(agents)}, texts)
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """SQLite's errors in our words."""
+def _explained(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite into StoreErrors that say how to mend them."""
     try:
         yield
     except sqlite3.DatabaseError as error:

@@ -1,0 +1,159 @@
+"""Which maps are due for a pose graph or a full bundle, and which of these jobs are pending."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import Job
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.correction import essential_graph_of, full_bundle_window, keyframes_of
+from kiteline_basestation.merging.graph_job import POSE_GRAPH
+from kiteline_basestation.merging.loop_edges import LoopEdge
+from kiteline_basestation.refinement import disparity_calibration as disparity
+from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, BundleInputs
+from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_basestation.refinement.full_bundle_schedule import FullBundleSchedule
+from kiteline_basestation.refinement.odometry_factors import with_odometry_factors
+from kiteline_core.ids import AgentId, SubmapId
+
+
+@dataclass(frozen=True, slots=True)
+class FullBundle:
+    """A pending full bundle. calibrated: agents whose disparity offsets it estimates too."""
+
+    map_id: SubmapId
+    window: BundleWindow
+    calibrated: tuple[AgentId, ...]
+
+
+class CorrectionJobs:
+    """Pose graphs and full bundles of whole maps: due, and pending at the worker."""
+
+    def __init__(self, config: BaseConfig, sparse_map: SparseMap, job_ids: Iterator[int]) -> None:
+        self._config = config
+        self._map = sparse_map
+        self._job_ids = job_ids
+        self._schedule = FullBundleSchedule(config.graph)
+        self._graphs_due: set[SubmapId] = set()
+        self._bundles_due: set[SubmapId] = set()
+        self._uncalibrated: set[SubmapId] = set()  # of the bundles due, those that take disparities as they are
+        self._graphs: dict[int, SubmapId] = {}
+        self._bundles: dict[int, FullBundle] = {}
+        self.uncertain_at: dict[SubmapId, int] = {}  # keyframes of a map when its disparity offsets were too uncertain
+
+    @property
+    def idle(self) -> bool:
+        """True if nothing is due or pending."""
+        due = self._graphs_due or self._bundles_due or self._schedule.waiting(self._sizes())
+        return not (due or self.pending)
+
+    @property
+    def pending(self) -> int:
+        """Number of pending jobs."""
+        return len(self._graphs) + len(self._bundles)
+
+    @property
+    def graphs_due(self) -> tuple[SubmapId, ...]:
+        """Maps with a pose graph due or pending."""
+        return tuple(sorted(self._graphs_due.union(self._graphs.values())))
+
+    @property
+    def bundles_due(self) -> tuple[SubmapId, ...]:
+        """Maps with a full bundle due or pending."""
+        return tuple(sorted(self._bundles_due | {bundle.map_id for bundle in self._bundles.values()}))
+
+    @property
+    def bundled_sizes(self) -> dict[SubmapId, int]:
+        """Number of keyframes of each map when its full bundle was last scheduled."""
+        return self._schedule.bundled
+
+    def restore(self, graphs: Collection[SubmapId], bundles: Collection[SubmapId]) -> None:
+        """Make jobs of an earlier process due again."""
+        self._graphs_due = {s for s in graphs if s in self._map.submaps}
+        self._bundles_due = {s for s in bundles if s in self._map.submaps}
+
+    def is_busy(self, map_id: SubmapId) -> bool:
+        """True if a correction of a map is due or pending."""
+        return map_id in self.graphs_due or map_id in self.bundles_due
+
+    def fits(self, map_id: SubmapId) -> bool:
+        """True if one bundle can hold a whole map."""
+        return len(keyframes_of(self._map, map_id)) <= self._config.graph.max_full
+
+    def request_graph(self, map_id: SubmapId) -> None:
+        """Make a pose graph of a map due."""
+        self._graphs_due.add(map_id)
+
+    def request_bundle(self, map_id: SubmapId, calibrate: bool = True) -> None:
+        """Make a full bundle of a map due. calibrate: estimate disparity offsets as well, if that may succeed."""
+        self._bundles_due.add(map_id)
+        if not calibrate:
+            self._uncalibrated.add(map_id)
+
+    def cancel_pending(self, map_id: SubmapId) -> None:
+        """Ignore the results of pending jobs of a map: they are out of date."""
+        self._graphs = {job: m for job, m in self._graphs.items() if m != map_id}
+        self._bundles = {job: bundle for job, bundle in self._bundles.items() if bundle.map_id != map_id}
+
+    def cancel(self, map_id: SubmapId) -> None:
+        """Cancel all corrections of a map that is no more."""
+        self.cancel_pending(map_id)
+        self._graphs_due.discard(map_id)
+        self._bundles_due.discard(map_id)
+
+    def take_graph(self, job: int) -> SubmapId | None:
+        """The map of a finished pose graph; None if it was cancelled."""
+        return self._graphs.pop(job, None)
+
+    def take_bundle(self, job: int, cost_ops: int, now_ns: int) -> FullBundle | None:
+        """The finished full bundle; None if it was cancelled."""
+        bundle = self._bundles.pop(job, None)
+        if bundle is not None:
+            self._schedule.done(cost_ops, now_ns)
+        return bundle
+
+    def jobs(self, edges: Sequence[LoopEdge], now_ns: int) -> list[Job]:
+        """Start pose graphs that are due, then full bundles of maps without a pending graph."""
+        sizes = self._sizes()
+        grown = self._schedule.next(sizes, [m for m in sizes if self.is_busy(m)], now_ns)
+        if grown is not None:
+            self._bundles_due.add(grown)
+        out: list[Job] = []
+        for map_id in sorted(self._graphs_due):
+            inputs = essential_graph_of(self._map, map_id, edges, self._config.graph)
+            if inputs is not None:
+                out.append(Job(next(self._job_ids), POSE_GRAPH.name, inputs))
+                self._graphs[out[-1].id] = map_id
+        self._graphs_due.clear()
+        for map_id in sorted(self._bundles_due - set(self._graphs.values())):
+            window = full_bundle_window(self._map, map_id, edges, self._config)
+            if window is not None:
+                bundle = self._with_calibration(FullBundle(map_id, window, ()))
+                problem = with_odometry_factors(self._map, bundle.window, self._config.links)
+                trials = self._config.graph.robust_trials, self._config.graph.final_trials
+                solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
+                out.append(Job(next(self._job_ids), FULL_BUNDLE.name, BundleInputs(problem, solver)))
+                self._bundles[out[-1].id] = bundle
+            self._bundles_due.discard(map_id)
+            self._uncalibrated.discard(map_id)
+        return out
+
+    def _with_calibration(self, bundle: FullBundle) -> FullBundle:
+        """Add disparity offsets to the unknowns, unless they were too uncertain in a map hardly smaller than now."""
+        size = len(keyframes_of(self._map, bundle.map_id))
+        enough = self._config.disparity.again * self.uncertain_at.get(bundle.map_id, 0)
+        if not self.fits(bundle.map_id) or bundle.map_id in self._uncalibrated or size < enough:
+            return bundle
+        window = bundle.window
+        problem, agents = disparity.with_border(self._map, window.slots, window.problem, self._config.disparity)
+        return FullBundle(bundle.map_id, replace(window, problem=problem), agents)
+
+    def _sizes(self) -> dict[SubmapId, int]:
+        """Number of keyframes of each map that one bundle can hold."""
+        out: dict[SubmapId, int] = {}
+        for submap, keyframes in self._map.submaps.items():
+            map_id = self._map.map_id(submap)
+            out[map_id] = out.get(map_id, 0) + len(keyframes)
+        return {map_id: size for map_id, size in out.items() if size <= self._config.graph.max_full}

@@ -1,0 +1,91 @@
+"""Checks that tell a true loop closure from a place that only looks alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, correction_of, depth_of
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import KeyframeId, submap_of_keyframe
+
+F64 = NDArray[np.float64]
+
+_PLANE_ROUNDS = 4  # plane fits, each to the points near the last one
+
+
+def agree(sparse_map: SparseMap, a: LoopEdge, b: LoopEdge, config: LoopConfig) -> bool:
+    """True if two matches imply the same correction, up to the drift between their keyframes."""
+    Xa, Xb = correction_of(sparse_map, a), correction_of(sparse_map, b)
+    same_submap = submap_of_keyframe(a.new) == submap_of_keyframe(b.new)
+    if not same_submap:
+        Xa = sim3.inverse(Xa)
+    if abs(np.log(sim3.scale_of(Xa) / sim3.scale_of(Xb))) > config.agree_scale:
+        return False
+    T_w_a, T_w_b = sparse_map.world_pose(a.new), sparse_map.world_pose(b.new)
+    assert T_w_a is not None and T_w_b is not None
+    at = T_w_b[:3, 3]
+    apart = float(np.linalg.norm(se3.transform(Xa, at[None])[0] - se3.transform(Xb, at[None])[0]))
+    path = float(np.linalg.norm(T_w_a[:3, 3] - at)) if same_submap else 0
+    depth = max(depth_of(sparse_map, a), depth_of(sparse_map, b))
+    limit = config.agree_m + config.agree_depth * depth + config.agree_path * path
+    return apart <= limit and _rotation_between(Xa, Xb) <= config.agree_rad
+
+
+def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:
+    """True if the correction of a loop is no larger than the drift expected over the path between its keyframes."""
+    X = correction_of(sparse_map, edge)
+    pose = sparse_map.world_pose(edge.new)
+    assert pose is not None
+    path = path_length(sparse_map, edge.old, edge.new)
+    share = config.drift_path
+    if any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (edge.new, edge.old)):
+        share = config.own_drift_path + abs(
+            float(np.log(sim3.scale_of(X)))
+        )  # scale drift displaces the end of the path
+    moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
+    return (
+        moved <= config.drift_m + share * path
+        and _rotation_between(np.eye(4), X) <= config.drift_rad + config.drift_rad_m * path
+        and abs(float(np.log(sim3.scale_of(X)))) <= config.own_drift_scale
+    )
+
+
+def path_length(sparse_map: SparseMap, a: KeyframeId, b: KeyframeId) -> float:
+    """Length in w of the path between two keyframes of one submap, or of both submaps together."""
+    total = 0.0
+    same = submap_of_keyframe(a) == submap_of_keyframe(b)
+    for submap in sorted({submap_of_keyframe(a), submap_of_keyframe(b)}):
+        keyframes = sparse_map.submaps[submap]
+        if same:
+            keyframes = [k for k in keyframes if min(a, b) <= k <= max(a, b)]
+        positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
+        total += float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    return total
+
+
+def has_depth_relief(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> bool:
+    """True if enough matched landmarks lie off their common plane; a flat picture may hang in two places."""
+    ids = np.concatenate([m.old_landmarks for m in matches])
+    xyz, known = sparse_map.positions(np.unique(sparse_map.find_landmarks(ids)))
+    xyz = xyz[known]
+    if len(xyz) < config.min_inliers:
+        return False
+    limit = config.off_plane * float(np.median([depth_of(sparse_map, m) for m in matches]))
+    inside = np.ones(len(xyz), np.bool_)
+    distance = np.zeros(len(xyz))
+    for _ in range(_PLANE_ROUNDS):
+        centre = xyz[inside].mean(axis=0)
+        normal = np.linalg.svd(xyz[inside] - centre, full_matrices=False)[2][2]
+        distance = np.abs((xyz - centre) @ normal)
+        inside = distance <= max(limit, float(np.median(distance)))
+    return float(np.mean(distance > limit)) >= config.min_off_plane
+
+
+def _rotation_between(Sa: F64, Sb: F64) -> float:
+    """Angle in rad between two similarities (4,4)."""
+    return float(np.linalg.norm(se3.so3_log(se3.orthonormalise(sim3.inverse(Sa) @ Sb)[:3, :3])))

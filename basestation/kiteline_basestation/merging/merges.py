@@ -1,0 +1,56 @@
+"""Merges of maps, and what a step of the map merger changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.ids import KeyframeId, SubmapId
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+def _no_pairs() -> I64:
+    return np.empty((0, 2), np.int64)
+
+
+@dataclass(slots=True, eq=False)
+class MapMerge:
+    """A merge of the map `map_id` into the map `into`.
+
+    moved: S_w_m (4,4) of each submap of the merged map before the merge. fused: (n,2) landmark ids fused by the merge.
+    """
+
+    map_id: SubmapId
+    into: SubmapId
+    moved: dict[SubmapId, F64]
+    fused: I64 = field(default_factory=_no_pairs)
+
+
+@dataclass(frozen=True, slots=True)
+class MergeResult:
+    """Changes of whole maps that the mapper has to apply.
+
+    moved: ids of maps in which all keyframes may have moved. rescaled: factors by which units of submaps grew in their
+    map. split: submaps that no longer belong to the map that they were merged into. requeried: keyframes for which loop
+    closures were searched again; local bundles are due around them.
+    """
+
+    moved: frozenset[SubmapId] = frozenset()
+    rescaled: Mapping[SubmapId, float] = field(default_factory=dict)
+    split: frozenset[SubmapId] = frozenset()
+    requeried: tuple[KeyframeId, ...] = ()
+
+    def __add__(self, later: MergeResult) -> MergeResult:
+        factors = {submap: self.rescaled.get(submap, 1.0) * factor for submap, factor in later.rescaled.items()}
+        return MergeResult(
+            self.moved | later.moved, {**self.rescaled, **factors}, self.split | later.split,
+            self.requeried + later.requeried,
+        )  # fmt: skip
+
+
+NOTHING = MergeResult()

@@ -1,0 +1,98 @@
+"""Reads maps and logs that are imported: a store, a base's log, or the log of an agent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job
+from kiteline_basestation.runtime import flight_log
+from kiteline_basestation.station import Import, Station
+from kiteline_basestation.store.keeper import snapshot
+from kiteline_basestation.store.restore import restore
+from kiteline_basestation.store.saved_map import SavedMap, unpack
+from kiteline_basestation.store.store import FILE, StoreError, read
+from kiteline_codec.schema import Key, record_log
+from kiteline_core.ids import AgentId
+from kiteline_hw.logs.mcap_log import LogMessage, LogReader
+
+_STEP_VALUES = 200  # values of an agent's log that one step takes in, so that the loop goes on
+
+
+def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | list[Import]:
+    """A saved map (of a store or a base's log), or the values of an agent's log in pieces for several steps.
+
+    make_station: from the metadata of a base's log, a station as in the log. Raises StoreError, SourceError.
+    """
+    if path.is_dir() or path.suffix == Path(FILE).suffix:
+        return read(path)
+    with LogReader(path) as log:
+        role = log.metadata.get("role")
+        if role == "agent":
+            return _of_agent(log, path)
+        if role == "base":
+            return _of_base(log, path, make_station(log.metadata))
+    raise StoreError(f"{path}: expected the log of an agent or of a base, or a base's store")
+
+
+def _of_agent(log: LogReader, path: Path) -> list[Import]:
+    values: dict[AgentId, dict[Key, bytes]] = {}
+    for message in log.messages((record_log.TOPIC,)):
+        agent, key, code = record_log.read_record(message.blob())
+        values.setdefault(agent, {})[key] = code
+    if not values:
+        raise StoreError(f"{path}: no keyframes in this log; expected an agent's log with {record_log.TOPIC} in it")
+    out = []
+    for agent, codes in sorted(values.items()):
+        items = sorted(codes.items())
+        out += [Import(agent, tuple(items[i : i + _STEP_VALUES])) for i in range(0, len(items), _STEP_VALUES)]
+    return out
+
+
+def _of_base(log: LogReader, path: Path, station: Station) -> SavedMap:
+    """Replay a base to its end."""
+    if log.metadata.get("channel") != "CodedChannel":
+        raise StoreError(f"{path}: the log of a monolith holds no packets: expected that of a base with a link")
+    before = SavedMap()
+    for blob in log.messages((flight_log.RESTORED,)):
+        before = unpack(blob.blob())
+        restore(station, before, blob.t_ns)
+    station.track_changes()
+    jobs: dict[int, Job] = {}
+    for messages in _steps(log):
+        head = messages[0].json()
+        topics = {AgentId(int(a)): flight_log.packets_in(int(a)) for a in head["agents"]}
+        packets = {agent: [m.blob() for m in messages if m.topic == topic] for agent, topic in topics.items()}
+        done = [run_job(jobs.pop(number)) for number in head["done"]]
+        output = station.step(packets, done, head["now_ns"], flight_log.read_orders(messages))
+        jobs.update({job.id: job for job in output.jobs})
+    return snapshot(station, before)
+
+
+def _steps(log: LogReader) -> Iterator[Sequence[LogMessage]]:
+    step: list[LogMessage] = []
+    for message in log.messages():
+        if message.topic == flight_log.STEP:
+            if step:
+                yield step
+            step = [message]
+        elif step:
+            step.append(message)
+    if step and log.cut is None:
+        yield step
+
+
+def read_imports(
+    paths: Sequence[str], make_station: Callable[[Mapping[str, str]], Station]
+) -> tuple[list[SavedMap], list[Import]]:
+    """Saved maps and pieces of agents' logs that --import names. Raises StoreError, SourceError."""
+    maps: list[SavedMap] = []
+    pieces: list[Import] = []
+    for text in paths:
+        found = import_map(Path(text), make_station)
+        if isinstance(found, SavedMap):
+            maps.append(found)
+        else:
+            pieces += found
+    return maps, pieces
