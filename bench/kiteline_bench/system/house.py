@@ -1,0 +1,123 @@
+"""The bars of the sources themselves: structure, replay of an older build's logs, CPU beside it, compilation."""
+
+from __future__ import annotations
+
+from statistics import median
+from typing import Any
+
+import cv2
+
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.simulated import rendered_paths
+from kiteline_bench.system.compile_time import measure
+from kiteline_bench.system.older_build import REVISION, older_build, replay_difference, todays_build
+from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circles
+
+_MODULES, _LINES, _ALL_LINES = 14, 400, 38_000  # in a folder, in a file, in all rooms
+_COMPILE_S = 12.0
+_ROUNDS = 5
+_CPU_RATIO = 1.02
+_TWO_AGENTS_S = 15.0
+
+
+def _structure(bench: Bench) -> list[Bar]:
+    """Sizes of folders and files, import circles, lines of all rooms."""
+    sources = Sources.of(ROOT)
+    lines, folders, imports = sources.lines(), sources.folder_sizes(), sources.imports()
+    (largest_folder, modules), *_ = folders.most_common(1)
+    longest = max(lines, key=lambda name: lines[name])
+    large_folders = [folder for folder, count in folders.items() if count > _MODULES]
+    long_files = [name for name, count in lines.items() if count > _LINES]
+    modules_in_circles, packages_in_circles = circles(imports), circles(by_sub_package(imports))
+    rooms = {room: sum(n for name, n in lines.items() if name.startswith(f"{room}.") or name == room)
+             for room in sorted({name.split(".")[0] for name in lines})}  # fmt: skip
+    bench.more.append("Lines: " + ", ".join(f"{room} {count}" for room, count in rooms.items()) + ".")
+    for title, groups in (("modules", modules_in_circles), ("sub-packages", packages_in_circles)):
+        bench.more.extend(f"Circle of {title}: {', '.join(group)}." for group in groups)
+    return [
+        is_true("modules in a folder", f"<= {_MODULES}", not large_folders,
+                f"{modules} in {largest_folder.removeprefix(f'{ROOT}/')}, {len(large_folders)} folders above"),
+        is_true("lines of a file", f"<= {_LINES}", not long_files,
+                f"{lines[longest]} in {longest}, {len(long_files)} files above"),
+        at_most("import circles of modules, under TYPE_CHECKING too", len(modules_in_circles), 0, "", 0),
+        at_most("import circles of sub-packages", len(packages_in_circles), 0, "", 0),
+        at_most("lines of all rooms", sum(lines.values()), _ALL_LINES, "", 0),
+    ]  # fmt: skip
+
+
+def _replay(bench: Bench) -> list[Bar]:
+    """Logs of an older build, replayed by this one."""
+    cv2.setNumThreads(1)
+    build = older_build(bench)
+    room = bench.source("room_flight.mcap")
+    both = [str(path.resolve()) for path in rendered_paths(
+        bench, "house", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _TWO_AGENTS_S)]  # fmt: skip
+    flights: dict[str, tuple[list[str], list[str]]] = {
+        "stereo and IMU": ([room], []),
+        "monocular": ([bench.source("kitti07_mono")], ["--mono"]),
+        "RGB-D": ([bench.source("tum_rgbd_xyz")], []),
+        "lossy link": ([room], ["--link-loss", "0.2"]),
+        "two agents": (both, []),
+    }
+    bars = []
+    for name, (sources, options) in flights.items():
+        bench.say(f"flying with {REVISION[:8]}: {name}")
+        out = bench.folder.resolve() / f"older {name}"
+        build.fly(sources, out, *options)
+        logs = [*(out / f"agent{k}" / "log.mcap" for k in range(len(sources))), out / "base" / "log.mcap"]
+        bench.say(f"replaying its logs: {name}")
+        found = {log.parent.name: replay_difference(build, log) for log in logs}
+        differences = [f"{half}: {difference}" for half, difference in found.items() if difference is not None]
+        bars.append(is_true(f"logs of {REVISION[:8]}, {name}", "every output as in the log", not differences,
+                            "; ".join(differences) or f"{len(logs)} logs equal bit for bit"))  # fmt: skip
+    return bars
+
+
+def _cpu(bench: Bench) -> list[Bar]:
+    """CPU of this build over that of an older one, flown in alternation."""
+    builds = {"older": older_build(bench), "today": todays_build(bench)}
+    bars = []
+    for name in ("room_flight.mcap", "kitti_straight"):
+        source, rounds = bench.source(name), []
+        for k in range(_ROUNDS + 1):  # the first one compiles
+            reports = {}
+            for kind in sorted(builds, reverse=bool(k % 2)):
+                bench.say(f"flying {name}, round {k}: {kind}")
+                reports[kind] = builds[kind].fly([source], bench.folder.resolve() / f"cpu_{kind}")
+            rounds.append(reports)
+        for half, cpu_ms in (("agent, CPU a frame", _agent_ms), ("base, CPU a step", _base_ms)):
+            pairs = [(cpu_ms(reports["today"]), cpu_ms(reports["older"])) for reports in rounds[1:]]
+            listed = ", ".join(f"{ours:.2f} / {theirs:.2f}" for ours, theirs in pairs)
+            bench.more.append(f"{name}, {half}, ms: {listed}.")
+            ratio = median(ours / theirs for ours, theirs in pairs)
+            bars.append(at_most(f"{name}: {half}, over that of {REVISION[:8]}, median of {_ROUNDS}", ratio, _CPU_RATIO,
+                                "", 3))  # fmt: skip
+    return bars
+
+
+def _agent_ms(report: dict[str, Any]) -> float:
+    return float(report["agents"][0]["timing"]["cpu_ms_per_frame"]["mean"])
+
+
+def _base_ms(report: dict[str, Any]) -> float:
+    return float(report["base"]["timing"]["step_ms"]["mean"])
+
+
+def _compile(bench: Bench) -> list[Bar]:
+    """CPU to compile the kernels of each half from an empty cache."""
+    bars = []
+    for room in ("agent", "base"):
+        bench.say(f"compiling the kernels of the {room}")
+        found = measure(room)
+        slowest = sorted(found.seconds.items(), key=lambda item: -item[1])[:8]
+        bench.more.append(f"{room}, slowest: " + ", ".join(f"`{name}` {s:.1f} s" for name, s in slowest) + ".")
+        bars.append(at_most(f"compilation of all kernels of the {room}, CPU", found.total_s, _COMPILE_S, "s", 1))
+    return bars
+
+
+PARTS = {
+    "structure": ("The house: structure", _structure),
+    "replay": ("The house: logs of an older build", _replay),
+    "cpu": ("The house: CPU beside an older build", _cpu),
+    "compile": ("The house: compilation", _compile),
+}

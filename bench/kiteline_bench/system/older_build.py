@@ -1,0 +1,81 @@
+"""The build of an older revision, run beside today's: its flights, and the logs that they leave."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kiteline_bench.harness.bars import Bench
+from kiteline_bench.system import job_values
+from kiteline_bench.system.renamed_logs import copy_renamed
+from kiteline_bench.system.structure import ROOMS, ROOT
+from kiteline_hw.logs.mcap_log import LogReader
+from kiteline_hw.ports import SourceError
+from kiteline_lab.replay.replay import replay_agent, replay_base
+
+REVISION = "384637ec35adaf05e73532fa9ac33b0a977b2137"  # before the rooms were cut into sub-packages
+_TIMEOUT_S = 900.0
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """Sources of one revision, run by this interpreter. cache: of its compiled kernels."""
+
+    root: Path
+    cache: Path
+
+    def run(self, arguments: Sequence[str]) -> None:
+        """Run `python ARGUMENTS` on these sources. Raises RuntimeError with the end of its stderr."""
+        rooms = os.pathsep.join(str(self.root / room) for room in ROOMS if (self.root / room).is_dir())
+        environment = {**os.environ, "PYTHONPATH": rooms, "NUMBA_CACHE_DIR": str(self.cache), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [sys.executable, *arguments], check=False, env=environment, capture_output=True, text=True,
+            timeout=_TIMEOUT_S, cwd=self.root,
+        )  # fmt: skip
+        if done.returncode:
+            raise RuntimeError(f"{' '.join(arguments[:4])}: {done.stderr[-300:]}")
+
+    def fly(self, sources: Sequence[str], out: Path, *options: str) -> dict[str, Any]:
+        """Fly as `kiteline fly` does; the report. Raises RuntimeError."""
+        self.run(["-m", "kiteline_cli", "fly", *sources, "--out", str(out), *options])
+        report: dict[str, Any] = json.loads((out / "report.json").read_text())
+        return report
+
+
+def todays_build(bench: Bench) -> Build:
+    """These sources, with a cache of their own."""
+    return Build(ROOT, bench.folder.resolve() / "today-cache")
+
+
+def older_build(bench: Bench) -> Build:
+    """The sources of REVISION, unpacked into the bench's folder. Raises SourceError without their history."""
+    folder = bench.folder.resolve() / "older"
+    if not folder.exists():
+        bench.say(f"unpacking {REVISION[:8]}")
+        archive = bench.folder.resolve() / "older.tar"
+        command = ["git", "-C", str(ROOT), "archive", "-o", str(archive), REVISION]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        if done.returncode:
+            raise SourceError(f"{ROOT}: needs a checkout with the history of {REVISION[:8]}: {done.stderr.strip()}")
+        folder.mkdir(parents=True)
+        subprocess.run(["tar", "-xf", str(archive), "-C", str(folder)], check=True)
+        archive.unlink()
+    return Build(folder, bench.folder.resolve() / "older-cache")
+
+
+def replay_difference(build: Build, log: Path) -> str | None:
+    """Replay an older build's log by today's code, names mapped; the first difference in words, None without any."""
+    if log.parent.name == "base":
+        build.run([str(Path(job_values.__file__)), str(log)])
+    renamed = log.with_name("renamed.mcap")
+    copy_renamed(log, renamed)
+    with LogReader(renamed) as reader:
+        replay = replay_base if reader.metadata.get("role") == "base" else replay_agent
+        result = replay(reader)
+    return result.difference if result.steps else "it has no steps"
