@@ -214,9 +214,9 @@ class Mapper:
         """Match, triangulate and cull landmarks around a new keyframe, then search for its place in all maps."""
         config, publisher = self.config, self._publisher
         self._placements.place_new(keyframe)
-        self.counts.found += landmark_matching.match_landmarks(self.map, keyframe, config.refind, publisher)
+        self.counts.found += landmark_matching.match_landmarks(self.map, keyframe, config.landmark_matching, publisher)
         self.counts.triangulated += triangulation.triangulate_landmarks(
-            self.map, keyframe, config.new_points, config.measurement, publisher
+            self.map, keyframe, config.triangulation, config.measurement, publisher
         )
         self.counts.culled += culling.cull_weak(self.map, keyframe, config.cull, publisher)
         culled = culling.cull_redundant(self.map, keyframe, config.cull, publisher)

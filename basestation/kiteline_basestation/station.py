@@ -40,7 +40,7 @@ class Station:
         self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], vocabulary: Vocabulary | None = None
     ) -> None:  # fmt: skip
         self.mapper = Mapper(config, vocabulary)
-        self.supply = MapCachePlanner(config.supply, config.loops, self.mapper.map)
+        self.supply = MapCachePlanner(config.map_cache, config.loops, self.mapper.map)
         self.channels: dict[AgentId, RecordChannel] = {}
         self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
         self.unreadable = 0  # imported values whose code is no valid record

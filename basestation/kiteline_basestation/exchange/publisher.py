@@ -1,4 +1,4 @@
-"""Gathers what changed in the map and words it as records for the agents that own the keyframes."""
+"""Collects changes of the map as records for the agents that own the keyframes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
 
 
 class Publisher:
-    """The dirty values of the base. A record always tells the whole value, so that a later one replaces an earlier."""
+    """The base's changed values. A record holds a whole value, so that a later one replaces an earlier one."""
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
@@ -33,30 +33,30 @@ class Publisher:
         self._records: list[tuple[AgentId, Record]] = []
 
     def mark_changed(self, kind: int, keyframe: KeyframeId) -> None:
-        """A value of a keyframe has changed."""
+        """Mark a value of a keyframe as changed. kind: KIND of a record class."""
         self._dirty.add((int(kind), keyframe))
 
     def mark_changed_slots(self, kind: int, slots: I32) -> None:
-        """Values of the keyframes that own these slots have changed."""
+        """Mark a value of the keyframes that own slots (n,) as changed."""
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
             self.mark_changed(kind, KeyframeId(keyframe))
 
     def publish_placement(self, submap: SubmapId, S_w_m: F64) -> None:
-        """A submap has a new place in the world, or another unit of length in it."""
+        """Send where a submap lies in w, as a similarity (4,4)."""
         self._records.append((agent_of_submap(submap), SubmapPlacement(submap, S_w_m)))
 
     def withdraw_placement(self, submap: SubmapId) -> None:
-        """A submap has no place any more: what is not said yet is not to be said."""
+        """Drop placements of a submap that have not been sent yet."""
         self._records = [
             (a, r) for a, r in self._records if not (isinstance(r, SubmapPlacement) and r.submap == submap)
         ]  # fmt: skip
 
     def send(self, agent: AgentId, record: Record) -> None:
-        """Any other record, as it is."""
+        """Send any other record."""
         self._records.append((agent, record))
 
     def collect(self) -> Published:
-        """All that changed since the last call, by agent, in order of kind and keyframe."""
+        """All changes since the last call, by agent, in order of kind and keyframe."""
         out: dict[AgentId, list[Record]] = {}
         for agent, record in self._records:
             out.setdefault(agent, []).append(record)
@@ -72,21 +72,23 @@ class Publisher:
         sparse_map, table = self._map, self._map.keypoints
         slots = sparse_map.slots_of(keyframe)
         row = sparse_map.rows[keyframe]
-        born = table.kind[slots] == LANDMARK
+        is_landmark = table.kind[slots] == LANDMARK
         if kind == KeyframePose.KIND:
             if sparse_map.keyframes.pose_source[row] != REFINED_POSE:
                 return None
             return KeyframePose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
         if kind == RefinedLandmarks.KIND:
-            here = slots[born & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)]
+            here = slots[
+                is_landmark & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)
+            ]
             return RefinedLandmarks(keyframe, self._index(here), table.refined[here].copy(), table.offset[here].copy())
         if kind == FusedLandmarks.KIND:
-            here = slots[born & (table.root[slots] != slots)]
+            here = slots[is_landmark & (table.root[slots] != slots)]
             return FusedLandmarks(keyframe, self._index(here), sparse_map.landmark_ids(table.root[here]))
         if kind == RemovedObservations.KIND:
             return RemovedObservations(keyframe, self._index(slots[table.flags[slots] & REMOVED != 0]))
         if kind == CulledLandmarks.KIND:
-            here = slots[born & (table.flags[slots] & CULLED != 0)]
+            here = slots[is_landmark & (table.flags[slots] & CULLED != 0)]
             return CulledLandmarks(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
         raise ValueError(f"the base writes record of kind {kind} for a keyframe")
 
@@ -95,9 +97,9 @@ class Publisher:
 
 
 def apply_record(sparse_map: SparseMap, record: Record) -> None:
-    """Make a record that the base wrote true in the map: as quantised just now, or as an earlier base left it.
+    """Apply a record of the base to the map: the quantised value just sent, or one that an earlier base stored.
 
-    Records of keyframes that are not here, and what is true already, change nothing.
+    Records of unknown keyframes change nothing.
     """
     if (
         not isinstance(record, KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks)

@@ -1,9 +1,8 @@
-"""The sparse map: keyframes, their keypoints and the points that hang on them, as structures of arrays keyed by id.
+"""The sparse map: keyframes, keypoints and landmarks as structures of arrays.
 
-Points hang on keyframes: a point is a pixel of the keyframe of its birth (its *anchor*) and an inverse depth, so that
-it moves with its keyframe. Each keypoint owns one *slot* (its row in `keypoints`); a point is named inside the map by
-the slot of its birth. `root` maps every slot to the point it observes, fused points to the one they were fused into.
-Sections may come in any order and any number of times; what a section does not know yet is linked when it comes.
+A landmark is a keypoint of the keyframe that observed it first (its anchor) with an inverse depth, so that it moves
+with that keyframe. Each keypoint has one slot (row of `keypoints`), and a landmark is named by its slot. `root` is the
+landmark that a keypoint observes; for a fused landmark, the root landmark. Records may come in any order, repeatedly.
 """
 
 from __future__ import annotations
@@ -49,21 +48,21 @@ Bool = NDArray[np.bool_]
 
 
 class SparseMap(MapView):
-    """Keyframes, keypoints and points of any number of agents and submaps. Row and slot numbers never change."""
+    """Keyframes, keypoints and landmarks of all agents. Row and slot numbers never change."""
 
-    # -- what the agents wrote ---------------------------------------------------------------------------------------
+    # -- values of the agents ------------------------------------------------------------------------------------------
 
     def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
-        """The ideal camera of an agent; keyframes that are already here take it on."""
+        """Set the rectified camera of an agent, also for its keyframes so far."""
         self.cameras[agent] = camera
         for keyframe, row in self.rows.items():
             if agent_of_keyframe(keyframe) == agent:
                 self.keyframes.camera[row] = _parameters(camera)
 
     def add_keyframe(self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64, keypoints: int) -> int:
-        """Add a keyframe, or renew its header. T_p_k: (4,4). Returns its row.
+        """Add a keyframe, or update its header. T_p_k: (4,4). Returns its row.
 
-        Raises ValueError on too many keypoints, or a parent that is not an older keyframe of the same submap.
+        Raises ValueError for too many keypoints, or a parent that is not an older keyframe of the same submap.
         """
         if not 0 <= keypoints <= MAX_KEYPOINTS:
             raise ValueError(f"keyframe {keyframe} claims {keypoints} keypoints: expected at most {MAX_KEYPOINTS}")
@@ -82,7 +81,7 @@ class SparseMap(MapView):
             table.id[row] = keyframe
             table.start[row] = self._allocate(row, keypoints)
             table.count[row] = keypoints
-            table.unit[row] = 1.0
+            table.scale[row] = 1.0
             camera = self.cameras.get(agent_of_keyframe(keyframe))
             if camera is not None:
                 table.camera[row] = _parameters(camera)
@@ -104,8 +103,8 @@ class SparseMap(MapView):
         self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,
         angle: U8, descriptor: U8,
     ) -> None:  # fmt: skip
-        """Births of a keyframe whose header is here (see codec schema Births); a newer part replaces an older one."""
-        slots, keep = self._section(keyframe, part, index, LANDMARK)
+        """Set the new landmarks of a known keyframe (see codec NewLandmarks); a part replaces its older version."""
+        slots, keep = self._slots_of_record(keyframe, part, index, LANDMARK)
         table = self.keypoints
         table.uv[slots] = uv[keep]
         table.inv_depth[slots] = inv_depth[keep]
@@ -115,7 +114,7 @@ class SparseMap(MapView):
         fresh = slots[table.kind[slots] != LANDMARK]
         table.kind[slots] = LANDMARK
         table.part[slots] = part
-        table.point[slots] = NO_LANDMARK
+        table.landmark[slots] = NO_LANDMARK
         kernels.link(fresh, fresh, table.root, table.first, table.next)
         self._refresh_usable(self.rows[keyframe])
 
@@ -127,95 +126,95 @@ class SparseMap(MapView):
         uv: F32,
         inv_depth: F32,
         octave: U8,
-        point: I64,
+        landmark: I64,
     ) -> None:
-        """Sightings of a keyframe whose header is here (see codec schema Sightings); a newer part replaces an older."""
-        slots, keep = self._section(keyframe, part, index, OBSERVATION)
+        """Set the observations of a known keyframe (see codec Observations); a part replaces its older version."""
+        slots, keep = self._slots_of_record(keyframe, part, index, OBSERVATION)
         table = self.keypoints
         table.uv[slots] = uv[keep]
         table.inv_depth[slots] = inv_depth[keep]
         table.octave[slots] = octave[keep]
         table.kind[slots] = OBSERVATION
         table.part[slots] = part
-        table.point[slots] = point[keep]
+        table.landmark[slots] = landmark[keep]
         if bool(np.any(inv_depth > 0)):
             self.measures_depth.add(agent_of_keyframe(keyframe))
         self._link_observations(slots)
         self._refresh_usable(self.rows[keyframe])
 
-    # -- what the base wrote -----------------------------------------------------------------------------------------
+    # -- values of the base ------------------------------------------------------------------------------------------
 
     def set_pose(self, keyframe: KeyframeId, T_m_k: F64) -> None:
-        """The base's pose (4,4) of a keyframe; descendants without a base value move along."""
+        """Set the refined pose (4,4) of a keyframe; descendants without a refined pose move along."""
         row = self.rows[keyframe]
         had = self.keyframes.pose_source[row]
         self.keyframes.T_m_k[row] = T_m_k
-        self._follow(row)
+        self._update_world_pose(row)
         self.keyframes.pose_source[row] = REFINED_POSE
         if had == NO_POSE:
             self._refresh_usable(row)
         self._compose_children(keyframe)
 
     def set_world_pose(self, keyframe: KeyframeId, T_w_k: F64) -> None:
-        """The base's pose of a keyframe, said in w; its submap stays where it is."""
-        frame = self.submap_poses.get(submap_of_keyframe(keyframe))
-        self.set_pose(keyframe, T_w_k if frame is None else se3.orthonormalise(sim3.place(sim3.inverse(frame), T_w_k)))
+        """Set the refined pose (4,4) of a keyframe, given in w; its submap does not move."""
+        S_w_m = self.submap_poses.get(submap_of_keyframe(keyframe))
+        self.set_pose(keyframe, T_w_k if S_w_m is None else se3.orthonormalise(sim3.place(sim3.inverse(S_w_m), T_w_k)))
 
     def move_submap(self, submap: SubmapId, S_w_m: F64) -> None:
-        """Lay a submap, with all that hangs on it, at S_w_m (4,4): a rigid motion, or with another unit of length."""
+        """Set S_w_m (4,4) of a submap; its keyframes and landmarks move along."""
         if submap in self.submap_poses or not np.array_equal(S_w_m, np.eye(4)):
             self.submap_poses[submap] = np.array(S_w_m)
             self._scales[submap] = sim3.scale_of(S_w_m)
         for keyframe in self.submaps.get(submap, []):
-            self._follow(self.rows[keyframe])
+            self._update_world_pose(self.rows[keyframe])
 
     def scale_submap(self, submap: SubmapId, factor: float) -> None:
-        """Let lengths of a submap be so many times as long in w; its beginning stays where it is."""
+        """Multiply the scale of a submap in w; its first keyframe does not move."""
         self.move_submap(submap, sim3.grown(self.submap_pose(submap), factor, self.first_pose(submap)))
 
     def first_pose(self, submap: SubmapId) -> F64:
-        """T_m_k (4,4) of the first keyframe of a submap; the identity while that has no pose."""
+        """T_m_k (4,4) of the first keyframe of a submap; the identity if it has no pose."""
         begin = self.pose(self.submaps[submap][0]) if submap in self.submaps else None
         return np.eye(4) if begin is None else begin
 
     def set_depths(self, slots: I32, inv_depth: F32, offset: F32) -> None:
-        """The base's positions of the points born at `slots` (n,): inv_depth (n,) 1/m, offset (n,2) px."""
+        """Set refined positions of landmarks (n,): inv_depth (n,) 1/m, offset (n,2) px."""
         self.keypoints.refined[slots] = inv_depth
         self.keypoints.offset[slots] = offset
         self.keypoints.flags[slots] |= REFINED
 
     def set_flags(self, slots: I32, bit: int) -> None:
-        """Set REMOVED (observations) or CULLED (points) at `slots` (n,)."""
+        """Set flag REMOVED (of observations) or CULLED (of landmarks) at `slots` (n,)."""
         self.keypoints.flags[slots] |= bit
         for row in np.unique(self.keypoints.row[slots]).tolist():
             self._refresh_usable(row)
 
     def cull_keyframe(self, keyframe: KeyframeId) -> None:
-        """Drop a keyframe's observations; its pose stays while points hang on it."""
+        """Drop the observations of a keyframe; its pose stays as the anchor of its landmarks."""
         row = self.rows[keyframe]
         self.keyframes.culled[row] = 1
         self._refresh_usable(row)
 
     def fuse(self, child: int, parent: int) -> list[KeyframeId]:
-        """Make the point born at slot `child` an alias of the point born at slot `parent` (both roots).
+        """Fuse root landmark `child` into root landmark `parent`.
 
-        Returns the keyframes, sorted, that have births which now show another root than before.
+        Returns the keyframes, sorted, of the landmarks that have another root now.
         """
         table = self.keypoints
         one = np.array([child], np.int32)
         moved = np.empty(kernels.count(one, table.first, table.next), np.int32)
         kernels.fuse(child, parent, table.root, table.first, table.next, moved)
-        births = moved[table.kind[moved] == LANDMARK]
-        rows = np.union1d(table.row[births], table.row[one])
+        landmarks = moved[table.kind[moved] == LANDMARK]
+        rows = np.union1d(table.row[landmarks], table.row[one])
         return [KeyframeId(k) for k in np.sort(self.keyframes.id[rows]).tolist()]
 
-    def unfuse(self, births: I32) -> None:
-        """The opposite of `fuse` for births at slots (n,): each is a point of its own again, seen where it is named."""
+    def unfuse(self, landmarks: I32) -> None:
+        """Undo `fuse`: each landmark (n,) is a root again, with the observations that name it."""
         table = self.keypoints
-        kernels.link(births, births, table.root, table.first, table.next)
-        hangs = (table.kind[: self.slots] == OBSERVATION) & (table.root[: self.slots] >= 0)
-        slots = np.flatnonzero(hangs).astype(np.int32)
-        self._link_observations(slots[np.isin(self.find_landmarks(table.point[slots]), births)])
+        kernels.link(landmarks, landmarks, table.root, table.first, table.next)
+        linked = (table.kind[: self.slots] == OBSERVATION) & (table.root[: self.slots] >= 0)
+        slots = np.flatnonzero(linked).astype(np.int32)
+        self._link_observations(slots[np.isin(self.find_landmarks(table.landmark[slots]), landmarks)])
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
@@ -229,11 +228,13 @@ class SparseMap(MapView):
         table.root[new] = -1
         table.first[new] = -1
         table.next[new] = -1
-        table.point[new] = NO_LANDMARK
+        table.landmark[new] = NO_LANDMARK
         return start
 
-    def _section(self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], kind: int) -> tuple[I32, Bool]:
-        """Slots of a section's rows, and which rows fit the header; what an older version of it had is withdrawn."""
+    def _slots_of_record(
+        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], kind: int
+    ) -> tuple[I32, Bool]:
+        """Slots for the rows of a record, and which rows fit the header. Clears rows of the record's older version."""
         row = self.rows[keyframe]
         keep = index < self.keyframes.count[row]
         slots = (int(self.keyframes.start[row]) + index[keep].astype(np.int32)).astype(np.int32)
@@ -241,26 +242,26 @@ class SparseMap(MapView):
         mine = self.slots_of(keyframe)
         old = mine[(table.kind[mine] == kind) & (table.part[mine] == part)]
         gone = np.setdiff1d(old, slots).astype(np.int32)
-        turned = slots[(table.kind[slots] != EMPTY) & (table.kind[slots] != kind)]
-        gone = np.union1d(gone, turned).astype(np.int32)
+        other_kind = slots[(table.kind[slots] != EMPTY) & (table.kind[slots] != kind)]
+        gone = np.union1d(gone, other_kind).astype(np.int32)
         kernels.link(gone, np.full(len(gone), -1, np.int32), table.root, table.first, table.next)
         table.kind[gone] = EMPTY
         return slots, keep
 
     def _link_observations(self, slots: I32) -> None:
-        """Hang sightings on the points they name; those whose keyframe is not here wait for it."""
+        """Link observations to the landmarks they name, or later if those have not been received yet."""
         table = self.keypoints
         slots = slots[table.kind[slots] == OBSERVATION]
-        named = self.find_landmarks(table.point[slots])
+        named = self.find_landmarks(table.landmark[slots])
         roots = np.full(len(slots), -1, np.int32)
         known = named >= 0
         target = named[known]
-        # A point that was fused is followed to its root; one whose own section is still to come is its own root.
+        # A fused landmark leads to its root; one whose record has not been received yet is its own root.
         fused = (table.kind[target] == LANDMARK) & (table.root[target] >= 0)
         roots[known] = np.where(fused, table.root[target], target)
         kernels.link(slots, roots, table.root, table.first, table.next)
         for slot in slots[~known].tolist():
-            anchor = KeyframeId(int(table.point[slot]) >> KEYPOINT_BITS)
+            anchor = KeyframeId(int(table.landmark[slot]) >> KEYPOINT_BITS)
             if anchor not in self.rows:
                 self._waiting.setdefault(anchor, []).append(slot)
 
@@ -274,7 +275,7 @@ class SparseMap(MapView):
         self.keyframes.filled[row] = np.count_nonzero(here)
 
     def _compose(self, row: int) -> None:
-        """Set a pose from the parent's (or from the submap frame), and those of the descendants that hang on it."""
+        """Set a pose from the parent's, and the poses of descendants that are composed from it."""
         table = self.keyframes
         parent = KeyframeId(int(table.parent[row]))
         if parent == NO_KEYFRAME:
@@ -284,20 +285,20 @@ class SparseMap(MapView):
             if above is None or table.pose_source[above] == NO_POSE:
                 return
             table.T_m_k[row] = table.T_m_k[above] @ table.T_p_k[row]
-        self._follow(row)
+        self._update_world_pose(row)
         table.pose_source[row] = COMPOSED
         self._refresh_usable(row)
         self._compose_children(KeyframeId(int(table.id[row])))
 
-    def _follow(self, row: int) -> None:
-        """Where a keyframe lies in w, from its place in m."""
+    def _update_world_pose(self, row: int) -> None:
+        """Set T_w_k and scale of a keyframe from T_m_k and the pose of its submap."""
         table = self.keyframes
         submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
-        frame, unit = self.submap_poses.get(submap), self._scales.get(submap, 1.0)
-        table.unit[row] = unit
-        table.T_w_k[row] = table.T_m_k[row] if frame is None else frame @ table.T_m_k[row]
-        if unit != 1.0:
-            table.T_w_k[row, :3, :3] /= unit
+        S_w_m, scale = self.submap_poses.get(submap), self._scales.get(submap, 1.0)
+        table.scale[row] = scale
+        table.T_w_k[row] = table.T_m_k[row] if S_w_m is None else S_w_m @ table.T_m_k[row]
+        if scale != 1.0:
+            table.T_w_k[row, :3, :3] /= scale
 
     def _compose_children(self, keyframe: KeyframeId) -> None:
         table = self.keyframes
@@ -308,7 +309,7 @@ class SparseMap(MapView):
                 if table.pose_source[row] == REFINED_POSE:
                     continue
                 table.T_m_k[row] = table.T_m_k[self.rows[above]] @ table.T_p_k[row]
-                self._follow(row)
+                self._update_world_pose(row)
                 if table.pose_source[row] == NO_POSE:
                     table.pose_source[row] = COMPOSED
                     self._refresh_usable(row)

@@ -1,7 +1,7 @@
-"""Kernels of the sparse map: the lists of observations that hang on each point, kept inside flat arrays.
+"""Kernels of the sparse map: a linked list of observations for each landmark, inside flat arrays.
 
-Every keypoint of every keyframe owns one *slot*. `root[s]` is the slot of the point that keypoint s observes (-1 while
-unknown). `first[p]` is the newest observation of point p and `next_[s]` the one that follows s in that list (-1: end).
+Each keypoint has one slot. `root[s]`: slot of the landmark that keypoint s observes, -1 unknown. `first[p]`: newest
+observation of landmark p. `next_[s]`: observation after s in the list, -1 at its end.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from kiteline_core.jit import njit
 
 @njit
 def link(slots, roots, root, first, next_):  # type: ignore[no-untyped-def]
-    """Let observation slots[i] (n,) int32 hang on point roots[i]; a slot that hangs on another point leaves it."""
+    """Make slots[i] (n,) int32 observations of landmarks roots[i] (-1: of none), and no longer of any other."""
     for i in range(slots.shape[0]):
         s = slots[i]
         old = root[s]
@@ -36,7 +36,7 @@ def link(slots, roots, root, first, next_):  # type: ignore[no-untyped-def]
 
 @njit
 def fuse(child, parent, root, first, next_, moved):  # type: ignore[no-untyped-def]
-    """Hang all observations of point `child` on point `parent`. Writes the slots that moved; returns how many."""
+    """Move all observations of landmark `child` to landmark `parent`. Writes their slots to `moved`; returns the number."""
     n = 0
     s = first[child]
     last = -1
@@ -55,11 +55,11 @@ def fuse(child, parent, root, first, next_, moved):  # type: ignore[no-untyped-d
 
 
 @njit
-def count(points, first, next_):  # type: ignore[no-untyped-def]
-    """How many slots hang on the points (n,) together."""
+def count(landmarks, first, next_):  # type: ignore[no-untyped-def]
+    """Total number of observations of landmarks (n,), valid or not."""
     n = 0
-    for i in range(points.shape[0]):
-        s = first[points[i]]
+    for i in range(landmarks.shape[0]):
+        s = first[landmarks[i]]
         while s >= 0:
             n += 1
             s = next_[s]
@@ -67,15 +67,15 @@ def count(points, first, next_):  # type: ignore[no-untyped-def]
 
 
 @njit
-def gather(points, first, next_, row, usable, keyframe_id, starts, slots):  # type: ignore[no-untyped-def]
-    """Observations of points (n,) whose `usable` slot flag is set, as rows starts[i]:starts[i + 1] of slots.
+def gather(landmarks, first, next_, row, usable, keyframe_id, starts, slots):  # type: ignore[no-untyped-def]
+    """Write the usable observations of landmarks (n,): those of landmark i to slots[starts[i]:starts[i + 1]].
 
-    Within a point they are in order of keyframe id, at most one of each keyframe (the lowest slot). starts: (n + 1,).
+    They are in order of keyframe id, at most one per keyframe (the lowest slot). starts: (n + 1,). Returns the number.
     """
     n = 0
-    for i in range(points.shape[0]):
+    for i in range(landmarks.shape[0]):
         starts[i] = n
-        s = first[points[i]]
+        s = first[landmarks[i]]
         while s >= 0:
             if usable[s] != 0:
                 key = keyframe_id[row[s]]
@@ -97,13 +97,13 @@ def gather(points, first, next_, row, usable, keyframe_id, starts, slots):  # ty
                     slots[j] = s
                     n += 1
             s = next_[s]
-    starts[points.shape[0]] = n
+    starts[landmarks.shape[0]] = n
     return n
 
 
 @njit
 def share_keyframe(a, b, first, next_, row, usable):  # type: ignore[no-untyped-def]
-    """Whether some keyframe observes both points a and b: then they cannot be one."""
+    """True if a keyframe observes both landmarks a and b, so that they cannot be the same."""
     s = first[a]
     while s >= 0:
         if usable[s] != 0:
@@ -117,10 +117,10 @@ def share_keyframe(a, b, first, next_, row, usable):  # type: ignore[no-untyped-
 
 
 @njit
-def covisibility(points, first, next_, row, usable, shared):  # type: ignore[no-untyped-def]
-    """Add to shared[k] (keyframes,) how many of the points (n,) keyframe row k observes."""
-    for i in range(points.shape[0]):
-        s = first[points[i]]
+def covisibility(landmarks, first, next_, row, usable, shared):  # type: ignore[no-untyped-def]
+    """Add the number of landmarks (n,) that keyframe row k observes to shared[k] (keyframes,)."""
+    for i in range(landmarks.shape[0]):
+        s = first[landmarks[i]]
         while s >= 0:
             if usable[s] != 0:
                 shared[row[s]] += np.int32(1)

@@ -173,5 +173,5 @@ def full_bundle_window(
         keyframes = [keyframes[i] for i in keep.tolist()]
     if len(keyframes) < 2:
         return None
-    wide = replace(base.window, fixed=config.max_full // 2)
+    wide = replace(base.bundle_window, max_fixed=config.max_full // 2)
     return bundle_window(sparse_map, keyframes, wide, base.measurement, {first})

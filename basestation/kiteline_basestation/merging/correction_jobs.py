@@ -131,7 +131,7 @@ class CorrectionJobs:
             window = full_bundle_window(self._map, map_id, edges, self._config)
             if window is not None:
                 bundle = self._with_calibration(FullBundle(map_id, window, ()))
-                problem = with_odometry_factors(self._map, bundle.window, self._config.links)
+                problem = with_odometry_factors(self._map, bundle.window, self._config.odometry_factors)
                 trials = self._config.graph.robust_trials, self._config.graph.final_trials
                 solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
                 out.append(Job(next(self._job_ids), FULL_BUNDLE.name, BundleInputs(problem, solver)))
@@ -143,7 +143,7 @@ class CorrectionJobs:
     def _with_calibration(self, bundle: FullBundle) -> FullBundle:
         """Add disparity offsets to the unknowns, unless they were too uncertain in a map hardly smaller than now."""
         size = len(keyframes_of(self._map, bundle.map_id))
-        enough = self._config.disparity.again * self.uncertain_at.get(bundle.map_id, 0)
+        enough = self._config.disparity.retry_growth * self.uncertain_at.get(bundle.map_id, 0)
         if not self.fits(bundle.map_id) or bundle.map_id in self._uncalibrated or size < enough:
             return bundle
         window = bundle.window

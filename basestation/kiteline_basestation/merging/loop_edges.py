@@ -53,7 +53,7 @@ Edge = TypeVar("Edge", bound=LoopEdge)
 def similarity(sparse_map: SparseMap, keyframe: KeyframeId) -> F64:
     """S_w_k (4,4) of a keyframe, from the unit of its submap to the unit of w."""
     row = sparse_map.rows[keyframe]
-    return sim3.of(float(sparse_map.keyframes.unit[row]), sparse_map.keyframes.T_w_k[row])
+    return sim3.of(float(sparse_map.keyframes.scale[row]), sparse_map.keyframes.T_w_k[row])
 
 
 def correction_of(sparse_map: SparseMap, edge: LoopEdge) -> F64:
@@ -65,12 +65,12 @@ def correction_of(sparse_map: SparseMap, edge: LoopEdge) -> F64:
 
 def depth_of(sparse_map: SparseMap, edge: LoopEdge) -> float:
     """Median depth of the matched landmarks in units of w."""
-    return edge.depth_m * float(sparse_map.keyframes.unit[sparse_map.rows[edge.old]])
+    return edge.depth_m * float(sparse_map.keyframes.scale[sparse_map.rows[edge.old]])
 
 
 def graph_edge_of(sparse_map: SparseMap, edge: LoopEdge) -> tuple[F64, float]:
     """T_old_new (4,4) in units of w, and the scale of the old keyframe over that of the new one in w."""
-    unit_old, unit_new = (float(sparse_map.keyframes.unit[sparse_map.rows[k]]) for k in (edge.old, edge.new))
+    unit_old, unit_new = (float(sparse_map.keyframes.scale[sparse_map.rows[k]]) for k in (edge.old, edge.new))
     return sim3.stretched(edge.T_old_new, unit_old), edge.scale * unit_old / unit_new
 
 

@@ -115,7 +115,7 @@ def verify_loop(
     scale = depth_scale(_depths_in_own_map(sparse_map, new, mine, which), depth[mine.known[which]], config)
     if scale is None:
         return None
-    unit_new, unit_old = (float(sparse_map.keyframes.unit[sparse_map.rows[k]]) for k in (new, old))
+    unit_new, unit_old = (float(sparse_map.keyframes.scale[sparse_map.rows[k]]) for k in (new, old))
     return LoopMatch(
         new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), float(np.median(depth)) / unit_old,
         scale * unit_new / unit_old, *ids,
@@ -284,5 +284,5 @@ def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig
     ray = xyz - pose[:, :3, 3]
     depth = np.maximum(np.einsum("ni,ni->n", pose[:, :3, 2], ray), 1e-3)
     bf = np.maximum(sparse_map.keyframes.camera[rows, 4], 1.0)
-    own = depth / sparse_map.keyframes.unit[rows]
+    own = depth / sparse_map.keyframes.scale[rows]
     return np.ascontiguousarray(ray * (config.sigma_disparity_px * own / bf)[:, None])

@@ -120,7 +120,7 @@ class MapMerger:
         now, self._requery = self._requery[:count], self._requery[count:]
         result = MergeResult(requeried=tuple(now))
         for keyframe in now:
-            landmark_matching.match_landmarks(self._map, keyframe, self._config.refind, self._publisher)
+            landmark_matching.match_landmarks(self._map, keyframe, self._config.landmark_matching, self._publisher)
             result += self._query(keyframe)
         if now and not self._requery:
             self._corrections.request_bundle(self._map.map_id(submap_of_keyframe(now[-1])))
@@ -346,11 +346,11 @@ class MapMerger:
             self.merges[-1].fused = np.concatenate([self.merges[-1].fused, ids])
         seen: set[KeyframeId] = set()
         for match in matches:
-            around = self._map.covisible_keyframes(match.new, self._config.window.min_shared)
+            around = self._map.covisible_keyframes(match.new, self._config.bundle_window.min_shared)
             for keyframe in [match.new, *around[: self._config.loops.neighbours]]:
                 if keyframe not in seen:
                     seen.add(keyframe)
-                    landmark_matching.match_landmarks(self._map, keyframe, self._config.refind, self._publisher)
+                    landmark_matching.match_landmarks(self._map, keyframe, self._config.landmark_matching, self._publisher)
 
     # -- full bundles --------------------------------------------------------------------------------------------------
 

@@ -145,7 +145,7 @@ def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWi
         return 1.0
     T = result.T_c_m[number[anchors[here]]]
     after = np.einsum("nj,nj->n", T[:, 2, :3], result.points[here]) + T[:, 2, 3]
-    inverse = sparse_map.inverse_depths(window.points[here]) / table.unit[anchors[here]]
+    inverse = sparse_map.inverse_depths(window.points[here]) / table.scale[anchors[here]]
     good = (after > 0.0) & (inverse > 0.0)
     return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _ENOUGH else 1.0
 

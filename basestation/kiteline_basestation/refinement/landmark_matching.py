@@ -47,7 +47,7 @@ def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: Landma
     covisible = sparse_map.covisible_keyframes(keyframe, 1)[: config.keyframes]
     table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
     points = sparse_map.landmarks_of(keyframe)
-    inverse = sparse_map.inverse_depths(points) / table.unit[sparse_map.keypoints.row[points]]
+    inverse = sparse_map.inverse_depths(points) / table.scale[sparse_map.keypoints.row[points]]
     inverse = inverse[inverse > 0]
     if len(inverse) == 0:
         return covisible

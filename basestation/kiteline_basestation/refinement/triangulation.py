@@ -63,7 +63,7 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: Triangulat
     row = sparse_map.rows[keyframe]
     made = 0
     seen = sparse_map.landmarks_of(keyframe)
-    inverse = sparse_map.inverse_depths(seen) / keyframes.unit[table.row[seen]]
+    inverse = sparse_map.inverse_depths(seen) / keyframes.scale[table.row[seen]]
     inverse = inverse[inverse > 0]
     here = _open_births(sparse_map, keyframe)
     for other in sparse_map.covisible_keyframes(keyframe, 1)[: config.keyframes]:
