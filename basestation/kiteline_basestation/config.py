@@ -22,64 +22,67 @@ class IntakeConfig:
 
 @dataclass(frozen=True, slots=True)
 class MeasurementConfig:
-    """How well an agent measures."""
+    """Standard deviations of the agents' measurements."""
 
-    sigma_px: float = 0.25  # one standard deviation of an aligned pixel coordinate at octave 0
-    sigma_growth: float = 1.4  # by which it grows with each octave: alignment is finer than its pixels
-    sigma_disparity_px: float = 0.4  # the same of a disparity; sightings of a point share its template's error
-    sigma_settled_px: float = 0.2  # the same once the offset of the agent's disparities is known
-    fused_px: float = 0.6  # the same of a birth that shows an older point: two detections of one corner
-    fused_growth: float = 2.0  # corners are found to a share of their level's pixels
+    sigma_px: float = 0.25  # px at octave 0; of an aligned keypoint
+    sigma_growth: float = 1.4  # factor per octave; less than 2, as alignment is finer than the octave's pixels
+    sigma_disparity_px: float = (
+        0.4  # px at octave 0; of a disparity: observations of a landmark share its template's error
+    )
+    sigma_calibrated_px: float = 0.2  # px at octave 0; of a disparity once the agent's disparity offset is known
+    sigma_fused_px: float = 0.6  # px at octave 0; of a new landmark that was fused: two detections of one corner
+    sigma_fused_growth: float = 2.0  # factor per octave; corners are detected to a fraction of the octave's pixels
 
 
 @dataclass(frozen=True, slots=True)
 class BundleWindowConfig:
     """Which keyframes a local bundle adjusts."""
 
-    free: int = 10  # keyframes whose poses move: more cost time and change little
-    fixed: int = 15  # keyframes that only hold: those that see most of the same points
-    min_shared: int = 12  # points that two covisible keyframes share at least
-    min_points: int = 20  # fewer points hold no pose
+    max_free: int = 10  # keyframes whose poses are free: more cost time and change little
+    max_fixed: int = 15  # keyframes held fixed: those that observe most of the same landmarks
+    min_shared: int = 12  # landmarks that two covisible keyframes share
+    min_landmarks: int = 20  # landmarks of a bundle: fewer do not constrain the poses
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryFactorConfig:
-    """The agent's own pose of a keyframe in its parent."""
+    """Weight of the relative pose that an agent measured between a keyframe and its parent."""
 
-    enough: int = 80  # observations of a keyframe above which its points hold it: every keyframe of a wide link
-    enough_px: float = 0.1  # of each of 6 far made-up points there: together they say the turn to 0.15 mrad
-    run: int = 20  # links one after the other, over which an agent's turns may all be off the same way
-    sigma_px: float = 0.15  # of each of 12 made-up points where there is nothing else; it grows with what there is
+    enough_observations: int = 80  # observations of a keyframe above which only the rotation is constrained
+    rotation_sigma_px: float = (
+        0.1  # px; of each of 6 far synthetic points: together they constrain rotation to 0.15 mrad
+    )
+    run: int = 20  # keyframes; consecutive rotations whose common error is estimated together
+    sigma_px: float = 0.15  # px; of each of 12 synthetic points if the keyframe has no observations
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkMatchingConfig:
-    """Known points recognised where the agent bore new ones."""
+    """Matching of known landmarks with an agent's new ones."""
 
-    keyframes: int = 12  # covisible keyframes searched
-    near_keyframes: int = 8  # keyframes that merely look at the same place: revisits
+    max_covisible: int = 12  # covisible keyframes searched
+    max_nearby: int = 8  # other keyframes searched that view the same place: revisits
     near_ratio: float = 0.5  # distance of such a keyframe over the median depth
-    near_cosine: float = 0.7  # cosine of the angle between the two optical axes: 45 degrees
-    radius_px: float = 8.0  # px at octave 0: drift within a room; doubles with each octave
-    max_hamming: int = 60  # of 256 bits: unrelated ORB descriptors differ by 128 +- 20
+    near_cosine: float = 0.7  # cosine of the angle between the optical axes: 45 degrees
+    radius_px: float = 8.0  # px at octave 0; search radius: drift within a room; doubles with each octave
+    max_hamming: int = 60  # of 256 bits; unrelated ORB descriptors differ by 128 +- 20
     ratio: float = 0.8  # best over second-best distance: below it, a match is distinct
-    octave_gap: float = 1.2  # octaves between the size foreseen and the size found
-    angle_gap: int = 24  # 1/256 turns between the orientation foreseen and found: 34 degrees
-    disparity_px: float = 3.0  # px at octave 0 between the disparity foreseen and measured
-    min_gap: int = 1  # keyframes between two that are matched
+    octave_gap: float = 1.2  # octaves between the predicted and the detected scale
+    angle_gap: int = 24  # 1/256 turns; between the predicted and the detected orientation: 34 degrees
+    disparity_px: float = 3.0  # px at octave 0; between the predicted and the measured disparity
 
 
 @dataclass(frozen=True, slots=True)
 class TriangulationConfig:
-    """Points made from two views, where stereo saw no depth."""
+    """Triangulation of landmarks for which the agent has no depth."""
 
-    keyframes: int = 6  # covisible keyframes searched
-    epipolar_px: float = 1.5  # px at octave 0 between a keypoint and the other's line
-    max_hamming: int = 50  # of 256 bits; stricter than refind, for a line is longer than a circle
+    max_covisible: int = 6  # covisible keyframes searched
+    epipolar_px: float = 1.5  # px at octave 0; between a keypoint and its epipolar line
+    max_hamming: int = 50  # of 256 bits; stricter than landmark matching, as a line is longer than a circle
     ratio: float = 0.75  # best over second-best distance
     max_cosine: float = 0.9998  # parallax of at least 1.1 degrees: below it depth is noise
-    reprojection_px: float = 2.0  # px at octave 0 in every view
-    min_baseline_ratio: float = 0.01  # baseline over median depth: below it two keyframes are one view
+    reprojection_px: float = 2.0  # px at octave 0; in every view
+    min_baseline_ratio: float = 0.01  # baseline over median depth: below it two keyframes have one viewpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,92 +166,96 @@ class GraphConfig:
 
 @dataclass(frozen=True, slots=True)
 class DisparityConfig:
-    """What an agent's disparities are off by, found by bundles of a whole map."""
+    """Calibration of each agent's disparity offset by bundles of a whole map."""
 
-    again: float = 1.1  # growth of the map after which an offset that was not believed is looked for again
-    prior_px: float = 0.1  # one deviation of a constant offset: what calibrations are good to
-    prior_rad: float = 3e-4  # of the turn of a right camera (times the focal length: px where x or y is 1)
-    inflation: float = 3.0  # of deviations of what is found: the lens bends what motion tells of depths, too
-    stands_out: float = 0.5  # of such deviations a number, from which on an offset is believed: by chance 1 in 20
-    settled_px: float = 0.03  # deviation of the offset below which it is known
+    retry_growth: float = 1.1  # growth of the map after which an insignificant offset is estimated again
+    prior_px: float = 0.1  # px; standard deviation of a constant offset: the accuracy of calibrations
+    prior_rad: float = 3e-4  # rad; of the right camera's rotation (times the focal length: px where x or y is 1)
+    inflation: float = (
+        3.0  # factor on the estimated standard deviations: lens distortion biases depths from motion, too
+    )
+    min_significance: float = 0.5  # standard deviations; from which an offset is accepted: by chance 1 in 20
+    calibrated_px: float = 0.03  # px; standard deviation of the offset below which it counts as known
 
 
 @dataclass(frozen=True, slots=True)
 class CullConfig:
-    """Points and observations that are dropped."""
+    """Culling of landmarks, observations and keyframes."""
 
-    age: int = 4  # keyframes after its birth at which a point is judged
-    min_found: float = 0.25  # share of the keyframes that should see a point and do
-    min_visible: int = 4  # keyframes that should have seen it before it is judged
+    landmark_age: int = 4  # keyframes after the first observation at which a landmark is tested
+    min_found: float = 0.25  # share of the keyframes with a landmark in view that observe it
+    min_visible: int = 4  # keyframes with the landmark in view before it is tested
     min_observations: int = 2  # observations that must remain after the outlier test
-    keyframe_age: int = 10  # keyframes of its submap after it before a keyframe may be found to tell nothing new
-    keyframe_share: float = 0.9  # of its points that others see as well
-    keyframe_others: int = 3  # how many others have to see them, at no coarser a scale
-    max_offset_px: float = 8.0  # px that a point's bearing may leave its birth; more is another point
+    keyframe_age: int = 10  # later keyframes of its submap before a keyframe may be culled as redundant
+    keyframe_share: float = 0.9  # share of its landmarks that other keyframes observe as well
+    keyframe_others: int = 3  # other keyframes that observe them, at a scale at most one octave coarser
+    max_offset_px: float = 8.0  # px at octave 0; from the keypoint to the refined projection: more is another landmark
 
 
 @dataclass(frozen=True, slots=True)
 class PublishConfig:
-    """Corrections smaller than these are not worth their bytes, nor kept."""
+    """Smallest corrections that are sent and kept, and how often the grid is built."""
 
-    pose_m: float = 0.0005
-    pose_rad: float = 0.0002  # a tenth of a pixel at 500 px of focal length
-    depth_px: float = 0.1  # px of bearing or disparity, the largest of a keyframe's points
+    pose_m: float = 0.0005  # m
+    pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
+    depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
     grid_every: int = 3  # keyframes between two grids
-    grid_share: int = 40  # of the map's keyframes at least this share, one in so many: a grid reads the whole map
+    grid_share: int = 40  # a grid is built after 1 in so many of the map's keyframes: it reads the whole map
 
 
 @dataclass(frozen=True, slots=True)
 class MapCacheConfig:
-    """The window of the map that each agent is kept supplied with."""
+    """Keyframes that are sent to an agent for its map cache."""
 
-    copies: int = 24  # keyframes an agent holds copies of; 0: none. They cover two views of a room and its way there
-    every_s: float = 1.0  # between two looks at what an agent needs
-    horizon_s: float = 2.0  # how far ahead along its motion: what a thin link takes to bring two keyframes
-    remembered: int = 48  # newest keyframes of its own that an agent remembers by itself
-    reach: float = 1.5  # distance of a keyframe over the depth in view: farther ones see little of the same
-    min_cosine: float = 0.3  # of the angle between the optical axes: descriptors do not bear more than 70 degrees
-    looked_at: int = 60  # keyframes whose points are projected
-    min_points: int = 8  # of a keyframe that are about to be in view: fewer are not worth their bytes
-    keep: float = 1.5  # how much more a copy that is there counts than one that would have to be sent
-    pose_m: float = 0.002  # a copy that moved less stays where it is: half a pixel at 2 m
-    pose_rad: float = 0.0005  # a quarter of a pixel at 500 px of focal length
-    length: float = 0.01  # relative change of the reader's unit of length from which on copies are lent anew
+    max_keyframes: int = 24  # keyframes in an agent's cache, 0 none; they cover two views of a room and the way there
+    period_s: float = 1.0  # s between two plans
+    horizon_s: float = 2.0  # s that the motion is predicted: what a thin link takes to carry two keyframes
+    local_keyframes: int = 48  # newest keyframes of its own that an agent keeps in its local map
+    max_distance_ratio: float = (
+        1.5  # distance of a keyframe over the depth in view: farther ones share little of the view
+    )
+    min_cosine: float = 0.3  # of the angle between the optical axes: descriptors match up to 70 degrees
+    max_candidates: int = 60  # keyframes whose landmarks are projected
+    min_landmarks: int = 8  # landmarks of a keyframe that will be in view: fewer are not worth their bytes
+    hysteresis: float = 1.5  # factor on the landmarks in view of a keyframe that is cached already
+    pose_m: float = 0.002  # m; smaller corrections of a cached keyframe are not sent: half a pixel at 2 m
+    pose_rad: float = 0.0005  # rad; a quarter of a pixel at 500 px of focal length
+    max_scale_change: float = 0.01  # relative change of the agent's unit of length at which keyframes are sent again
 
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
-    """How the ground is found."""
+    """Estimation of the ground height."""
 
-    camera_above_m: float = 0.1  # m; ground points lie at least this far below every camera that sees them
-    patch_m: float = 2.0  # m; side of the neighbourhoods; three by three of them share their points
-    height_bin_m: float = 0.05  # m; a floor's points, with stereo noise, fill two or three bins
-    slope: float = 0.25  # m/m; how steep the ground may be: a ramp, or a map whose z is 10 degrees off the vertical
-    peak_share: float = 0.25  # of the highest peak: a lower peak with this share is the ground, below it is noise
-    peak_points: float = 4.0  # points; fewer make no peak
+    camera_above_m: float = 0.1  # m; ground points are at least this far below every camera that observes them
+    patch_m: float = 2.0  # m; side of a patch; three by three patches share their points
+    height_bin_m: float = 0.05  # m; the points of a floor, with stereo noise, fill two or three bins
+    slope: float = 0.25  # m/m; steepest ground: a ramp, or a map whose z is 10 degrees off the vertical
+    peak_share: float = 0.25  # of the highest peak; the lowest peak with this share is the ground, below it is noise
+    min_peak_points: float = 4.0  # points of a peak
     bands_m: tuple[float, ...] = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
-    plane_points: float = 12.0  # points that a neighbourhood's plane needs; with fewer it stays as it is
-    level_m: float = 0.3  # m; a patch of points with less spread than this says nothing of the slope
+    min_plane_points: float = 12.0  # points that a patch needs for a fit of its plane
+    slope_prior_m: float = 0.3  # m; points with less horizontal spread than this leave the slope near zero
 
 
 @dataclass(frozen=True, slots=True)
 class GridConfig:
-    """The grid's numbers. Heights are relative to the local ground."""
+    """The occupancy grid. Heights are relative to the local ground."""
 
     cell_m: float = 0.1  # m; finer cells fall between the rays to sparse points; 0.2 suits streets
-    max_ray_m: float = 20.0  # m; beyond, a stereo point is wrong by more than a cell
-    obstacle_low_m: float = 0.1  # m; lower than this is ground: a vehicle rolls, and noise reaches this far
-    vehicle_height_m: float = 2.0  # m; what hangs higher is passed below
-    noise_per_m: float = 0.01  # m of height per m of distance from the nearest view: stereo noise grows with distance
-    free_below_m: float = 0.7  # m; a ray to the ground that is still higher says nothing about the floor below it
-    clear_below_m: float = 0.5  # m; the same of a ray to an obstacle: higher up it passes over boxes and chairs
+    max_ray_m: float = 20.0  # m; beyond, the error of a stereo point exceeds a cell
+    obstacle_low_m: float = 0.1  # m; anything lower is ground: noise reaches this far
+    vehicle_height_m: float = 2.0  # m; anything higher is no obstacle
+    noise_per_m: float = 0.01  # m/m; height noise per distance from the nearest view: stereo noise grows with distance
+    free_below_m: float = 0.7  # m; a ray to the ground marks cells free only below this height
+    clear_below_m: float = 0.5  # m; the same for a ray to an obstacle, which passes over boxes and chairs higher up
     log_hit: float = 0.6  # log-odds of one view of an obstacle point (p = 0.65): two views make 0.77
     log_through: float = -0.3  # log-odds of one ray through an obstacle's heights (p = 0.43)
     log_free: float = -0.7  # log-odds of one ray over a cell without obstacle (p = 0.33)
-    log_limit: float = 3.5  # log-odds; p within 0.03..0.97, so that the grid can still change its mind
+    log_limit: float = 3.5  # log-odds; p stays within 0.03..0.97, so that cells can still change
     quartile: float = 0.675  # standard deviations from the mean to a quartile of a normal distribution
     fence: float = 1.5  # interquartile ranges above the upper quartile: longer rays are outliers (Segfloor eq. 5.3)
-    floor: GroundConfig = field(default_factory=GroundConfig)
+    ground: GroundConfig = field(default_factory=GroundConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,15 +264,15 @@ class BaseConfig:
 
     intake: IntakeConfig = field(default_factory=IntakeConfig)
     measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
-    window: BundleWindowConfig = field(default_factory=BundleWindowConfig)
-    links: OdometryFactorConfig = field(default_factory=OdometryFactorConfig)
+    bundle_window: BundleWindowConfig = field(default_factory=BundleWindowConfig)
+    odometry_factors: OdometryFactorConfig = field(default_factory=OdometryFactorConfig)
     bundle: BundleConfig = field(default_factory=BundleConfig)
-    refind: LandmarkMatchingConfig = field(default_factory=LandmarkMatchingConfig)
-    new_points: TriangulationConfig = field(default_factory=TriangulationConfig)
+    landmark_matching: LandmarkMatchingConfig = field(default_factory=LandmarkMatchingConfig)
+    triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
     cull: CullConfig = field(default_factory=CullConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     disparity: DisparityConfig = field(default_factory=DisparityConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
-    supply: MapCacheConfig = field(default_factory=MapCacheConfig)
+    map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
     grid: GridConfig = field(default_factory=GridConfig)

@@ -121,5 +121,7 @@ def test_who_shares_with_whom() -> None:
 
 
 def test_a_config_without_loops_has_none(make_flight: MakeFlight, words: Any) -> None:
-    config = replace(BaseConfig(), refind=LandmarkMatchingConfig(), loops=replace(BaseConfig().loops, enabled=False))
+    config = replace(
+        BaseConfig(), landmark_matching=LandmarkMatchingConfig(), loops=replace(BaseConfig().loops, enabled=False)
+    )
     assert Mapper(config, words).merger is None

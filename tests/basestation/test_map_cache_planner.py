@@ -65,7 +65,7 @@ class Base:
 
 def test_own_keyframes_come_back_where_they_are_seen_again(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=80, turns=1.25, points=1500)
-    base = Base(flight, remembered=20)
+    base = Base(flight, local_keyframes=20)
     lent = base.serve(flight.keyframes[-1], turns=6)
     assert lent
     numbers = [flight.keyframes.index(k) for k in lent]
@@ -81,7 +81,7 @@ def test_own_keyframes_come_back_where_they_are_seen_again(make_flight: MakeFlig
 
 def test_points_are_said_as_the_readers_camera_would_see_them(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=1.2, points=1500)
-    base = Base(flight, remembered=10)
+    base = Base(flight, local_keyframes=10)
     camera = replace(flight.camera, fx=300.0, fy=310.0, cx=300.0, cy=200.0)
     base.map.cameras[flight.agent] = camera  # the reader has got another camera since
     base.serve(flight.keyframes[-1])
@@ -101,7 +101,7 @@ def test_points_are_said_as_the_readers_camera_would_see_them(make_flight: MakeF
 
 def test_the_number_is_bounded_and_the_farthest_go_back(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=80, turns=1.0, points=1500)
-    base = Base(flight, copies=5, remembered=1)
+    base = Base(flight, max_keyframes=5, local_keyframes=1)
     first = base.serve(flight.keyframes[10], turns=4)
     assert len(first) == 5
     second = base.serve(flight.keyframes[50], turns=4)  # the other side of the room
@@ -146,7 +146,7 @@ def test_a_copy_moves_with_the_map_and_leaves_with_it(make_flight: MakeFlight) -
 
 def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=1.2, points=1500)
-    base = Base(flight, remembered=10)
+    base = Base(flight, local_keyframes=10)
     base.here.profile = RADIO  # type: ignore[misc]
     base.serve(flight.keyframes[-1])
     for keyframe in base.supply.lent(flight.agent):
@@ -163,7 +163,7 @@ def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
 
 def test_a_new_base_does_not_go_on_sharing_what_the_last_one_lent(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=1.2, points=1500)
-    base = Base(flight, remembered=10)
+    base = Base(flight, local_keyframes=10)
     base.serve(flight.keyframes[-1])
     lent = [r for r in base.heard if isinstance(r, CachedKeyframe | CachedLandmarks)]
     assert lent

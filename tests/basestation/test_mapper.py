@@ -85,7 +85,7 @@ def test_without_refind_the_second_round_does_not_join_the_first(make_flight: Ma
     apart, together = [], []
     for seed in (0, 1):
         flight = make_flight(keyframes=60, turns=2.0, memory=3, seed=seed)
-        mapper = Mapper(replace(BaseConfig(), refind=LandmarkMatchingConfig(max_hamming=-1)))
+        mapper = Mapper(replace(BaseConfig(), landmark_matching=LandmarkMatchingConfig(max_hamming=-1)))
         feed(mapper, flight, flight.records)
         assert mapper.counts.found == 0
         joined = Mapper()
@@ -156,7 +156,7 @@ def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight
 
 def test_strict_new_point_rules_refuse_two_views_that_are_one(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=8, turns=0.2, no_depth=1.0)
-    mapper = Mapper(replace(BaseConfig(), new_points=TriangulationConfig(max_cosine=-1.0)))
+    mapper = Mapper(replace(BaseConfig(), triangulation=TriangulationConfig(max_cosine=-1.0)))
     feed(mapper, flight, flight.records)
     assert mapper.counts.triangulated == 0
 

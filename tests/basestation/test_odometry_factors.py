@@ -62,10 +62,10 @@ def test_links_hold_what_few_points_cannot() -> None:
     sparse_map, truth = flight(noise_px=1.5)
     config = BaseConfig()
     keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    part = bundle_window(sparse_map, keyframes, config.window, config.measurement)
+    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
     assert part is not None
     alone = bundle(part.problem, config.bundle)
-    linked = with_odometry_factors(sparse_map, part, config.links)
+    linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
     assert len(linked.points) > len(part.problem.points)
     result = without_odometry_factors(part, bundle(linked, config.bundle))
     assert len(result.points) == len(part.points)
@@ -83,14 +83,15 @@ def test_keyframes_with_many_points_are_told_how_they_turned_and_no_lengths() ->
         sparse_map.keyframes.T_p_k[row, :3, 3] *= 1.03
     config = BaseConfig()
     part = bundle_window(
-        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement
+        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
     )
     assert part is not None
     far = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
     alone = bundle(far.problem, config.bundle)
     loose, firm = (
         without_odometry_factors(
-            part, bundle(with_odometry_factors(sparse_map, far, OdometryFactorConfig(enough=e)), config.bundle)
+            part,
+            bundle(with_odometry_factors(sparse_map, far, OdometryFactorConfig(enough_observations=e)), config.bundle),
         )
         for e in (5, 80)
     )
@@ -112,11 +113,11 @@ def test_turns_that_are_all_off_the_same_way_count_less() -> None:
             sparse_map.keyframes.T_p_k[row] = sparse_map.keyframes.T_p_k[row] @ off
         config = BaseConfig()
         part = bundle_window(
-            sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement
+            sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
         )
         assert part is not None
         part = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
-        sigma[name] = with_odometry_factors(sparse_map, part, OdometryFactorConfig(enough=5)).sigma[-1, 0]
+        sigma[name] = with_odometry_factors(sparse_map, part, OdometryFactorConfig(enough_observations=5)).sigma[-1, 0]
     assert sigma["alike"] > 1.3 * sigma["by chance"]
 
 
@@ -124,12 +125,12 @@ def test_links_stand_aside_of_the_border() -> None:
     sparse_map, _ = flight(noise_px=0.3)
     config = BaseConfig()
     part = bundle_window(
-        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.window, config.measurement
+        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
     )
     assert part is not None
     problem, agents = with_border(sparse_map, part.slots, part.problem, config.disparity)
     assert agents == (AgentId(0),)
-    linked = with_odometry_factors(sparse_map, replace(part, problem=problem), config.links)
+    linked = with_odometry_factors(sparse_map, replace(part, problem=problem), config.odometry_factors)
     assert linked.border is not None
     assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
     assert (linked.border.group[len(part.slots) :] == -1).all()

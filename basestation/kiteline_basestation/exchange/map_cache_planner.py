@@ -64,12 +64,12 @@ class MapCachePlanner:
     def serve(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Now and then, see what an agent at `live` is about to need, and share it over its channel."""
         reader = self._readers.setdefault(agent, _Reader())
-        if not self._config.copies or live is None or now_ns < reader.due_ns:
+        if not self._config.max_keyframes or live is None or now_ns < reader.due_ns:
             return
         here = self._map.world_pose(live.keyframe)
         if here is None or agent not in self._map.cameras:
             return
-        reader.due_ns = now_ns + round(self._config.every_s * 1e9)
+        reader.due_ns = now_ns + round(self._config.period_s * 1e9)
         here = se3.orthonormalise(here @ live.T_k_c)
         submap = submap_of_keyframe(live.keyframe)
         self._move(reader, live, submap, here)
@@ -84,7 +84,7 @@ class MapCachePlanner:
         """How the agent moves, from two of its poses in one submap that are neither too close nor too old."""
         dt_s = (live.t_ns - reader.seen_ns) * 1e-9
         reader.velocity = np.zeros(3)
-        if reader.seen_ns >= 0 and reader.submap == submap and 0.0 < dt_s <= 4.0 * self._config.every_s:
+        if reader.seen_ns >= 0 and reader.submap == submap and 0.0 < dt_s <= 4.0 * self._config.period_s:
             reader.velocity = (here[:3, 3] - reader.at) / dt_s
         reader.seen_ns, reader.submap, reader.at = live.t_ns, submap, here[:3, 3].copy()
 
@@ -96,7 +96,7 @@ class MapCachePlanner:
         table, keypoints = self._map.keyframes, self._map.keypoints
         ahead = here.copy()
         ahead[:3, 3] += self._config.horizon_s * reader.velocity
-        reach = self._config.reach * self._depth_m(submap, here)
+        reach = self._config.max_distance_ratio * self._depth_m(submap, here)
         places, axes = table.T_w_k[rows, :3, 3], table.T_w_k[rows, :3, 2]
         distance = np.minimum(
             np.linalg.norm(places - here[:3, 3], axis=1), np.linalg.norm(places - ahead[:3, 3], axis=1)
@@ -104,7 +104,7 @@ class MapCachePlanner:
         turn = axes @ here[:3, 2]
         likely = np.flatnonzero((distance < reach) & (turn > self._config.min_cosine))
         cost = distance[likely] / reach + 1.0 - turn[likely]
-        rows = rows[likely[np.lexsort((table.id[rows[likely]], cost))[: self._config.looked_at]]]
+        rows = rows[likely[np.lexsort((table.id[rows[likely]], cost))[: self._config.max_candidates]]]
         if not len(rows):
             return []
         points = np.concatenate([self._points(KeyframeId(int(table.id[row]))) for row in rows])
@@ -113,10 +113,10 @@ class MapCachePlanner:
         seen = self._in_view(agent, here, xyz) | self._in_view(agent, ahead, xyz)
         counts = np.bincount(keypoints.row[points[seen]], minlength=len(table.id))[rows].astype(np.float64)
         held = np.array([int(k) in reader.lent for k in table.id[rows]], np.bool_)
-        enough = counts >= np.where(held, 0.5, 1.0) * self._config.min_points
-        counts[held] *= self._config.keep
+        enough = counts >= np.where(held, 0.5, 1.0) * self._config.min_landmarks
+        counts[held] *= self._config.hysteresis
         order = np.lexsort((table.id[rows], -counts))
-        chosen = order[enough[order]][: self._config.copies]
+        chosen = order[enough[order]][: self._config.max_keyframes]
         return [KeyframeId(int(k)) for k in table.id[rows[chosen]]]
 
     def _lacking(self, agent: AgentId, submap: SubmapId) -> NDArray[np.int64]:
@@ -127,9 +127,9 @@ class MapCachePlanner:
         newest = sorted(
             (int(self._map.keyframes.t_ns[self._map.rows[k]]), k)
             for s in own
-            for k in self._map.submaps[s][-self._config.remembered :]
+            for k in self._map.submaps[s][-self._config.local_keyframes :]
         )
-        remembered = {k for _, k in newest[-self._config.remembered :]}
+        remembered = {k for _, k in newest[-self._config.local_keyframes :]}
         for other in self._map.submaps_of_map(submap):
             if self._sharing.allows(agent, agent_of_submap(other)):
                 rows += [self._map.rows[k] for k in self._map.submaps.get(other, []) if k not in remembered]
@@ -168,12 +168,12 @@ class MapCachePlanner:
             k
             for k, lent in reader.lent.items()
             if map_id(submap_of_keyframe(k)) != map_id(lent.copy.submap)
-            or abs(self._length(k, submap) / lent.length - 1.0) > self._config.length
+            or abs(self._length(k, submap) / lent.length - 1.0) > self._config.max_scale_change
             or (k not in wanted and not _arrived(lent, channel))
         ]
         new = sum(k not in reader.lent for k in wanted)
         idle = [k for k in reader.lent if k not in wanted and k not in gone]
-        spare = self._config.copies - len(reader.lent) + len(gone)
+        spare = self._config.max_keyframes - len(reader.lent) + len(gone)
         gone += idle[: max(0, min(new, channel.profile.cached_ahead) - spare)]
         for keyframe in gone:
             for key in reader.lent.pop(keyframe).keys:
@@ -198,7 +198,7 @@ class MapCachePlanner:
     ) -> None:  # fmt: skip
         """The best of what is wanted, as far as there is room here and on the link."""
         ahead = channel.profile.cached_ahead - sum(not _arrived(lent, channel) for lent in reader.lent.values())
-        room = self._config.copies - len(reader.lent)
+        room = self._config.max_keyframes - len(reader.lent)
         for keyframe in [k for k in wanted if k not in reader.lent][: max(0, min(ahead, room))]:
             copy = self._copy(keyframe, submap)
             points, strength = self._copied(agent, keyframe, self._length(keyframe, submap))

@@ -132,7 +132,7 @@ def build(config: GridConfig, positions: F64, points: F64, observations: I64) ->
     used = np.isfinite(distance)
 
     ground = np.full(len(points), np.nan)
-    ground[used] = ground_heights(config.floor, points[used], camera_z[used])
+    ground[used] = ground_heights(config.ground, points[used], camera_z[used])
     labels = label(config, points[:, 2] - ground, distance)
     views = np.bincount(seen[:, 1], minlength=len(points))
     keep = (labels[seen[:, 1]] != UNLABELLED) & ~_overlong(config, seen, length, labels)

@@ -95,7 +95,7 @@ def _levels(config: GroundConfig, patches: _Patches, z: F64, below: Bool) -> F64
     seed_bin = _lowest_peak(counts[seed // patches.columns, seed % patches.columns], config)
     ground = np.zeros((patches.rows, patches.columns), np.int32)
     kernels.spread_ground(
-        counts, seed, seed_bin if seed_bin >= 0 else floor_bin, reach, config.peak_share, config.peak_points,
+        counts, seed, seed_bin if seed_bin >= 0 else floor_bin, reach, config.peak_share, config.min_peak_points,
         ground, np.zeros(ground.size, np.int32),
     )  # fmt: skip
     return np.asarray(base + (ground.astype(np.float64) + 0.5) * config.height_bin_m)
@@ -105,10 +105,10 @@ def _fit(config: GroundConfig, patches: _Patches, z: F64, near: Bool, planes: F6
     """Least-squares plane (3, rows, columns) of the points `near` in every neighbourhood; slopes kept small."""
     x, y = patches.xy.T
     n = patches.total(near, np.ones_like(x))
-    enough = n >= config.plane_points
+    enough = n >= config.min_plane_points
     m = np.maximum(n, 1.0)
     mx, my, mz = (patches.total(near, v) / m for v in (x, y, z))
-    xx, yy = (patches.total(near, u * u) / m - w * w + config.level_m**2 for u, w in ((x, mx), (y, my)))
+    xx, yy = (patches.total(near, u * u) / m - w * w + config.slope_prior_m**2 for u, w in ((x, mx), (y, my)))
     xy, xz, yz = (
         patches.total(near, u * v) / m - w * t for u, v, w, t in ((x, y, mx, my), (x, z, mx, mz), (y, z, my, mz))
     )
@@ -132,6 +132,6 @@ def _box3(values: F64, axis: int) -> F64:
 def _lowest_peak(count: NDArray[np.float32], config: GroundConfig) -> int:
     """The lowest bin that is a peak, with enough points and a fair share of the highest count; -1 none."""
     after = np.append(count[1:], 0.0)
-    need = max(config.peak_share * float(count.max()), config.peak_points)
+    need = max(config.peak_share * float(count.max()), config.min_peak_points)
     peaks = np.flatnonzero((count >= need) & (count >= after))
     return int(peaks[0]) if len(peaks) else -1

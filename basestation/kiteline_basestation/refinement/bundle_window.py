@@ -33,9 +33,9 @@ def local_bundle_window(
     sparse_map: SparseMap, keyframe: KeyframeId, config: BundleWindowConfig, measurement: MeasurementConfig
 ) -> BundleWindow | None:
     """The keyframe, its most covisible ones, all they see, and the keyframes that hold these points in place."""
-    free = [keyframe, *sparse_map.covisible_keyframes(keyframe, config.min_shared)[: config.free - 1]]
+    free = [keyframe, *sparse_map.covisible_keyframes(keyframe, config.min_shared)[: config.max_free - 1]]
     parent = keyframe
-    while len(free) < config.free // 2:  # few points are known: go on along the way that the agent came
+    while len(free) < config.max_free // 2:  # few points are known: go on along the way that the agent came
         parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[parent]]))
         if parent not in sparse_map or sparse_map.pose(parent) is None:
             break
@@ -71,7 +71,7 @@ def bundle_window(
     counts[free_rows] = 0
     others = np.flatnonzero(counts > 0)
     order = np.lexsort((-keyframes.id[others], -counts[others]))
-    others = others[order[: config.fixed]].astype(np.int32)
+    others = others[order[: config.max_fixed]].astype(np.int32)
     rows = np.concatenate([free_rows, others])
     rows = rows[np.argsort(keyframes.id[rows])]
     number = np.full(len(sparse_map), -1, np.int32)
@@ -82,7 +82,7 @@ def bundle_window(
     seen = np.bincount(which[keep], minlength=len(points))
     keep &= seen[which] >= 2
     points = points[seen >= 2]
-    if len(points) < config.min_points:
+    if len(points) < config.min_landmarks:
         return None
     slots = slots[keep]
     starts = np.concatenate([[0], np.cumsum(seen[seen >= 2])]).astype(np.int32)
@@ -111,7 +111,7 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
         if agent in sparse_map.disparity_calibrated:
-            sigma[row] = config.sigma_settled_px
+            sigma[row] = config.sigma_calibrated_px
         deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & deep[rows]
     measured = np.empty((len(slots), 3))
@@ -121,7 +121,7 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     octave = table.octave[slots].astype(np.float64)
     aligned = config.sigma_growth**octave
     fused = (table.kind[slots] == LANDMARK) & (table.root[slots] != slots)
-    pixel = np.where(fused, config.fused_px * config.fused_growth**octave, config.sigma_px * aligned)
+    pixel = np.where(fused, config.sigma_fused_px * config.sigma_fused_growth**octave, config.sigma_px * aligned)
     return measured, np.stack([pixel, sigma[rows] * aligned], 1)
 
 

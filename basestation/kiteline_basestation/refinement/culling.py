@@ -18,15 +18,15 @@ def cull_weak(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, p
     """Judge the points born `age` keyframes before this one. Returns how many were dropped."""
     same = sparse_map.submaps[submap_of_keyframe(keyframe)]
     number = same.index(keyframe)
-    if number < config.age:
+    if number < config.landmark_age:
         return 0
-    judged = same[number - config.age]
+    judged = same[number - config.landmark_age]
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(judged)
     own = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
     points = slots[own]
     visible = np.zeros(sparse_map.slots, np.int32)
-    for later in same[number - config.age + 1 : number + 1]:
+    for later in same[number - config.landmark_age + 1 : number + 1]:
         if sparse_map.pose(later) is not None:
             visible[predict_projections(sparse_map, points, later)[0]] += 1
     found = np.diff(sparse_map.observations(points)[0]) - 1

@@ -74,7 +74,7 @@ def stands_out(result: BundleResult, config: DisparityConfig) -> bool:
     """Whether what a bundle found is more than chance for one of the agents."""
     for g, offset in enumerate(result.offset):
         cov = config.inflation**2 * result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
-        if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > config.stands_out**2 * TERMS:
+        if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > config.min_significance**2 * TERMS:
             return True
     return False
 
@@ -92,7 +92,7 @@ def take(
         at = border.terms[border.group == g]
         cov = result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         sigma_px = config.inflation * float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", at, cov, at))))
-        if sigma_px < config.settled_px:
+        if sigma_px < config.calibrated_px:
             sparse_map.disparity_calibrated.add(agent)
 
 

@@ -44,7 +44,7 @@ def match_landmarks(
 
 def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig) -> list[KeyframeId]:
     """Covisible keyframes, then those that stand near and look the same way; never ones without a pose."""
-    covisible = sparse_map.covisible_keyframes(keyframe, 1)[: config.keyframes]
+    covisible = sparse_map.covisible_keyframes(keyframe, 1)[: config.max_covisible]
     table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
     points = sparse_map.landmarks_of(keyframe)
     inverse = sparse_map.inverse_depths(points) / table.scale[sparse_map.keypoints.row[points]]
@@ -62,7 +62,7 @@ def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: Landma
     order = np.argsort(distance[near], kind="stable")
     taken = set(covisible)
     extra = [same[i] for i in np.flatnonzero(near)[order].tolist() if same[i] not in taken]
-    return covisible + extra[: config.near_keyframes]
+    return covisible + extra[: config.max_nearby]
 
 
 def _search(

@@ -37,7 +37,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
     table = sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    loose = max(config.enough_px, _LOOSE * _turns_differ_px(sparse_map, window, number, config.run))
+    loose = max(config.rotation_sigma_px, _LOOSE * _turns_differ_px(sparse_map, window, number, config.run))
     points, camera, measured, sigma = [], [], [], []
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
@@ -45,7 +45,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         deep = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
         if p is None or not deep or not (problem.free[k] or problem.free[p]):
             continue
-        few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough)
+        few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
         deviation = 1.0 / np.hypot(few / config.sigma_px, 1.0 / loose)
         seen = _made_up(sparse_map, problem, k, p, table.T_p_k[row], _DEPTHS if few > 0.0 else _FAR)
         if seen is None:

@@ -66,7 +66,7 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: Triangulat
     inverse = sparse_map.inverse_depths(seen) / keyframes.scale[table.row[seen]]
     inverse = inverse[inverse > 0]
     here = _open_births(sparse_map, keyframe)
-    for other in sparse_map.covisible_keyframes(keyframe, 1)[: config.keyframes]:
+    for other in sparse_map.covisible_keyframes(keyframe, 1)[: config.max_covisible]:
         if len(here) == 0:
             break
         there = _open_births(sparse_map, other)

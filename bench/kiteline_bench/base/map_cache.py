@@ -79,7 +79,7 @@ def _lost(bench: Bench, first: str) -> list[Bar]:
     bench.say("flying with black images")
     found = KeyframesInWorld(
         fly_with_base(
-            [Scenario(first, 0, parts=parts)], small, replace(base, supply=replace(base.supply, remembered=_SMALL_MAP))
+            [Scenario(first, 0, parts=parts)], small, replace(base, map_cache=replace(base.map_cache, local_keyframes=_SMALL_MAP))
         )
     )
     flown = found.agent(0)
@@ -116,7 +116,7 @@ def _both(
 ) -> tuple[KeyframesInWorld, KeyframesInWorld]:
     """The same flight with a map cache and without."""
     base = BaseConfig()
-    none = replace(base, supply=replace(base.supply, copies=0))
+    none = replace(base, map_cache=replace(base.map_cache, max_keyframes=0))
     out = []
     for config, condition in ((base, ""), (none, ", without a cache")):
         bench.say(f"flying: {what}{condition}")
