@@ -350,7 +350,9 @@ class MapMerger:
             for keyframe in [match.new, *around[: self._config.loops.neighbours]]:
                 if keyframe not in seen:
                     seen.add(keyframe)
-                    landmark_matching.match_landmarks(self._map, keyframe, self._config.landmark_matching, self._publisher)
+                    landmark_matching.match_landmarks(
+                        self._map, keyframe, self._config.landmark_matching, self._publisher
+                    )
 
     # -- full bundles --------------------------------------------------------------------------------------------------
 

@@ -77,15 +77,15 @@ class LocalBundles:
         for submap in sorted(self._waiting, key=lambda s: (self._last_job.get(s, 0), s)):
             if self._map.map_id(submap) in busy:
                 continue
-            waiting, size = self._waiting.pop(submap), self._config.window.free
+            waiting, size = self._waiting.pop(submap), self._config.bundle_window.max_free
             keyframe = waiting[-1] if len(waiting) <= size else waiting[size // 2]  # half a window at a time
-            window = local_bundle_window(self._map, keyframe, self._config.window, self._config.measurement)
+            window = local_bundle_window(self._map, keyframe, self._config.bundle_window, self._config.measurement)
             moved = set() if window is None else set(self._map.keyframes.id[window.rows[window.problem.free]].tolist())
             left = [k for k in waiting if k != keyframe and k not in moved]
             if left:
                 self._waiting[submap] = left
             if window is not None:
-                problem = with_odometry_factors(self._map, window, self._config.links)
+                problem = with_odometry_factors(self._map, window, self._config.odometry_factors)
                 job = Job(next(self._job_ids), LOCAL_BUNDLE.name, BundleInputs(problem, self._config.bundle))
                 jobs.append(job)
                 self._pending[job.id] = (submap, window)

@@ -79,7 +79,9 @@ def _lost(bench: Bench, first: str) -> list[Bar]:
     bench.say("flying with black images")
     found = KeyframesInWorld(
         fly_with_base(
-            [Scenario(first, 0, parts=parts)], small, replace(base, map_cache=replace(base.map_cache, local_keyframes=_SMALL_MAP))
+            [Scenario(first, 0, parts=parts)],
+            small,
+            replace(base, map_cache=replace(base.map_cache, local_keyframes=_SMALL_MAP)),
         )
     )
     flown = found.agent(0)
