@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from kiteline_bench.benchmark import parts
+from kiteline_cli.main import find_commands
+
 ROOT = Path(__file__).parents[2]
 ROOMS = ("core", "codec", "hw", "agent", "basestation", "lab", "bench", "cli", "docs", "tests", "examples", "systemd")
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), ROOT / "codec" / "SPEC.md"])
@@ -41,8 +44,20 @@ def test_links_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_files_that_are_named_exist(page: Path) -> None:
     named = re.findall(rf"`((?:{'|'.join(ROOMS)})/[\w./-]+)`", text_of(page))
-    missing = [name for name in named if not (ROOT / name).exists()]
+    missing = [name for name in named if not (ROOT / name).exists() and "NAME" not in name]
     assert not missing, f"{page.name} names what does not exist: {missing}"
+
+
+def test_commands_that_are_named_exist() -> None:
+    commands = {c.name for group in find_commands().values() for c in group}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        blocks = "".join(re.findall(r"^```(?!text).*?^```", text, re.DOTALL | re.MULTILINE))
+        for name in re.findall(r"`kiteline ([a-z]+)", text) + re.findall(r"^kiteline ([a-z]+)", blocks, re.MULTILINE):
+            assert name in commands | {"hello"}, f"{page.name}: kiteline {name}"
+        if page.name != "results.md":
+            for name in re.findall(r"`kiteline bench ([a-z/-]+)", text):
+                assert parts(name), f"{page.name}: kiteline bench {name}"
 
 
 def test_every_page_is_in_the_navigation() -> None:
