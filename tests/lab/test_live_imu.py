@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_agent.__main__ import fly_live
 from kiteline_agent.runtime.flight_log import estimate_from_json
+from kiteline_agent.runtime.live import fly_live
 from kiteline_agent.runtime.options import AgentOptions, options_of, parser
 from kiteline_core.config import ConfigError
 from kiteline_core.geometry.cameras import CameraModel, CameraRig

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_agent.__main__ import fly_live
+from kiteline_agent.runtime.live import fly_live
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.mavlink.messages import WheelDistance

@@ -1,12 +1,12 @@
-"""What a person at a terminal is told of a live flight: what changes, and now and then how it stands. No clock."""
+"""Status messages of a live flight for a terminal: important events, and a summary every 10 s. No clock."""
 
 from __future__ import annotations
 
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import StepOutput
 
-_EVERY_NS = 10_000_000_000  # between two lines while nothing happens
-_TOLD = (
+_SUMMARY_NS = 10_000_000_000  # between two summaries
+_SHOWN = (
     "submap",
     "recovered",
     "mono",
@@ -14,7 +14,7 @@ _TOLD = (
     "governor: level",
     "odometer",
     "imu",
-)  # beginnings of the events worth a line
+)  # beginnings of the events that are shown
 
 
 class StatusMessages:
@@ -23,12 +23,12 @@ class StatusMessages:
     def __init__(self) -> None:
         self._tracking: bool | None = None  # None: no pose yet
         self._lost_ns = 0
-        self._summary_ns = _EVERY_NS
+        self._next_summary_ns = _SUMMARY_NS
         self._bytes_up = 0
 
-    def lines(self, output: StepOutput, tally: FrameCounts, flight_ns: int) -> list[str]:
-        """What is to be said after a step at a time of the flight."""
-        out = [event for event in output.events if event.startswith(_TOLD)]
+    def lines(self, output: StepOutput, counts: FrameCounts, flight_ns: int) -> list[str]:
+        """The lines to print after a step. flight_ns: since the flight began."""
+        out = [event for event in output.events if event.startswith(_SHOWN)]
         estimate = output.estimate
         if estimate is not None:
             tracking = live_pose(estimate) is not None
@@ -41,16 +41,16 @@ class StatusMessages:
                 self._lost_ns = flight_ns
             if tracking or self._tracking is not None:
                 self._tracking = tracking
-        if flight_ns >= self._summary_ns:
-            rate = (tally.bytes_up - self._bytes_up) * 1e9 / (flight_ns - self._summary_ns + _EVERY_NS)
-            out.append(f"{summary(tally)}; {rate / 1000:.1f} kB/s up")
-            self._summary_ns, self._bytes_up = flight_ns + _EVERY_NS, tally.bytes_up
+        if flight_ns >= self._next_summary_ns:
+            rate = (counts.bytes_up - self._bytes_up) * 1e9 / (flight_ns - self._next_summary_ns + _SUMMARY_NS)
+            out.append(f"{summary(counts)}; {rate / 1000:.1f} kB/s up")
+            self._next_summary_ns, self._bytes_up = flight_ns + _SUMMARY_NS, counts.bytes_up
         return [f"{flight_ns / 1e9:8.1f} s  {line}" for line in out]
 
 
-def summary(tally: FrameCounts) -> str:
+def summary(counts: FrameCounts) -> str:
     """The flight so far in one line."""
     return (
-        f"{tally.frames} frames: {tally.tracked} tracked, {tally.lost} lost, {tally.dropped} dropped; "
-        f"{len(tally.keyframes)} keyframes in {len(tally.submaps)} submap{'s' * (len(tally.submaps) != 1)}"
+        f"{counts.frames} frames: {counts.tracked} tracked, {counts.lost} lost, {counts.dropped} dropped; "
+        f"{len(counts.keyframes)} keyframes in {len(counts.submaps)} submap{'s' * (len(counts.submaps) != 1)}"
     )

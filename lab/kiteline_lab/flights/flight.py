@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.__main__ import Onboard
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.runtime.agent_runtime import AgentRuntime
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.base_runtime import BaseRuntime
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
@@ -85,7 +85,7 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
     with contextlib.ExitStack() as stack:
         onboards = {}
         for spec, source in zip(flight.agents, sources, strict=True):
-            onboards[spec.agent] = Onboard(spec, source, ours[spec.agent], whole_process=False)
+            onboards[spec.agent] = AgentRuntime(spec, source, ours[spec.agent], whole_process=False)
             stack.callback(onboards[spec.agent].close)
         progress = stack.enter_context(Progress("flying", flight.frames, "frames")) if not flight.quiet else None
         outcome = Outcome([None] * len(flight.agents))
@@ -104,26 +104,26 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
     return outcome
 
 
-def _fly_alone(onboards: Mapping[int, Onboard], progress: Progress | None) -> None:
+def _fly_alone(onboards: Mapping[int, AgentRuntime], progress: Progress | None) -> None:
     for onboard in onboards.values():
         while onboard.next_ns is not None:
-            onboard.turn(Down(onboard.next_ns, Phase.FLY, ()))
+            onboard.tick(Down(onboard.next_ns, Phase.FLY, ()))
             _show(onboards, progress)
 
 
-def _fly_joined(onboards: Mapping[int, Onboard], base: BaseRuntime, progress: Progress | None) -> None:
-    ups = {agent: onboard.hello() for agent, onboard in onboards.items()}
+def _fly_joined(onboards: Mapping[int, AgentRuntime], base: BaseRuntime, progress: Progress | None) -> None:
+    ups = {agent: onboard.first_message() for agent, onboard in onboards.items()}
     while True:
         downs = base.tick(ups)
         if base.phase is Phase.END:
             return
-        ups = {agent: onboard.turn(downs[agent]) for agent, onboard in onboards.items()}
+        ups = {agent: onboard.tick(downs[agent]) for agent, onboard in onboards.items()}
         _show(onboards, progress)
 
 
-def _show(onboards: Mapping[int, Onboard], progress: Progress | None) -> None:
+def _show(onboards: Mapping[int, AgentRuntime], progress: Progress | None) -> None:
     if progress is not None:
-        progress.update(sum(onboard.tally.frames for onboard in onboards.values()))
+        progress.update(sum(onboard.counts.frames for onboard in onboards.values()))
 
 
 # As child processes

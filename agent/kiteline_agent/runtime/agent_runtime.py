@@ -1,0 +1,221 @@
+"""One agent in flight: source, agent, log and modelled link, driven step by step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import cost_ns
+from kiteline_agent.governor.cpu_account import CpuAccount
+from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.runtime.flight_record import FlightRecord, metadata
+from kiteline_agent.runtime.frame_counts import FrameCounts
+from kiteline_agent.runtime.frame_reader import FrameReader
+from kiteline_agent.runtime.options import (
+    AgentOptions,
+    agent_config,
+    channel_for,
+)
+from kiteline_agent.runtime.warm import warm
+from kiteline_agent.step import Identity, StepInput, StepOutput
+from kiteline_codec import warm as codec_warm
+from kiteline_codec.channel import CodedChannel, RecordChannel, settled
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
+from kiteline_core.ids import AgentId
+from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.logs.mcap_log import LogWriter
+from kiteline_hw.logs.spill_file import SpillFile
+from kiteline_hw.ports import FrameSource
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
+from kiteline_hw.sources.open import open_source
+from kiteline_hw.system import kernel_cache
+from kiteline_hw.system.memory import release_memory, rss_mib
+from kiteline_hw.system.vocabulary import shipped_vocabulary
+
+PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
+
+
+class AgentRuntime:
+    """Drives one agent step by step, in lock-step or live: reads frames, logs, counts, and models link and CPU.
+
+    whole_process: the agent is alone in this process. Then all CPU time between two frames but for decoding counts as
+    the agent's, else only that of its steps.
+    """
+
+    def __init__(self, options: AgentOptions, source: FrameSource, channel: RecordChannel, whole_process: bool) -> None:
+        cv2.setNumThreads(1)
+        self.options = options
+        self.source = source
+        self.channel = channel
+        self.counts = FrameCounts()
+        self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
+        self.rss_mib = 0.0
+        config = agent_config(options.config, options.cpu_percent)
+        if whole_process:
+            kernel_cache.fill("kiteline_agent.runtime.warm")
+        begin_ns = time.process_time_ns()
+        codec_warm.warm()
+        warm(source.rig, config)
+        if whole_process:
+            release_memory()
+        self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
+        until_ns = options.start_ns + round(options.seconds * 1e9) if options.seconds > 0 else None
+        self.reader = FrameReader(source, until_ns, time.process_time_ns)
+        self._files = ExitStack()
+        self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
+        self._record = self._open_record(config) if options.log_name else None
+        self.agent = Agent(
+            source.rig,
+            source.imu,
+            config,
+            Identity(AgentId(options.agent), options.boot),
+            channel,
+            shipped_vocabulary(),
+        )
+        disorder = LinkModelConfig(
+            loss=options.loss, duplicate=options.disorder, reorder=options.disorder, delay_ns=round(options.delay_s * 1e9)
+        )  # fmt: skip
+        self._wire = LinkModel(disorder, options.seed)
+        self._overhead_bytes = channel.endpoint.config.overhead_bytes if isinstance(channel, CodedChannel) else 0
+        self._account = CpuAccount(time.process_time_ns, self.reader, whole_process)
+        self._last_cpu_ns = 0  # of the last frame: modelled in lock-step, measured in a live flight
+        self._live_clock = False
+        self._core = VirtualCpu(options.cpu_percent)
+        self.output: StepOutput | None = None  # of the last step
+
+    def _open_record(self, config: AgentConfig) -> FlightRecord:
+        options, source = self.options, self.source
+        folder = Path(options.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        about = metadata(options, source.name, config, self.channel)
+        log = self._files.enter_context(LogWriter(folder / options.log_name, about))
+        log.rig(self._log_shift_ns, source.rig, source.imu)
+        log.flush()  # an agent that dies at once leaves a log that can be read
+        live, odometry = (
+            self._files.enter_context((folder / name).open("w", buffering=1)) for name in ("live.tum", "odometry.tum")
+        )
+        return FlightRecord(log, live, odometry, options.agent, self.channel)
+
+    @property
+    def next_ns(self) -> int | None:
+        """Flight time of the next frame; None after the last."""
+        stamp = self.reader.next_ns
+        return None if stamp is None else stamp - self.options.start_ns
+
+    def first_message(self) -> Up:
+        """The first message at the barrier."""
+        return Up(self._next_or_end(), False, False, ())
+
+    def tick(self, down: Down) -> Up:
+        """One tick of a lock-step flight: take the base's packets, and the next frame if it is due."""
+        if down.phase is not Phase.FLY:
+            self.end_of_frames()
+        frame = imu = odometry = None
+        if self.next_ns is not None and self.next_ns <= down.now_ns:
+            if self._core.newest_wins(self.next_ns, self.reader.period_ns):
+                self.reader.drop()
+                self.counts.dropped += 1
+            else:
+                frame, imu, odometry = self.reader.take()
+        sent = self.step(frame, imu, down.packets, down.now_ns, odometry)
+        quiet, equal = settled(self.channel)
+        return Up(self._next_or_end(), quiet, equal, tuple(sent))
+
+    def begin_at(self, begin_ns: int) -> None:
+        """Begin a live flight: `begin_ns` of its clock is flight time 0."""
+        assert self.reader.next_ns is not None
+        self._live_clock = True
+        self.options = replace(self.options, start_ns=self.reader.next_ns)
+        self._log_shift_ns = self.options.start_ns - begin_ns
+
+    def drop_stale(self, flight_ns: int) -> bool:
+        """Drop frames until the next one is the newest at a flight time. False if none is left."""
+        while self.next_ns is not None and 0 < self.reader.period_ns <= flight_ns - self.next_ns:
+            self.reader.drop()
+            self.counts.dropped += 1
+        return self.next_ns is not None
+
+    def end_of_frames(self) -> None:
+        """The last frame was flown: what follows is draining, which is reported apart."""
+        if self.flight_counts is None:
+            self.flight_counts = self.counts.as_report()
+
+    def _next_or_end(self) -> int:
+        next_ns = self.next_ns
+        return NO_MORE_FRAMES_NS if next_ns is None else next_ns
+
+    def step(
+        self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int,
+        odometry: OdometryBatch | None = None,
+    ) -> list[bytes]:  # fmt: skip
+        """One step of the agent, logged and counted. Returns the packets to send."""
+        self._account.begin()
+        step_input = StepInput(frame, imu, tuple(packets), self._last_cpu_ns, odometry)
+        self.output = output = self.agent.step(step_input, now_ns)
+        if self._record is not None:
+            self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
+        if frame is not None:
+            self.counts.count(output.estimate)
+            if output.estimate is not None and self._record is not None:
+                self._record.pose(output.estimate)
+            if not self._live_clock:
+                ops = cost_ns(self.agent.work)
+                self._core.spend(ops, now_ns)
+                self._last_cpu_ns = ops
+        for packet in output.packets:
+            self._wire.send(packet, now_ns)
+        sent = self._wire.deliver(now_ns)
+        self.counts.bytes_up += sum(map(len, output.packets)) + len(output.packets) * self._overhead_bytes
+        self.counts.bytes_down += sum(map(len, packets)) + len(packets) * self._overhead_bytes
+        self._account.end(frame is not None)
+        if frame is not None and self._live_clock:
+            self._last_cpu_ns = self._account.last_ns
+        if frame is not None and len(self._account.ms) % PROGRESS_FRAMES == 1:
+            self.rss_mib = max(self.rss_mib, rss_mib())
+        return sent
+
+    def report(self) -> dict[str, Any]:
+        """The agent's part of report.json, with raw samples in place of statistics."""
+        self.end_of_frames()
+        assert self.flight_counts is not None
+        total = self.counts.as_report()
+        skipped = self.source.report.skipped
+        return {
+            "source": self.source.name,
+            **self.flight_counts,
+            "link": self.channel.report() if isinstance(self.channel, CodedChannel) else {},
+            "skipped": dict(sorted(skipped.items())),
+            "notes": list(self.source.report.notes),
+            "scale": "metric" if self.agent.metric else "own",
+            "time_offset": self.agent.time_offset_report(),
+            "odometer": self.agent.odometer_report(),
+            "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},
+            "timing": {
+                "cpu_ms_per_frame": self._account.ms,
+                "decode_ms": self.reader.decode_ms,
+                "warm_up_s": round(self.warm_s, 3),
+                "rss_mib": round(self.rss_mib, 1),
+            },
+        }
+
+    def close(self) -> None:
+        """Finish the files."""
+        self._files.close()
+
+
+def opened(options: AgentOptions) -> FrameSource:
+    """The source of a flight. Raises SourceError."""
+    return open_source(options.source, mono=options.mono, imu=options.imu)
+
+
+def channel_with_spill(options: AgentOptions) -> RecordChannel:
+    """The channel to the base; beside a log, values that wait while the link is down are moved to a file."""
+    return channel_for(options, SpillFile(Path(options.folder)) if options.log_name else None)

@@ -1,0 +1,133 @@
+"""A live flight: real clocks, a real link, and a flight controller if there is one."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
+from kiteline_agent.runtime.controller import controller_link, with_controller_imu
+from kiteline_agent.runtime.options import (
+    AgentOptions,
+)
+from kiteline_agent.runtime.terminal import StatusMessages, summary
+from kiteline_codec.channel import settled
+from kiteline_codec.transport.framing import StreamFramer
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_hw.links.open import open_link
+from kiteline_hw.links.sealed_link import SealedLink
+from kiteline_hw.ports import ByteLink, LinkError, PoseSample
+from kiteline_hw.system import process
+from kiteline_hw.system.clock import MonotonicClock
+from kiteline_hw.system.cpu import CpuQuota
+from kiteline_hw.system.key_store import read_keys
+
+_IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
+_DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
+_QUIET_S = 1.0  # s that the link has to stay quiet: the base may still be working on the last keyframe
+
+
+def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
+    """Fly on real clocks: frames are paced by their stamps, and late ones are dropped."""
+    source = opened(options)
+    with ExitStack() as stack:
+        stack.callback(source.close)
+        source = with_controller_imu(options, source)
+        runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
+        stack.callback(runtime.close)
+        link = open_link(options.link, "agent", options.agent, framer=StreamFramer, required=False)
+        stack.callback(link.close)
+        if options.key:
+            link = _sealed(options, link)
+        clock = MonotonicClock()
+        controller = controller_link(options, source, clock, stack)
+        if options.cpu_percent > 0.0:
+            stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
+        if parent is not None:
+            parent.send_event("ready", frames=source.frame_count)
+        process.notify("READY=1")
+        status = StatusMessages()
+        if parent is None:
+            process.print_lines([f"flying {source.name}, {_link_text(options)}"])
+        begin_ns = clock.now_ns()
+        runtime.begin_at(begin_ns)
+        if controller is not None:
+            controller.take_imu(begin_ns)  # drop what was measured before the flight
+        shift_ns = runtime.options.start_ns - begin_ns
+        while not stop and runtime.next_ns is not None:
+            wait_s = (begin_ns + runtime.next_ns - clock.now_ns()) / 1e9
+            if wait_s > 0.0 and stop.wait(min(wait_s, _IDLE_TICK_S)):
+                break
+            now_ns = clock.now_ns()
+            frame = imu = odometry = None
+            if now_ns >= begin_ns + runtime.next_ns:
+                if not runtime.drop_stale(now_ns - begin_ns):
+                    break
+                captured_ns = begin_ns + runtime.next_ns
+                frame, imu, odometry = runtime.reader.take()
+                measured = None if controller is None else controller.take_odometry(captured_ns)
+                odometry = odometry if measured is None else replace(measured, t_ns=measured.t_ns + shift_ns)
+                # IMU samples that arrive late come with the next frame.
+                samples = None if controller is None else controller.take_imu(captured_ns)
+                imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
+            for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry):
+                link.send(packet)
+            e = runtime.output.estimate if runtime.output is not None else None
+            if controller is not None and e is not None and e.T_l_b is not None:
+                quality = runtime.agent.odometry_quality(e)
+                controller.push(
+                    PoseSample(captured_ns, e.T_l_b, e.tracked, quality, options.boot, e.cov_l), clock.now_ns()
+                )
+            process.notify("WATCHDOG=1")
+            if parent is None:
+                process.print_lines(
+                    status.lines(runtime.output, runtime.counts, now_ns - begin_ns) if runtime.output else ()
+                )
+            elif runtime.counts.frames % PROGRESS_FRAMES == 0:
+                parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
+        if parent is None:
+            process.print_lines([f"over: {summary(runtime.counts)}"])
+        _drain_live(runtime, link, clock, parent, stop)
+        if parent is not None:
+            parent.send_event("result", report=runtime.report())
+
+
+def _link_text(options: AgentOptions) -> str:
+    return "without a link" if options.link == "none" else f"the base at {options.link}"
+
+
+def _sealed(options: AgentOptions, link: ByteLink) -> ByteLink:
+    """The link with its packets sealed. Raises LinkError without a key for this agent."""
+    keys = read_keys(Path(options.key))
+    if options.agent not in keys:
+        raise LinkError(
+            f"{options.key} has no key for agent {options.agent}; `kiteline keys new {options.agent}` makes one"
+        )
+    key = {options.agent: keys[options.agent]}
+    sealer = Sealer(key[options.agent], options.agent, options.boot + 1, Direction.UP, suite_for(options.link))
+    return SealedLink(link, options.agent, sealer, Opener(key, Direction.DOWN))
+
+
+def _drain_live(
+    runtime: AgentRuntime,
+    link: ByteLink,
+    clock: MonotonicClock,
+    parent: process.Parent | None,
+    stop: process.StopSignal,
+) -> None:
+    """After the last frame: step until both sides hold the same values, or _DRAIN_S have passed."""
+    runtime.end_of_frames()
+    if parent is not None:
+        parent.send_event("frames_over")
+    now_ns = quiet_ns = clock.now_ns()
+    end_ns = now_ns + round(_DRAIN_S * 1e9)
+    while not stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
+        stop.wait(_IDLE_TICK_S / 2)
+        now_ns = clock.now_ns()
+        for packet in runtime.step(None, None, link.receive(), now_ns):
+            link.send(packet)
+        if not all(settled(runtime.channel)):
+            quiet_ns = now_ns
+        process.notify("WATCHDOG=1")
