@@ -97,7 +97,7 @@ class Agent:
         self.work.clear()
         self.work.steps = 1
         events = self._take_corrections(self._channel.receive(step_input.packets, now_ns))
-        self._camera.motion.hear(step_input.odometry)
+        self._camera.motion.add_odometry(step_input.odometry)
         estimate = None
         if step_input.frame is not None:
             tracked, more = self._govern(step_input.frame.t_ns, step_input)
@@ -198,7 +198,7 @@ class Agent:
             return []
         self._channel.put(alignment)
         self._corrections.set_upright(alignment)
-        return [f"submap lies {np.degrees(self._camera.gravity.askew_rad):.1f} degrees askew"]
+        return [f"submap lies {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees askew"]
 
     def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
         """Whether to track the frame, at the effort that the governor decides; its IMU samples are kept. And events."""
@@ -266,7 +266,7 @@ class Agent:
         quality = camera.covariance.quality(
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
         )
-        carried = camera.submaps.any and camera.motion.carried
+        carried = camera.submaps.any and camera.motion.measures_motion
         if not tracked and (not carried or quality < ctx.config.certainty.flagged_below):
             quality = -1
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.inertial.controller_imu import ControllerImuConfig
-from kiteline_agent.inertial.inertial_tracker import InertialConfig
+from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.initialisation.two_view import TwoViewConfig
 from kiteline_agent.motion.odometer import OdometerConfig
 from kiteline_core.imaging.matching import MatchConfig

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
-from kiteline_agent.inertial.inertial_tracker import InertialConfig, InertialTracker
+from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -85,7 +86,9 @@ def run(
     states: list[InertialState | None] = []
     for k, step in enumerate(steps):
         tracker.predict(step.imu, step.t_ns)
-        states.append(tracker.coast(step.t_ns) if k in blind else tracker.update(step.t_ns, step.visual, step.points))
+        states.append(
+            tracker.dead_reckon(step.t_ns) if k in blind else tracker.update(step.t_ns, step.visual, step.points)
+        )
     return tracker, states
 
 
@@ -118,7 +121,7 @@ def test_starts_in_motion_in_a_map_that_is_not_level(seed: int) -> None:
     tracker, states = run(steps)
     assert tracker.started == "motion"
     assert next(k for k, s in enumerate(states) if s is not None) < 25
-    level_R = tracker.level_R()
+    level_R = tracker.gravity_rotation()
     assert level_R is not None
     upright = level_R @ lean[:3, :3]
     assert upright[2, 2] > np.cos(np.radians(1.0))
@@ -148,7 +151,7 @@ def test_two_seconds_blind() -> None:
     assert error @ np.linalg.solve(end.pose_cov[:3, :3], error) < 16.3  # 99.9 % of 3 degrees of freedom
     assert np.trace(end.pose_cov[:3, :3]) > 10.0 * np.trace(states[59].pose_cov[:3, :3])
     assert apart_m(states[-1], steps[-1].truth) < 0.004
-    assert tracker.blind_s == 0.0
+    assert tracker.image_loss_s == 0.0
 
 
 def test_blind_for_too_long_says_so() -> None:
@@ -187,11 +190,11 @@ def test_a_configured_time_offset_holds_and_changes_are_told() -> None:
     tracker, states = run(steps, config=InertialConfig(offset_s=0.012, apply_offset=False))
     assert tracker.offset_report()["applied_ms"] == 12.0
     assert tracker.offset_report()["ms"] == pytest.approx(12.0, abs=2.0)
-    assert tracker.offset_news() == []
+    assert tracker.take_offset_events() == []
     assert apart_m(states[-1], steps[-1].truth) < 0.004
     tracker, _ = run(flight(160, 6, late_ns=12_000_000))
-    assert "ms are the IMU's time" in tracker.offset_news()[0]
-    assert tracker.offset_news() == []
+    assert "ms are the IMU's time" in tracker.take_offset_events()[0]
+    assert tracker.take_offset_events() == []
 
 
 def test_scale_of_a_map_without_one() -> None:
@@ -223,7 +226,7 @@ def test_a_moved_map_and_a_new_one() -> None:
     tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig())
     for k, step in enumerate(steps):
         if k == 40:
-            tracker.shift_map(shift)
+            tracker.move_map(shift)
         if k == 60:
             tracker.reset()
             assert not tracker.running
@@ -247,12 +250,12 @@ def test_a_new_map_after_a_blackout_needs_no_new_start() -> None:
     for k, step in enumerate(steps):
         tracker.predict(step.imu, step.t_ns)
         if 30 <= k <= 50:
-            state = tracker.coast(step.t_ns)
+            state = tracker.dead_reckon(step.t_ns)
         if k == 50:  # texture again, but nothing that is known
             assert state is not None
             shift = state.T_m_b @ se3.inverse(step.truth)
             tracker.begin_map(step.t_ns, state.T_m_b)
-            assert tracker.blind_s == 0.0
+            assert tracker.image_loss_s == 0.0
         if not 30 <= k <= 50:
             points = VisualPoints(
                 se3.transform(shift, step.points.xyz), step.points.ray, step.points.observed, step.points.sigma_px,

@@ -57,19 +57,19 @@ class Flown:
             t_ns = k * FRAME_NS
             if batch is not None:
                 end = int(np.searchsorted(batch.t_ns, t_ns - arrives * 1e9, side="right"))
-                self.odometer.hear(odometry.chosen(batch, slice(done, end)))
+                self.odometer.add(odometry.chosen(batch, slice(done, end)))
                 done = end
             predicted = self.odometer.predict(self.pose, t_ns)
             if k == 0:
                 self.odometer.restart(self.seen(t_ns, unit_m), t_ns)
             elif t_ns < blind_from_s * 1e9:
                 self.pose = self.seen(t_ns, unit_m)
-                self.odometer.seen(self.pose, t_ns)
+                self.odometer.update(self.pose, t_ns)
             else:
                 self.pose = self.pose if predicted is None else predicted
-                cov = self.odometer.coasted(self.pose, t_ns)
+                cov = self.odometer.dead_reckon(self.pose, t_ns)
                 self.cov = self.cov if cov is None else cov
-            self.events += self.odometer.news()
+            self.events += self.odometer.take_events()
             self.trusted.append(self.odometer.trusted)
 
     @staticmethod
@@ -193,7 +193,7 @@ def test_a_short_slip_while_blind_is_passed_over() -> None:
     velocity[(batch.t_ns > 4.5e9) & (batch.t_ns < 4.7e9)] *= 4.0  # 0.2 s: 0.8 m too far
     slipped = Flown(replace(batch, velocity=velocity), 6.0, blind_from_s=4.0)
     assert np.linalg.norm(slipped.error(6.0)[:3]) < 0.15
-    assert slipped.odometer.sure
+    assert slipped.odometer.used
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.6, 3.0])
@@ -206,7 +206,7 @@ def test_a_slip_while_blind_that_lasts_is_not_followed(factor: float) -> None:
     error = slipped.error(6.0)
     assert np.linalg.norm(error[:3]) < np.linalg.norm(plain.error(6.0)[:3])
     assert error @ np.linalg.solve(slipped.cov, error) < 22.5  # 99.9 % of 6 degrees of freedom
-    assert not slipped.odometer.sure
+    assert not slipped.odometer.used
 
 
 def test_stamps_of_another_clock_are_told_of() -> None:
@@ -221,11 +221,11 @@ def test_an_odometer_that_falls_silent_is_not_guessed_at() -> None:
     flown = Flown(odometry.chosen(batch, batch.t_ns < 4_000_000_000), 6.0)
     assert flown.trusted[70]
     blind = Flown(odometry.chosen(batch, batch.t_ns < 4_500_000_000), 6.0, blind_from_s=4.0)
-    assert not blind.odometer.sure
+    assert not blind.odometer.used
     error = blind.error(6.0)
     assert error @ np.linalg.solve(blind.cov, error) < 22.5
     assert flown.odometer.predict(flown.pose, 6_000_000_000) is None
-    assert not flown.odometer.carries
+    assert not flown.odometer.predicts
 
 
 def test_one_stamp_of_the_future_does_not_silence_it() -> None:
@@ -238,8 +238,8 @@ def test_one_stamp_of_the_future_does_not_silence_it() -> None:
     for k in range(1, 120):
         now_ns = k * FRAME_NS
         mine = (batch.t_ns > now_ns - FRAME_NS) & (batch.t_ns <= now_ns)
-        odometer.hear(odometry.chosen(replace(batch, t_ns=t_ns), mine))
-        odometer.seen(camera_at(now_ns * 1e-9), now_ns)
+        odometer.add(odometry.chosen(replace(batch, t_ns=t_ns), mine))
+        odometer.update(camera_at(now_ns * 1e-9), now_ns)
     assert odometer.trusted
     assert odometer.predict(camera_at(5.95), 6_000_000_000) is not None
 
@@ -253,11 +253,11 @@ def test_a_sudden_turn_in_the_dark_is_followed() -> None:
     velocity = twist[None, :3]
     for k in range(80, 100):
         now_ns = k * FRAME_NS
-        odometer.hear(OdometryBatch(np.array([now_ns]), velocity, np.array([[0.0, 0.0, 3.0]]), cov, cov))
+        odometer.add(OdometryBatch(np.array([now_ns]), velocity, np.array([[0.0, 0.0, 3.0]]), cov, cov))
         predicted = odometer.predict(pose, now_ns)
         assert predicted is not None
         pose = predicted
-        odometer.coasted(pose, now_ns)
+        odometer.dead_reckon(pose, now_ns)
     turned = se3.so3_log(T_B_C[:3, :3] @ start[:3, :3].T @ pose[:3, :3] @ T_B_C[:3, :3].T)
     assert turned[2] == pytest.approx(3.0, abs=0.15)  # after a second; the first frame was half a turn's begin
 
@@ -281,7 +281,7 @@ def test_no_numbers_break_it(numbers: list[float], seed: int) -> None:
 
 def test_without_use_nothing_is_looked_at() -> None:
     flown = Flown(driven(3.0), 3.0, config=OdometerConfig(use=False))
-    assert not flown.odometer.heard
+    assert not flown.odometer.has_samples
     assert flown.odometer.report() is None
 
 
@@ -304,7 +304,7 @@ def test_wheels_tell_what_they_measure_alone() -> None:
 @pytest.mark.parametrize("unit_m", [0.3, 1.0, 7.0])
 def test_the_unit_of_one_eye_becomes_known(unit_m: float) -> None:
     flown = Flown(driven(6.0, 0.05), 6.0, unit_m=unit_m, metric=False)
-    found = flown.odometer.unit_m()
+    found = flown.odometer.metres_per_unit()
     assert found is not None
     assert found[0] == pytest.approx(unit_m, rel=0.01)
     assert found[1] < 0.02 * unit_m
@@ -315,14 +315,14 @@ def test_a_slip_does_not_move_the_unit() -> None:
     batch = driven(8.0, 0.05)
     velocity = batch.velocity.copy()
     velocity[(batch.t_ns > 3e9) & (batch.t_ns < 5e9)] *= 2.0
-    found = Flown(replace(batch, velocity=velocity), 8.0, unit_m=2.0, metric=False).odometer.unit_m()
+    found = Flown(replace(batch, velocity=velocity), 8.0, unit_m=2.0, metric=False).odometer.metres_per_unit()
     assert found is not None
     assert found[0] == pytest.approx(2.0, rel=0.02)
 
 
 @pytest.mark.parametrize("spoil", [dead, in_camera_axes])
 def test_no_unit_comes_from_what_disagrees(spoil: object) -> None:
-    assert Flown(spoil(driven(8.0)), 8.0, unit_m=2.0, metric=False).odometer.unit_m() is None  # type: ignore[operator]
+    assert Flown(spoil(driven(8.0)), 8.0, unit_m=2.0, metric=False).odometer.metres_per_unit() is None  # type: ignore[operator]
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array))
@@ -334,18 +334,18 @@ def test_where_the_map_lies_does_not_matter(move: F64) -> None:
     def fly(moved: bool) -> tuple[F64, F64]:
         flown = Flown(odometry.chosen(batch, batch.t_ns <= 2_000_000_000), 2.05)
         odometer, pose = flown.odometer, flown.pose
-        odometer.hear(odometry.chosen(batch, batch.t_ns > 2_000_000_000))
+        odometer.add(odometry.chosen(batch, batch.t_ns > 2_000_000_000))
         cov = np.zeros((6, 6))
         for k in range(41, 50):
             predicted = odometer.predict(pose, k * FRAME_NS)
             assert predicted is not None
             pose = predicted
-            coasted = odometer.coasted(pose, k * FRAME_NS)
+            coasted = odometer.dead_reckon(pose, k * FRAME_NS)
             assert coasted is not None
             cov = coasted
             if k == 44 and moved:
                 pose = T @ pose
-                odometer.shift(T)
+                odometer.move_map(T)
         return pose, cov
 
     (pose, cov), (other, other_cov) = fly(False), fly(True)

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Tracks and dead-reckoned motion enter; pose covariances, consistency checks and quality leave."""

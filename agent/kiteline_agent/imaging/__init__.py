@@ -1,1 +1,1 @@
-"""TODO."""
+"""Images enter; pyramids, corners, descriptors and aligned templates leave."""

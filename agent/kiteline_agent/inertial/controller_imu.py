@@ -1,4 +1,4 @@
-"""The inertial unit of a flight controller, as configured: how good it is, and where the camera sits."""
+"""Options for the IMU of a flight controller: its noise, and the pose of the camera."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
-_RIGID = 1e-3  # by which printed digits may miss a rotation
+_RIGID = 1e-3  # tolerance of a rotation matrix for printed digits
 
-# What a small MEMS unit on a flying frame measures: vibration and whole mg are more than the noise of its data sheet.
+# Measured noise of a small MEMS unit in flight: vibration exceeds the noise of its data sheet.
 _FLYING = ImuCalibration(gyro_noise=1e-3, gyro_walk=5e-5, accel_noise=2e-2, accel_walk=3e-3)
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerImuConfig:
-    """What `--imu controller` needs to know."""
+    """Options of `--imu controller`."""
 
-    T_f_c: tuple[float, ...] = ()  # 16 numbers in rows: left camera in the controller's FRD frame, m; (): as the source
-    noise: ImuCalibration = field(default_factory=lambda: _FLYING)  # rate_hz: what the controller is asked for
+    T_f_c: tuple[float, ...] = ()  # row-major 4x4: left camera in the controller's FRD frame, m; (): from the source
+    noise: ImuCalibration = field(default_factory=lambda: _FLYING)  # rate_hz: requested from the controller
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.noise.rate_hz <= 2000.0:
@@ -37,5 +37,5 @@ class ControllerImuConfig:
             )
 
     def camera(self) -> NDArray[np.float64] | None:
-        """T_f_c (4,4); None where it is not configured."""
+        """T_f_c (4,4); None if not configured."""
         return se3.orthonormalise(np.array(self.T_f_c).reshape(4, 4)) if self.T_f_c else None

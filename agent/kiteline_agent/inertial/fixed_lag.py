@@ -1,7 +1,7 @@
 """A tightly coupled smoother over the last few frames: poses, velocities, biases and gravity from images and IMU.
 
-Points are fixed, with their own uncertainty of depth. What leaves the window stays as a dense prior on the oldest state
-that remains, linearised once (S. Leutenegger et al., "Keyframe-based visual-inertial odometry using nonlinear
+Points are fixed, with their own depth uncertainty. States that leave the window become a dense prior on the oldest
+remaining state, linearised once (S. Leutenegger et al., "Keyframe-based visual-inertial odometry using nonlinear
 optimization", 2015; the chain is that of T. Qin et al., "VINS-Mono", 2018, without points among the unknowns).
 """
 
@@ -25,28 +25,28 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class FixedLagConfig:
-    """The window, and what is believed of the measurements."""
+    """Length of the window, and error models of the measurements."""
 
-    states: int = 3  # frames in the window; points being fixed, 2 to 6 measure the same and more cost time
-    fresh: int = 1  # newest frames whose points are linearised anew; older ones are condensed to 6x6
-    iterations: int = 3  # Gauss-Newton steps; the prediction is near
+    states: int = 3  # frames in the window; with fixed points, 2 to 6 are equally accurate and more cost time
+    fresh: int = 1  # newest frames whose points are relinearised; older ones are condensed to 6x6
+    iterations: int = 3  # Gauss-Newton steps; the prediction is close
     points: int = 320  # most points of a frame
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
-    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it counts less
-    velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity counts nothing, wheels slip
-    visual_inflation: float = 16.0  # of variance: successive frames share errors of templates and points
-    imu_inflation: float = 3.0  # of noise densities: vibration, scale and axes are not calibrated, and the map bends
+    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
+    velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity is rejected: wheels slip
+    visual_inflation: float = 16.0  # of variance: errors of templates and points are correlated over frames
+    imu_inflation: float = 3.0  # of noise densities: vibration, uncalibrated scale and axes, a bent map
     turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
     velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
     position_floor_m: float = 2e-5  # the same of position
     tilt_walk_rad: float = 2e-4  # per sqrt(s): the map itself bends while it grows
-    relinearise_gyro_rad_s: float = 0.01  # bias change from which on an interval is integrated anew
+    relinearise_gyro_rad_s: float = 0.01  # change of bias above which an interval is integrated again
     relinearise_accel_m_s2: float = 0.2  # the same of the accelerometer
 
 
 @dataclass(frozen=True, slots=True)
 class StartDeviations:
-    """One standard deviation of what is known at the start."""
+    """Standard deviations of the initial state."""
 
     turn_rad: float = 0.02
     position_m: float = 0.02
@@ -58,8 +58,10 @@ class StartDeviations:
 
 @dataclass(frozen=True, slots=True)
 class VisualPoints:
-    """What one frame saw of the map. xyz: (n,3) m in m. ray: (n,3) m, one deviation of depth. observed: (n,3) u, v,
-    disparity px (< 0: none). sigma_px: (n,). inlier: (n,) which of them to believe.
+    """Observations of landmarks in one frame.
+
+    xyz: (n,3) m in m. ray: (n,3) m, one standard deviation of depth. observed: (n,3) u, v, disparity px (< 0: none).
+    sigma_px: (n,). inlier: (n,) which of them are used.
     """
 
     xyz: F64
@@ -71,22 +73,24 @@ class VisualPoints:
 
 @dataclass(frozen=True, slots=True)
 class BodyVelocity:
-    """What an odometer measured. value: (3,) m/s of the body's origin in the body's axes. cov: (3,3) of it, huge where
-    nothing was measured. counted: (3,3) as what it counts beside those of other frames, whose errors are alike. age_s:
-    how long before the frame.
+    """Velocity by an odometer.
+
+    value: (3,) m/s of the body's origin in the body's axes. cov: (3,3) of it, huge in unmeasured directions. inflated:
+    (3,3) the same, inflated for errors that are correlated over frames. age_s: time from measurement to frame.
     """
 
     value: F64
     cov: F64
-    counted: F64
+    inflated: F64
     age_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class InertialState:
-    """T_m_b: (4,4). velocity: (3,) m/s in m. bias: (6,) gyro rad/s, accel m/s^2. tilt: (2,) rad, turn of true up
-    against z of m about its x and y. cov: (17,17) of [rotation (right), position, velocity, gyro bias, accel bias,
-    tilt].
+    """State of the body at a frame.
+
+    T_m_b: (4,4). velocity: (3,) m/s in m. bias: (6,) gyro rad/s, accel m/s^2. tilt: (2,) rad, rotation of the vertical
+    from z of m about x and y. cov: (17,17) of [rotation (right), position, velocity, gyro bias, accel bias, tilt].
     """
 
     T_m_b: F64
@@ -103,7 +107,7 @@ class InertialState:
 
 
 class FixedLagSmoother:
-    """Window, prior and buffers. `start` first; then `add` once a frame."""
+    """Fixed-lag smoother with a dense prior. Call `start` first, then `add` once a frame."""
 
     def __init__(
         self, camera: RectifiedCamera, calibration: ImuCalibration, config: FixedLagConfig, gravity_m_s2: float = 9.81
@@ -133,7 +137,7 @@ class FixedLagSmoother:
 
     @property
     def running(self) -> bool:
-        """Whether there is a state."""
+        """True if there is a state."""
         return self._n > 0
 
     @property
@@ -153,7 +157,7 @@ class FixedLagSmoother:
         )
 
     def start(self, T_m_b: F64, velocity: F64, bias: F64, gravity: F64, deviations: StartDeviations) -> None:
-        """Begin (anew) with one state. gravity: (3,) in m, of which the direction counts."""
+        """Start with one state. gravity: (3,) in m, of which only the direction is used."""
         self._n = 1
         self._samples = []
         self._rot[0] = T_m_b[:3, :3]
@@ -174,22 +178,21 @@ class FixedLagSmoother:
         self._vel_info[0] = 0.0
 
     def stop(self) -> None:
-        """Forget everything."""
+        """Drop all states."""
         self._n = 0
 
     def predict(self, samples: Samples) -> tuple[F64, F64]:
-        """Pose (4,4) and velocity (3,) after the samples, which begin at the newest state."""
+        """Predict pose (4,4) and velocity (3,) after the samples, which begin at the newest state."""
         state = self.state
         motion = preintegrate(samples, state.bias, self._calibration, self._config.imu_inflation)
         return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)
 
     def add(
-        self, samples: Samples, points: VisualPoints | None, driven: BodyVelocity | None = None
+        self, samples: Samples, points: VisualPoints | None, odometry: BodyVelocity | None = None
     ) -> InertialState | None:
-        """One more frame: the samples since the last one, what it saw (None: nothing, the IMU alone carries it), and
-        what an odometer said.
+        """Add a frame: samples since the last one, landmark observations (None: dead reckoning) and odometry.
 
-        None when the system could not be solved; then nothing is believed any more, and `start` is needed.
+        Returns None, without a state, if the system could not be solved; `start` is needed then.
         """
         if self._n > self._config.states - 1 and not self._drop_oldest():
             self.stop()
@@ -208,7 +211,7 @@ class FixedLagSmoother:
         self._rot[k] = se3.orthonormalise(T_m_b)[:3, :3]
         self._state[k] = np.concatenate([T_m_b[:3, 3], velocity, bias])
         self._put_points(k, points)
-        self._put_velocity(k, driven, motion)
+        self._put_velocity(k, odometry, motion)
         self._n = k + 1
         self._relinearise_biases()
         c = self._config
@@ -226,7 +229,7 @@ class FixedLagSmoother:
         return self.state
 
     def replace_last(self, samples: Samples) -> None:
-        """Better samples of the interval that leads to the newest state, before the next one is added."""
+        """Replace the samples of the interval before the newest state."""
         k = self._n - 2
         if k >= 0 and self._samples:
             self._samples[-1] = samples
@@ -234,14 +237,15 @@ class FixedLagSmoother:
             self._put_interval(k, preintegrate(samples, bias, self._calibration, self._config.imu_inflation))
 
     def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
-        """A new map begins in which the newest body pose is T_m_b (4,4) by definition. Velocity, biases and the
-        direction of gravity are taken along, with what the old map's pose lacked in certainty.
+        """Begin a new map, in which the newest body pose is T_m_b (4,4) by definition.
+
+        Velocity, biases and gravity are kept; the uncertainty of the old attitude is added to theirs.
         """
         old = self.state
         r, gravity = old.T_m_b[:3, :3], self.gravity
         down, jac = np.empty(3), np.empty((3, 2))
         inertial_kernels.down_of_tilt(self._tilt, down, jac)
-        # the error of the old attitude becomes one of what is known in the map's axes
+        # the error of the old attitude becomes one of vectors in the map's axes
         carry = np.eye(17)[6:]
         carry[:3, :3] = se3.skew(old.velocity) @ r
         carry[9:, :3] = np.linalg.pinv(self._gravity * jac) @ se3.skew(gravity) @ r
@@ -252,29 +256,29 @@ class FixedLagSmoother:
         self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations())
         self._cov = 0.5 * (cov + cov.T)
         self._prior_h[:] = np.linalg.inv(self._cov)
-        self.shift_map(T_new_old)
+        self.move_map(T_new_old)
 
-    def shift_map(self, T_new_old: F64) -> None:
-        """The map moved: express everything in the new place, `p_new = T_new_old p_old`."""
+    def move_map(self, T_new_old: F64) -> None:
+        """Transform all states after the map moved: `p_new = T_new_old p_old`."""
         if self._n == 0:
             return
         r, t = T_new_old[:3, :3], T_new_old[:3, 3]
         n = self._n
-        tilt_turn = _tilt_jacobian(r, self._tilt)
+        tilt_change = _tilt_jacobian(r, self._tilt)
         old_prior_tilt = self._prior_tilt - self._tilt
         self._tilt[:] = tilt_of(r @ self.gravity)
-        self._prior_tilt[:] = self._tilt + tilt_turn @ old_prior_tilt
+        self._prior_tilt[:] = self._tilt + tilt_change @ old_prior_tilt
         self._rot[:n] = r @ self._rot[:n]
         self._prior_r[:], self._vis_r[:n] = r @ self._prior_r, r @ self._vis_r[:n]
         for block in (self._state[:n], self._prior_s[None, :]):
             block[:, :3] = block[:, :3] @ r.T + t
             block[:, 3:6] = block[:, 3:6] @ r.T
         self._vis_p[:n] = self._vis_p[:n] @ r.T + t
-        # positions, velocities and the tilt of the prior turn with the map, the rest hangs on the body
+        # positions, velocities and the tilt of the prior rotate with the map; the rest is in the body frame
         q = np.eye(17)
-        q[3:6, 3:6], q[6:9, 6:9], q[15:, 15:] = r, r, tilt_turn
+        q[3:6, 3:6], q[6:9, 6:9], q[15:, 15:] = r, r, tilt_change
         back = np.eye(17)
-        back[3:6, 3:6], back[6:9, 6:9], back[15:, 15:] = r.T, r.T, np.linalg.inv(tilt_turn)
+        back[3:6, 3:6], back[6:9, 6:9], back[15:, 15:] = r.T, r.T, np.linalg.inv(tilt_change)
         self._prior_h[:] = back.T @ self._prior_h @ back
         self._prior_b[:] = back.T @ self._prior_b
         self._cov = q @ self._cov @ q.T
@@ -306,26 +310,26 @@ class FixedLagSmoother:
         self._observed[k, :n], self._sigma[k, :n] = points.observed[:n], points.sigma_px[:n]
         self._use[k, :n] = points.inlier[:n]
 
-    def _put_velocity(self, k: int, driven: BodyVelocity | None, motion: Preintegrated) -> None:
-        """An odometer's velocity, brought to the frame by what the IMU felt since, unless it surprises."""
+    def _put_velocity(self, k: int, odometry: BodyVelocity | None, motion: Preintegrated) -> None:
+        """Store an odometer's velocity, propagated to the frame by the IMU, unless it fails the gate."""
         self._vel_info[k] = 0.0
-        if driven is None:
+        if odometry is None:
             return
         c, r, velocity = self._config, self._rot[k], self._state[k, 3:6]
-        change = (velocity - self._state[k - 1, 3:6]) * (driven.age_s / motion.dt_s)
-        turned = se3.so3_exp(se3.so3_log(motion.turn) * (driven.age_s / motion.dt_s))
-        value = turned.T @ driven.value + r.T @ change
-        cov = turned.T @ driven.cov @ turned
+        change = (velocity - self._state[k - 1, 3:6]) * (odometry.age_s / motion.dt_s)
+        rotation = se3.so3_exp(se3.so3_log(motion.turn) * (odometry.age_s / motion.dt_s))
+        value = rotation.T @ odometry.value + r.T @ change
+        cov = rotation.T @ odometry.cov @ rotation
         off = value - r.T @ velocity
         square = float(off @ np.linalg.solve(cov + r.T @ self._cov[6:9, 6:9] @ r, off))
         if not square < c.velocity_gate:
             return
         self._vel[k] = value
         weight = min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
-        self._vel_info[k] = weight * np.linalg.inv(turned.T @ driven.counted @ turned)
+        self._vel_info[k] = weight * np.linalg.inv(rotation.T @ odometry.inflated @ rotation)
 
     def _relinearise_biases(self) -> None:
-        """Integrate again where the bias has left the neighbourhood in which its first-order correction holds."""
+        """Integrate intervals again whose bias changed too much for the first-order correction."""
         c = self._config
         for k in range(self._n - 1):
             change = np.abs(self._state[k, 6:] - self._imu_bias[k])
@@ -335,7 +339,7 @@ class FixedLagSmoother:
                 )
 
     def _drop_oldest(self) -> bool:
-        """Fold the oldest state into the prior and move the rest down."""
+        """Marginalise the oldest state into the prior and shift the others."""
         walk = self._config.tilt_walk_rad**2 * float(self._imu_dt[0])
         ok = kernels.marginalise(
             self._rot[:2], self._state[:2], self._tilt, self._gravity, self._imu_dt[0], self._imu_turn[0],
@@ -349,7 +353,7 @@ class FixedLagSmoother:
             self._imu_info, self._imu_walk, self._counts, self._scale, self._vis_h, self._vis_b, self._vis_r,
             self._vis_p, self._vel, self._vel_info,
         ]  # fmt: skip
-        if self._config.fresh > 1:  # else nobody looks at the points of older frames again
+        if self._config.fresh > 1:  # else points of older frames are condensed already
             arrays += [self._xyz, self._ray, self._observed, self._sigma, self._use]
         for array in arrays:
             array[: n - 1] = array[1:n].copy()
@@ -359,7 +363,7 @@ class FixedLagSmoother:
 
 
 def tilt_of(gravity: F64) -> F64:
-    """The two angles (2,) in rad about x and y by which `-gravity` is turned against z."""
+    """Rotation (2,) in rad about x and y from z to `-gravity`."""
     up = -gravity / np.linalg.norm(gravity)
     s, angle = float(np.hypot(up[0], up[1])), float(np.arctan2(np.hypot(up[0], up[1]), up[2]))
     k = angle / s if s > 1e-12 else 1.0
@@ -367,7 +371,7 @@ def tilt_of(gravity: F64) -> F64:
 
 
 def _tilt_jacobian(r: F64, tilt: F64) -> F64:
-    """Change (2,2) of the tilt of a turned map by the tilt before."""
+    """Jacobian (2,2) of the tilt of a rotated map by the tilt before."""
     down, jac, down_new, jac_new = np.empty(3), np.empty((3, 2)), np.empty(3), np.empty((3, 2))
     inertial_kernels.down_of_tilt(tilt, down, jac)
     inertial_kernels.down_of_tilt(tilt_of(r @ down), down_new, jac_new)

@@ -1,9 +1,8 @@
-"""Which way is up: a first guess, what motion and IMU say a few frames later, and who is told.
+"""Gravity alignment of the odometry frame and the first submap.
 
-The accelerometer alone is good at rest and a guess in motion. Four intervals later the images know how the vehicle
-accelerated, so that what else was felt is gravity: flights that begin in motion then know up to half a degree. What was
-shared of the first submap keeps its axes; the base is told how they lie, and a flight controller gets its first pose
-when that is known.
+The accelerometer gives a first guess, which is accurate at rest only. A few frames later the poses by images give the
+acceleration, so that gravity is known to half a degree in motion too. The first submap keeps its axes; its rotation is
+sent to the base, and a flight controller gets its first pose once the rotation is known.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from kiteline_core.ids import SubmapId
 
 F64 = NDArray[np.float64]
 
-_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera
+_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
 
 
 def level_rotation(accel: F64) -> F64:
@@ -34,49 +33,52 @@ def level_rotation(accel: F64) -> F64:
     return se3.so3_exp(axis / s * np.arctan2(s, c))
 
 
-class Levelling:
-    """Once: `first_pose`. Once a frame: `look`."""
+class GravityAligner:
+    """Estimates the tilt of the odometry frame and of the first submap. Call `update` once a frame."""
 
-    def __init__(self, camera: RectifiedCamera, inertial: InertialTracker | None, askew_rad: float, patience_s: float):
-        """askew_rad: a submap that leans by less is left as it is. patience_s: after which nobody waits any longer."""
+    def __init__(
+        self, camera: RectifiedCamera, inertial: InertialTracker | None, min_tilt_rad: float, patience_s: float
+    ):
+        """min_tilt_rad: least tilt that is corrected. patience_s: after which the odometry frame is final."""
         self._camera = camera
         self._inertial = inertial
-        self._askew_rad = askew_rad
+        self._min_tilt_rad = min_tilt_rad
         self._patience_ns = round(1e9 * patience_s)
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
-        self.askew_rad = 0.0  # how far the first submap was found to lean
+        self.tilt_rad = 0.0  # of the first submap
 
     @property
     def R_l_o(self) -> F64 | None:
-        """(3,3): sets the odometry frame upright, the same for good; None until it is known, or need not be."""
+        """(3,3) that gravity-aligns the odometry frame, constant once known; None before."""
         return self._R_l_o
 
     def first_pose(self, imu: ImuBatch | None) -> F64:
-        """T_m_c of the first keyframe: body at the origin, z up by gravity, else as if the camera stood level."""
+        """T_m_c of the first keyframe: body at the origin, z up by the accelerometer, else for a level camera."""
         if self._inertial is not None and imu is not None and len(imu.t_ns):
             R_m_b = level_rotation(imu.accel.mean(axis=0))
         else:
             R_m_b = _AHEAD @ self._camera.T_b_c[:3, :3].T
         return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
 
-    def look(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> GravityAlignment | None:
-        """A frame was measured at T_m_b (4,4) in a submap, the first one or not, whose axes R_o_m (3,3) turns into
-        those of o. What to tell the base, once.
+    def update(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> GravityAlignment | None:
+        """Process a frame tracked at T_m_b (4,4), with R_o_m (3,3) from the submap to the odometry frame.
+
+        first: it is the first submap. Returns the record for the base, once, if that submap is tilted.
         """
         if self._R_l_o is not None or self._inertial is None:
             return None
         if self._began_ns is None:
             self._began_ns = t_ns
-        R_l_m = self._inertial.level_R()
+        R_l_m = self._inertial.gravity_rotation()
         if R_l_m is None:
             if t_ns - self._began_ns > self._patience_ns:
                 self._R_l_o = np.eye(3)
             return None
         self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
-        self.askew_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
-        if not first or self.askew_rad < self._askew_rad:
+        self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
+        if not first or self.tilt_rad < self._min_tilt_rad:
             return None
-        # Turned about where the vehicle is now, so that its place in the world does not jump.
+        # Rotate about the vehicle, so that its position in the world does not jump.
         here = T_m_b[:3, 3]
         return GravityAlignment(submap, se3.from_rt(R_l_m, here - R_l_m @ here))

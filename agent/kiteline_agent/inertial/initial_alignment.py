@@ -20,11 +20,12 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
-    """velocities: (n,3) m/s in m of every pose. gravity: (3,) m/s^2 in m. accel_bias: (3,) m/s^2. scale: metres per
-    unit of the map, scale_sigma: one deviation of it, 0 when it was not asked for. residual_m: rms of what the
-    positions disagree. gravity_error: relative difference of the length of gravity, before it was imposed, from the
-    true one.
+class ImuAlignment:
+    """Result of `align`.
+
+    velocities: (n,3) m/s in m of every pose. gravity: (3,) m/s^2 in m. accel_bias: (3,) m/s^2. scale: metres per unit
+    of the map. scale_sigma: its standard deviation, 0 if not estimated. residual_m: rms of the positions.
+    gravity_error: relative error of gravity's length, found without imposing it.
     """
 
     velocities: F64
@@ -37,15 +38,13 @@ class Alignment:
 
 
 def gyro_bias(T_m_b: F64, motions: list[Preintegrated]) -> F64:
-    """Bias (3,) rad/s that makes the gyro agree with turns of the poses T_m_b (n,4,4) between which motions (n-1)
-    lead.
-    """
+    """Gyro bias (3,) rad/s that fits the n-1 motions to the rotations of the poses T_m_b (n,4,4)."""
     bias = motions[0].bias[:3].copy()
     for _ in range(2):
         h, g = np.zeros((3, 3)), np.zeros(3)
         for k, motion in enumerate(motions):
-            turn, _ = motion.corrected(np.concatenate([bias, motion.bias[3:]]))
-            error = se3.so3_log(turn.T @ T_m_b[k, :3, :3].T @ T_m_b[k + 1, :3, :3])
+            rotation, _ = motion.corrected(np.concatenate([bias, motion.bias[3:]]))
+            error = se3.so3_log(rotation.T @ T_m_b[k, :3, :3].T @ T_m_b[k + 1, :3, :3])
             j = motion.jac[:3, :3]
             h += j.T @ j
             g += j.T @ error
@@ -63,19 +62,19 @@ def align(
     with_scale: bool,
     position_sigma_m: float = 0.003,
     accel_bias_sigma: float = 0.1,
-) -> Alignment | None:
-    """Velocities, gravity, accelerometer bias and scale from n >= 5 poses by least squares; None when it is degenerate.
+) -> ImuAlignment | None:
+    """Velocities, gravity, accelerometer bias and scale from n >= 5 poses by least squares; None if degenerate.
 
-    T_m_b: (n,4,4) poses of which the *camera* lies at s p_c, p_c = p_b + R p_b_c, with p_b_c (3,) in metres, so the
-    body lies at s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess. position_sigma_m: of a
-    visual position. accel_bias_sigma: m/s^2, of the guess.
+    T_m_b: (n,4,4) poses. The *camera* is at s p_c, p_c = p_b + R p_b_c, with p_b_c (3,) in metres, and the body at
+    s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess. position_sigma_m: of a position by
+    images. accel_bias_sigma: m/s^2, of the guess.
     """
     n = len(T_m_b)
     if n < 5:
         return None
     rotated = T_m_b[:, :3, :3] @ p_b_c
     camera = (T_m_b[:, :3, 3] + rotated).reshape(-1)
-    times, v, p = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))  # what the accelerometer alone makes of them
+    times, v, p = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))  # integrated accelerometer
     jv, jp = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
     for k, motion in enumerate(motions):
         _, vp = motion.corrected(bias)
@@ -83,9 +82,9 @@ def align(
         times[k + 1] = times[k] + dt
         p[k + 1], v[k + 1] = p[k] + v[k] * dt + r @ vp[3:], v[k] + r @ vp[:3]
         jp[k + 1], jv[k + 1] = jp[k] + jv[k] * dt + r @ motion.jac[6:, 3:], jv[k] + r @ motion.jac[3:6, 3:]
-    felt = (rotated + p).reshape(-1)
-    # With q = 1 / s the noisy positions stand alone on their side, so that noise does not pull at the scale:
-    # p_c = p0 q + v0 q t + gravity q t^2 / 2 + jp bias q + felt q
+    integrated = (rotated + p).reshape(-1)
+    # With q = 1 / s the noisy positions are alone on one side, so that noise does not bias the scale:
+    # p_c = p0 q + v0 q t + gravity q t^2 / 2 + jp bias q + integrated q
     free = np.concatenate(
         [
             np.tile(np.eye(3), (n, 1)),
@@ -100,9 +99,9 @@ def align(
     ratio = position_sigma_m / accel_bias_sigma
     unit, length = -v[-1] / float(np.linalg.norm(v[-1])), gravity_m_s2
     if not with_scale:
-        x = np.linalg.lstsq(np.concatenate([free, ratio * guess]), np.append(camera - felt, np.zeros(3)), rcond=1e-10)[
-            0
-        ]
+        x = np.linalg.lstsq(
+            np.concatenate([free, ratio * guess]), np.append(camera - integrated, np.zeros(3)), rcond=1e-10
+        )[0]
         length = float(np.linalg.norm(x[9:]))
         if not 0.3 * gravity_m_s2 < length < 3.0 * gravity_m_s2:
             return None
@@ -111,7 +110,7 @@ def align(
     q = 1.0
     for _ in range(8):
         basis = np.linalg.svd(unit[None, :])[2][1:].T
-        pull = felt + gravity_m_s2 * free[:, 9:] @ unit
+        pull = integrated + gravity_m_s2 * free[:, 9:] @ unit
         a = np.concatenate([free[:, :9], gravity_m_s2 * free[:, 9:] @ basis], axis=1)
         b = camera - (0.0 if with_scale else pull)
         if with_scale:
@@ -125,8 +124,8 @@ def align(
         q = float(x[11]) if with_scale else 1.0
         if q <= 0.0:
             return None
-        turned = q * unit + basis @ x[9:11]
-        unit = turned / float(np.linalg.norm(turned))
+        rotated_unit = q * unit + basis @ x[9:11]
+        unit = rotated_unit / float(np.linalg.norm(rotated_unit))
     rest = a @ x - b
     gravity, change = gravity_m_s2 * unit, x[6:9] / q
     velocities = x[3:6] / q + times[:, None] * gravity + v + jv @ change
@@ -136,4 +135,4 @@ def align(
         sigma = float(np.sqrt(variance * np.linalg.inv(a.T @ a)[11, 11])) / q**2
     residual = float(np.sqrt(np.mean(rest[: 3 * n] ** 2))) / q
     error = abs(length / gravity_m_s2 - 1.0)
-    return Alignment(velocities, gravity, bias[3:] + change, 1.0 / q, sigma, residual, error)
+    return ImuAlignment(velocities, gravity, bias[3:] + change, 1.0 / q, sigma, residual, error)

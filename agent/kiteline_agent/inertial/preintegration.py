@@ -1,4 +1,4 @@
-"""Inertial samples between two instants as one relative motion with covariance and bias Jacobians."""
+"""Preintegration of IMU samples between two instants, with covariance and bias Jacobians."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Inertial samples that begin and end exactly at the two instants. t_s: (n,) s from the first. gyro, accel:
-    (n,3).
-    """
+    """IMU samples between two instants, both included. t_s: (n,) s from the first. gyro, accel: (n,3)."""
 
     t_s: F64
     gyro: F64
@@ -33,10 +31,10 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Preintegrated:
-    """Relative motion in the body frame of the first instant, gravity left out.
+    """Relative motion in the body frame of the first instant, without gravity.
 
     turn: (3,3) R_b0_b1. vp: (6,) change of velocity m/s, of position m. cov: (9,9) of [rotation, velocity, position],
-    rotation perturbed on the right. jac: (9,6) of the same by [gyro bias, accel bias]. bias: (6,) that was taken off.
+    rotation perturbed on the right. jac: (9,6) of the same by [gyro bias, accel bias]. bias: (6,) that was subtracted.
     """
 
     dt_s: float
@@ -61,9 +59,7 @@ class Preintegrated:
 
 
 def preintegrate(samples: Samples, bias: F64, calibration: ImuCalibration, inflation: float = 1.0) -> Preintegrated:
-    """Integrate samples with a bias (6,) [gyro rad/s, accel m/s^2] taken off. inflation: factor on the noise
-    densities.
-    """
+    """Integrate samples after subtracting a bias (6,) [gyro, accel]. inflation: factor on the noise densities."""
     turn, vp, cov, jac = np.empty((3, 3)), np.empty(6), np.empty((9, 9)), np.empty((9, 6))
     density = np.array([calibration.gyro_noise, calibration.accel_noise]) * inflation
     imu_kernels.preintegrate(samples.t_s, samples.gyro, samples.accel, bias, density, turn, vp, cov, jac)
@@ -71,17 +67,17 @@ def preintegrate(samples: Samples, bias: F64, calibration: ImuCalibration, infla
 
 
 class SampleBuffer:
-    """The newest inertial samples, in order of time; older ones are forgotten."""
+    """The newest IMU samples in order of time."""
 
     def __init__(self, keep_s: float, max_gap_s: float) -> None:
-        """keep_s: how much is remembered. max_gap_s: a longer hole in the samples makes an interval unknown."""
+        """keep_s: length of the buffer. max_gap_s: a longer gap makes an interval unknown."""
         self._keep_ns = int(keep_s * 1e9)
         self._gap_ns = int(max_gap_s * 1e9)
         self._t: I64 = np.zeros(0, np.int64)
         self._values = np.zeros((0, 6))
 
     def push(self, imu: ImuBatch | None) -> None:
-        """Take in samples; those not newer than the newest, or not finite, are passed over."""
+        """Append samples that are finite and newer than the newest one."""
         if imu is None or len(imu.t_ns) == 0:
             return
         values = np.concatenate([imu.gyro, imu.accel], axis=1)
@@ -93,19 +89,13 @@ class SampleBuffer:
         first = int(np.searchsorted(t, t[-1] - self._keep_ns))
         self._t, self._values = t[first:], np.concatenate([self._values, values[good]])[first:]
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self._t, self._values = np.zeros(0, np.int64), np.zeros((0, 6))
-
     @property
     def newest_t_ns(self) -> int | None:
         """Time of the newest sample."""
         return int(self._t[-1]) if len(self._t) else None
 
     def between(self, from_ns: int, to_ns: int) -> Samples | None:
-        """Samples from one instant to another, the ends interpolated (held beyond the newest sample); None with a
-        hole.
-        """
+        """Samples from one instant to another, ends interpolated (held beyond the newest); None with a gap."""
         t = self._t
         if len(t) < 2 or to_ns <= from_ns:
             return None
@@ -122,7 +112,7 @@ class SampleBuffer:
         )
 
     def mean(self, from_ns: int, to_ns: int) -> tuple[F64, F64, int]:
-        """Mean (6,) and standard deviation (6,) of the samples within two instants, and how many they are."""
+        """Mean (6,) and standard deviation (6,) of the samples between two instants, and their number."""
         chosen = self._values[(self._t >= from_ns) & (self._t <= to_ns)]
         if len(chosen) == 0:
             return np.zeros(6), np.zeros(6), 0

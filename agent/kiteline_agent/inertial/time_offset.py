@@ -1,4 +1,4 @@
-"""By how much the camera's stamps are early: the lag at which the gyro turns as the images do."""
+"""Time offset between camera and IMU: the lag at which the gyro's rotations match those of the images."""
 
 from __future__ import annotations
 
@@ -7,21 +7,19 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
-_BIAS_RAD_S = 0.1  # deviation of a gyro bias before anything is known
+_BIAS_RAD_S = 0.1  # standard deviation of an unknown gyro bias
 
 
 class TimeOffsetEstimator:
     """Recursive least squares with forgetting over [offset s, gyro bias rad/s].
 
-    Moving an interval by d turns the gyro's rotation by d (rate at its end - turned rate at its begin), so every
-    frame gives three equations (after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems",
+    Shifting an interval by d rotates the gyro's rotation by d (rate at its end - rotated rate at its start), so each
+    interval gives three equations (after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems",
     2014).
     """
 
     def __init__(self, memory_s: float, start_sigma_s: float, turn_sigma_rad: float, start_s: float = 0.0) -> None:
-        """memory_s: time constant of forgetting. turn_sigma_rad: error of a visual turn between two frames. start_s:
-        the offset as configured.
-        """
+        """memory_s: time constant of forgetting. turn_sigma_rad: error of a rotation. start_s: initial offset."""
         self._memory_s = memory_s
         self._weight = turn_sigma_rad**-2.0
         self._prior = np.diag([start_sigma_s**-2.0, *3 * [_BIAS_RAD_S**-2.0]])
@@ -29,8 +27,10 @@ class TimeOffsetEstimator:
         self._h, self._g = self._prior.copy(), self._at_start.copy()
 
     def add(self, error: F64, rate_change: F64, dt_s: float) -> None:
-        """error: (3,) Log(gyro_turn^T visual_turn) with an interval taken at the present offset 0 of this estimator.
-        rate_change: (3,) rate at the end less turn^T rate at the begin, rad/s. dt_s: length of the interval.
+        """Add an interval of dt_s.
+
+        error: (3,) Log(R_gyro^T R_images) at offset 0. rate_change: (3,) rate at the end less R^T rate at the start,
+        rad/s.
         """
         j = np.column_stack([rate_change, -dt_s * np.eye(3)])
         size = float(np.sqrt(error @ error))
@@ -41,10 +41,10 @@ class TimeOffsetEstimator:
 
     @property
     def offset_s(self) -> float:
-        """Camera stamp + offset = time of the IMU."""
+        """Camera stamp + offset = IMU time."""
         return float(np.linalg.solve(self._h, self._g)[0])
 
     @property
     def sigma_s(self) -> float:
-        """One standard deviation of it."""
+        """Standard deviation of the offset."""
         return float(np.sqrt(np.linalg.inv(self._h)[0, 0]))

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.covariance.pose_covariance import Certainty
-from kiteline_agent.inertial.gravity_alignment import Levelling
+from kiteline_agent.covariance.pose_covariance import PoseCovariance
+from kiteline_agent.inertial.gravity_alignment import GravityAligner
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.submaps import Submaps
-from kiteline_agent.motion.motion_model import Inertia
+from kiteline_agent.motion.motion_model import MotionModel
 from kiteline_agent.relocalisation.relocaliser import Relocalisation
 from kiteline_agent.step import Identity
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -41,11 +41,11 @@ class CameraState:
         self.T_c_b = se3.inverse(camera.T_b_c)
         self.T_o_first: F64 = np.eye(4)
         self.pose = PoseState()
-        self.motion = Inertia(camera, imu, config.inertial, config.odometer, self.pose, metric=has_depth)
-        self.covariance = Certainty(
+        self.motion = MotionModel(camera, imu, config.inertial, config.odometer, self.pose, metric=has_depth)
+        self.covariance = PoseCovariance(
             local_map, camera.T_b_c, config.certainty, has_body=rig.has_body, has_depth=has_depth
         )  # fmt: skip
-        self.gravity = Levelling(
+        self.gravity = GravityAligner(
             camera, self.motion.tracker, config.inertial.askew_rad, config.inertial.level_patience_s
         )
         self.reference = ReferenceKeyframe(local_map)
@@ -61,12 +61,12 @@ class CameraState:
     def predict(self, t_ns: int, dt_s: float, imu: ImuBatch | None) -> F64:
         """T_m_c (4,4) of the next frame: from the IMU, else an odometer, else the last motion."""
         predicted = self.motion.predict(t_ns, imu, dt_s)
-        self.covariance.guide(self.motion.running)
+        self.covariance.set_imu_motion(self.motion.running)
         return predicted
 
     def is_consistent(self, ctx: FrameContext, T_c_m: F64, submap: SubmapId, *, relocalised: bool) -> bool:
         """True if the camera can be at T_c_m (4,4) in a submap, by the motion since it was last measured there."""
-        return self.covariance.believes(
+        return self.covariance.is_consistent(
             T_c_m, submap, ctx.T_m_c, self.pose, self.T_c_b, self.submaps.active, found=relocalised
         )
 
@@ -74,8 +74,8 @@ class CameraState:
         """The track with the pose that images, IMU and odometer give together, and events."""
         fused = self.motion.fuse(track, ctx.t_ns)
         if self.motion.tracker is not None:
-            self.covariance.fused(track.T_c_m, fused.T_c_m)
-        return fused, self.motion.news()
+            self.covariance.update_imu_offset(track.T_c_m, fused.T_c_m)
+        return fused, self.motion.take_events()
 
     def resume_after_loss(self, ctx: FrameContext, track: Track) -> None:
         """Tracked again after a loss: the map moves by the error of the prediction, the odometry frame stays."""
@@ -86,20 +86,20 @@ class CameraState:
     def set_measured(self, track: Track, dt_s: float, *, repeated: bool) -> None:
         """Take over a measured pose. repeated: the image was an old one."""
         self.pose.measured(track.T_m_c, dt_s, repeated=repeated)
-        self.covariance.measured(track)
+        self.covariance.update(track)
         self.reference.set_camera(self.pose.T_m_c)
 
     def dead_reckon(self, ctx: FrameContext) -> bool:
         """Take over the predicted pose of a frame without a measured one. True while IMU or odometer can be trusted."""
-        reckoned = self.motion.coast(ctx.T_m_c, ctx.t_ns)
+        reckoned = self.motion.dead_reckon(ctx.T_m_c, ctx.t_ns)
         self.pose.T_m_c = reckoned.T_m_c
         self.reference.set_camera(self.pose.T_m_c)
-        self.covariance.blind(ctx.dt_s, reckoned.cov, moves=self.pose.moves)
+        self.covariance.dead_reckon(ctx.dt_s, reckoned.cov, moves=self.pose.moves)
         return reckoned.trusted
 
     def align_gravity(self, t_ns: int) -> GravityAlignment | None:
         """Estimate the vertical; a record, once, if the first submap is tilted because it began in motion."""
-        return self.gravity.look(
+        return self.gravity.update(
             t_ns, self.T_m_b, self.pose.T_o_m[:3, :3], self.submaps.active, first=self.submaps.opened == 1
         )
 
@@ -109,13 +109,13 @@ class CameraState:
         """Carry the covariance over to the odometry frame, before the map changes under the camera."""
         if self.submaps.active == self.submaps.first:
             self.T_o_first = self.pose.T_o_m
-        self.covariance.carry(self.pose, self.T_c_b, self.submaps.active)
+        self.covariance.before_map_change(self.pose, self.T_c_b, self.submaps.active)
 
     def move_map(self, T_m_c: F64) -> None:
         """The map moved: the camera is at T_m_c (4,4) in it now."""
         before = self.pose.T_m_c
         self.pose.move_map(T_m_c)
-        self.motion.shift(se3.orthonormalise(self.pose.T_m_c @ se3.inverse(before)))
+        self.motion.move_map(se3.orthonormalise(self.pose.T_m_c @ se3.inverse(before)))
         self.reference.set_camera(self.pose.T_m_c)
 
     def follow_corrections(self) -> None:
@@ -123,7 +123,7 @@ class CameraState:
         T_m_k = self.reference.T_m_k
         if T_m_k is not None:
             self.move_map(T_m_k @ self.reference.T_k_c)
-            self.covariance.corrected(self.pose)
+            self.covariance.apply_refinement(self.pose)
 
     def return_to(self, found: Relocalisation, frame_number: int) -> None:
         """Continue in the submap in which the frame was relocalised."""
@@ -135,10 +135,10 @@ class CameraState:
         self.reference.set_camera(self.pose.T_m_c)
         self._map.note_tracking(found.track.rows, found.track.inlier, frame_number)
         if found.from_cache:
-            self.covariance.met(found.keyframe, found.T_c_m, found.track.inliers)
+            self.covariance.relocalise(found.keyframe, found.T_c_m, found.track.inliers)
         else:
-            self.covariance.measured(found.track)
-        self.covariance.returned()
+            self.covariance.update(found.track)
+        self.covariance.confirm_relocalisation()
 
     # new submaps
 
@@ -153,7 +153,7 @@ class CameraState:
 
     def open_submap(self) -> SubmapId:
         """Open a submap at the present pose."""
-        self.covariance.begin(self.T_m_b)
+        self.covariance.begin_submap(self.T_m_b)
         submap = self.submaps.open_next()
         self._map.activate(submap)
         return submap

@@ -63,14 +63,14 @@ class KeyframeStage:
         Returns whether the map goes on there, also if the keyframe has to wait for CPU time, and events.
         """
         limits = ctx.config.recovery
-        if not self._camera.covariance.blind_within(limits.carried_m, limits.carried_rad):
+        if not self._camera.covariance.dead_reckoning_within(limits.carried_m, limits.carried_rad):
             return False, []
         if not self._governor.may(Extra.KEYFRAME, urgent=True):
             return True, ["governor: keyframe put off"]
         points = self._maker.first_points(ctx)
         if points is None:
             return False, []
-        self._camera.covariance.bridge(self._camera.T_m_b)
+        self._camera.covariance.extend_map(self._camera.T_m_b)
         self.make(ctx, None, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
         return True, ["keyframe: carried by the IMU"]
 
@@ -82,7 +82,7 @@ class KeyframeStage:
         reference.set_new(keyframe, submap, se3.inverse(T_m_k) @ T_m_c, ctx.t_ns, ctx.number)
         self._governor.note(kind)
         self._relocaliser.add_keyframe(keyframe)
-        self._camera.covariance.remember(keyframe)
+        self._camera.covariance.store(keyframe)
         if ctx.images.right is not None and ctx.images.right.needs_rectification:
             self._work.rectified_px += ctx.images.left[1].size
         return keyframe

@@ -98,7 +98,7 @@ class SubmapStage:
             "submap: opened",
             f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m",
         ]
-        camera.motion.forget_unit()
+        camera.motion.begin_unscaled_map()
         camera.open_submap()
         camera.pose.reset_motion()
         # The second view stays where the camera was predicted, which places the first one.
@@ -140,7 +140,7 @@ class SubmapStage:
         limits, camera = ctx.config.mono_start, self._camera
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
-        unit_m = camera.motion.unit_m(limits.scale_sigma)
+        unit_m = camera.motion.metres_per_unit(limits.scale_sigma)
         if unit_m is None:
             return []
         metric = metric_points(ctx, track, self._map, unit_m)
@@ -160,4 +160,4 @@ class SubmapStage:
         keyframe = self._keyframes.make(ctx, None, metric.points, camera.pose.T_m_c, Extra.SUBMAP)
         metric.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))
-        camera.motion.begin_metres(unit_m, T_new_old)
+        camera.motion.set_scale(unit_m, T_new_old)

@@ -1,4 +1,4 @@
-"""The newest velocities of an odometer, and what they come to over an interval."""
+"""Buffer of odometer samples and their means over an interval."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from kiteline_core.frame import OdometryBatch
 
 F64 = NDArray[np.float64]
 
-_ANY = 100.0  # (m/s)^2 or (rad/s)^2; what is measured at all is measured far better
+_ANY = 100.0  # (m/s)^2 or (rad/s)^2; any measured direction is far more precise
 
 
 @dataclass(slots=True)
-class Driven:
+class MeanVelocity:
     """Means over an interval, in b: velocity (3,) m/s, rate (3,) rad/s, covariances (3,3) of one sample."""
 
     velocity: F64
@@ -26,25 +26,25 @@ class Driven:
 
 
 class OdometerSamples:
-    """Samples in order of time; older ones are forgotten."""
+    """The newest samples in order of time."""
 
     def __init__(self, keep_s: float, max_gap_s: float) -> None:
-        """keep_s: how much is remembered. max_gap_s: a longer hole makes an interval unknown."""
+        """keep_s: length of the buffer. max_gap_s: a longer gap makes an interval unknown."""
         self._keep_ns, self._gap_ns = int(keep_s * 1e9), int(max_gap_s * 1e9)
         self._samples: OdometryBatch | None = None
 
     @property
     def any(self) -> bool:
-        """Whether there ever was one."""
+        """True once a sample has arrived."""
         return self._samples is not None
 
-    def hear(self, batch: OdometryBatch | None) -> None:
-        """Take in samples; those not newer than the newest, or not finite, are passed over."""
+    def add(self, batch: OdometryBatch | None) -> None:
+        """Append samples that are finite and newer than the newest one."""
         if batch is None or len(batch.t_ns) == 0:
             return
         good = odometry.usable(batch)
         if self._samples is not None and len(self._samples.t_ns):
-            if batch.t_ns[-1] < self._samples.t_ns[-1] - self._keep_ns:  # a stamp had leapt ahead: begin anew
+            if batch.t_ns[-1] < self._samples.t_ns[-1] - self._keep_ns:  # an earlier stamp was far ahead: start again
                 self._samples = None
             else:
                 good &= batch.t_ns > self._samples.t_ns[-1]
@@ -55,8 +55,8 @@ class OdometerSamples:
             joined = odometry.chosen(joined, slice(first, len(joined.t_ns)))
         self._samples = joined
 
-    def between(self, from_ns: int, to_ns: int) -> Driven | None:
-        """Means over an interval, the ends interpolated (held beyond the newest sample); None with a hole."""
+    def between(self, from_ns: int, to_ns: int) -> MeanVelocity | None:
+        """Means over an interval, its ends interpolated (held beyond the newest sample); None with a gap."""
         samples, gap_ns = self._samples, self._gap_ns
         if samples is None or len(samples.t_ns) == 0 or to_ns <= from_ns:
             return None
@@ -76,21 +76,23 @@ class OdometerSamples:
         mean = np.array([weight @ np.interp(now, seconds, values[:, i]) for i in range(6)])
         some = slice(max(min(lo, hi - 1), 0), max(hi, 1))
         cov, rate_cov = samples.velocity_cov[some].mean(axis=0), samples.rate_cov[some].mean(axis=0)
-        return Driven(measured(cov, _ANY) @ mean[:3], measured(rate_cov, _ANY) @ mean[3:], cov, rate_cov)
+        return MeanVelocity(
+            measured_part(cov, _ANY) @ mean[:3], measured_part(rate_cov, _ANY) @ mean[3:], cov, rate_cov
+        )
 
     def within(self, from_ns: int, to_ns: int) -> tuple[F64, F64, float] | None:
-        """Mean velocity (3,), its covariance (3,3) and age in s of the samples after from_ns up to to_ns, if any."""
+        """Mean velocity (3,), its covariance (3,3) and age in s of the samples in (from_ns, to_ns], if any."""
         samples = self._samples
         if samples is None:
             return None
-        mine = (samples.t_ns > from_ns) & (samples.t_ns <= to_ns)
-        if not mine.any():
+        inside = (samples.t_ns > from_ns) & (samples.t_ns <= to_ns)
+        if not inside.any():
             return None
-        cov = samples.velocity_cov[mine].mean(axis=0)
-        value = measured(cov, _ANY) @ samples.velocity[mine].mean(axis=0)
-        return value, cov, float(np.mean(to_ns - samples.t_ns[mine])) * 1e-9
+        cov = samples.velocity_cov[inside].mean(axis=0)
+        value = measured_part(cov, _ANY) @ samples.velocity[inside].mean(axis=0)
+        return value, cov, float(np.mean(to_ns - samples.t_ns[inside])) * 1e-9
 
 
-def measured(cov: F64, limit: float) -> F64:
-    """(3,3) that leaves of a vector what is measured: 1 where the variance is far below `limit`, 0 where far above."""
+def measured_part(cov: F64, limit: float) -> F64:
+    """Projection (3,3) onto the measured directions: 1 for variances far below `limit`, 0 far above."""
     return np.asarray(limit * np.linalg.inv(cov + limit * np.eye(3)))

@@ -397,14 +397,14 @@ def test_a_moved_map_moves_everything() -> None:
         state = None
         for k in range(20):
             if move and k == 10:
-                smoother.shift_map(shift)
+                smoother.move_map(shift)
             points = see(flight, k + 1, rng, 0.3)
             if move and k >= 10:
                 points = replace(points, xyz=se3.transform(shift, points.xyz))
             state = smoother.add(flight.samples(k), points)
             assert state is not None
         if move:
-            smoother.shift_map(se3.inverse(shift))
+            smoother.move_map(se3.inverse(shift))
             state = smoother.state
         assert state is not None
         ends.append(state)

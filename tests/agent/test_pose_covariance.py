@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
-from kiteline_agent.covariance.pose_covariance import Certainty, adjoint, probability_good
+from kiteline_agent.covariance.pose_covariance import PoseCovariance, adjoint, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -80,10 +80,10 @@ def test_what_an_error_of_calibration_does_to_a_pose_is_foreseen(shape: int) -> 
     error[shape] = 0.05
     local_map = map_of(seen_with(error, X, np.eye(4)))
     track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
-    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
-    certainty.measured(track)
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance.update(track)
     moved = se3.log(se3.inverse(track.T_c_m) @ T_c_m)  # on the left of T_m_c
-    np.testing.assert_allclose(certainty._shift @ error, moved, atol=0.04 * np.abs(moved).max() + 2e-6)
+    np.testing.assert_allclose(covariance._shift @ error, moved, atol=0.04 * np.abs(moved).max() + 2e-6)
     assert np.abs(moved).max() > 1e-5
 
 
@@ -93,18 +93,18 @@ def test_the_error_of_a_keyframe_is_that_of_what_is_measured_against_it() -> Non
     nothing = np.zeros(SHAPES)
     moved = se3.exp(np.array([0.01, -0.02, 0.015, 0.002, -0.003, 0.004]))
     local_map = map_of(seen_with(nothing, X, np.eye(4)), moved)
-    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
-    certainty._shift_k[0, :, 0] = se3.log(moved)
-    certainty.measured(tracked(local_map, seen_with(nothing, X, T_c_m), T_c_m))
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance._shift_k[0, :, 0] = se3.log(moved)
+    covariance.update(tracked(local_map, seen_with(nothing, X, T_c_m), T_c_m))
     # observations in the moved map put the camera at moved @ T_m_c: the same perturbation on the left
-    np.testing.assert_allclose(certainty._shift[:, 0] - _alone(X, T_c_m)[:, 0], se3.log(moved), atol=2e-4)
+    np.testing.assert_allclose(covariance._shift[:, 0] - _alone(X, T_c_m)[:, 0], se3.log(moved), atol=2e-4)
 
 
 def _alone(X: F64, T_c_m: F64) -> F64:
     local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
-    certainty.measured(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
-    return certainty._shift
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
+    return covariance._shift
 
 
 def test_noise_of_a_measured_pose_is_what_it_says() -> None:
@@ -114,16 +114,16 @@ def test_noise_of_a_measured_pose_is_what_it_says() -> None:
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
     config = CovarianceConfig(calibration_px=0.0, least_rms=0.0)
-    certainty = Certainty(local_map, np.eye(4), config, has_body=False, has_depth=True)
-    certainty.begin(np.eye(4))
+    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=False, has_depth=True)
+    covariance.begin_submap(np.eye(4))
     nees = []
     for _ in range(100):
         track = tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m) + 0.15 * rng.normal(size=(120, 3)), T_c_m)
-        certainty.measured(track)
+        covariance.update(track)
         T = se3.inverse(track.T_c_m)
         good = se3.inverse(T_c_m)
         e = np.concatenate([good[:3, 3] - T[:3, 3], se3.so3_log(T[:3, :3].T @ good[:3, :3])])
-        nees.append(e @ np.linalg.solve(certainty.of_poses(PoseState(), T)[0], e))
+        nees.append(e @ np.linalg.solve(covariance.of_poses(PoseState(), T)[0], e))
     assert 5.0 < np.mean(nees) < 7.2
 
 
@@ -131,37 +131,39 @@ def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
     X = scene()
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
-    certainty = Certainty(local_map, np.eye(4), CovarianceConfig(calibration_px=0.0), has_body=False, has_depth=True)
-    certainty.begin(np.eye(4))
+    covariance = PoseCovariance(
+        local_map, np.eye(4), CovarianceConfig(calibration_px=0.0), has_body=False, has_depth=True
+    )
+    covariance.begin_submap(np.eye(4))
     track = tracked(local_map, clean, np.eye(4))
     pull = np.array([0.0, 0.0, 0.004, 0.0, 0.001, 0.0])
 
     def deviation() -> F64:
-        certainty._age = 100  # weighed anew
-        certainty.measured(track)
-        return np.sqrt(np.diag(certainty.of_poses(PoseState(), np.eye(4))[0]))
+        covariance._age = 100  # weighed anew
+        covariance.update(track)
+        return np.sqrt(np.diag(covariance.of_poses(PoseState(), np.eye(4))[0]))
 
     alone = deviation()
     for _ in range(100):
-        certainty.fused(np.eye(4), se3.exp(pull))
+        covariance.update_imu_offset(np.eye(4), se3.exp(pull))
     np.testing.assert_allclose(deviation()[[2, 4]], pull[[2, 4]], rtol=0.05)
-    certainty.remember(KeyframeId(0))
+    covariance.store(KeyframeId(0))
     np.testing.assert_allclose(deviation()[[2, 4]], 2.0 * pull[[2, 4]], rtol=0.05)
     for sign in [1.0, -1.0] * 100:  # to and fro, it is noise, which adds up as squares
-        certainty.fused(np.eye(4), se3.exp(sign * pull))
-    certainty._noise_k[:], certainty._shift_k[:] = 0.0, 0.0
+        covariance.update_imu_offset(np.eye(4), se3.exp(sign * pull))
+    covariance._noise_k[:], covariance._shift_k[:] = 0.0, 0.0
     np.testing.assert_allclose(deviation()[[2, 4]], pull[[2, 4]], rtol=0.15)
     assert alone[2] < 0.001
 
 
 def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
     config = CovarianceConfig(calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
-    certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config, has_body=True,
+    covariance = PoseCovariance(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config, has_body=True,
                           has_depth=True)  # fmt: skip
-    certainty.begin(np.eye(4))
-    assert not certainty.of_poses(PoseState(), np.eye(4))[0].any()
+    covariance.begin_submap(np.eye(4))
+    assert not covariance.of_poses(PoseState(), np.eye(4))[0].any()
     half = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi]))
-    sigma = np.sqrt(np.diag(certainty.of_poses(PoseState(), half)[0])[3:])
+    sigma = np.sqrt(np.diag(covariance.of_poses(PoseState(), half)[0])[3:])
     np.testing.assert_allclose(sigma, [2e-3, 2e-3, 0.0], atol=1e-6)
 
 
@@ -170,22 +172,22 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
     config = replace(CovarianceConfig(), calibration_px=0.0)
-    certainty = Certainty(local_map, np.eye(4), config, has_body=True, has_depth=True)
+    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=True, has_depth=True)
     pose = PoseState()
-    certainty.begin(np.eye(4))
-    certainty.measured(tracked(local_map, clean, np.eye(4)))
-    before = certainty.of_poses(pose, np.eye(4))[1]
+    covariance.begin_submap(np.eye(4))
+    covariance.update(tracked(local_map, clean, np.eye(4)))
+    before = covariance.of_poses(pose, np.eye(4))[1]
     sizes = []
     for _ in range(20):
-        certainty.blind(0.05, None)
-        sizes.append(certainty.of_poses(pose, np.eye(4))[1][0, 0])
+        covariance.dead_reckon(0.05, None)
+        sizes.append(covariance.of_poses(pose, np.eye(4))[1][0, 0])
     assert (np.diff(sizes) > 0.0).all()
     assert np.sqrt(sizes[-1]) == pytest.approx(1.0, abs=0.1)  # half of 2 m/s^2 for a second
-    certainty.carry(pose, np.eye(4), SubmapId(0))
+    covariance.before_map_change(pose, np.eye(4), SubmapId(0))
     pose.move_map(se3.exp(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.3])))
-    certainty.measured(tracked(local_map, clean, np.eye(4)))
-    assert certainty.of_poses(PoseState(), np.eye(4))[0][0, 0] < 1e-4  # seen in the map again
-    after = certainty.of_poses(pose, pose.T_m_c)[1]
+    covariance.update(tracked(local_map, clean, np.eye(4)))
+    assert covariance.of_poses(PoseState(), np.eye(4))[0][0, 0] < 1e-4  # seen in the map again
+    after = covariance.of_poses(pose, pose.T_m_c)[1]
     assert np.trace(after[:3, :3]) == pytest.approx(3 * sizes[-1], rel=0.05)  # but nobody knows the way there
     assert after[0, 0] > before[0, 0]
 
@@ -194,11 +196,11 @@ def test_where_the_speed_was_not_known_blindness_is_worse() -> None:
     config = replace(CovarianceConfig(), blind_speed_m_s=5.0, blind_speed_rad_s=1.0)
     sigma = []
     for moves in (True, False):
-        certainty = Certainty(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config,
+        covariance = PoseCovariance(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config,
                               has_body=False, has_depth=True)  # fmt: skip
-        certainty.begin(np.eye(4))
-        certainty.blind(0.3, None, moves=moves)
-        sigma.append(np.sqrt(np.diag(certainty.of_poses(PoseState(), np.eye(4))[0])))
+        covariance.begin_submap(np.eye(4))
+        covariance.dead_reckon(0.3, None, moves=moves)
+        sigma.append(np.sqrt(np.diag(covariance.of_poses(PoseState(), np.eye(4))[0])))
     np.testing.assert_allclose(sigma[0], np.repeat([0.03 * 0.3 + 0.09, 0.02 * 0.3 + 0.09], 3), rtol=1e-6)
     np.testing.assert_allclose(sigma[1], np.repeat([5.0 * 0.3 + 0.09, 1.0 * 0.3 + 0.09], 3), rtol=1e-6)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial.gravity_alignment import Levelling, level_rotation
+from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rotation
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.step import Estimate
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -23,12 +23,12 @@ class Knows(InertialTracker):
         super().__init__(CAMERA, ImuCalibration(), _config())
         self.up: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None = None
 
-    def level_R(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+    def gravity_rotation(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
         return self.up
 
 
 def _config():  # type: ignore[no-untyped-def]
-    from kiteline_agent.inertial.inertial_tracker import InertialConfig
+    from kiteline_agent.inertial.inertial_config import InertialConfig
 
     return InertialConfig()
 
@@ -40,42 +40,42 @@ def test_the_accelerometer_alone_sets_the_body_upright() -> None:
 
 
 def test_without_an_imu_nobody_waits() -> None:
-    levelling = Levelling(CAMERA, None, 0.035, 2.0)
-    np.testing.assert_array_equal(levelling.R_l_o, np.eye(3))
-    assert levelling.look(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
-    ahead = levelling.first_pose(None)[:3, :3]
+    aligner = GravityAligner(CAMERA, None, 0.035, 2.0)
+    np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))
+    assert aligner.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    ahead = aligner.first_pose(None)[:3, :3]
     np.testing.assert_allclose(ahead @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_the_base_is_told_once_and_the_place_stays() -> None:
     knows = Knows()
-    levelling = Levelling(CAMERA, knows, 0.035, 2.0)
+    aligner = GravityAligner(CAMERA, knows, 0.035, 2.0)
     T_m_b = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    assert levelling.look(0, T_m_b, np.eye(3), SubmapId(0), first=True) is None
-    assert levelling.R_l_o is None
+    assert aligner.update(0, T_m_b, np.eye(3), SubmapId(0), first=True) is None
+    assert aligner.R_l_o is None
     lean = se3.so3_exp(np.array([0.2, -0.3, 0.0]))
     knows.up = lean.T
-    level = levelling.look(10**8, T_m_b, np.eye(3), SubmapId(0), first=True)
+    level = aligner.update(10**8, T_m_b, np.eye(3), SubmapId(0), first=True)
     assert level is not None
     np.testing.assert_allclose((level.T_l_m @ T_m_b)[:3, 3], T_m_b[:3, 3], atol=1e-12)
-    assert levelling.R_l_o is not None
-    np.testing.assert_allclose(levelling.R_l_o @ lean @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
-    assert levelling.askew_rad == pytest.approx(np.hypot(0.2, 0.3))
-    assert levelling.look(2 * 10**8, T_m_b, np.eye(3), SubmapId(0), first=True) is None
+    assert aligner.R_l_o is not None
+    np.testing.assert_allclose(aligner.R_l_o @ lean @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
+    assert aligner.tilt_rad == pytest.approx(np.hypot(0.2, 0.3))
+    assert aligner.update(2 * 10**8, T_m_b, np.eye(3), SubmapId(0), first=True) is None
 
 
 def test_what_leans_hardly_is_left_and_patience_ends() -> None:
     knows = Knows()
-    hardly = Levelling(CAMERA, knows, 0.035, 2.0)
+    hardly = GravityAligner(CAMERA, knows, 0.035, 2.0)
     knows.up = se3.so3_exp(np.array([0.02, 0.0, 0.0]))
-    assert hardly.look(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    assert hardly.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
     assert hardly.R_l_o is not None and abs(hardly.R_l_o[2, 1]) > 0.01  # the flight controller gets even this
     knows.up = None
-    patient = Levelling(CAMERA, knows, 0.035, 2.0)
+    patient = GravityAligner(CAMERA, knows, 0.035, 2.0)
     for t_s in (0.0, 1.0, 1.9):
-        patient.look(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+        patient.update(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
         assert patient.R_l_o is None
-    patient.look(int(2.1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+    patient.update(int(2.1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
     np.testing.assert_array_equal(patient.R_l_o, np.eye(3))
 
 
@@ -96,10 +96,10 @@ def test_gravity_is_known_after_five_frames_in_motion() -> None:
             T = se3.from_rt(lean @ se3.so3_exp(turn * now), lean @ (v0 * now + 0.5 * accel * now * now))
             T[:3, 3] += 3e-4 * rng.normal(size=3)
             tracker.update(k * 50_000_000, T, _nothing())
-            if first is None and tracker.level_R() is not None:
+            if first is None and tracker.gravity_rotation() is not None:
                 first = k
         assert first is not None and first <= 5
-        up = tracker.level_R() @ lean @ [0.0, 0.0, 1.0]
+        up = tracker.gravity_rotation() @ lean @ [0.0, 0.0, 1.0]
         errors.append(np.degrees(np.arccos(min(up[2], 1.0))))
     assert np.mean(errors) < 1.0 and max(errors) < 2.5
 

@@ -1,0 +1,135 @@
+"""Initialisation of the inertial state from a window of poses by images: at rest, or in motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial import initial_alignment
+from kiteline_agent.inertial.fixed_lag import FixedLagSmoother, StartDeviations
+from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
+from kiteline_core.frame import ImuCalibration
+
+F64 = NDArray[np.float64]
+
+_MIN_FRAMES = 5
+_SCALE_FRAMES = 20  # with fewer, acceleration and scale are not distinguishable
+_REST_SAMPLES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPose:
+    """T_m_b (4,4) at t_ns, and the IMU samples since the pose before (None for the first one)."""
+
+    t_ns: int
+    T_m_b: F64
+    samples: Samples | None
+
+
+class ImuInitialiser:
+    """Window of poses by images, from which gravity, velocity, biases and scale are estimated."""
+
+    def __init__(self, config: InertialConfig, calibration: ImuCalibration, p_b_c: F64, buffer: SampleBuffer) -> None:
+        """p_b_c: (3,) m, camera in the body."""
+        self._config = config
+        self._calibration = calibration
+        self._p_b_c = p_b_c
+        self._buffer = buffer
+        self._poses: list[TimedPose] = []
+
+    def clear(self) -> None:
+        """Empty the window."""
+        self._poses = []
+
+    def add(self, pose: TimedPose) -> None:
+        """Append a pose; one without samples begins a new window."""
+        if pose.samples is None:
+            self._poses = []
+        self._poses = [*self._poses, pose][-self._config.window_frames :]
+
+    def transform(self, function: Callable[[F64], F64]) -> None:
+        """Replace every pose T_m_b by function(T_m_b)."""
+        self._poses = [replace(p, T_m_b=function(p.T_m_b)) for p in self._poses]
+
+    def velocity(self) -> F64:
+        """Velocity (3,) m/s between the last two poses; zero with fewer."""
+        if len(self._poses) < 2:
+            return np.zeros(3)
+        a, b = self._poses[-2], self._poses[-1]
+        return np.asarray((b.T_m_b[:3, 3] - a.T_m_b[:3, 3]) / ((b.t_ns - a.t_ns) * 1e-9))
+
+    def gravity(self, bias: F64) -> F64 | None:
+        """Gravity (3,) m/s^2 in m, a few frames after the start; None before. bias: (6,)."""
+        config = self._config
+        if len(self._poses) < _MIN_FRAMES or self._span_s() < config.level_window_s:
+            return None
+        poses, motions = self._window(config.window_frames, bias)
+        if len(motions) < len(poses) - 1:
+            return None
+        found = initial_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
+        fits = found is not None and found.residual_m < config.max_residual_m
+        return found.gravity if found is not None and fits and found.gravity_error < config.level_error else None
+
+    def metric_scale(self, bias: F64) -> tuple[float, float] | None:
+        """Metres per unit of a map without scale, and its standard deviation; None while unknown. bias: (6,)."""
+        poses, motions = self._window(self._config.window_frames, bias)
+        if len(poses) < _SCALE_FRAMES or len(motions) < len(poses) - 1:
+            return None
+        bias = np.concatenate([initial_alignment.gyro_bias(poses, motions), bias[3:]])
+        found = initial_alignment.align(poses, self._p_b_c, motions, bias, self._config.gravity_m_s2, with_scale=True)
+        return None if found is None else (found.scale, self._config.scale_inflation * found.scale_sigma)
+
+    def start(self, smoother: FixedLagSmoother, bias: F64) -> Literal["rest", "motion"] | None:
+        """Start the smoother at the last pose if the window allows it; returns how. bias: (6,) last known."""
+        if len(self._poses) < _MIN_FRAMES:
+            return None
+        span_s = self._span_s()
+        if span_s >= self._config.rest_window_s and self._start_at_rest(smoother, bias):
+            self.clear()
+            return "rest"
+        if span_s >= self._config.motion_window_s and self._start_in_motion(smoother, bias):
+            self.clear()
+            return "motion"
+        return None
+
+    def _start_at_rest(self, smoother: FixedLagSmoother, bias: F64) -> bool:
+        config, last = self._config, self._poses[-1]
+        recent = [p for p in self._poses if (last.t_ns - p.t_ns) * 1e-9 <= config.rest_window_s + 0.1]
+        moved = max(float(np.linalg.norm(p.T_m_b[:3, 3] - last.T_m_b[:3, 3])) for p in recent)
+        mean, spread, n = self._buffer.mean(recent[0].t_ns, last.t_ns)
+        still = spread[:3].max() < config.rest_gyro_rad_s and spread[3:].max() < config.rest_accel_m_s2
+        if n < _REST_SAMPLES or not still or moved > config.rest_moved_m:
+            return False
+        if abs(np.linalg.norm(mean[3:]) - config.gravity_m_s2) > 0.1 * config.gravity_m_s2:
+            return False
+        bias = np.concatenate([mean[:3], bias[3:]])
+        gravity = -last.T_m_b[:3, :3] @ (mean[3:] - bias[3:])
+        deviations = StartDeviations(velocity_m_s=0.02, gyro_bias_rad_s=0.002)
+        smoother.start(last.T_m_b, np.zeros(3), bias, gravity, deviations)
+        return True
+
+    def _start_in_motion(self, smoother: FixedLagSmoother, bias: F64) -> bool:
+        config, last = self._config, self._poses[-1]
+        recent = sum((last.t_ns - p.t_ns) * 1e-9 <= config.motion_window_s + 0.3 for p in self._poses)
+        poses, motions = self._window(max(recent, config.motion_frames), bias)
+        bias = np.concatenate([initial_alignment.gyro_bias(poses, motions), bias[3:]])
+        found = initial_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
+        if found is None or found.residual_m > config.max_residual_m or found.gravity_error > config.max_gravity_error:
+            return False
+        bias[3:] = found.accel_bias
+        smoother.start(last.T_m_b, found.velocities[-1], bias, found.gravity, StartDeviations())
+        return True
+
+    def _span_s(self) -> float:
+        return (self._poses[-1].t_ns - self._poses[0].t_ns) * 1e-9
+
+    def _window(self, most: int, bias: F64) -> tuple[F64, list[Preintegrated]]:
+        """The newest poses (n,4,4), and the motions between them."""
+        poses = self._poses[-most:]
+        motions = [preintegrate(p.samples, bias, self._calibration) for p in poses[1:] if p.samples is not None]
+        return np.array([p.T_m_b for p in poses]), motions

@@ -1,0 +1,43 @@
+"""Options of the inertial stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from kiteline_agent.inertial.fixed_lag import FixedLagConfig
+
+
+@dataclass(frozen=True, slots=True)
+class InertialConfig:
+    """How the inertial state is initialised, and how long dead reckoning is trusted."""
+
+    smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
+    gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
+    silent_s: float = 3.0  # time without a sample after which an event is logged
+    max_gap_s: float = 0.05  # a longer gap in the samples makes an interval unknown
+    rest_window_s: float = 0.3  # time that the vehicle must stand still to start from rest
+    rest_gyro_rad_s: float = 0.02  # standard deviation of the gyro below which the vehicle stands still
+    rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle
+    rest_moved_m: float = 0.005  # most motion by the images meanwhile
+    level_window_s: float = 0.19  # after which gravity is known to a degree: five frames at 20 Hz
+    level_error: float = 0.03  # relative error of gravity's length then: its direction is as accurate
+    level_patience_s: float = 2.0  # longest time that a flight controller waits for gravity-aligned poses
+    motion_window_s: float = 0.7  # window of the initialisation in motion
+    motion_frames: int = 7  # least frames of that window: with five, noise could pass for acceleration
+    window_frames: int = 60  # most frames kept before the initialisation; a scale needs some seconds
+    max_residual_m: float = 0.02  # of the initialisation; above it the poses do not fit the IMU
+    max_gravity_error: float = 0.12  # relative, of the length that is found without imposing it
+    trusted_blind_s: float = 1.0  # dead reckoning by the IMU counts as tracking for this long
+    askew_rad: float = 0.035  # tilt above which the map is gravity-aligned: two degrees
+    max_coast_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it
+    scale_inflation: float = 2.0  # of the deviation of a scale: errors of a young map are correlated over frames
+    unit_sigma: float = 0.03  # relative error of the scale by an IMU or odometer that their deviations leave out
+    offset_memory_s: float = 60.0  # time constant of the time offset's drift
+    offset_start_sigma_s: float = 0.02  # cameras without a trigger line
+    offset_window_s: float = 0.15  # over which rotations are compared
+    offset_turn_sigma_rad: float = 6e-4  # error of a rotation by the images over that window
+    offset_trusted_s: float = 3e-3  # deviation below which the estimate is applied
+    offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
+    offset_rate: float = 0.05  # s/s, how fast the applied offset follows
+    offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
+    apply_offset: bool = True  # False: only the configured offset is used
