@@ -32,7 +32,7 @@ def room() -> tuple[SimSource, list[Frame]]:
 def fly(room: tuple[SimSource, list[Frame]], latency_ns: int, jitter_ns: int) -> list[Estimate]:
     """EuRoC's body (x up, y right, z forward) holds a controller that speaks FRD."""
     source, frames = room
-    felt = source.inertial()
+    felt = source.imu_samples()
     late = latency_ns + np.random.default_rng(3).integers(0, jitter_ns + 1, len(felt.t_ns))
     arrives = np.maximum.accumulate(felt.t_ns + late)
     R_b_f = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])

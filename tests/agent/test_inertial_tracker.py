@@ -16,8 +16,8 @@ from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_hw.sim.sensors import imu as sim_imu
-from kiteline_hw.sim.world.paths import built_in
-from kiteline_hw.sim.world.trajectory import Path
+from kiteline_hw.sim.world.built_in_paths import built_in_path
+from kiteline_hw.sim.world.path import Path
 
 F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
@@ -47,7 +47,7 @@ def flight(
     """A lively flight along the room's course. late_ns: images are so much later than stamped. T_m_w: map."""
     T_m_w = np.eye(4) if T_m_w is None else T_m_w
     rng = np.random.default_rng([seed, 2])
-    path = built_in("room", (frames * 0.05 + 3.0) / HASTE, T_B_C, 0)
+    path = built_in_path("room", (frames * 0.05 + 3.0) / HASTE, T_B_C, 0)
     path = Path(path.coefficients, path.knot_s * HASTE, path.length_s * HASTE, 0.7, rest_s)
     stamps = np.arange(frames, dtype=np.int64) * FRAME_NS + 100_000_000
     imu_t = np.arange(0, int(stamps[-1]) + 1, 5_000_000, dtype=np.int64)

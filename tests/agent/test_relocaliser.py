@@ -212,7 +212,7 @@ def test_a_full_map_gives_up_old_submaps_first_and_still_flies(room: Recording, 
 
 def simulated(scene: str, seed: int, start: float = 0.0) -> tuple[CameraRig, list[Frame]]:
     source = open_sim(f"{scene}?seed={seed}&start={start}&seconds=3&scale=0.5&rest=0", imu=False, texture_bits=9)
-    eyes = source.eyes()
+    eyes = source.cameras()
     return source.rig, [source.render(k, eyes) for k in range(0, 50, 2)]
 
 

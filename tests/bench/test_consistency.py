@@ -12,7 +12,7 @@ from kiteline_bench.harness.result import pose_error
 from kiteline_bench.harness.simulated import random_flight
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
-from kiteline_hw.sim.sensors.lens import make_rig
+from kiteline_hw.sim.sensors.rig import make_rig
 
 
 def item(k: int) -> Item:

@@ -126,7 +126,7 @@ def test_hang_up_and_return(tmp_path: Path) -> None:
     device.symlink_to(first.a)
     with SerialLink(str(device), 57600, CobsFramer()) as a, SerialLink(second.b, 57600, CobsFramer()) as b:
         assert a.send(b"lost")
-        first.hang_up()
+        first.close()
         wait_for(lambda: not a.connected)
         assert not a.send(b"refused")
         device.unlink()
@@ -141,7 +141,7 @@ def test_hang_up_and_return(tmp_path: Path) -> None:
         a.close()
         a.close()
         assert time.monotonic() - began < 1.0
-    second.hang_up()
+    second.close()
 
 
 def test_a_port_in_use_or_missing_is_named() -> None:

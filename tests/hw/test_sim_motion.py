@@ -11,10 +11,11 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.sensors.imu import measure
-from kiteline_hw.sim.sensors.lens import make_rig
-from kiteline_hw.sim.world.paths import built_in
+from kiteline_hw.sim.sensors.rig import make_rig
+from kiteline_hw.sim.world.built_in_paths import built_in_path
+from kiteline_hw.sim.world.path import GRAVITY, Path
+from kiteline_hw.sim.world.path_fit import fit, read_trajectory
 from kiteline_hw.sim.world.scenes import SCENES
-from kiteline_hw.sim.world.trajectory import GRAVITY, Path, fit, read_trajectory
 
 T_B_C = make_rig().T_b_c
 
@@ -35,7 +36,7 @@ def integrate(path: Path, seconds: float, rate_hz: int) -> tuple[np.ndarray, np.
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_inertial_samples_integrate_to_the_path(scene: str) -> None:
-    found, true = integrate(built_in(scene, 6.0, T_B_C), 5.0, 1000)
+    found, true = integrate(built_in_path(scene, 6.0, T_B_C), 5.0, 1000)
     error = se3.log(se3.inverse(true) @ found)
     assert np.linalg.norm(error[:3]) < 0.003
     assert np.linalg.norm(error[3:]) < 2e-4
@@ -50,7 +51,7 @@ def test_real_drone_motion_integrates_too(data_dir: FilePath) -> None:
 
 
 def test_standing_still_reads_gravity_upward() -> None:
-    path = built_in("room", 5.0, T_B_C)
+    path = built_in_path("room", 5.0, T_B_C)
     t_ns = np.arange(0, 950_000_000, 5_000_000)
     batch = measure(path, t_ns, 0, ImuCalibration(), 0, noise=False)
     assert np.abs(batch.gyro).max() < 1e-12
@@ -60,7 +61,7 @@ def test_standing_still_reads_gravity_upward() -> None:
 
 
 def test_noise_and_bias_have_the_stated_densities() -> None:
-    path = built_in("room", 41.0, T_B_C)
+    path = built_in_path("room", 41.0, T_B_C)
     t_ns = np.arange(0, 40_000_000_000, 5_000_000)
     calibration = ImuCalibration()
     clean = measure(path, t_ns, 0, calibration, 5, noise=False)

@@ -11,7 +11,8 @@ import pytest
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.sim.sensors import lens
-from kiteline_hw.sim.sensors.render import Eye
+from kiteline_hw.sim.sensors.camera import SimCamera
+from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
 from kiteline_hw.sim.source import SimSource, open_sim
 from kiteline_hw.sim.world.raycast_kernels import box_hit, ground_hit, texture_value
@@ -97,8 +98,8 @@ def test_texture_value_is_the_mean_under_the_footprint(pool: TexturePool) -> Non
 
 @pytest.mark.parametrize("kind", list(Lens))
 def test_rays_invert_the_lens_that_opencv_knows(kind: Lens) -> None:
-    camera = lens.make_rig(kind).left
-    rays = lens.rays(camera)[1:-1, 1:-1].astype(np.float64)
+    camera = make_rig(kind).left
+    rays = lens.pixel_rays(camera)[1:-1, 1:-1].astype(np.float64)
     points = rays[::7, ::7].reshape(-1, 3) * 3.0
     v, u = np.mgrid[: camera.height : 7, : camera.width : 7]
     expected = np.stack([u.ravel(), v.ravel()], 1)
@@ -126,9 +127,9 @@ def corners(box: np.ndarray) -> np.ndarray:
 
 def test_corners_of_a_box_fall_where_the_camera_model_says(pool: TexturePool) -> None:
     """The silhouette is the hull of the projected corners, and depth at visible corners is theirs."""
-    world, rig = one_box(pool), lens.make_rig()
+    world, rig = one_box(pool), make_rig()
     t_w_c = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.0, 0.4]))
-    eye = Eye(world, rig.left, rig.T_b_c)
+    eye = SimCamera(world, rig.left, rig.T_b_c)
     _, distance, hits = eye.cast(t_w_c @ se3.inverse(rig.T_b_c))
     depth = eye.depth()
     seen = hits >= 0
@@ -150,11 +151,11 @@ def test_true_depth_carries_the_left_image_into_the_right_one(room: SimSource) -
     """Stereo geometry end to end: what the left eye sees, warped by true depth, is what the right eye sees."""
     rig = room.rig
     assert rig.right is not None and rig.T_c_r is not None
-    left, right = room.eyes()
+    left, right = room.cameras()
     pose = room.path.motion(np.array([5.0])).T_w_b[0]
     radiance, distance, _ = (a.copy() for a in left.cast(pose))
     other, other_distance, _ = right.cast(pose)
-    points = lens.rays(rig.left)[1:-1, 1:-1] * distance[..., None]
+    points = lens.pixel_rays(rig.left)[1:-1, 1:-1] * distance[..., None]
     in_right = se3.transform(se3.inverse(rig.T_c_r), points.reshape(-1, 3).astype(np.float64))
     uv = lens.project(rig.right, in_right).astype(np.float32).reshape(*distance.shape, 2)
     warped = cv2.remap(other, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderValue=-1)
@@ -168,7 +169,7 @@ def test_true_depth_carries_the_left_image_into_the_right_one(room: SimSource) -
 
 def test_motion_blur_is_the_mean_of_the_exposure(room: SimSource) -> None:
     """The streak of one cast against many casts along the exposure."""
-    eye = room.eyes()[0]
+    eye = room.cameras()[0]
     t, exposure = 3.0, 0.06
     times = t + exposure * ((np.arange(25) + 0.5) / 25 - 0.5)
     many = np.mean([eye.cast(pose)[0].copy() for pose in room.path.motion(times).T_w_b], axis=0)
@@ -181,7 +182,7 @@ def test_motion_blur_is_the_mean_of_the_exposure(room: SimSource) -> None:
     linear = to_camera @ (motion.velocity[0] + arm)
     _, distance, _ = eye.cast(motion.T_w_b[0])
     out = np.empty_like(sharp)
-    motion_blur(sharp, distance, lens.rays(room.rig.left), linear, angular, exposure, out)
+    motion_blur(sharp, distance, lens.pixel_rays(room.rig.left), linear, angular, exposure, out)
     assert np.abs(sharp - many).mean() > 3 * np.abs(out - many).mean()
 
 

@@ -33,7 +33,7 @@ def test_the_same_seed_gives_the_same_bytes(scene: str) -> None:
 
 def test_a_frame_does_not_depend_on_what_was_rendered_before() -> None:
     source = open_sim("room", **SMALL)
-    eyes = source.eyes()
+    eyes = source.cameras()
     late = source.render(7, eyes)
     early = source.render(2, eyes)
     everything = frames("room")
@@ -55,7 +55,7 @@ def test_samples_come_in_order_up_to_each_frame() -> None:
 
 def test_images_look_like_photographs() -> None:
     source = open_sim("room", scale=0.5, seconds=12.0)
-    eyes = source.eyes()
+    eyes = source.cameras()
     for k in (40, 120, 200):
         image = source.render(k, eyes).left
         assert 60 < image.mean() < 190 and 12 < image.std() < 75

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from kiteline_hw.sim.config import read_config
-from kiteline_hw.sim.sensors.lens import make_rig
+from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import build_world, open_sim
+from kiteline_hw.sim.world.path_fit import read_trajectory
 from kiteline_hw.sim.world.scenes import SCENES
 from kiteline_hw.sim.world.street import ground_field
 from kiteline_hw.sim.world.texture_kernels import paint
 from kiteline_hw.sim.world.textures import MAKERS, make_pool, shapes
-from kiteline_hw.sim.world.trajectory import read_trajectory
 from kiteline_hw.sim.world.world import (
     FREE,
     OCCUPIED,

@@ -90,7 +90,7 @@ def run(bench: Bench) -> list[Bar]:
 
 def _places(number: int, scene: str, path: str) -> list[_Place]:
     source = open_sim(scene, seed=7, trajectory=path, imu=False, depth=True)
-    rectifier, eyes, truth = Rectifier(source.rig), source.eyes(), source.ground_truth
+    rectifier, eyes, truth = Rectifier(source.rig), source.cameras(), source.ground_truth
     config = AgentConfig()
     detector = features.DetectorConfig(cell_px=config.recovery.cell_px, max_corners=config.recovery.max_corners)
     c = rectifier.camera

@@ -13,7 +13,7 @@ from kiteline_bench.harness.bars import Bench
 from kiteline_bench.harness.recording import Recording, items_of
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3, tum
-from kiteline_hw.sim.sensors.lens import make_rig
+from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import open_sim
 from kiteline_lab.flights import simulate
 

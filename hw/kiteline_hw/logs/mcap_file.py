@@ -1,8 +1,7 @@
-"""The records of an MCAP file, whole or cut: with its index when it has one, else by walking it from the front.
+"""Reads the records of an MCAP file, also of a cut one: by its index, else by scanning it from the front.
 
-A file cut anywhere gives all messages before the cut, also those of the chunk that was cut; `cut` then says where. A
-damaged chunk is passed over and noted. Memory holds one chunk, or those chunks that overlap in time when the messages
-are asked for in order. Format: mcap.dev/spec.
+A cut file yields all messages before the cut, also those of the chunk that was cut. A damaged chunk is skipped and
+noted. Memory holds one chunk, or the chunks that overlap in time if messages are read in order. Format: mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ from mcap.records import Channel, Metadata, Schema
 from kiteline_hw.ports import SourceError
 
 MAGIC = b"\x89MCAP0\r\n"
-_RUN_BYTES = 1 << 20  # bytes; bare messages are read in runs of this size, like chunks
+_RUN_BYTES = 1 << 20  # bytes; messages outside of chunks are read in runs of this size
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
 
 
 class RawMessage(NamedTuple):
-    """A message as it stands in the file."""
+    """A message as stored in the file."""
 
     channel: int
     sequence: int
@@ -46,7 +45,7 @@ class RawMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """A chunk, or a run of bare messages: where it stands, when its messages were logged, which channels it has."""
+    """A chunk, or a run of messages outside of chunks: position, range of log times, and channels (None: unknown)."""
 
     offset: int
     length: int
@@ -57,8 +56,9 @@ class _Span:
 
 
 class McapFile:
-    """An MCAP file, open only while it is read. Raises SourceError when it is none; for a cut or damaged one see `cut`
-    and `notes`.
+    """An MCAP file, open only while it is read. Raises SourceError if it is none.
+
+    cut: where a cut file ends, or None. notes: damaged parts.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ class McapFile:
                     raise SourceError(f"{path}: no MCAP file: starts with {head!r}" if head else f"{path}: empty file")
                 self._size = path.stat().st_size
                 if not self._read_index(file):
-                    self._walk(file)
+                    self._scan(file)
         except OSError as error:
             raise SourceError(f"{path}: {error.strerror}") from error
         used = [span for span in self._spans if span.last_ns]
@@ -92,15 +92,15 @@ class McapFile:
         return self.schemas.get(self.channels[channel].schema_id)
 
     def messages(self, channels: Collection[int] | None = None, ordered: bool = True) -> Iterator[RawMessage]:
-        """Messages of the channels (None: all), in order of log time, or (ordered False) as they stand in the file."""
+        """Messages of the channels (None: all), in order of log time, or (ordered=False) in file order."""
         wanted = None if channels is None else frozenset(channels)
         spans = [s for s in self._spans if wanted is None or s.channels is None or s.channels & wanted]
         with self.path.open("rb") as file:
-            yield from self._merged(file, spans, wanted) if ordered else self._in_file_order(file, spans, wanted)
-
-    def _in_file_order(self, file: BinaryIO, spans: list[_Span], wanted: frozenset[int] | None) -> Iterator[RawMessage]:
-        for span in spans:
-            yield from self._span(file, span, wanted)
+            if ordered:
+                yield from self._merged(file, spans, wanted)
+            else:
+                for span in spans:
+                    yield from self._span_messages(file, span, wanted)
 
     def _merged(self, file: BinaryIO, spans: list[_Span], wanted: frozenset[int] | None) -> Iterator[RawMessage]:
         heap: list[tuple[int, int, RawMessage]] = []
@@ -108,7 +108,7 @@ class McapFile:
         for span in sorted(spans, key=lambda s: (s.first_ns, s.offset)):
             while heap and heap[0][0] < span.first_ns:
                 yield heapq.heappop(heap)[2]
-            for message in self._span(file, span, wanted):
+            for message in self._span_messages(file, span, wanted):
                 heapq.heappush(heap, (message.log_ns, order, message))
                 order += 1
         while heap:
@@ -119,6 +119,7 @@ class McapFile:
         return next(self.messages((channel,), ordered=False), None)
 
     def _read_index(self, file: BinaryIO) -> bool:
+        """Find spans, schemas and channels from the index; False if there is no complete one."""
         try:
             file.seek(0)
             reader = SeekingReader(file)
@@ -141,8 +142,8 @@ class McapFile:
         self.indexed = True
         return True
 
-    def _walk(self, file: BinaryIO) -> None:
-        """Find spans, schemas and channels from the front, up to the end or the cut."""
+    def _scan(self, file: BinaryIO) -> None:
+        """Find spans, schemas and channels from the front up to the end or the cut."""
         self._spans, self.metadata = [], []
         offset = len(MAGIC)
         run_start, run_times, run_channels = 0, [0, 0], set[int]()
@@ -188,7 +189,7 @@ class McapFile:
                 self.cut = f"cut after {self._size} bytes, inside a record that needs {end - self._size} more"
                 break
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-                self._learn(opcode, file.read(length))
+                self._read_definition(opcode, file.read(length))
             offset = end
         end_run()
 
@@ -196,14 +197,15 @@ class McapFile:
         span = _Span(offset, length, 0, 0, True, None)
         channels: set[int] = set()
         first_ns, last_ns = 2**64, 0
-        for message in self._span(file, span, None):
+        for message in self._span_messages(file, span, None):
             channels.add(message.channel)
             self.counts[message.channel] = self.counts.get(message.channel, 0) + 1
             first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
         if channels:
             self._spans.append(_Span(offset, length, first_ns, last_ns, True, frozenset(channels)))
 
-    def _learn(self, opcode: int, body: bytes) -> None:
+    def _read_definition(self, opcode: int, body: bytes) -> None:
+        """Read a schema, channel or metadata record."""
         try:
             stream = ReadDataStream(BytesIO(body))
             if opcode == Opcode.SCHEMA:
@@ -217,11 +219,11 @@ class McapFile:
         except (McapError, struct.error, ValueError, UnicodeDecodeError) as error:
             self._note(f"unreadable schema, channel or metadata ({error})")
 
-    def _span(self, file: BinaryIO, span: _Span, wanted: frozenset[int] | None) -> Iterator[RawMessage]:
+    def _span_messages(self, file: BinaryIO, span: _Span, wanted: frozenset[int] | None) -> Iterator[RawMessage]:
         file.seek(span.offset)
         body = file.read(span.length)
         if span.chunk:
-            body = self._unpack(body, span.offset)
+            body = self._decompress(body, span.offset)
         at, size = 0, len(body)
         while at + _RECORD.size <= size:
             opcode, length = _RECORD.unpack_from(body, at)
@@ -237,11 +239,11 @@ class McapFile:
                     data = body[at + _MESSAGE.size : at + length]
                     yield RawMessage(channel, sequence, log_ns, publish_ns, data)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and not self.indexed:
-                self._learn(opcode, body[at : at + length])
+                self._read_definition(opcode, body[at : at + length])
             at += length
 
-    def _unpack(self, record: bytes, offset: int) -> bytes:
-        """The records inside a chunk; of a cut chunk those before the cut, of a damaged one none."""
+    def _decompress(self, record: bytes, offset: int) -> bytes:
+        """The records in a chunk; only those before the cut of a cut chunk, and none of a damaged one."""
         try:
             _, _, size, crc, name_length = _CHUNK.unpack_from(record, _RECORD.size)
             at = _RECORD.size + _CHUNK.size

@@ -1,4 +1,4 @@
-"""Logs: one MCAP file a process, readable by Foxglove and Lichtblick, recoverable when cut, reproducible in every byte.
+"""Writes logs: one MCAP file per process, readable by Foxglove and Lichtblick, recoverable if cut, reproducible.
 
 Write::
 
@@ -12,18 +12,18 @@ Write::
     log.poses("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.scan(...);  log.text("/log", t_ns, "info", "…")
     log.close()                                                 # also a context manager
 
-Every call takes the flight time that the caller hands in as log time; nothing here reads a clock, so equal calls give
-equal bytes. Chunks close at 64 KiB and after one second of flight time, so that a cut file loses little.
+Log times are handed in and nothing here reads a clock, so equal calls give equal bytes. Chunks are written at 64 KiB and
+after one second of flight time, so that a cut file loses little.
 
 Read::
 
     with LogReader(path) as log:
-        log.metadata["role"];  log.topics;  log.cut             # cut: None, or where a broken file ends
-        for m in log.messages(["/packets/in", "/left/image"]):  # in the order in which they were written
+        log.metadata["role"];  log.topics;  log.cut             # cut: None, or where a cut file ends
+        for m in log.messages(["/packets/in", "/left/image"]):  # in the order of writing
             m.topic, m.t_ns;  m.blob() | m.json() | m.image() | m.imu() | m.odometry() | m.pose() | m.transform()
 
-`read_frame(images, t_ns, has_depth)` decodes logged images to the Frame that the source gave. The whole log is a source
-as well: `open_source("mcap:agent0/log.mcap")` yields the same Frames, ImuBatches and OdometryBatches.
+`read_frame(images, t_ns, has_depth)` decodes logged images to the original Frame. A log is also a source:
+`open_source("mcap:agent0/log.mcap")` yields the same Frames, ImuBatches and OdometryBatches.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -46,6 +45,7 @@ from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
 from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.images import encode_depth, encode_image
+from kiteline_hw.system.closing import Closing
 
 F64 = NDArray[np.float64]
 
@@ -57,47 +57,35 @@ __all__ = [
 LEFT, RIGHT, DEPTH = "/left/image", "/right/image", "/depth/image"
 IMU, ODOMETER, RIG, GROUND_TRUTH = "/imu", "/odometer", "/rig", "/ground_truth"
 
-CHUNK_BYTES = 64 * 1024  # bytes; an unfinished chunk is what a cut may lose
-FLUSH_NS = 1_000_000_000  # ns of flight time after which an unfinished chunk is written out
+CHUNK_BYTES = 64 * 1024  # bytes; a cut loses one unfinished chunk at most
+FLUSH_NS = 1_000_000_000  # ns of flight time after which an unfinished chunk is written
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 
 
-class LogWriter:
-    """Writes one log. rotate_bytes: start a new file NAME_1.mcap, NAME_2.mcap… at this size. cap_bytes: never hold more
-    on disk: with rotation the oldest files go, without it writing stops there and `dropped` counts what was left out.
+class LogWriter(Closing):
+    """Writes one log. Raises SourceError if the file cannot be created.
 
-    Raises SourceError when the file cannot be created; a full disk later counts as dropped too.
+    rotate_bytes: size at which a new file NAME_1.mcap, NAME_2.mcap… is started. cap_bytes: limit on disk; with rotation
+    the oldest files are deleted, without it writing stops. dropped: messages not written, also because of a full disk.
     """
 
     def __init__(
-        self,
-        path: Path | str,
-        metadata: Mapping[str, str],
-        *,
-        rotate_bytes: int | None = None,
+        self, path: Path | str, metadata: Mapping[str, str], *, rotate_bytes: int | None = None,
         cap_bytes: int | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.path = Path(path)
         self.dropped = 0
         self._metadata = dict(metadata)
         self._rotate_bytes, self._cap_bytes = rotate_bytes, cap_bytes
         self._files: list[Path] = []
-        self._head: list[tuple[int, CameraRig, ImuCalibration | None]] = []
+        self._rig: tuple[CameraRig, ImuCalibration | None] | None = None
         self._open()
 
-    def __enter__(self) -> LogWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    # What a source delivers
+    # Data of a source
 
     def rig(self, t_ns: int, rig: CameraRig, imu: ImuCalibration | None) -> None:
         """Calibration: exact on /rig (JSON), and as Foxglove CameraCalibration and FrameTransforms for viewers."""
-        self._head = [(t_ns, rig, imu)]
+        self._rig = rig, imu
         self.json(RIG, t_ns, rig_to_json(rig, imu), "kiteline.Rig")
         self.calibration("/left/calibration", t_ns, rig.left, "left", 0.0)
         self.transform("/tf_static", t_ns, "body", "left", rig.T_b_c)
@@ -106,7 +94,7 @@ class LogWriter:
             self.transform("/tf_static", t_ns, "left", "right", rig.T_c_r)
 
     def frame(self, frame: Frame) -> None:
-        """The images of a frame, as the source held them; raw ones are coded as PNG."""
+        """The images of a frame, as encoded in the source; raw ones are encoded as PNG."""
         t, kept = frame.t_ns, list(frame.encoded)
         if not kept:
             kept.append(encode_image(frame.left))
@@ -121,7 +109,7 @@ class LogWriter:
             self.image(DEPTH, t, kept[-1], "left")
 
     def image(self, topic: str, t_ns: int, image: EncodedImage, frame_id: str) -> None:
-        """An encoded image. A depth format "png/5000" leaves "png" in the message and its scale in the channel."""
+        """An encoded image. The scale of a depth format such as "png/5000" is stored in the channel's metadata."""
         kind, _, scale = image.format.partition("/")
         message = schemas.CompressedImage(frame_id=frame_id, format=kind)
         self._stamp(message, t_ns)
@@ -148,10 +136,10 @@ class LogWriter:
         for t, pose in zip(truth.t_ns, truth.T_w_b, strict=True):
             self.pose(GROUND_TRUTH, int(t), "world", pose)
 
-    # For eyes
+    # Messages for viewers
 
     def calibration(self, topic: str, t_ns: int, camera: CameraModel, frame_id: str, baseline_m: float) -> None:
-        """A lens. baseline_m: how far this camera stands to the right of the left one."""
+        """Camera intrinsics. baseline_m: distance of this camera to the right of the left one."""
         k = camera.matrix()
         p = np.hstack([k, [[-camera.fx * baseline_m], [0.0], [0.0]]])
         message = schemas.CameraCalibration(
@@ -162,7 +150,7 @@ class LogWriter:
         self._add(topic, t_ns, message)
 
     def transform(self, topic: str, t_ns: int, parent: str, child: str, t_parent_child: F64) -> None:
-        """Where frame `child` lies in frame `parent`."""
+        """The pose of frame `child` in frame `parent`."""
         message = schemas.FrameTransform(parent_frame_id=parent, child_frame_id=child)
         self._stamp(message, t_ns)
         _fill_pose(message.translation, message.rotation, t_parent_child)
@@ -194,14 +182,9 @@ class LogWriter:
         self._add(topic, t_ns, message)
 
     def grid(
-        self,
-        topic: str,
-        t_ns: int,
-        frame_id: str,
-        cells: NDArray[np.int8],
-        cell_m: float,
+        self, topic: str, t_ns: int, frame_id: str, cells: NDArray[np.int8], cell_m: float,
         corner_m: tuple[float, float],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Occupancy (rows, columns) int8, 0..100 percent, -1 unknown; row 0 is the lowest y, corner_m lower left."""
         message = schemas.Grid(frame_id=frame_id, column_count=cells.shape[1], row_stride=cells.shape[1], cell_stride=1)
         self._stamp(message, t_ns)
@@ -218,19 +201,19 @@ class LogWriter:
         self._stamp(message, t_ns)
         self._add(topic, t_ns, message)
 
-    # For replay
+    # Data for replay
 
     def blob(self, topic: str, t_ns: int, data: bytes) -> None:
         """Opaque bytes."""
         self._add(topic, t_ns, schemas.Blob(data=data))
 
     def json(self, topic: str, t_ns: int, value: object, schema: str = "kiteline.Json") -> None:
-        """Anything that JSON can hold; keys keep their order."""
+        """A JSON value; keys keep their order."""
         data = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
         self._write(topic, t_ns, "json", schema, "jsonschema", b'{"type":"object"}', data, {})
 
     def flush(self) -> None:
-        """Hand all that was logged to the operating system."""
+        """Pass all logged data to the operating system."""
         try:
             self._writer.flush()
         except OSError:
@@ -275,16 +258,9 @@ class LogWriter:
         self._write(topic, t_ns, "protobuf", name, "protobuf", schema, data, notes or {})
 
     def _write(
-        self,
-        topic: str,
-        t_ns: int,
-        encoding: str,
-        name: str,
-        kind: str,
-        schema: bytes,
-        data: bytes,
+        self, topic: str, t_ns: int, encoding: str, name: str, kind: str, schema: bytes, data: bytes,
         notes: dict[str, str],
-    ) -> None:
+    ) -> None:  # fmt: skip
         size = len(data) + 64
         if self._cap_bytes is not None and not self._rotate_bytes and self._bytes + size > self._cap_bytes:
             self.dropped += 1
@@ -321,8 +297,8 @@ class LogWriter:
             for path in self._files[:-most]:
                 path.unlink(missing_ok=True)
         self._open()
-        for _, rig, imu in self._head:
-            self.rig(t_ns, rig, imu)
+        if self._rig is not None:
+            self.rig(t_ns, *self._rig)
 
 
 def _fill_pose(position: Any, orientation: Any, pose: F64) -> None:

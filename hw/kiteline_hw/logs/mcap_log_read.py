@@ -6,7 +6,6 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -20,13 +19,14 @@ from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.images import decode_depth, decode_grey
 from kiteline_hw.sensors.raw_pixels import BadImage
+from kiteline_hw.system.closing import Closing
 
 F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class LogMessage:
-    """One logged message; the accessor that fits its topic decodes it. Raises SourceError when it does not fit."""
+    """A logged message, decoded by the method for its type. Raises SourceError if the type differs."""
 
     topic: str
     t_ns: int
@@ -35,19 +35,19 @@ class LogMessage:
     notes: Mapping[str, str]
 
     def blob(self) -> bytes:
-        """The bytes that were logged."""
+        """The logged bytes."""
         data: bytes = self._parse(schemas.Blob).data
         return data
 
     def json(self) -> Any:
-        """The value that was logged."""
+        """The logged value."""
         try:
             return json.loads(self.data)
         except ValueError as error:
             raise SourceError(f"{self.topic} at {self.t_ns} ns holds no JSON") from error
 
     def image(self) -> EncodedImage:
-        """The encoded image; a depth image's format carries its scale."""
+        """The encoded image; the format of a depth image includes its scale."""
         message = self._parse(schemas.CompressedImage)
         scale = self.notes.get("depth_scale")
         return EncodedImage(message.data, f"{message.format}/{scale}" if scale else message.format)
@@ -87,8 +87,8 @@ class LogMessage:
         return message
 
 
-class LogReader:
-    """Reads a log, also one that was cut. Raises SourceError when it is no MCAP file."""
+class LogReader(Closing):
+    """Reads a log, also a cut one. Raises SourceError if it is no MCAP file."""
 
     def __init__(self, path: Path | str) -> None:
         self._file = McapFile(Path(path))
@@ -99,16 +99,8 @@ class LogReader:
                 self.metadata = dict(record.metadata)
         self.topics = {c.topic: self._file.counts.get(i, 0) for i, c in self._file.channels.items()}
 
-    def __enter__(self) -> LogReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def messages(self, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-        """Messages of the topics (None: all), in the order in which they were written."""
+        """Messages of the topics (None: all), in the order of writing."""
         channels = self._file.channels
         wanted = None if topics is None else [i for i, c in channels.items() if c.topic in topics]
         for raw in self._file.messages(wanted, ordered=False):
@@ -122,7 +114,7 @@ class LogReader:
 
 
 def read_frame(images: Sequence[EncodedImage], t_ns: int, has_depth: bool = False) -> Frame:
-    """The Frame of logged images: left, then right, or (has_depth) depth. Raises SourceError."""
+    """The Frame of logged images: left, right if there is one, depth last if has_depth. Raises SourceError."""
     try:
         left, _ = decode_grey(images[0])
         depth = decode_depth(images[-1])[0] if has_depth and len(images) > 1 else None
@@ -133,7 +125,7 @@ def read_frame(images: Sequence[EncodedImage], t_ns: int, has_depth: bool = Fals
 
 
 def read_odometry(message: Any) -> OdometryBatch:
-    """The batch of a kiteline.Odometry message. Raises ValueError where its fields do not fit each other."""
+    """The batch of a kiteline.Odometry message. Raises ValueError if its fields are inconsistent."""
     n = len(message.t_ns)
     velocity, rate = (np.array(v, np.float64).reshape(n, 3) for v in (message.velocity, message.rate))
     covs = (np.array(v, np.float64).reshape(n, 3, 3) for v in (message.velocity_cov, message.rate_cov))

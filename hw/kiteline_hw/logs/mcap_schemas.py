@@ -1,9 +1,8 @@
 """The message types of our logs: Foxglove's protobuf schemas where one fits, and small ones of our own.
 
 `kiteline.Blob` {bytes data}: opaque bytes. `kiteline.Imu` {sfixed64 t_ns[], double gyro[], double accel[]}: a batch of
-samples. `kiteline.Odometry` {sfixed64 t_ns[], double velocity[], rate[], velocity_cov[], rate_cov[]}: a batch of what
-an odometer measured, in the body frame. All are protobuf too, so that a viewer that does not know them still opens the
-log.
+samples. `kiteline.Odometry` {sfixed64 t_ns[], double velocity[], rate[], velocity_cov[], rate_cov[]}: a batch of
+odometer samples in the body frame. All are protobuf, so that viewers that do not know them can still open the log.
 """
 
 from __future__ import annotations
@@ -35,8 +34,6 @@ Grid = Grid_pb2.Grid
 Log = Log_pb2.Log
 
 _F = FieldDescriptorProto
-
-
 _OWN = ("Blob", "Imu", "Odometry")
 
 
@@ -72,8 +69,9 @@ def schema_data(message_class: Any) -> bytes:
 
 
 def bytes_field(message_class: Any, name: str, data: bytes) -> tuple[bytes, bytes]:
-    """A bytes field in protobuf's wire format, in two pieces: joined to a message it is the same as having set the
-    field, without the copies of a large image that setting and serialising would make.
+    """A bytes field in protobuf's wire format, in two pieces to be appended to a serialised message.
+
+    The result equals setting the field, without the copies of a large image that setting and serialising would make.
     """
     head = bytearray([message_class.DESCRIPTOR.fields_by_name[name].number << 3 | 2])
     size = len(data)

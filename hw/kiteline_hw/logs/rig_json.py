@@ -1,4 +1,4 @@
-"""A camera rig and its IMU as JSON, exact to the last bit: what a log keeps on /rig."""
+"""A camera rig and its IMU as JSON, exact to the last bit: the content of a log's topic /rig."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rig_to_json(rig: CameraRig, imu: ImuCalibration | None) -> dict[str, Any]:
 
 
 def rig_from_json(value: Mapping[str, Any]) -> tuple[CameraRig, ImuCalibration | None]:
-    """The rig and the IMU's calibration of such an object. Raises SourceError."""
+    """The rig and the IMU's calibration from such an object. Raises SourceError."""
     try:
         rig = CameraRig(
             _camera_from_json(value["left"]),

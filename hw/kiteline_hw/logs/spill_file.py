@@ -1,4 +1,4 @@
-"""Bytes kept on disk for as long as this process lives: a file without a name, so that nothing is left behind."""
+"""Temporary storage on disk: an unlinked file, which vanishes with this process."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ import os
 import tempfile
 from pathlib import Path
 
-_CLOSED = -1
-
 
 class SpillFile:
-    """Keeps bytes in a nameless file of a folder. Never raises: what cannot be done is refused and counted."""
+    """Stores bytes in an unlinked file of a folder. Never raises: failures are returned as None and counted."""
 
     def __init__(self, folder: Path) -> None:
         self.failures = 0
         self._size = 0
-        self._file = _CLOSED
+        self._file: int | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._file, name = tempfile.mkstemp(dir=folder)
@@ -24,33 +22,33 @@ class SpillFile:
             self.failures += 1
 
     def put(self, data: bytes) -> int | None:
-        """Keep bytes. Returns where they stand; None when the disk does not take them."""
-        where = self._size
+        """Store bytes. Returns their position; None if the disk refuses them."""
+        offset = self._size
         try:
-            if self._file == _CLOSED or os.pwrite(self._file, data, where) != len(data):
+            if self._file is None or os.pwrite(self._file, data, offset) != len(data):
                 raise OSError
         except OSError:
             self.failures += 1
             return None
         self._size += len(data)
-        return where
+        return offset
 
-    def get(self, where: int, n_bytes: int) -> bytes | None:
-        """The bytes that stand there; None when the disk does not give them."""
+    def get(self, offset: int, n_bytes: int) -> bytes | None:
+        """The bytes at a position; None if they cannot be read."""
         try:
-            data = os.pread(self._file, n_bytes, where) if self._file != _CLOSED else b""
+            data = os.pread(self._file, n_bytes, offset) if self._file is not None else b""
         except OSError:
             data = b""
-        if self._file != _CLOSED and len(data) == n_bytes:
+        if self._file is not None and len(data) == n_bytes:
             return data
         self.failures += 1
         return None
 
     def close(self) -> None:
-        """Give the disk back. May be called twice."""
-        if self._file != _CLOSED:
+        """Release the disk space. May be called twice."""
+        if self._file is not None:
             os.close(self._file)
-            self._file = _CLOSED
+            self._file = None
 
     def __del__(self) -> None:
         self.close()

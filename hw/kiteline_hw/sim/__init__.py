@@ -1,1 +1,1 @@
-"""A simulated world, a modelled link, a modelled flight controller."""
+"""Simulation: a SCENE with options enters, a FrameSource with exact ground truth leaves; models of links and radios."""

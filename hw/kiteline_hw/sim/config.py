@@ -1,4 +1,4 @@
-"""What a simulated flight is made of, and how it is asked for in words."""
+"""The options of a simulated flight, and their parser."""
 
 from __future__ import annotations
 
@@ -6,43 +6,43 @@ from dataclasses import dataclass, fields
 
 from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import SourceError
+from kiteline_hw.sim.world.path import REST_S
 from kiteline_hw.sim.world.scenes import SCENES
-from kiteline_hw.sim.world.trajectory import REST_S
 
 
 @dataclass(frozen=True, slots=True)
 class SimConfig:
-    """How a flight is simulated. Everything that is seen follows from these values."""
+    """The options of a simulated flight, which determine every measurement."""
 
     scene: str = "room"
     seed: int = 0
-    trajectory: str = ""  # file to fly, "" for the scene's own course
-    also: tuple[str, ...] = ()  # what the other agents fly in the same world, in order
-    agent: int = 0  # which of them this is
-    seconds: float = 0.0  # 0: to the end of the file, or 20 of the built-in course
+    trajectory: str = ""  # file to fly, "" for the scene's built-in path
+    also: tuple[str, ...] = ()  # trajectories of the other agents in the same world, in order
+    agent: int = 0  # number of this agent
+    seconds: float = 0.0  # 0: to the end of the file, or 20 s of the built-in path
     start: float = 0.0  # s into the trajectory
-    rest: float = REST_S  # s of standing still before the flight; 0 starts in full motion
+    rest: float = REST_S  # s at rest before the flight; 0 starts in full motion
     mono: bool = False
-    depth: bool = False  # depth in place of the right eye, like an RGB-D camera
+    depth: bool = False  # depth in place of the right image, like an RGB-D camera
     imu: bool = True
-    odometry: float = 0.0  # Hz of an odometer beside the cameras; 0: none
+    odometry: float = 0.0  # Hz of an odometer; 0: none
     odometry_noise: float = 0.05  # m/s a sample, white
     odometry_turn_noise: float = 0.01  # rad/s a sample, white
-    odometry_scale: float = 1.0  # times the true speed: tyres wear, flow sensors err in their height
+    odometry_scale: float = 1.0  # factor on the true speed: tyres wear, flow sensors misjudge their height
     odometry_slip: float = 0.0  # share of the time in which it reads up to 2.5 times the true speed
-    odometry_wheels: bool = False  # measures along the camera's view and about its vertical axis alone
+    odometry_wheels: bool = False  # measures only along the optical axis and about the camera's vertical axis
     lens: str = "radtan"  # or equidistant, none
     baseline: float = 0.11  # m
     scale: float = 1.0  # of image size and focal length
     exposure_s: float = 0.010  # indoor exposure of a small drone camera
     read_noise: float = 1.2  # grey values
     shot_noise: float = 0.02  # variance per grey value
-    miscalibration: float = 0.5  # how far the true cameras are from the stated ones, see lens.imperfect; 0: not at all
+    miscalibration: float = 0.5  # error of the stated calibration, see rig.perturb; 0: none
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
 
 def read_config(scene: str, **options: object) -> SimConfig:
-    """The configuration of `SCENE[?key=value&…]`, where `options`, fields of SimConfig, go before what the text says.
+    """The options of `SCENE[?key=value&…]`; `options`, fields of SimConfig, override the text.
 
     Raises SourceError for an unknown scene, option or value.
     """

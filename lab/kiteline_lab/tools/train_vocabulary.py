@@ -74,7 +74,7 @@ def descriptors(source: FrameSource, every: int) -> Iterator[U8]:
 
 def _frames(source: FrameSource, every: int) -> Iterator[Frame]:
     if isinstance(source, SimSource):  # renders only the frames that are used
-        cameras = source.eyes()
+        cameras = source.cameras()
         for k in range(0, source.frame_count or 0, every):
             yield source.render(k, cameras)
         return

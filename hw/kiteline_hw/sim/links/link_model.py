@@ -1,7 +1,7 @@
-"""A thin link as pure, seeded computation: rate, queue, delay, jitter, loss, bursts, duplicates, reordering.
+"""A model of a thin link: rate, queue, delay, jitter, loss, bursts, duplicates, reordering. Pure and seeded.
 
-Losses in bursts follow the two-state chain of Gilbert (Bell System Technical Journal 39, 1960): a good state with
-independent loss, and a bad one, entered at random, in which everything is lost.
+Burst losses follow Gilbert's two-state chain (Bell System Technical Journal 39, 1960): a good state with independent
+loss, and a bad one, entered at random, in which all packets are lost.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True, slots=True)
 class LinkModelConfig:
-    """What a link does to packets. The default is a perfect one."""
+    """Properties of one direction of a link. The default is a perfect link."""
 
     rate_bytes_s: int = 0  # B/s on the wire; 0: unlimited
     overhead_bytes: int = 0  # B that the carrier adds to each packet
-    queue_bytes: int = 65536  # B that may wait for a slow wire; a packet that does not fit is dropped
+    queue_bytes: int = 65536  # B that may wait to be sent; a packet that does not fit is dropped
     delay_ns: int = 0  # ns from the last byte sent to arrival
-    jitter_ns: int = 0  # ns; up to so much more, uniform; order is kept
-    loss: float = 0.0  # chance that a packet vanishes
-    burst: float = 0.0  # chance per packet that a burst of losses begins
+    jitter_ns: int = 0  # ns; maximum of an additional uniform delay; order is kept
+    loss: float = 0.0  # probability that a packet is lost
+    burst: float = 0.0  # probability per packet that a burst of losses begins
     burst_packets: float = 8.0  # mean length of a burst
-    duplicate: float = 0.0  # chance that a packet arrives twice
-    reorder: float = 0.0  # chance that a packet is held back, so that later ones overtake it
-    reorder_ns: int = 50_000_000  # ns; the longest that it is held back, uniform
-    turn_ns: int = 0  # ns; half-duplex: both directions take turns of so long. 0: both always
-    turn: int = 0  # whether this direction has the first (0) or the second (1) of two turns
-    outages: tuple[tuple[int, int], ...] = ()  # from, to in ns: what is sent meanwhile is lost
+    duplicate: float = 0.0  # probability that a packet arrives twice
+    reorder: float = 0.0  # probability that a packet is delayed so that later ones overtake it
+    reorder_ns: int = 50_000_000  # ns; maximum of that delay, uniform
+    turn_ns: int = 0  # ns; half-duplex: the directions alternate in turns of this length; 0: full duplex
+    turn: int = 0  # this direction has the first (0) or the second (1) of two turns
+    outages: tuple[tuple[int, int], ...] = ()  # begin, end in ns: packets sent in between are lost
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -46,7 +46,7 @@ class LinkModelConfig:
 
 @dataclass(slots=True)
 class LinkModelStats:
-    """What happened to packets. sent = delivered + lost + overflowed + still under way - duplicated."""
+    """Packet counts. sent = delivered + lost + overflowed + in transit - duplicated."""
 
     sent: int = 0
     lost: int = 0
@@ -57,10 +57,10 @@ class LinkModelStats:
 
 
 class LinkModel:
-    """One direction of a link. Same configuration, seed and calls give the same deliveries. Times must not go back.
+    """One direction of a link. Equal configuration, seed and calls give equal deliveries. Times must not decrease.
 
-    Each packet takes the same number of random draws whatever befalls it, so that a change of one setting leaves the
-    fate of packets under the others as it was.
+    Every packet uses the same number of random draws, so that changing one property does not change the effect of the
+    others.
     """
 
     def __init__(self, config: LinkModelConfig, seed: int) -> None:
@@ -69,14 +69,14 @@ class LinkModel:
         self._random = random.Random(seed)
         self._in_burst = False
         self._wire_free_ns = 0
-        self._waiting: deque[tuple[int, int]] = deque()  # (ns at which it has left, bytes) of what is queued
+        self._waiting: deque[tuple[int, int]] = deque()  # (ns at which it is sent, bytes) of each queued packet
         self._waiting_bytes = 0
         self._last_arrival_ns = 0
         self._order = 0
-        self._air: list[tuple[int, int, bytes]] = []  # heap of (arrival ns, order, packet)
+        self._in_transit: list[tuple[int, int, bytes]] = []  # heap of (arrival ns, order, packet)
 
     def send(self, packet: bytes, now_ns: int) -> bool:
-        """Hand over a packet; False when the queue before the wire is full."""
+        """Send a packet; False if the queue is full."""
         c = self.config
         self.stats.sent += 1
         draw = [self._random.random() for _ in range(7)]
@@ -87,7 +87,7 @@ class LinkModel:
             self.stats.overflowed += 1
             return False
         takes_ns = -(-size * 1_000_000_000 // c.rate_bytes_s) if c.rate_bytes_s else 0
-        self._wire_free_ns = self._through(max(now_ns, self._wire_free_ns), takes_ns)
+        self._wire_free_ns = self._end_of_sending(max(now_ns, self._wire_free_ns), takes_ns)
         self._waiting.append((self._wire_free_ns, size))
         self._waiting_bytes += size
         self.stats.wire_bytes += size
@@ -101,17 +101,17 @@ class LinkModel:
             return True
         arrival_ns = self._wire_free_ns + c.delay_ns + int(draw[2] * c.jitter_ns)
         if draw[3] < c.reorder:
-            self._fly(arrival_ns + int(draw[4] * c.reorder_ns), packet)
+            self._schedule(arrival_ns + int(draw[4] * c.reorder_ns), packet)
         else:
             self._last_arrival_ns = arrival_ns = max(arrival_ns, self._last_arrival_ns)
-            self._fly(arrival_ns, packet)
+            self._schedule(arrival_ns, packet)
         if draw[5] < c.duplicate:
             self.stats.duplicated += 1
-            self._fly(arrival_ns + int(draw[6] * c.reorder_ns), packet)
+            self._schedule(arrival_ns + int(draw[6] * c.reorder_ns), packet)
         return True
 
-    def _through(self, begins_ns: int, takes_ns: int) -> int:
-        """When a transmission that begins at a time is over: it goes on only in this direction's turns."""
+    def _end_of_sending(self, begins_ns: int, takes_ns: int) -> int:
+        """The end of a transmission that begins at begins_ns and runs only in this direction's turns."""
         turn_ns = self.config.turn_ns
         if not turn_ns:
             return begins_ns + takes_ns
@@ -127,39 +127,39 @@ class LinkModel:
             if not takes_ns:
                 return at_ns
 
-    def _fly(self, arrival_ns: int, packet: bytes) -> None:
+    def _schedule(self, arrival_ns: int, packet: bytes) -> None:
         self._order += 1
-        heapq.heappush(self._air, (arrival_ns, self._order, packet))
+        heapq.heappush(self._in_transit, (arrival_ns, self._order, packet))
 
     def deliver(self, now_ns: int) -> list[bytes]:
-        """The packets that have arrived by now and were not delivered yet, in order of arrival."""
+        """The packets that have arrived since the last call, in order of arrival."""
         packets = []
-        while self._air and self._air[0][0] <= now_ns:
-            packets.append(heapq.heappop(self._air)[2])
+        while self._in_transit and self._in_transit[0][0] <= now_ns:
+            packets.append(heapq.heappop(self._in_transit)[2])
         self.stats.delivered += len(packets)
         return packets
 
     def next_ns(self) -> int | None:
-        """When the next packet arrives, or None when nothing is under way."""
-        return self._air[0][0] if self._air else None
+        """Arrival time of the next packet, or None if none is in transit."""
+        return self._in_transit[0][0] if self._in_transit else None
 
 
 class LinkModels:
-    """One direction of a link to each of any number of receivers, each made at its first packet."""
+    """One direction of the links to any number of receivers, each created at its first packet."""
 
     def __init__(self, config: LinkModelConfig, seed: int) -> None:
-        """seed: of the link to receiver 0; each further one has the next."""
+        """seed: of the link to receiver 0; receiver n uses seed + n."""
         self._config = config
         self._seed = seed
         self._links: dict[int, LinkModel] = {}
 
     def send(self, to: int, packets: Iterable[bytes], now_ns: int) -> None:
-        """Packets leave for a receiver."""
+        """Send packets to a receiver."""
         for packet in packets:
             if to not in self._links:
                 self._links[to] = LinkModel(self._config, self._seed + to)
             self._links[to].send(packet, now_ns)
 
     def deliver(self, now_ns: int) -> dict[int, tuple[bytes, ...]]:
-        """What has arrived by now, by receiver; those without a link are left out."""
+        """The packets that have arrived since the last call, by receiver."""
         return {to: tuple(link.deliver(now_ns)) for to, link in sorted(self._links.items())}

@@ -1,4 +1,4 @@
-"""Modelled links between real processes: two UDP ports, and a LinkModel or a flight controller's radio between them."""
+"""Link models between real processes: two UDP ports with a LinkModel or a telemetry radio between them."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import select
 import socket
 import threading
 import time
-from types import TracebackType
 from typing import Self
 
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sim.links.telemetry_radio import RoutingController
+from kiteline_hw.system.closing import Closing
 
 _TICK_S = 0.005  # s that the thread sleeps at most while packets are under way
 _Address = tuple[str, int]
 
 
-class _TwoPorts:
-    """Two UDP ports of this machine, `port_a` and `port_b`, and a thread that serves them."""
+class _TwoPorts(Closing):
+    """Two UDP ports of this machine, `port_a` and `port_b`, and a thread that forwards between them."""
 
     def __init__(self, name: str, far: _Address | None = None) -> None:
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
@@ -32,10 +32,11 @@ class _TwoPorts:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def _busy(self) -> bool:
+        """True if packets are in transit."""
         raise NotImplementedError
 
-    def _pass(self, arrived: tuple[list[bytes], list[bytes]], now_ns: int) -> tuple[list[bytes], list[bytes]]:
-        """What came from a and from b; what goes to b and to a."""
+    def _forward(self, arrived: tuple[list[bytes], list[bytes]], now_ns: int) -> tuple[list[bytes], list[bytes]]:
+        """Process the packets from a and from b; returns those for b and for a."""
         raise NotImplementedError
 
     def _run(self) -> None:
@@ -49,17 +50,17 @@ class _TwoPorts:
                     except OSError:
                         break
                     arrived[i].append(data)
-            to_b, to_a = self._pass(arrived, time.monotonic_ns())
+            to_b, to_a = self._forward(arrived, time.monotonic_ns())
             for i, outgoing in enumerate((to_a, to_b)):
                 peer = self._peers[i]
                 if peer is None:
                     continue
                 for data in outgoing:
-                    with contextlib.suppress(OSError):  # nobody there: that is loss
+                    with contextlib.suppress(OSError):  # no listener: the packet is lost
                         self._sockets[i].sendto(data, peer)
 
     def close(self) -> None:
-        """Cut the link. May be called twice."""
+        """Stop forwarding. May be called twice."""
         self._closed.set()
         if self._thread.is_alive():
             self._thread.join(1.0)
@@ -70,16 +71,11 @@ class _TwoPorts:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 class UdpRelay(_TwoPorts):
-    """Joins two peers that send datagrams to `port_a` and `port_b`; each is known by its first one.
+    """Connects two peers that send datagrams to `port_a` and `port_b`; their addresses are those of their first ones.
 
-    up: what happens on the way from a to b. down: from b to a. far: the address of b, where it waits to be spoken to.
+    up: the link from a to b. down: from b to a. far: the address of b, if b sends nothing by itself.
     """
 
     def __init__(
@@ -91,7 +87,7 @@ class UdpRelay(_TwoPorts):
     def _busy(self) -> bool:
         return any(model.next_ns() is not None for model in self.models)
 
-    def _pass(self, arrived: tuple[list[bytes], list[bytes]], now_ns: int) -> tuple[list[bytes], list[bytes]]:
+    def _forward(self, arrived: tuple[list[bytes], list[bytes]], now_ns: int) -> tuple[list[bytes], list[bytes]]:
         for model, packets in zip(self.models, arrived, strict=True):
             for packet in packets:
                 model.send(packet, now_ns)
@@ -99,7 +95,7 @@ class UdpRelay(_TwoPorts):
 
 
 class UdpController(_TwoPorts):
-    """A modelled flight controller: the companion speaks MAVLink to `port_a`, the ground station to `port_b`."""
+    """A modelled flight controller with the companion at `port_a` and the ground station at `port_b`."""
 
     def __init__(self, controller: RoutingController) -> None:
         super().__init__("udp-controller")
@@ -107,8 +103,8 @@ class UdpController(_TwoPorts):
         self._begin_ns = time.monotonic_ns()
 
     def _busy(self) -> bool:
-        return True  # its own telemetry goes on
+        return True  # it sends telemetry of its own
 
-    def _pass(self, arrived: tuple[list[bytes], list[bytes]], now_ns: int) -> tuple[list[bytes], list[bytes]]:
+    def _forward(self, arrived: tuple[list[bytes], list[bytes]], now_ns: int) -> tuple[list[bytes], list[bytes]]:
         to_a, to_b = self.controller.step(*arrived, now_ns - self._begin_ns)
         return to_b, to_a

@@ -1,4 +1,4 @@
-"""What an inertial unit on the body would measure along a path."""
+"""The samples of an IMU on the body along a path."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import ImuBatch, ImuCalibration
-from kiteline_hw.sim.world.trajectory import GRAVITY, Path, flight_s
+from kiteline_hw.sim.world.path import GRAVITY, Path, flight_s
 
-START_GYRO_BIAS = 0.003  # rad/s, deviation of the bias at switch-on
-START_ACCEL_BIAS = 0.05  # m/s^2, the same
+START_GYRO_BIAS = 0.003  # rad/s, standard deviation of the bias at switch-on
+START_ACCEL_BIAS = 0.05  # m/s^2, likewise
 
 
 def measure(
     path: Path, t_ns: NDArray[np.int64], start_ns: int, calibration: ImuCalibration, seed: int, noise: bool = True
 ) -> ImuBatch:
-    """Samples at the stamps t_ns (n,): angular rate, and acceleration less gravity, with noise and biases that walk.
+    """Samples at t_ns (n,): angular rate and specific force, with white noise and random-walk biases.
 
-    A longer flight with the same seed has the shorter one's samples as its beginning.
+    The samples of a longer flight with the same seed begin with those of a shorter one.
     """
     motion = path.motion(flight_s(t_ns, start_ns))
     force = motion.acceleration + [0.0, 0.0, GRAVITY]

@@ -1,26 +1,18 @@
-"""Lenses: which ray a pixel sees, and where a point falls; cameras like EuRoC's."""
+"""Lens models of the simulated cameras: distortion, projection, pixel rays and vignette."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
+from kiteline_core.geometry.cameras import CameraModel, Lens
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
-_UP_BODY_X = np.array([[0.0149, -0.9999, 0.0041], [0.9996, 0.0150, 0.0257], [-0.0258, 0.0038, 0.9997]])
-_UP_BODY_X_RIGHT = np.array([[0.0126, -0.9998, 0.0182], [0.9996, 0.0130, 0.0252], [-0.0254, 0.0179, 0.9995]])
-_RADTAN = ((-0.2831, 0.0739, 1.9e-4, 1.8e-5), (-0.2839, 0.0746, -1.0e-4, -3.6e-5))
-_EQUIDISTANT = ((-0.0036, 0.0012, -0.0013, 0.0002), (-0.0041, 0.0016, -0.0014, 0.0003))
-
 
 def distort(camera: CameraModel, points: F64) -> F64:
-    """Image plane points (n, 2) (x/z, y/z) after the lens, (n, 2)."""
+    """Distort image plane points (n, 2) (x/z, y/z); returns (n, 2)."""
     x, y = points[:, 0], points[:, 1]
     k = np.zeros(8)
     k[: len(camera.distortion)] = camera.distortion
@@ -45,11 +37,11 @@ def project(camera: CameraModel, points: F64) -> F64:
     return np.asarray(bent * [camera.fx, camera.fy] + [camera.cx, camera.cy])
 
 
-def rays(camera: CameraModel) -> F32:
-    """Unit directions (h+2, w+2, 3) that the pixels see, with a border of one pixel all around.
+def pixel_rays(camera: CameraModel) -> F32:
+    """Unit ray directions (h+2, w+2, 3) of the pixels, with a border of one pixel.
 
-    Radial-tangential lenses are inverted by Gauss-Newton with the numeric Jacobian; equidistant ones by Newton in the
-    angle. Both are iterated to below a thousandth of a pixel.
+    Radial-tangential lenses are inverted by Gauss-Newton with a numeric Jacobian, equidistant ones by Newton on the
+    angle, both to below a thousandth of a pixel.
     """
     v, u = np.mgrid[-1 : camera.height + 1, -1 : camera.width + 1].astype(np.float64)
     target = np.stack([(u.ravel() - camera.cx) / camera.fx, (v.ravel() - camera.cy) / camera.fy], 1)
@@ -81,41 +73,6 @@ def rays(camera: CameraModel) -> F32:
     return np.ascontiguousarray(out.reshape(camera.height + 2, camera.width + 2, 3), np.float32)
 
 
-def fall_off(directions: F32) -> F32:
-    """Vignette (h, w) of the inner pixels: cos^2.2 of the angle to the axis, 1 in the middle."""
+def vignette(directions: F32) -> F32:
+    """Relative brightness (h, w) of the inner pixels: cos^2.2 of the angle to the optical axis."""
     return np.ascontiguousarray(directions[1:-1, 1:-1, 2] ** 2.2, np.float32)
-
-
-def imperfect(rig: CameraRig, rng: np.random.Generator, amount: float) -> CameraRig:
-    """The cameras as they truly are where `rig` is what a good calibration says: off by about a tenth of a pixel."""
-
-    def camera(c: CameraModel) -> CameraModel:
-        e = amount * rng.standard_normal(4 + len(c.distortion))
-        centre = 0.1 * c.width / 752  # px
-        k = tuple(value * (1.0 + 1e-3 * error) for value, error in zip(c.distortion, e[4:], strict=True))
-        fx, fy = c.fx * (1.0 + 2e-4 * e[0]), c.fy * (1.0 + 2e-4 * e[1])
-        return replace(c, fx=fx, fy=fy, cx=c.cx + centre * e[2], cy=c.cy + centre * e[3], distortion=k)
-
-    def turn(t: F64, angle_rad: float, shift_m: float) -> F64:
-        e = amount * rng.standard_normal(6)
-        return t @ se3.exp(np.concatenate([shift_m * e[:3], angle_rad * e[3:]]))
-
-    left, t_b_c = camera(rig.left), turn(rig.T_b_c, 4e-4, 5e-4)
-    if rig.right is None or rig.T_c_r is None:
-        return replace(rig, left=left, T_b_c=t_b_c)
-    return replace(rig, left=left, right=camera(rig.right), T_b_c=t_b_c, T_c_r=turn(rig.T_c_r, 1e-4, 1e-5))
-
-
-def make_rig(
-    lens: Lens = Lens.RADTAN, stereo: bool = True, depth: bool = False, baseline_m: float = 0.11, scale: float = 1.0
-) -> CameraRig:
-    """Cameras like EuRoC's: 752x480, body x up and z forward; `scale` shrinks images and focal lengths for tests."""
-    coefficients = {Lens.RADTAN: _RADTAN, Lens.EQUIDISTANT: _EQUIDISTANT, Lens.NONE: ((), ())}[lens]
-    size = round(752 * scale), round(480 * scale)
-    left = CameraModel(*size, 458.2 * scale, 457.0 * scale, 367.0 * scale, 248.5 * scale, lens, coefficients[0])
-    right = CameraModel(*size, 457.4 * scale, 456.2 * scale, 379.5 * scale, 254.8 * scale, lens, coefficients[1])
-    t_b_c = se3.orthonormalise(se3.from_rt(_UP_BODY_X, np.array([-0.0216, -0.0647, 0.0098])))
-    t_b_r = se3.orthonormalise(se3.from_rt(_UP_BODY_X_RIGHT, np.array([-0.0198, 0.0454, 0.0079])))
-    t_c_r = se3.inverse(t_b_c) @ t_b_r
-    t_c_r[:3, 3] *= baseline_m / np.linalg.norm(t_c_r[:3, 3])
-    return CameraRig(left, right if stereo else None, t_b_c, t_c_r if stereo else None, depth, True)

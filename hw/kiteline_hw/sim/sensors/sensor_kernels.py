@@ -1,4 +1,4 @@
-"""What happens between light and numbers: motion blur, vignette, exposure, shot and read noise, quantisation."""
+"""From radiance to grey values: motion blur, vignette, exposure, shot and read noise, quantisation."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 
-_STILL_PX = 0.7  # a shorter streak blurs less than resampling it would
-_MOST_TAPS = 17
+_MIN_STREAK_PX = 0.7  # resampling would blur more than a shorter streak
+_MAX_TAPS = 17
 
 
 @njit
 def motion_blur(
     radiance: F32, distance: F32, rays: F32, linear: F64, angular: F64, exposure_s: float, out: F32
 ) -> None:
-    """Average each pixel along its streak of one exposure. linear, angular: the camera's twist in its own frame.
+    """Average each pixel along its streak during the exposure. linear, angular: the camera's twist in its own frame.
 
-    A point at distance t along the unit ray d moves by -(v/t + w x d) per second, seen from the camera. The streak
-    lies symmetrically around the middle of the exposure, which is the frame's stamp.
+    A point at distance t along the unit ray d moves by -(v/t + w x d) per second in the camera frame. The streak is
+    centred on the middle of the exposure, which is the frame's stamp.
     """
     height, width = radiance.shape
     for y in range(height):
@@ -42,10 +42,10 @@ def motion_blur(
             u = exposure_s * (fa * bb - fb * ab) / determinant
             v = exposure_s * (fb * aa - fa * ab) / determinant
             length = np.sqrt(u * u + v * v)
-            if not length > _STILL_PX:
+            if not length > _MIN_STREAK_PX:
                 out[y, x] = radiance[y, x]
                 continue
-            taps = min(_MOST_TAPS, int(length * 1.2) + 2)
+            taps = min(_MAX_TAPS, int(length * 1.2) + 2)
             total = 0.0
             for k in range(taps):
                 s = (k + 0.5) / taps - 0.5
@@ -60,16 +60,16 @@ def motion_blur(
 
 
 @njit
-def expose(radiance: F32, fall_off: F32, gain: float, read: float, shot: float, key: np.uint64, out: U8) -> None:
+def expose(radiance: F32, vignette: F32, gain: float, read: float, shot: float, key: np.uint64, out: U8) -> None:
     """Grey values of a radiance image: vignette, gain, then noise of variance read^2 + shot * value, rounded.
 
-    The noise of a pixel depends on `key` and its place alone (splitmix64; the sum of four uniforms is nearly normal),
-    so frames can be made in any order.
+    The noise of a pixel depends only on `key` and its position (splitmix64; the sum of four uniforms is nearly normal),
+    so frames can be rendered in any order.
     """
     height, width = radiance.shape
     for y in range(height):
         for x in range(width):
-            value = radiance[y, x] * fall_off[y, x] * gain
+            value = radiance[y, x] * vignette[y, x] * gain
             z = key + np.uint64(y * width + x + 1) * np.uint64(0x9E3779B97F4A7C15)
             z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
             z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

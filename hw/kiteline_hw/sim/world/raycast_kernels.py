@@ -1,11 +1,11 @@
 """Ray casting of textured solids: yawed boxes, one room shell seen from inside, a height field, and a sky.
 
-Boxes are culled against the pyramid of each screen tile, so a pixel tests only the few boxes its tile can see, nearest
-first. Textures are mip pyramids; a pixel reads the level of its footprint on the surface, with a few probes along the
-long axis of a grazing footprint. Pixels on the outline of a solid are cast again with four sub-pixel rays.
+Boxes are culled against the pyramid of each screen tile, so a pixel tests only the few boxes visible in its tile,
+nearest first. Textures are mip pyramids, read at the level of the pixel's footprint, with several probes along the long
+axis of a grazing footprint. Pixels on the outline of a solid are cast again with four sub-pixel rays.
 
-What is called for every ray is inlined and compiled without reference counting (`_nrt=False`): counting each array
-argument up and down atomically takes longer than the ray.
+Functions called per ray are inlined and compiled without reference counting (`_nrt=False`): counting each array
+argument atomically would take longer than the ray.
 
 Arrays shared by the kernels (see world.py for their meaning):
 boxes (n, 8) float64: centre x y z, half-extent x y z, cos yaw, sin yaw. faces (6 n, 8) float64: texels per metre
@@ -33,7 +33,7 @@ _FACE_LIGHT = (0.86, 0.74, 0.95, 0.80, 0.70, 1.0)  # brightness by outward norma
 
 @njit(cache=True, nogil=True)
 def visible_boxes(boxes: F64, shell: int, o: F64, axis: F64, half_angle: float, near: F64, items: I32) -> int:
-    """Boxes that a cone from `o` (3,) may see, nearest first: indices in `items` (n,), distances in `near` (n,)."""
+    """Boxes that may intersect a cone from `o` (3,), nearest first: indices in `items`, distances in `near` (n,)."""
     count = 0
     for i in range(boxes.shape[0]):
         if i == shell:
@@ -61,7 +61,7 @@ def visible_boxes(boxes: F64, shell: int, o: F64, axis: F64, half_angle: float, 
 
 @njit(cache=True, nogil=True)
 def tile_lists(boxes: F64, items: I32, count: int, o: F64, rot: F64, rays: F32, lists: I32, lengths: I32) -> None:
-    """For each screen tile the positions in `items` whose boxes touch its pyramid, in the same order.
+    """For each screen tile the positions in `items` of the boxes that touch its pyramid, in the same order.
 
     rays (h+2, w+2, 3): unit directions in the camera frame, with a border of one pixel. lists (tiles, >= count).
     """
@@ -146,7 +146,7 @@ def _ground(field: F32, frame: F64, x: float, y: float, channel: int) -> float:
 def ground_hit(field: F32, frame: F64, o: F64, dx: float, dy: float, dz: float, limit: float) -> float:
     """Distance at which a ray meets the height field, or inf beyond `limit`.
 
-    Steps by the largest slope never pass the surface; close to it, secant steps finish.
+    Steps bounded by the largest slope never pass the surface; near it secant steps follow.
     """
     fall = frame[3] * np.sqrt(dx * dx + dy * dy) - dz
     if fall <= 1e-9:
@@ -211,7 +211,7 @@ def _bilinear(atlas: U8, base: int, bits: int, u: float, v: float) -> float:
 def texture_value(atlas: U8, table: NDArray[np.int64], k: int, u: float, v: float, lod: float) -> float:
     """Value, 0..255, of texture k at texel (u, v) of its finest level. table (n, 1 + levels): log2 of side, offsets.
 
-    Blends two mip levels in the middle half between them and takes the nearer one alone elsewhere.
+    Two mip levels are blended in the middle half between them; elsewhere the nearer one is used.
     """
     last = table.shape[1] - 2
     lod = min(max(lod, 0.0), float(last))
@@ -247,7 +247,7 @@ def _surface(
         total += texture_value(atlas, table, k, us, vs, lod)
     value = 1.0 + faces[n, 5] * (total / probes - 128.0) / 128.0
     fine = np.log2(max(along, across) / detail_m)
-    if fine < 3.0:  # texture 0 adds what lies below the texels of the others, until it blurs away
+    if fine < 3.0:  # texture 0 adds detail below the texel size, until it blurs away
         d = texture_value(atlas, table, 0, u / detail_m + faces[n, 3], v / detail_m + faces[n, 2], fine)
         value += 0.10 * min(1.0, 3.0 - fine) * (d - 128.0) / 128.0
     return float(faces[n, 4] * value)

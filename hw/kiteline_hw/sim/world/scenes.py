@@ -1,4 +1,4 @@
-"""Indoor scenes that fit themselves around the paths flown in them."""
+"""Indoor scenes, built around the paths flown in them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from kiteline_hw.sim.world.world import NO_GROUND, Builder, World
 
 F64 = NDArray[np.float64]
 
-CLEARANCE_M = 0.5  # no solid comes nearer to a path
+CLEARANCE_M = 0.5  # smallest distance of a solid from a path
 SCENES = ("room", "hall", "corridor", "street")
 _NO_FIELD = np.zeros(7)
 
 _INDOOR_TEXTURES = ("leaves", "leaves2", "clutter", "posters", "plaster", "concrete", "wood", "brick")
-# name, contrast, brightness, painted upright
+# name, contrast, brightness, whether the texture is kept upright
 _WALLS = (("posters", 0.81, 1.0, True), ("brick", 0.61, 0.8, True), ("plaster", 0.30, 1.15, True),
           ("clutter", 0.74, 0.95, False), ("leaves", 0.68, 0.9, False), ("concrete", 0.54, 0.95, True))  # fmt: skip
-_THINGS = (("leaves", 0.94, 0.9, False), ("leaves2", 0.88, 1.0, False), ("clutter", 0.81, 0.9, False),
+_FURNITURE = (("leaves", 0.94, 0.9, False), ("leaves2", 0.88, 1.0, False), ("clutter", 0.81, 0.9, False),
            ("wood", 0.68, 0.8, False), ("posters", 0.88, 1.05, False), ("concrete", 0.54, 1.0, False),
            ("plaster", 0.34, 1.1, False))  # fmt: skip
 
 
 def build_indoor(scene: str, points: F64, seed: int, bits: int) -> World:
-    """A room, hall or corridor around the paths through points (n, 3), the same for the same arguments."""
+    """A room, hall or corridor around the paths through points (n, 3). Deterministic."""
     rng = np.random.default_rng([seed, 3, *scene.encode()])
     pool = make_pool(_INDOOR_TEXTURES, seed, bits)
     builder = Builder(rng, pool, points, CLEARANCE_M)
@@ -49,22 +49,22 @@ def build_indoor(scene: str, points: F64, seed: int, bits: int) -> World:
     )
     builder.add(centre, half, 0.0, faces, force=True)
     if scene == "corridor":
-        _walls_between(builder, centre, half)
-        _panels(builder, floor)
+        _add_walls(builder, centre, half)
+        _add_panels(builder, floor)
     else:
-        _things(builder, centre, half, scene)
+        _add_furniture(builder, centre, half, scene)
     boxes, all_faces = builder.arrays()
     far = float(2.5 * np.linalg.norm(half))
     return World(boxes, all_faces, 0, NO_GROUND, _NO_FIELD, np.zeros((4, 8)), pool, far, floor)
 
 
-def _thing_faces(builder: Builder) -> F64:
-    kinds = [_THINGS[int(k)] for k in builder.rng.integers(0, len(_THINGS), 2)]
+def _furniture_faces(builder: Builder) -> F64:
+    kinds = [_FURNITURE[int(k)] for k in builder.rng.integers(0, len(_FURNITURE), 2)]
     return np.stack([builder.face(*kinds[int(builder.rng.random() < 0.25)]) for _ in range(6)])
 
 
-def _things(builder: Builder, centre: F64, half: F64, scene: str) -> None:
-    """Crates, shelves, pictures and pillars, mostly along the walls, some within, none on a path."""
+def _add_furniture(builder: Builder, centre: F64, half: F64, scene: str) -> None:
+    """Add crates, shelves, pictures and pillars, most of them along the walls, none on a path."""
     rng = builder.rng
     floor = centre[2] - half[2]
     area = 4 * half[0] * half[1]
@@ -81,27 +81,27 @@ def _things(builder: Builder, centre: F64, half: F64, scene: str) -> None:
         z = floor + size[2]
         if rng.random() < 0.2:
             z += rng.uniform(0.0, 0.6) * 2 * half[2]
-        placed += builder.add(np.array([*xy, z]), size, rng.uniform(0, np.pi), _thing_faces(builder))
-    for _ in range(8 if scene == "room" else 24):  # things that hang on the walls
+        placed += builder.add(np.array([*xy, z]), size, rng.uniform(0, np.pi), _furniture_faces(builder))
+    for _ in range(8 if scene == "room" else 24):  # objects that hang on the walls
         axis, sign = int(rng.integers(0, 2)), float(rng.choice([-1.0, 1.0]))
         size = np.array([rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.5)]) * big
         size[axis] = rng.uniform(0.01, 0.12)
         xy = centre[:2] + rng.uniform(-0.85, 0.85, 2) * half[:2]
         xy[axis] = centre[axis] + sign * (half[axis] - size[axis])
         z = floor + rng.uniform(0.25, 0.85) * 2 * half[2]
-        builder.add(np.array([*xy, z]), size, 0.0, _thing_faces(builder))
+        builder.add(np.array([*xy, z]), size, 0.0, _furniture_faces(builder))
     if scene == "hall":
         for _ in range(12):
             xy = centre[:2] + rng.uniform(-0.8, 0.8, 2) * half[:2]
             width = rng.uniform(0.15, 0.35)
-            builder.add(np.array([*xy, centre[2]]), np.array([width, width, half[2]]), 0.0, _thing_faces(builder))
+            builder.add(np.array([*xy, centre[2]]), np.array([width, width, half[2]]), 0.0, _furniture_faces(builder))
         for y in np.linspace(-0.8, 0.8, 6) * half[1] + centre[1]:  # beams under the ceiling
             at = np.array([centre[0], y, floor + 2 * half[2] - 0.3])
-            builder.add(at, np.array([half[0], 0.12, 0.2]), 0.0, _thing_faces(builder))
+            builder.add(at, np.array([half[0], 0.12, 0.2]), 0.0, _furniture_faces(builder))
 
 
-def _walls_between(builder: Builder, centre: F64, half: F64) -> None:
-    """Fill what is farther than a corridor's width from every path with walls from floor to ceiling."""
+def _add_walls(builder: Builder, centre: F64, half: F64) -> None:
+    """Fill the space farther than a corridor's width from every path with walls from floor to ceiling."""
     cell = 0.5
     columns, rows = (int(v) for v in np.ceil(2 * half[:2] / cell))
     lower = centre[:2] - half[:2]
@@ -111,7 +111,7 @@ def _walls_between(builder: Builder, centre: F64, half: F64) -> None:
     middle = lower + np.stack([x, y], 2) * cell + 0.5 * cell
     for p in flat:
         solid &= np.abs(middle - p).max(2) > 1.5
-    while solid.any():  # greedy rectangles
+    while solid.any():  # cover the solid cells with rectangles, greedily
         j, i = (int(v[0]) for v in np.nonzero(solid))
         i1 = i
         while i1 < columns and solid[j, i1]:
@@ -127,8 +127,8 @@ def _walls_between(builder: Builder, centre: F64, half: F64) -> None:
         builder.add(np.array([*at, centre[2]]), np.array([*size, half[2]]), 0.0, faces)
 
 
-def _panels(builder: Builder, floor: float) -> None:
-    """Doors, boards, cupboards and pipes along the corridor's walls, found by probing sideways from the path."""
+def _add_panels(builder: Builder, floor: float) -> None:
+    """Add doors, boards, cupboards and pipes to the corridor's walls, which are found by probing sideways."""
     rng = builder.rng
     boxes, _ = builder.arrays()
     shell, walls = boxes[0], boxes[1:]
@@ -147,4 +147,4 @@ def _panels(builder: Builder, floor: float) -> None:
         size[axis] = rng.choice([0.02, 0.04, 0.15])
         at = np.array([*p[:2], floor + max(size[2], rng.uniform(0.2, 2.2))])
         at[axis] = probe[int(np.argmax(inside)), axis]
-        builder.add(at, size, 0.0, _thing_faces(builder))
+        builder.add(at, size, 0.0, _furniture_faces(builder))

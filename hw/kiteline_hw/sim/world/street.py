@@ -1,4 +1,4 @@
-"""A street that follows the paths: road on the paths' own height, pavements, houses, parked cars, poles, trees."""
+"""A street along the paths: a road at their height, pavements, houses, parked cars, poles and trees."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from kiteline_hw.sim.world.world import Builder, World, bilinear
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
-CAMERA_HEIGHT_M = 1.65  # of the path above the road
+CAMERA_HEIGHT_M = 1.65  # m of the path above the road
 CLEARANCE_M = 0.6
-CELL_M = 1.0  # of the ground's field
-MARGIN_M = 70.0  # of the field around the paths
+CELL_M = 1.0  # m; cell of the ground's field
+MARGIN_M = 70.0  # m of the field around the paths
 ROAD_M, PAVEMENT_M = 3.8, 6.2  # half-width of the road, far side of the pavement
 FAR_M = 400.0
 
@@ -23,14 +23,14 @@ _TEXTURES = ("facade", "facade2", "facade3", "leaves", "clutter", "posters", "as
 
 
 def build_street(points: F64, seed: int, bits: int) -> World:
-    """A street along the paths through points (n, 3), the same for the same arguments."""
+    """A street along the paths through points (n, 3). Deterministic."""
     rng = np.random.default_rng([seed, 5])
     pool = make_pool(_TEXTURES, seed, bits)
     field, frame = ground_field(points)
     builder = Builder(rng, pool, points, CLEARANCE_M)
     along, sides = _stations(points)
-    _houses(builder, field, frame, along, sides)
-    _furniture(builder, field, frame, along, sides)
+    _add_houses(builder, field, frame, along, sides)
+    _add_furniture(builder, field, frame, along, sides)
     boxes, faces = builder.arrays()
     ground = np.stack(
         [
@@ -47,8 +47,8 @@ def build_street(points: F64, seed: int, bits: int) -> World:
 def ground_field(points: F64) -> tuple[F32, F64]:
     """Height and distance to the path (2, rows, columns), and its frame (7,): x0 y0 cell slope 0 road pavement.
 
-    The height is the paths' own, less CAMERA_HEIGHT_M, spread by normalised convolution at ever finer widths, then
-    lowered wherever a path would come nearer to it than CLEARANCE_M.
+    The height is that of the paths less CAMERA_HEIGHT_M, extended by normalised convolution from coarse to fine widths,
+    then lowered so that no path comes nearer to it than CLEARANCE_M.
     """
     lower = np.floor(points[:, :2].min(0) - MARGIN_M)
     columns, rows = (int(v) for v in np.ceil((points[:, :2].max(0) + MARGIN_M - lower) / CELL_M) + 1)
@@ -73,7 +73,7 @@ def ground_field(points: F64) -> tuple[F32, F64]:
 
 
 def _blur(image: F64, sigma_cells: float) -> F64:
-    """Gaussian blur with plain borders, as one separable convolution in a fixed order of sums."""
+    """Gaussian blur with replicated borders; one separable convolution, so that the order of sums is fixed."""
     radius = int(np.ceil(3 * sigma_cells))
     x = np.arange(-radius, radius + 1)
     kernel = np.exp(-0.5 * (x / sigma_cells) ** 2)
@@ -82,7 +82,7 @@ def _blur(image: F64, sigma_cells: float) -> F64:
 
 
 def _stations(points: F64) -> tuple[F64, F64]:
-    """Places along the path (m, 3), one per half metre, and the unit vectors (m, 2) to its left."""
+    """Points along the path (m, 3), one per half metre, and the unit vectors (m, 2) to its left."""
     step = max(1, round(0.5 / max(1e-6, float(np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))))))
     p = points[::step]
     ahead = np.roll(p, -3, axis=0)[:, :2] - np.roll(p, 3, axis=0)[:, :2]
@@ -92,10 +92,10 @@ def _stations(points: F64) -> tuple[F64, F64]:
     return p[good], np.stack([-ahead[:, 1], ahead[:, 0]], 1)
 
 
-def _stand(
+def _put_on_ground(
     builder: Builder, field: F32, frame: F64, xy: F64, half: F64, yaw: float, faces: F64, lift: float = 0.0
 ) -> bool:
-    """Put a box on the ground, its foot below the lowest of it there."""
+    """Add a box that stands on the ground, its bottom below the lowest ground under it; `lift` m higher if positive."""
     reach = np.hypot(half[0], half[1]) * 0.7
     around = xy + reach * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     height = bilinear(field[0], frame, around)
@@ -105,8 +105,8 @@ def _stand(
     return builder.add(np.array([*xy, 0.5 * (top + bottom)]), size, yaw, faces)
 
 
-def _houses(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) -> None:
-    """Rows of houses on both sides, farther from the paths than the pavement, overlapping none before."""
+def _add_houses(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) -> None:
+    """Add rows of houses on both sides, beyond the pavement and without overlap."""
     rng = builder.rng
     flat = along[:, :2]
     taken = np.zeros((0, 3))
@@ -131,19 +131,19 @@ def _houses(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) ->
             walls = np.tile(wall, (6, 1))
             walls[:, 2] = rng.uniform(0, 2048, 6)
             walls[4:] = builder.face("concrete", 0.5, 0.6, False)
-            _stand(builder, field, frame, xy, half, yaw, walls)
+            _put_on_ground(builder, field, frame, xy, half, yaw, walls)
             taken = np.vstack([taken, [*xy, half[0]]])
             if rng.random() < 0.8:  # a roof storey set back, of another material
                 attic = half * np.array([0.85, 0.7, 0.0]) + np.array([0.0, 0.0, rng.uniform(0.5, 1.4)])
                 roof = np.stack([builder.face("clutter", 0.5, 0.55, False) for _ in range(6)])
-                _stand(builder, field, frame, xy, attic, yaw, roof, lift=2 * half[2])
+                _put_on_ground(builder, field, frame, xy, attic, yaw, roof, lift=2 * half[2])
 
 
-def _furniture(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) -> None:
-    """Cars, poles, trees, hedges, bins and signs beside the road."""
+def _add_furniture(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) -> None:
+    """Add cars, poles, trees, hedges, bins and signs beside the road."""
     rng = builder.rng
 
-    def thing(name: str, contrast: float, brightness: float) -> F64:
+    def faces(name: str, contrast: float, brightness: float) -> F64:
         return np.stack([builder.face(name, contrast, brightness, False) for _ in range(6)])
 
     for sign in (-1.0, 1.0):
@@ -157,32 +157,37 @@ def _furniture(builder: Builder, field: F32, frame: F64, along: F64, sides: F64)
                 xy = at + side * rng.uniform(2.6, 3.1)
                 name = str(rng.choice(["clutter", "leaves", "concrete"]))
                 light = rng.uniform(0.35, 1.2)
-                if _stand(builder, field, frame, xy, half, yaw, thing(name, 0.35, light)):
+                if _put_on_ground(builder, field, frame, xy, half, yaw, faces(name, 0.35, light)):
                     cabin = np.array([0.55 * half[0], 0.9 * half[1], 0.3])
-                    _stand(builder, field, frame, xy, cabin, yaw, thing("facade2", 0.5, 0.5), lift=2 * half[2])
+                    _put_on_ground(builder, field, frame, xy, cabin, yaw, faces("facade2", 0.5, 0.5), lift=2 * half[2])
                 i += int(rng.integers(11, 30))
             elif kind < 0.50:
                 width = rng.uniform(0.06, 0.14)
                 half = np.array([width, width, rng.uniform(1.5, 4.0)])
                 xy = at + side * rng.uniform(4.2, 5.6)
-                if _stand(builder, field, frame, xy, half, yaw, thing("concrete", 0.5, 0.7)) and rng.random() < 0.6:
+                if (
+                    _put_on_ground(builder, field, frame, xy, half, yaw, faces("concrete", 0.5, 0.7))
+                    and rng.random() < 0.6
+                ):
                     board = np.array([0.04, rng.uniform(0.25, 0.6), rng.uniform(0.2, 0.5)])
-                    _stand(builder, field, frame, xy, board, yaw, thing("posters", 0.7, 1.1), lift=2 * half[2])
+                    _put_on_ground(builder, field, frame, xy, board, yaw, faces("posters", 0.7, 1.1), lift=2 * half[2])
                 i += int(rng.integers(8, 24))
             elif kind < 0.80:
                 trunk = np.array([0.15, 0.15, rng.uniform(0.9, 1.6)])
                 xy = at + side * rng.uniform(5.2, 9.0)
-                if _stand(builder, field, frame, xy, trunk, yaw, thing("concrete", 0.7, 0.45)):
+                if _put_on_ground(builder, field, frame, xy, trunk, yaw, faces("concrete", 0.7, 0.45)):
                     for _ in range(4):  # a crown of turned blocks
                         crown = rng.uniform([0.5, 0.5, 0.5], [1.3, 1.3, 1.2])
                         where = xy + rng.normal(0, 0.5, 2)
                         lift = 2 * trunk[2] + rng.uniform(-0.3, 1.2)
-                        _stand(
-                            builder, field, frame, where, crown, rng.uniform(0, 3), thing("foliage", 0.75, 0.6), lift
+                        _put_on_ground(
+                            builder, field, frame, where, crown, rng.uniform(0, 3), faces("foliage", 0.75, 0.6), lift
                         )
                 i += int(rng.integers(8, 26))
             else:
                 half = rng.uniform([0.3, 0.25, 0.4], [2.5, 0.5, 0.8])
                 name = str(rng.choice(["foliage", "posters", "clutter", "leaves"]))
-                _stand(builder, field, frame, at + side * rng.uniform(5.0, 7.0), half, yaw, thing(name, 0.6, 0.8))
+                _put_on_ground(
+                    builder, field, frame, at + side * rng.uniform(5.0, 7.0), half, yaw, faces(name, 0.6, 0.8)
+                )
                 i += int(rng.integers(6, 20))

@@ -1,4 +1,4 @@
-"""Painting of opaque shapes onto a square texture that wraps around."""
+"""Paints opaque shapes onto a square texture that wraps around."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ F32 = NDArray[np.float32]
 def paint(shapes: F32, kinds: NDArray[np.int32], out: F32) -> None:
     """Paint shapes in order, later ones over earlier ones; `out` (n, n), n a power of two, wraps around.
 
-    shapes (m, 9): centre x y, half-sides a b in texels, cos and sin of the turn, value, its gradient along a and b over
+    shapes (m, 9): centre x y, half-sides a b in texels, cos and sin of the rotation, value, its gradient along a and b over
     the shape. kinds: 0 ellipse, 1 rectangle, 2 triangle, 3 ring.
     """
     mask = out.shape[0] - 1

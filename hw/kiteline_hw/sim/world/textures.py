@@ -1,8 +1,8 @@
-"""Textures with the statistics of natural images, made from a seed.
+"""Textures with the statistics of natural images, generated from a seed.
 
-The dead leaves model (A. Lee, D. Mumford, J. Huang, "Occlusion models for natural images", 2001) gives opaque shapes
-with sizes distributed as r^-3 and so a power spectrum near f^-2 with real edges; layers of 1/f noise, planks, stones,
-sheets and windows make the materials. Every texture wraps around, has mean 128 and its own contrast is set where used.
+The dead leaves model (A. Lee, D. Mumford, J. Huang, "Occlusion models for natural images", 2001) paints opaque shapes
+with sizes distributed as r^-3, which gives sharp edges and a power spectrum near f^-2. Materials add 1/f noise, planks,
+bricks, posters and windows. Every texture wraps around and has mean 128; its contrast is set by the face that uses it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 
 TEXEL_M = 0.005  # side of the finest texel of a surface texture
-DETAIL_M = 0.0015  # side of a texel of the detail texture, which all surfaces share at their own offsets
+DETAIL_M = 0.0015  # side of a texel of the detail texture, which all surfaces use at different offsets
 LEVELS = 8
 Rng = np.random.Generator
 
@@ -29,7 +29,7 @@ class TexturePool:
     """Mip pyramids of all textures in one array.
 
     atlas: (bytes,) uint8. table: (textures, 1 + LEVELS) int64: log2 of the side, offset of each level in the atlas.
-    names: which texture is which; texture 0 is the detail texture.
+    names: by texture number; number 0 is the detail texture.
     """
 
     atlas: U8
@@ -49,7 +49,7 @@ class TexturePool:
 
 
 def make_pool(names: tuple[str, ...], seed: int, bits: int = 11) -> TexturePool:
-    """Make the named textures (see MAKERS; a trailing digit, as in `leaves2`, asks for another of the same kind)."""
+    """Generate the named textures of MAKERS; a trailing digit, as in `leaves2`, selects another one of the kind."""
     parts: list[U8] = []
     everything = ("detail", *names)
     table = np.zeros((len(everything), 1 + LEVELS), np.int64)
@@ -57,7 +57,7 @@ def make_pool(names: tuple[str, ...], seed: int, bits: int = 11) -> TexturePool:
     for k, name in enumerate(everything):
         rng = np.random.default_rng([seed, 71, *name.encode()])
         side = 1 << (min(bits, 9) if k == 0 else bits)
-        image = _standard(MAKERS[name.rstrip("0123456789")](rng, side))
+        image = _standardised(MAKERS[name.rstrip("0123456789")](rng, side))
         table[k, 0] = side.bit_length() - 1
         level = image
         for m in range(LEVELS):
@@ -69,13 +69,14 @@ def make_pool(names: tuple[str, ...], seed: int, bits: int = 11) -> TexturePool:
     return TexturePool(np.concatenate(parts), table, everything)
 
 
-def _standard(image: F32) -> F32:
+def _standardised(image: F32) -> F32:
+    """The image with mean 128 and standard deviation 44, clipped to 4..251."""
     image = image - image.mean()
     return np.asarray(np.clip(128.0 + image * (44.0 / max(1e-6, float(image.std()))), 4, 251), np.float32)
 
 
 def pink(rng: Rng, side: int, slope: float = 1.0, stretch: float = 1.0) -> F32:
-    """Noise with amplitude f^-slope, zero mean, unit deviation; `stretch` > 1 draws it out along u. (side, side)."""
+    """Noise with amplitude f^-slope, zero mean, unit deviation (side, side); `stretch` > 1 elongates it along u."""
     small = min(side, 1024)
     fy = np.fft.fftfreq(small)[:, None]
     fx = np.fft.rfftfreq(small)[None, :] * stretch
@@ -92,7 +93,7 @@ def shapes(
     rng: Rng, side: int, cover: float, smallest: float, largest: float, spread: float = 40.0, exponent: float = 3.0,
     tone: float = 0.0,
 ) -> tuple[F32, NDArray[np.int32]]:  # fmt: skip
-    """Random opaque shapes that cover the texture `cover` times; radii from `smallest` to `largest` texels."""
+    """Random shapes for `paint` that cover the texture `cover` times; radii from `smallest` to `largest` texels."""
     power = 1.0 - exponent
 
     def radii(n: int) -> NDArray[np.float64]:
@@ -123,7 +124,7 @@ def leaves(rng: Rng, side: int) -> F32:
 
 
 def clutter(rng: Rng, side: int) -> F32:
-    """A noisy ground with groups of things on it: part busy, part nearly bare."""
+    """A noisy background with groups of objects: densely covered and nearly bare areas."""
     image = 30.0 * pink(rng, side, 1.3)
     paint(*shapes(rng, side, 0.5, 10.0, side * 0.08, 30.0, 2.2), image)
     small, kinds = shapes(rng, side, 0.8, 2.0, 30.0, 45.0)
@@ -134,7 +135,7 @@ def clutter(rng: Rng, side: int) -> F32:
 
 
 def plaster(rng: Rng, side: int) -> F32:
-    """A wall with little to hold on to: stains, hairline cracks, a few marks."""
+    """A wall with little texture: stains, hairline cracks, a few marks."""
     image = 14.0 * pink(rng, side, 1.5) + 4.0 * pink(rng, side, 0.7)
     paint(*_strokes(rng, side, 30, (60.0, 200.0), (0.6, 1.2), -30.0), image)
     paint(*shapes(rng, side, 0.02, 2.0, 40.0, 30.0), image)
@@ -142,7 +143,7 @@ def plaster(rng: Rng, side: int) -> F32:
 
 
 def concrete(rng: Rng, side: int) -> F32:
-    """Stains, pores and the joints of the formwork."""
+    """Stains, pores and formwork joints."""
     image = 22.0 * pink(rng, side, 1.3) + 7.0 * pink(rng, side, 0.5)
     paint(*shapes(rng, side, 0.08, 1.5, 12.0, 35.0, tone=-15.0), image)
     paint(*_strokes(rng, side, 40, (40.0, 300.0), (0.7, 2.0), -40.0), image)
@@ -151,7 +152,7 @@ def concrete(rng: Rng, side: int) -> F32:
 
 
 def wood(rng: Rng, side: int) -> F32:
-    """Boards along u, each with its own tone, grain and knots."""
+    """Boards along u, of different tone, with grain and knots."""
     grain = 10.0 * pink(rng, side, 1.1, 14.0) + 4.0 * pink(rng, side, 0.8, 4.0)
     image = np.zeros((side, side), np.float32)
     y = 0
@@ -175,7 +176,7 @@ def wood(rng: Rng, side: int) -> F32:
 
 
 def brick(rng: Rng, side: int) -> F32:
-    """Courses of stones of unequal height and length in mortar."""
+    """Courses of bricks of unequal height and length in mortar."""
     image = np.full((side, side), 30.0, np.float32)
     rough = 7.0 * pink(rng, side, 0.8) + 9.0 * pink(rng, side, 1.4)
     y = 0
@@ -197,7 +198,7 @@ def brick(rng: Rng, side: int) -> F32:
 
 
 def posters(rng: Rng, side: int) -> F32:
-    """A wall with sheets: pictures, written pages and notices, one over the other."""
+    """A wall with overlapping pictures and printed pages."""
     image = 12.0 * pink(rng, side, 1.4) + 4.0 * pink(rng, side, 0.7)
     picture = leaves(rng, side)
     tone = 25.0 * pink(rng, side, 1.5)
@@ -227,7 +228,7 @@ def posters(rng: Rng, side: int) -> F32:
 
 
 def asphalt(rng: Rng, side: int) -> F32:
-    """Grain, mended patches, cracks, oil."""
+    """Grain, patches, cracks, oil."""
     image = 14.0 * pink(rng, side, 0.6) + 12.0 * pink(rng, side, 1.5)
     paint(*shapes(rng, side, 0.15, 40.0, side * 0.12, 16.0), image)
     paint(*_strokes(rng, side, 120, (30.0, 260.0), (0.8, 2.2), -35.0), image)
@@ -236,14 +237,14 @@ def asphalt(rng: Rng, side: int) -> F32:
 
 
 def foliage(rng: Rng, side: int) -> F32:
-    """Small leaves, dark gaps between them."""
+    """Small leaves with dark gaps between them."""
     image = 25.0 * pink(rng, side, 1.4) - 30.0
     paint(*shapes(rng, side, 2.0, 3.0, 60.0, 34.0, 2.6), image)
     return np.asarray(image + 18.0 * pink(rng, side, 1.4) + 5.0 * pink(rng, side, 0.6), np.float32)
 
 
 def facade(rng: Rng, side: int) -> F32:
-    """A house front: windows of unequal size and curtain in plaster or brick, a door now and then, pipes."""
+    """A house front of plaster or brick: windows of unequal size, and a few doors."""
     image = 0.5 * brick(rng, side) if rng.random() < 0.5 else 0.8 * plaster(rng, side)
     image += 15.0 * pink(rng, side, 1.5)
     storey = side // 4 if side >= 1024 else side // 2
@@ -274,7 +275,7 @@ def clouds(rng: Rng, side: int) -> F32:
 
 
 def detail(rng: Rng, side: int) -> F32:
-    """What is finer than a texel of the others: grain and specks."""
+    """Grain and specks finer than a texel of the other textures."""
     image = 20.0 * pink(rng, side, 0.8)
     paint(*shapes(rng, side, 0.3, 1.5, 12.0, 25.0), image)
     return image
@@ -283,7 +284,7 @@ def detail(rng: Rng, side: int) -> F32:
 def _strokes(
     rng: Rng, side: int, count: int, length: tuple[float, float], width: tuple[float, float], tone: float
 ) -> tuple[F32, NDArray[np.int32]]:
-    """Cracks: chains of thin rectangles whose direction wanders. Counts are for a texture of 2048 texels."""
+    """Cracks: chains of thin rectangles of wandering direction. `count` is are for a texture of 2048 texels."""
     rows = []
     for _ in range(max(1, int(count * (side / 2048) ** 2))):
         x, y = rng.uniform(0, side, 2)

@@ -1,4 +1,4 @@
-"""A world of textured solids, and the truth that can be asked of it."""
+"""A world of textured solids: its arrays, its builder, and its true occupancy grid."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ def box_distances(box: F64, points: F64) -> F64:
 
 
 class Builder:
-    """Collects solids that keep clear of the paths, and gives every face its own piece of texture.
+    """Collects solids that keep a distance from the paths, and assigns a piece of texture to every face.
 
-    path_points (n, 3): points along all paths, not more than 0.1 m apart indoors.
+    path_points (n, 3): points along all paths, at most 0.1 m apart indoors.
     """
 
     def __init__(self, rng: np.random.Generator, pool: TexturePool, path_points: F64, clearance_m: float) -> None:
@@ -85,7 +85,7 @@ class Builder:
         self._faces: list[F64] = []
 
     def face(self, name: str, contrast: float, brightness: float, upright: bool, base_m: float = 0.0) -> F64:
-        """A face (8,): a random piece of a texture; `upright` keeps it as painted, rows rising from base_m below."""
+        """A face (8,) with a random piece of a texture; `upright`: not rotated, its rows start base_m below the centre."""
         rng = self.rng
         stretch = 1.0 / (TEXEL_M * rng.uniform(0.85, 1.2))
         side = 1 << int(self.pool.table[self.pool.index(name), 0])
@@ -100,13 +100,13 @@ class Builder:
         return np.array([scale[0], scale[1], offset[0], offset[1], light, depth, float(self.pool.index(name)), swap])
 
     def clear(self, box: F64) -> bool:
-        """Whether a box keeps its distance from the paths."""
+        """True if a box keeps the distance from the paths."""
         reach = self.clearance_m + float(np.linalg.norm(box[3:6]))
         near = self.points[(np.abs(self.points - box[:3]) < reach).all(1)]
         return len(near) == 0 or float(box_distances(box, near).min()) >= self.clearance_m
 
     def add(self, centre: F64, half: F64, yaw: float, faces: F64, force: bool = False) -> bool:
-        """Add a box with faces (6, 8) unless it comes too near to a path; whether it was added."""
+        """Add a box with faces (6, 8) unless it is too near to a path (and not `force`); True if it was added."""
         box = np.array([*centre, *half, np.cos(yaw), np.sin(yaw)])
         if not force and not self.clear(box):
             return False
@@ -115,7 +115,7 @@ class Builder:
         return True
 
     def arrays(self) -> tuple[F64, F64]:
-        """All boxes (n, 8) and faces (6 n, 8) in order of addition."""
+        """All boxes (n, 8) and faces (6 n, 8), in the order in which they were added."""
         return np.array(self._boxes).reshape(-1, 8), np.array(self._faces).reshape(-1, 8)
 
 
@@ -139,7 +139,8 @@ def occupancy(
     image = np.full((rows, columns), FREE, np.uint8)
     half = 0.5 * resolution_m
 
-    def window(box: F64) -> tuple[slice, slice, F64, F64]:
+    def cells_around(box: F64) -> tuple[slice, slice, F64, F64]:
+        """Rows and columns around a box, and the cells' distances from its centre along its axes."""
         radius = float(np.hypot(box[3], box[4])) + resolution_m
         x0, y0 = np.maximum(((box[:2] - radius - lower) / resolution_m).astype(int), 0)
         x1, y1 = np.maximum(((box[:2] + radius - lower) / resolution_m).astype(int) + 1, 0)
@@ -149,7 +150,7 @@ def occupancy(
         return ys, xs, np.abs(box[6] * dx + box[7] * dy), np.abs(box[6] * dy - box[7] * dx)
 
     if world.shell >= 0:
-        ys, xs, x, y = window(world.boxes[world.shell])
+        ys, xs, x, y = cells_around(world.boxes[world.shell])
         image[:] = UNKNOWN
         sx, sy = extent[3:5]
         image[ys, xs][(x < sx + resolution_m) & (y < sy + resolution_m)] = OCCUPIED
@@ -158,7 +159,7 @@ def occupancy(
         floor = float(world.height(box[None, :2])[0])
         if box[2] + box[5] <= floor + low_m or box[2] - box[5] >= floor + high_m:
             continue
-        ys, xs, x, y = window(box)
+        ys, xs, x, y = cells_around(box)
         spread = half * (abs(box[6]) + abs(box[7]))  # half-width of a square cell along the box's axes
         inside = (x < box[3] + spread) & (y < box[4] + spread)
         view = image[ys, xs]
@@ -167,7 +168,7 @@ def occupancy(
 
 
 def write_occupancy(image: U8, origin: F64, resolution_m: float, file: FilePath) -> None:
-    """Write `file` (.yaml) and the PGM beside it, as map_server reads them."""
+    """Write `file` (.yaml) and the PGM beside it, in the format of ROS's map_server."""
     picture = file.with_suffix(".pgm")
     ok, data = cv2.imencode(".pgm", image)
     assert ok

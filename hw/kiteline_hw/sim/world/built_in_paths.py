@@ -1,4 +1,4 @@
-"""The flights that each scene knows by itself; each is a closed course, repeated as long as asked."""
+"""The built-in path of each scene: a closed course, flown as often as needed."""
 
 from __future__ import annotations
 
@@ -6,44 +6,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.geometry import se3
-from kiteline_hw.sim.world.trajectory import Path, fit
+from kiteline_hw.sim.world.path import Path
+from kiteline_hw.sim.world.path_fit import fit
 
 F64 = NDArray[np.float64]
 
-# T_c axes in a level world: camera forward along +x, right along -y, down along -z.
-_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+# Camera axes (columns) of a level camera that looks along +x: right is -y, down is -z.
+_R_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def built_in(scene: str, seconds: float, camera_in_body: F64, agent: int = 0) -> Path:
-    """The built-in path of a scene for one of several agents, at least `seconds` long. Raises KeyError if unknown."""
+def built_in_path(scene: str, seconds: float, camera_in_body: F64, agent: int = 0) -> Path:
+    """The path of a scene for one of several agents, at least `seconds` long. Raises KeyError for an unknown scene."""
     t = np.arange(0.0, seconds + 2.0, 0.05)
     position, heading = _COURSES[scene](t, agent)
-    bob = 0.05 * np.sin(1.9 * t + agent), 0.07 * np.sin(1.3 * t + 0.5 * agent)  # pitch and roll of a drone, rad
+    sway = 0.05 * np.sin(1.9 * t + agent), 0.07 * np.sin(1.3 * t + 0.5 * agent)  # pitch and roll of a drone, rad
     poses = np.empty((len(t), 4, 4))
     for i in range(len(t)):
         yaw = se3.so3_exp(np.array([0.0, 0.0, heading[i]]))
-        tilt = se3.so3_exp(np.array([bob[1][i], 0.06 + bob[0][i], 0.0]))  # the camera looks a little down
-        poses[i] = se3.from_rt(yaw @ tilt @ _LEVEL, position[i])
+        tilt = se3.so3_exp(np.array([sway[1][i], 0.06 + sway[0][i], 0.0]))  # the camera looks a little down
+        poses[i] = se3.from_rt(yaw @ tilt @ _R_LEVEL, position[i])
     return fit(t, poses @ se3.inverse(camera_in_body), 0.2, 1e-4)
 
 
-def course_length_s(scene: str) -> float:
-    """Seconds after which a built-in course repeats, so that a world built around this much suits any length."""
+def lap_s(scene: str) -> float:
+    """Seconds after which the path repeats: a world built around one lap suits a flight of any length."""
     return {"room": 40.0, "hall": 60.0, "corridor": 70.0, "street": 64.0}[scene]
 
 
-def _wave(t: F64, period: float, agent: int) -> F64:
+def _phase(t: F64, period: float, agent: int) -> F64:
     return np.asarray(2 * np.pi * (t / period + 0.31 * agent))
 
 
 def _room(t: F64, agent: int) -> tuple[F64, F64]:
-    a = _wave(t, 40.0, agent)
+    a = _phase(t, 40.0, agent)
     p = np.stack([1.7 * np.sin(2 * a), 2.3 * np.sin(a + 0.4), 1.4 + 0.35 * np.sin(3 * a + 1.0)], 1)
     return p, a + 0.7 * np.sin(2 * a) + 0.35 * np.sin(5 * a)
 
 
 def _hall(t: F64, agent: int) -> tuple[F64, F64]:
-    a = _wave(t, 60.0, agent)
+    a = _phase(t, 60.0, agent)
     p = np.stack([7.0 * np.sin(a), 5.0 * np.sin(2 * a + 0.3), 2.6 + 1.0 * np.sin(3 * a)], 1)
     return p, a + 0.6 * np.sin(3 * a)
 

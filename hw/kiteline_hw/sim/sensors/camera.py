@@ -1,4 +1,4 @@
-"""One camera's view of the world, from light to grey values."""
+"""A simulated camera: renders the world to grey values and depth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
-from kiteline_hw.sim.sensors import lens
+from kiteline_hw.sim.sensors.lens import pixel_rays, vignette
 from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
 from kiteline_hw.sim.world.raycast_kernels import TILE, render, tile_lists, visible_boxes
 from kiteline_hw.sim.world.textures import DETAIL_M
@@ -19,14 +19,14 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
 
-class Eye:
-    """A camera in a world. `see` may be called from several threads on different eyes, not on the same one."""
+class SimCamera:
+    """A camera in a world. Not thread-safe: its buffers are reused."""
 
     def __init__(self, world: World, camera: CameraModel, T_b_c: F64) -> None:
         self.world = world
         self.T_b_c = T_b_c
-        self._rays = lens.rays(camera)
-        self._fall_off = lens.fall_off(self._rays)
+        self._rays = pixel_rays(camera)
+        self._vignette = vignette(self._rays)
         shape = (camera.height, camera.width)
         inner = self._rays[1:-1, 1:-1].reshape(-1, 3).astype(np.float64)
         axis = inner.mean(0)
@@ -45,8 +45,9 @@ class Eye:
         self._hits = np.empty(shape, np.int32)
 
     def cast(self, T_w_b: F64) -> tuple[F32, F32, I32]:
-        """Radiance, distance in m along the ray (inf for the sky) and hit of every pixel, each (h, w); overwritten by
-        the next call.
+        """Radiance, distance in m along the ray (inf for the sky) and hit of every pixel, each (h, w).
+
+        The arrays are overwritten by the next call.
         """
         w = self.world
         t_w_c = T_w_b @ self.T_b_c
@@ -63,14 +64,14 @@ class Eye:
         return self._radiance, self._distance, self._hits
 
     def depth(self) -> F32:
-        """Depth (h, w) in m along the optical axis of the last cast, 0 where there is sky."""
+        """Depth (h, w) in m along the optical axis of the last cast, 0 for the sky."""
         z = self._distance * self._rays[1:-1, 1:-1, 2]
         return np.where(np.isfinite(z), z, 0.0).astype(np.float32)
 
-    def see(
+    def take_image(
         self, T_w_b: F64, velocity: F64, rate: F64, exposure_s: float, gain: float, noise: tuple[float, float], key: int
     ) -> U8:
-        """The image (h, w) taken around this pose.
+        """The image (h, w) of an exposure centred on this pose.
 
         velocity (3,) in w, rate (3,) in b. noise: read and shot (see `expose`), drawn from `key`.
         """
@@ -80,5 +81,5 @@ class Eye:
         linear = to_camera @ (velocity + T_w_b[:3, :3] @ (se3.skew(rate) @ self.T_b_c[:3, 3]))
         motion_blur(radiance, distance, self._rays, linear, angular, exposure_s, self._streaked)
         out = np.empty(radiance.shape, np.uint8)
-        expose(self._streaked, self._fall_off, gain, noise[0], noise[1], np.uint64(key), out)
+        expose(self._streaked, self._vignette, gain, noise[0], noise[1], np.uint64(key), out)
         return out
