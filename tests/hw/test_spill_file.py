@@ -29,8 +29,9 @@ def test_a_folder_that_takes_no_files_is_no_error(tmp_path: Path) -> None:
     assert spill.put(b"x") is None
     assert spill.failures == 2
     gone = SpillFile(tmp_path)
+    assert gone._file is not None
     os.close(gone._file)
     assert gone.put(b"x") is None
     assert gone.get(0, 1) is None
     assert gone.failures == 2
-    gone._file = -1
+    gone._file = None
