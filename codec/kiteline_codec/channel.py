@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from kiteline_codec.pacing.pacer import Pacer
-from kiteline_codec.pacing.profiles import EXACT, PROFILES, RADIO, Profile
+from kiteline_codec.pacing.profiles import EXACT, PROFILES, Profile
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Record, WireError, messages
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import SyncConfig, SyncStats
 from kiteline_codec.sync.endpoint import Endpoint
+from kiteline_codec.transport.link_traits import LinkTraits
 
 
 class RecordChannel(Protocol):
@@ -219,9 +220,6 @@ def settled(channel: RecordChannel) -> tuple[bool, bool]:
     return True, True
 
 
-# What a link adds to a packet: IPv4 and UDP; frames of a serial line; four pieces in MAVLink's TUNNEL.
-_LINK_BYTES = {"zenoh": 28, "serial": 7, "mavlink": 76}
-_RADIOS = ("serial", "mavlink")
 _SPILLED_BYTES = 2 << 20  # memory for own values: some 140 keyframes, three times a local map
 _SPILLED_INBOX_BYTES = 1 << 20  # memory for the peer's values: some 400 keyframes
 _UNSPILLED_BYTES = 7 << 20  # memory for own values if old ones are lost: five minutes without a link
@@ -232,25 +230,25 @@ def coded_channel(
     budget_bytes: int = 0,
     profile: str = "",
     seal_bytes: int = 0,
-    link: str = "",
+    link: LinkTraits | None = None,
     spill: Spill | None = None,
     bounded: bool = False,
 ) -> CodedChannel:
     """One end of a channel over a link. budget_bytes: on the wire in any second; 0: unlimited. profile: wifi, radio, or
-    "" to choose by the link. seal_bytes: what sealing adds to a packet. link: its name, LINK. bounded: whether values
-    of keyframes may take only so much memory, and then go to `spill`. Raises ValueError.
+    "" to choose by the link. seal_bytes: what sealing adds to a packet. bounded: whether values of keyframes may take
+    only so much memory, and then go to `spill`. Raises ValueError.
     """
-    kind = link.partition(":")[0]
-    if not profile and kind in _RADIOS:
-        profile = RADIO.name
+    if link is not None:
+        profile = profile or link.profile
     if profile and profile not in PROFILES:
         raise ValueError(f"profile {profile!r}: expected {' or '.join(PROFILES)}")
     named = PROFILES.get(profile)
     limit = budget_bytes or None
     shape = named or Pacer(None, limit).profile
+    overhead_bytes = None if link is None else link.overhead_bytes
     config = SyncConfig(
         packet_bytes=shape.packet_bytes,
-        overhead_bytes=_LINK_BYTES.get(kind, shape.overhead_bytes) + seal_bytes,
+        overhead_bytes=seal_bytes + (shape.overhead_bytes if overhead_bytes is None else overhead_bytes),
         budget_bytes=limit,
         heartbeat_ns=shape.heartbeat_ns,
         resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else None,

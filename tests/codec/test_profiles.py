@@ -16,6 +16,7 @@ from kiteline_codec.pacing.throughput import Throughput
 from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations, messages
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_core.imaging import descriptors
+from kiteline_hw.links.kinds import link_traits
 
 KEYFRAME = keyframe_id(submap_id(1, 2, 3), 40)
 SECOND = 1_000_000_000
@@ -106,7 +107,7 @@ def test_a_budget_chooses_the_profile() -> None:
     assert Pacer(None, 100_000).profile is WIFI
     assert Pacer(WIFI, 1000).profile is WIFI
     assert coded_channel(1, 800).profile.name == "radio"
-    assert coded_channel(1, 0, link="serial:/dev/ttyUSB0:57600").profile.name == "radio"
+    assert coded_channel(1, 0, link=link_traits("serial:/dev/ttyUSB0:57600")).profile.name == "radio"
     assert coded_channel(1).profile is WIFI
     with pytest.raises(ValueError, match="wifi or radio"):
         coded_channel(1, profile="pigeon")

@@ -11,6 +11,7 @@ from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import Key, LivePose, NewLandmarks, RefinedLandmarks
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, seal_bytes, suite_for
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
 
 SECOND = 1_000_000_000
@@ -33,8 +34,8 @@ def wire_bytes(link: str, packet: bytes) -> int:
 @pytest.mark.parametrize("budget", [600, 1000, 5000])
 def test_no_second_exceeds_the_budget(link: str, budget: int) -> None:
     draw = random.Random(budget)
-    suite = suite_for(link)
-    ends = [coded_channel(1, budget, "radio", seal_bytes(suite), link) for _ in range(2)]
+    suite = suite_for(link_traits(link))
+    ends = [coded_channel(1, budget, "radio", seal_bytes(suite), link_traits(link)) for _ in range(2)]
     sealers = [Sealer(KEY, 0, 1, d, suite) for d in Direction]
     openers = [Opener({0: KEY}, d) for d in Direction]
     spent: list[deque[tuple[int, int]]] = [deque(), deque()]

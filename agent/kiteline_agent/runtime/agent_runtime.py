@@ -30,6 +30,7 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
@@ -218,4 +219,6 @@ def opened(options: AgentOptions) -> FrameSource:
 
 def channel_with_spill(options: AgentOptions) -> RecordChannel:
     """The channel to the base; beside a log, values that wait while the link is down are moved to a file."""
-    return channel_for(options, SpillFile(Path(options.folder)) if options.log_name else None)
+    return channel_for(
+        options, link_traits(options.link), SpillFile(Path(options.folder)) if options.log_name else None
+    )

@@ -16,6 +16,7 @@ from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_codec.channel import settled
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
 from kiteline_hw.ports import ByteLink, LinkError, PoseSample
@@ -106,7 +107,9 @@ def _sealed(options: AgentOptions, link: ByteLink) -> ByteLink:
             f"{options.key} has no key for agent {options.agent}; `kiteline keys new {options.agent}` makes one"
         )
     key = {options.agent: keys[options.agent]}
-    sealer = Sealer(key[options.agent], options.agent, options.boot + 1, Direction.UP, suite_for(options.link))
+    sealer = Sealer(
+        key[options.agent], options.agent, options.boot + 1, Direction.UP, suite_for(link_traits(options.link))
+    )
     return SealedLink(link, options.agent, sealer, Opener(key, Direction.DOWN))
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
-from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.sync.archive import Spill
+from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 
@@ -69,15 +70,20 @@ def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
 
 
-def channel_for(spec: AgentOptions, spill: Spill | None = None) -> RecordChannel:
+def channel_for(spec: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
     """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1.
 
     spill: keeps what would take too much memory while the link is down.
     """
     if spec.link == "none":
         return NoBaseChannel()
-    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
-    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, spec.link, spill, bounded=True)
+    return coded_channel_for(spec, link, spill)
+
+
+def coded_channel_for(spec: AgentOptions, link: LinkTraits, spill: Spill | None) -> CodedChannel:
+    """The agent's end of the codec."""
+    sealed = seal_bytes(suite_for(link)) if spec.key else 0
+    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, link, spill, bounded=True)
 
 
 def parser(forms: str = "") -> argparse.ArgumentParser:

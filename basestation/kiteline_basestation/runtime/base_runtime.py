@@ -30,6 +30,7 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import RecordChannel, settled
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
@@ -103,7 +104,9 @@ class BaseRuntime:
         """
         self.keeper = Keeper(Path(self.options.store)) if self.options.store else None
         stored = saved = SavedMap() if self.keeper is None else self.keeper.load()
-        maps, self._imports = read_imports(self.options.imports, lambda data: station_of(data, load_vocabulary()))
+        maps, self._imports = read_imports(
+            self.options.imports, lambda data: station_of(data, load_vocabulary(), link_traits)
+        )
         for other in maps:
             saved = combine(saved, other)
         restored = None

@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +21,7 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
+from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
@@ -37,12 +38,14 @@ def metadata_of(spec: BaseOptions, config: BaseConfig, plain_channels: bool) -> 
     return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
 
 
-def station_of(metadata: Mapping[str, str], words: Vocabulary | None) -> Station:
-    """A station as the one of a base's log was."""
+def station_of(
+    metadata: Mapping[str, str], words: Vocabulary | None, link_traits: Callable[[str], LinkTraits]
+) -> Station:
+    """A station as the one of a base's log was. link_traits: of a kind of link."""
     config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
     logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseOptions.__dataclass_fields__}
     spec = configuration.from_json(BaseOptions, json.dumps({"folder": "", **logged}))
-    return Station(config, coded_channels(replace(spec, link=spec.link + ":")), words)
+    return Station(config, coded_channels(spec, link_traits(spec.link)), words)
 
 
 class StepLog(Protocol):

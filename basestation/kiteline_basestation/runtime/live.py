@@ -16,6 +16,7 @@ from kiteline_basestation.runtime.worker import Worker
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core.ids import AgentId
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedHub
 from kiteline_hw.links.zenoh_link import ZenohHub
@@ -43,7 +44,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         hub = _sealed(options, link) if options.key else link
         worker = Worker()
         stack.callback(worker.close)
-        base = BaseRuntime(options, coded_channels(options), worker)
+        base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), worker)
         stack.callback(base.close)
         report_restored(base.restore_maps(clock.now_ns()), parent)
         queries = _open_queries(options, link, stack)
@@ -92,7 +93,11 @@ def _sealed(options: BaseOptions, hub: LinkHub) -> LinkHub:
 
     def sealer(agent: int) -> Sealer | None:
         key = keys.get(agent)
-        return None if key is None else Sealer(key, agent, options.session, Direction.DOWN, suite_for(options.link))
+        return (
+            None
+            if key is None
+            else Sealer(key, agent, options.session, Direction.DOWN, suite_for(link_traits(options.link)))
+        )
 
     return SealedHub(hub, sealer, Opener(keys, Direction.UP))
 

@@ -9,6 +9,7 @@ import threading
 
 from kiteline_basestation.runtime.base_runtime import BaseRuntime, report_restored
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
 from kiteline_hw.ports import LinkError
@@ -21,7 +22,7 @@ _COLLECT_S = 120.0  # s that an agent may take for one tick before it counts as 
 def fly_lockstep(options: BaseOptions, parent: process.Parent) -> None:
     """Serve the barrier until the flight ends. An agent whose process ends is left out."""
     return_large_arrays()
-    base = BaseRuntime(options, coded_channels(options))
+    base = BaseRuntime(options, coded_channels(options, link_traits(options.link)))
     report_restored(base.restore_maps(0), parent)
     server = LockstepServer(options.link.removeprefix("lockstep:"))
     try:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
@@ -81,7 +82,7 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
     )  # fmt: skip
 
 
-def coded_channels(spec: BaseOptions) -> Callable[[AgentId], RecordChannel]:
+def coded_channels(spec: BaseOptions, link: LinkTraits) -> Callable[[AgentId], RecordChannel]:
     """Opens our end of the codec to an agent."""
-    sealed = seal_bytes(suite_for(spec.link)) if spec.key else 0
-    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, spec.link)
+    sealed = seal_bytes(suite_for(link)) if spec.key else 0
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link)

@@ -1,8 +1,7 @@
 """Packets on a raw byte stream, such as a serial cable: COBS between zero bytes, with a checksum.
 
 Source: S. Cheshire, M. Baker, "Consistent overhead byte stuffing", 1999. A frame is COBS(packet, CRC-32 of packet
-little endian) and a zero byte. A reader that starts in the middle or meets garbage is in step again after the next
-zero.
+little endian) and a zero byte. After garbage a reader is synchronised again at the next zero.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ def framed_bytes(packet_bytes: int) -> int:
 
 
 class Deframer:
-    """Finds packets in bytes fed in pieces of any size. Memory is bounded by the longest packet allowed."""
+    """Finds packets in a byte stream fed in pieces of any size. Memory is bounded by the longest packet allowed."""
 
     def __init__(self, max_packet_bytes: int = 1 << 16) -> None:
         self.damaged = 0  # frames that were no packet

@@ -1,8 +1,8 @@
-"""Seals packets, so that only holders of an agent's key can write them, and none is taken twice. See SPEC.md, "Seals".
+"""Seals packets: only holders of an agent's key can write them, and replayed ones are refused. See SPEC.md, "Seals".
 
-On IP links packets are encrypted (ChaCha20-Poly1305, RFC 8439); on a radio, where bytes are dear, they are readable but
-carry a keyed BLAKE2s tag of 8 bytes (RFC 7693). The nonce is (direction, agent, boot, counter): boots are counted by
-their owner and never reused, so no nonce is, not even after a crash.
+On IP links packets are encrypted (ChaCha20-Poly1305, RFC 8439); on thin links they are readable but carry a keyed
+BLAKE2s tag of 8 bytes (RFC 7693). The nonce is (direction, agent, boot, counter). Each writer counts its boots and
+never uses one again, so no nonce is used twice, not even after a crash.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from enum import IntEnum
 from hashlib import blake2b, blake2s
 from typing import TYPE_CHECKING
 
-from kiteline_codec.coding.packing import Reader, Writer
-from kiteline_codec.schema import WireError
+from kiteline_codec.coding.packing import Reader, WireError, Writer
+from kiteline_codec.transport.link_traits import LinkTraits
+from kiteline_codec.transport.sequence_window import SequenceWindow
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 KEY_BYTES = 32
-WINDOW_PACKETS = 1024  # packets behind the newest that may still come: more than any link reorders
+WINDOW_PACKETS = 1024  # a packet further behind the newest one is refused; no link reorders so much
 _MAX_AGENT = 63
 _MAX_BOOT = (1 << 35) - 1
 _MAX_COUNTER = (1 << 48) - 1
@@ -45,23 +46,23 @@ _TAG_BYTES = {Suite.ENCRYPTED: 16, Suite.TAGGED: 8}
 
 
 def seal_bytes(suite: Suite) -> int:
-    """What sealing adds to a packet at most, below 2 million boots and 34 thousand million packets each."""
+    """Bytes that sealing adds to a packet at most, below 2 million boots and 34 thousand million packets each."""
     return 1 + 3 + 5 + _TAG_BYTES[suite]
 
 
-def suite_for(link: str) -> Suite:
-    """How packets of a link are sealed, by the link's name: radios have few bytes to spare."""
-    return Suite.TAGGED if link.startswith(("serial:", "mavlink:")) else Suite.ENCRYPTED
+def suite_for(link: LinkTraits) -> Suite:
+    """The suite of a link: thin links have few bytes to spare."""
+    return Suite.TAGGED if link.thin else Suite.ENCRYPTED
 
 
 def fingerprint(key: bytes) -> str:
-    """Tells keys apart without giving them away."""
+    """A short text that identifies a key and does not reveal it."""
     digest = blake2b(key, digest_size=8, person=b"kiteline-print").hexdigest()
     return "-".join(digest[i : i + 4] for i in range(0, 16, 4))
 
 
 def _derived(key: bytes, suite: Suite, direction: Direction) -> bytes:
-    """One key for each use, so that no two uses can be played off against each other."""
+    """The key of one suite and direction, so that a packet of one use is not valid in another."""
     if len(key) != KEY_BYTES:
         raise ValueError(f"a key has {KEY_BYTES} bytes, found {len(key)}")
     return blake2b(bytes((suite, direction)), key=key, digest_size=32, person=b"kiteline-seal").digest()
@@ -76,7 +77,7 @@ def _tag(key: bytes, data: bytes) -> bytes:
 
 
 def _cipher(key: bytes) -> ChaCha20Poly1305:
-    """The library is loaded when it is needed: it takes 6 MiB."""
+    """The cipher; its library, which takes 6 MiB, is loaded only when needed."""
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
     return ChaCha20Poly1305(key)
@@ -86,7 +87,7 @@ class Sealer:
     """Seals the packets of one start of one writer."""
 
     def __init__(self, key: bytes, agent: int, boot: int, direction: Direction, suite: Suite) -> None:
-        """boot: counts the starts of this writer, never given twice. Raises ValueError."""
+        """boot: number of this start of the writer, never used again. Raises ValueError."""
         if not (0 <= agent <= _MAX_AGENT and 0 <= boot <= _MAX_BOOT):
             raise ValueError(f"agent {agent} is 0..{_MAX_AGENT} and boot {boot} is 0..{_MAX_BOOT}")
         self._first = suite << 7 | direction << 6 | agent
@@ -96,7 +97,7 @@ class Sealer:
         self._counter = 0
 
     def seal(self, packet: bytes) -> bytes:
-        """The sealed packet. Raises OverflowError after 2^48 packets: start anew."""
+        """The sealed packet. Raises OverflowError after 2^48 packets."""
         self._counter += 1
         if self._counter > _MAX_COUNTER:
             raise OverflowError("no nonces left in this boot")
@@ -113,13 +114,13 @@ class Sealer:
 
 @dataclass(slots=True)
 class SealCounters:
-    """What came. Only `opened` went on."""
+    """Packets received. Only `opened` ones were passed on."""
 
     opened: int = 0
     truncated: int = 0  # too short, or no sealed packet at all
     unknown: int = 0  # of an agent without a key here, or of the wrong direction
-    forged: int = 0  # the seal does not hold
-    replayed: int = 0  # seen before, or too old to tell
+    forged: int = 0  # the seal is wrong
+    replayed: int = 0  # received before, or too old to tell
     by_agent: dict[int, int] = field(default_factory=dict)  # refused packets that named an agent
 
     @property
@@ -129,45 +130,37 @@ class SealCounters:
 
 
 @dataclass(slots=True)
-class _Window:
-    boot: int  # the newest heard; at first the one below the oldest that is let in
-    newest: int = _MAX_COUNTER + WINDOW_PACKETS
-    seen: int = 0  # bit i: newest - i has come
-    heard: bool = False
+class _Writer:
+    """What was received of one writer. packets: of its newest boot; None: no packet of `boot` or below is accepted."""
+
+    boot: int
+    packets: SequenceWindow | None = None
 
     def is_new(self, boot: int, counter: int) -> bool:
         if boot != self.boot:
             return boot > self.boot
-        behind = self.newest - counter
-        return behind < 0 or (behind < WINDOW_PACKETS and not self.seen >> behind & 1)
+        return self.packets is not None and self.packets.is_new(counter)
 
     def mark(self, boot: int, counter: int) -> None:
-        self.heard = True
-        if boot != self.boot:
-            self.boot, self.newest, self.seen = boot, counter, 1
-            return
-        ahead = counter - self.newest
-        if ahead > 0:
-            self.seen = (self.seen << ahead | 1) & (1 << WINDOW_PACKETS) - 1 if ahead < WINDOW_PACKETS else 1
-            self.newest = counter
-        else:
-            self.seen |= 1 << -ahead
+        if self.packets is None or boot != self.boot:
+            self.boot, self.packets = boot, SequenceWindow(WINDOW_PACKETS - 1)
+        self.packets.mark(counter)
 
 
 class Opener:
-    """Opens the packets of any number of writers in one direction. What is not sound and new is counted and ignored."""
+    """Opens packets of any number of writers in one direction. Packets that are not genuine and new are counted."""
 
     def __init__(self, keys: Mapping[int, bytes], direction: Direction, boots: Mapping[int, int] | None = None) -> None:
-        """keys: by agent. boots: below which packets of an agent's link are refused, as known from an earlier start."""
+        """keys: by agent. boots: by agent, from an earlier start of this process; packets of lower ones are refused."""
         self.counters = SealCounters()
         self._direction = direction
         self._keys = {(a, s): _derived(key, s, direction) for a, key in keys.items() for s in Suite}
-        self._windows = {a: _Window((boots or {}).get(a, 0) - 1) for a in keys}
+        self._writers = {a: _Writer((boots or {}).get(a, 0) - 1) for a in keys}
 
     @property
     def boots(self) -> dict[int, int]:
-        """The newest boot heard, by agent."""
-        return {a: w.boot for a, w in self._windows.items() if w.heard}
+        """The newest boot received, by agent."""
+        return {a: w.boot for a, w in self._writers.items() if w.packets is not None}
 
     def open(self, sealed: bytes) -> tuple[int, bytes] | None:
         """The agent and the packet, or None. Never raises."""
@@ -186,21 +179,21 @@ class Opener:
         if key is None or direction != self._direction:
             self._refuse("unknown", agent)
             return None
-        window = self._windows[agent]
-        if not window.is_new(boot, counter):
+        writer = self._writers[agent]
+        if not writer.is_new(boot, counter):
             self._refuse("replayed", agent)
             return None
-        packet = self._sound(key, suite, sealed[:body_at], sealed[body_at:], _nonce(first, boot, counter))
+        packet = self._opened(key, suite, sealed[:body_at], sealed[body_at:], _nonce(first, boot, counter))
         if packet is None:
             self._refuse("forged", agent)
             return None
-        window.mark(boot, counter)
+        writer.mark(boot, counter)
         self.counters.opened += 1
         return agent, packet
 
     @staticmethod
-    def _sound(key: bytes, suite: Suite, head: bytes, body: bytes, nonce: bytes) -> bytes | None:
-        """The packet, None where the seal does not hold."""
+    def _opened(key: bytes, suite: Suite, head: bytes, body: bytes, nonce: bytes) -> bytes | None:
+        """The packet, None if the seal is wrong."""
         if suite == Suite.TAGGED:
             packet = body[: -_TAG_BYTES[suite]]
             sound = hmac.compare_digest(_tag(key, head + packet), body[-_TAG_BYTES[suite] :])

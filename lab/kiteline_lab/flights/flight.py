@@ -18,7 +18,7 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.base_runtime import BaseRuntime
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
-from kiteline_hw.links.kinds import is_link, link_forms
+from kiteline_hw.links.kinds import is_link, link_forms, link_traits
 from kiteline_hw.lockstep.messages import Down, Phase
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import FrameSource, LinkError
@@ -92,7 +92,7 @@ def fly_here(flight: Flight, sources: Sequence[FrameSource], mode: str) -> Outco
         if flight.base is None:
             _fly_alone(onboards, progress)
         else:
-            open_channel = theirs.__getitem__ if theirs else coded_channels(flight.base)
+            open_channel = theirs.__getitem__ if theirs else coded_channels(flight.base, link_traits(flight.base.link))
             base = BaseRuntime(flight.base, open_channel, plain=bool(theirs))
             stack.callback(base.close)
             _fly_joined(onboards, base, progress)

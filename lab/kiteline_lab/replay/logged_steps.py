@@ -6,7 +6,7 @@ import json
 import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,13 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime import flight_log
-from kiteline_agent.runtime.options import AgentOptions, channel_for
+from kiteline_agent.runtime.options import AgentOptions, coded_channel_for
 from kiteline_agent.step import Identity, StepInput
 from kiteline_codec.channel import RecordChannel
 from kiteline_core import config as configuration
 from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import AgentId
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader, read_frame
 from kiteline_hw.logs.mcap_repair import REPAIRED
 from kiteline_hw.logs.rig_json import rig_from_json
@@ -89,7 +90,7 @@ def agent_of_log(log: LogReader) -> Agent:
     channel: RecordChannel = NoBaseChannel()
     if log.metadata.get("channel") == "CodedChannel":
         spill = SpillFile(Path(tempfile.gettempdir())) if options.log_name else None
-        channel = channel_for(replace(options, link=options.link + ":"), spill)
+        channel = coded_channel_for(options, link_traits(options.link), spill)
     config = configuration.apply(AgentConfig(), tomllib.loads(log.metadata["config"]))
     return Agent(rig, imu, config, Identity(AgentId(options.agent), options.boot), channel, shipped_vocabulary())
 

@@ -23,6 +23,7 @@ from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import unpack
 from kiteline_core.ids import AgentId
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.logs.mcap_repair import REPAIRED
 from kiteline_lab.flights.progress import Progress
@@ -96,7 +97,7 @@ def replay_base(
 ) -> ReplayResult:
     """Run a base again. watch: called after each step. Raises SourceError for a log that cannot be replayed."""
     check_replayable(log, "base")
-    station = base_log.station_of(log.metadata, load_vocabulary())
+    station = base_log.station_of(log.metadata, load_vocabulary(), link_traits)
     start_ns = int(json.loads(log.metadata["spec"])["start_ns"])
     jobs: dict[int, Job] = {}
     out = ReplayResult(station=station)
