@@ -218,8 +218,8 @@ class Mapper:
         self.counts.triangulated += triangulation.triangulate_landmarks(
             self.map, keyframe, config.triangulation, config.measurement, publisher
         )
-        self.counts.culled += culling.cull_weak(self.map, keyframe, config.cull, publisher)
-        culled = culling.cull_redundant(self.map, keyframe, config.cull, publisher)
+        self.counts.culled += culling.cull_weak_landmarks(self.map, keyframe, config.cull, publisher)
+        culled = culling.cull_redundant_keyframes(self.map, keyframe, config.cull, publisher)
         self.counts.keyframes_culled += len(culled)
         self._local_bundles.add(keyframe)
         self._grid.add_keyframe()

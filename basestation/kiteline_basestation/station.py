@@ -40,7 +40,7 @@ class Station:
         self, config: BaseConfig, open_channel: Callable[[AgentId], RecordChannel], vocabulary: Vocabulary | None = None
     ) -> None:  # fmt: skip
         self.mapper = Mapper(config, vocabulary)
-        self.supply = MapCachePlanner(config.map_cache, config.loops, self.mapper.map)
+        self.map_cache_planner = MapCachePlanner(config.map_cache, config.loops, self.mapper.map)
         self.channels: dict[AgentId, RecordChannel] = {}
         self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
         self.unreadable = 0  # imported values whose code is no valid record
@@ -88,7 +88,7 @@ class Station:
             if self.changed is not None:
                 self.changed[agent, True, key] = None
         for agent, channel in sorted(self.channels.items()):
-            self.supply.serve(agent, self.mapper.live(agent), channel, now_ns)
+            self.map_cache_planner.update(agent, self.mapper.live(agent), channel, now_ns)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))
         return StationOutput(sent, output.jobs, output.answers)
 

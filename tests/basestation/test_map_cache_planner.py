@@ -46,7 +46,7 @@ class Base:
             intake.take(flight.agent, (CameraIntrinsics(flight.agent, flight.camera), *flight.all_records()), 0)
         self.agent = flights[0].agent
         config = replace(MapCacheConfig(), **supply)
-        self.supply = MapCachePlanner(config, replace(BaseConfig().loops, share=share), self.map)
+        self.map_cache_planner = MapCachePlanner(config, replace(BaseConfig().loops, share=share), self.map)
         self.here, self.there = plain_pair()
         self.heard: list[Record] = []
         self.taken_back: list[Key] = []
@@ -57,10 +57,10 @@ class Base:
         for _ in range(turns):
             self.now_ns += SECOND_NS
             live = LivePose(self.agent, self.now_ns, keyframe, np.eye(4), 100)
-            self.supply.serve(self.agent, live, self.here, self.now_ns)
+            self.map_cache_planner.update(self.agent, live, self.here, self.now_ns)
             self.heard += self.there.receive((), 0)
             self.taken_back += self.there.take_removed()
-        return self.supply.lent(self.agent)
+        return self.map_cache_planner.cached(self.agent)
 
 
 def test_own_keyframes_come_back_where_they_are_seen_again(make_flight: MakeFlight) -> None:
@@ -149,12 +149,12 @@ def test_a_thin_link_gets_the_best_of_few(make_flight: MakeFlight) -> None:
     base = Base(flight, local_keyframes=10)
     base.here.profile = RADIO  # type: ignore[misc]
     base.serve(flight.keyframes[-1])
-    for keyframe in base.supply.lent(flight.agent):
+    for keyframe in base.map_cache_planner.cached(flight.agent):
         parts = [r for r in base.heard if isinstance(r, CachedLandmarks) and r.keyframe == keyframe]
         assert 0 < sum(len(p.index) for p in parts) <= RADIO.cached_landmarks
-    assert len(base.supply.lent(flight.agent)) == 1
+    assert len(base.map_cache_planner.cached(flight.agent)) == 1
     base.here.arrived = lambda key: False  # type: ignore[method-assign]
-    first = base.supply.lent(flight.agent)
+    first = base.map_cache_planner.cached(flight.agent)
     assert base.serve(flight.keyframes[-1], turns=3) == first, "one is on its way"
     later = base.serve(flight.keyframes[35], turns=2)  # the other side of the room
     assert not set(later) & set(first), "what is no longer wanted is not sent"

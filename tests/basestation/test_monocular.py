@@ -201,10 +201,10 @@ def test_what_one_eye_is_lent_is_said_in_its_unit(make_flight: MakeFlight, words
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [pair, eye])
     base, reader = plain_pair()
-    supply = MapCachePlanner(
+    planner = MapCachePlanner(
         replace(BaseConfig().map_cache, min_cosine=-1.0, max_distance_ratio=9.0), BaseConfig().loops, mapper.map
     )
-    supply.serve(eye.agent, LivePose(eye.agent, 10**9, eye.keyframes[-1], np.eye(4), 90), base, 10**9)
+    planner.update(eye.agent, LivePose(eye.agent, 10**9, eye.keyframes[-1], np.eye(4), 90), base, 10**9)
     records = reader.receive((), 0)
     copies = {r.keyframe: r for r in records if isinstance(r, CachedKeyframe)}
     assert any(k in pair.keyframes for k in copies)

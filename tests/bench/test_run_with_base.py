@@ -34,14 +34,14 @@ def test_a_new_boot_is_sent_the_old_boots_map_and_is_merged_with_it(data_dir: Pa
     assert world.placed_s(1) < 3.0
     assert world.live_m(1) < 0.03
     assert second.cached_keyframes > 0
-    own = flight.station.supply.lent(AgentId(0))
+    own = flight.station.map_cache_planner.cached(AgentId(0))
     assert {k >> 32 for k in own} >= {first.found[0].submap >> 12}
     assert first.bytes_up > 0 and second.bytes_down > 0
 
 
 def test_nothing_is_sent_where_the_cache_may_hold_nothing(data_dir: Path) -> None:
     flight = flown(data_dir, max_keyframes=0)
-    assert not flight.station.supply.lent(AgentId(0))
+    assert not flight.station.map_cache_planner.cached(AgentId(0))
     assert flight.agents[1].cached_keyframes == 0
 
 

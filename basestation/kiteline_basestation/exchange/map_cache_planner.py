@@ -1,7 +1,8 @@
-"""Keeps each agent supplied with the part of the map that it is about to need: copies of keyframes that it lacks.
+"""Plans each agent's map cache: which keyframes that it lacks it will need soon.
 
-Which ones: those whose points stand in view from where the agent is, or will be soon, of its own map and of all that
-it shares with. They are said in the submap in which the agent flies, and taken back when others are of more use.
+Candidates are keyframes of its map, of agents that share with it, whose landmarks are in view from the agent's pose
+now or after a short prediction. They are sent in the frame of the submap that the agent is in, and removed again when
+others are needed more.
 """
 
 from __future__ import annotations
@@ -26,93 +27,100 @@ I64 = NDArray[np.int64]
 
 
 @dataclass(slots=True)
-class _Lent:
-    """A keyframe that an agent holds a copy of: where it was last said to be, the keys under which it went, and how
-    many of the reader's units of length were one of its own.
-    """
+class _Cached:
+    """A keyframe in an agent's cache. scale: its unit of length in units of the submap for which it was sent."""
 
-    copy: CachedKeyframe
+    record: CachedKeyframe
     keys: list[Key]
-    length: float
+    scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Fix:
+    """Where an agent was at its last plan. position: (3,) in w."""
+
+    t_ns: int
+    submap: SubmapId
+    position: F64
 
 
 @dataclass(slots=True)
-class _Reader:
-    """What is remembered of an agent."""
+class _AgentCache:
+    """State of one agent's cache."""
 
-    due_ns: int = 0
-    seen_ns: int = -1  # stamp of the pose from which the last motion was taken
-    submap: int = -1  # in which it flew then
-    at: F64 = field(default_factory=lambda: np.zeros(3))
-    velocity: F64 = field(default_factory=lambda: np.zeros(3))  # m/s in w
-    lent: dict[KeyframeId, _Lent] = field(default_factory=dict)
+    due_ns: int = 0  # time of the next plan
+    last: _Fix | None = None
+    cached: dict[KeyframeId, _Cached] = field(default_factory=dict)  # in order of sending
 
 
 class MapCachePlanner:
-    """The windows of all agents."""
+    """The map caches of all agents."""
 
     def __init__(self, config: MapCacheConfig, loops: LoopConfig, sparse_map: SparseMap) -> None:
         self._config = config
         self._map = sparse_map
         self._sharing = SharingPolicy(loops.share)
-        self._readers: dict[AgentId, _Reader] = {}
+        self._caches: dict[AgentId, _AgentCache] = {}
 
-    def lent(self, agent: AgentId) -> list[KeyframeId]:
-        """The keyframes of which an agent holds copies, in order of lending."""
-        return list(self._readers[agent].lent) if agent in self._readers else []
+    def cached(self, agent: AgentId) -> list[KeyframeId]:
+        """The keyframes in an agent's cache, in order of sending."""
+        return list(self._caches[agent].cached) if agent in self._caches else []
 
-    def serve(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
-        """Now and then, see what an agent at `live` is about to need, and share it over its channel."""
-        reader = self._readers.setdefault(agent, _Reader())
-        if not self._config.max_keyframes or live is None or now_ns < reader.due_ns:
+    def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
+        """Plan the cache of an agent at `live` once a period, and send the changes over its channel."""
+        cache = self._caches.setdefault(agent, _AgentCache())
+        if not self._config.max_keyframes or live is None or now_ns < cache.due_ns:
             return
-        here = self._map.world_pose(live.keyframe)
-        if here is None or agent not in self._map.cameras:
+        T_w_k = self._map.world_pose(live.keyframe)
+        if T_w_k is None or agent not in self._map.cameras:
             return
-        reader.due_ns = now_ns + round(self._config.period_s * 1e9)
-        here = se3.orthonormalise(here @ live.T_k_c)
+        cache.due_ns = now_ns + round(self._config.period_s * 1e9)
+        T_w_c = se3.orthonormalise(T_w_k @ live.T_k_c)
         submap = submap_of_keyframe(live.keyframe)
-        self._move(reader, live, submap, here)
-        wanted = self._wanted(agent, reader, here, submap)
-        self._take_back(reader, wanted, submap, channel)
-        self._tell_moves(reader, submap, channel)
-        self._lend(agent, reader, wanted, submap, channel)
+        predicted = T_w_c.copy()
+        predicted[:3, 3] += self._config.horizon_s * self._velocity(cache, live, submap, T_w_c[:3, 3])
+        needed = self._needed(agent, cache, T_w_c, predicted, submap)
+        self._remove(cache, needed, submap, channel)
+        self._send_moved(cache, submap, channel)
+        self._send_new(agent, cache, needed, submap, channel)
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
-    def _move(self, reader: _Reader, live: LivePose, submap: SubmapId, here: F64) -> None:
-        """How the agent moves, from two of its poses in one submap that are neither too close nor too old."""
-        dt_s = (live.t_ns - reader.seen_ns) * 1e-9
-        reader.velocity = np.zeros(3)
-        if reader.seen_ns >= 0 and reader.submap == submap and 0.0 < dt_s <= 4.0 * self._config.period_s:
-            reader.velocity = (here[:3, 3] - reader.at) / dt_s
-        reader.seen_ns, reader.submap, reader.at = live.t_ns, submap, here[:3, 3].copy()
+    def _velocity(self, cache: _AgentCache, live: LivePose, submap: SubmapId, position: F64) -> F64:
+        """Velocity (3,) in w, m/s, from the last two plans in one submap; zero if they are too far apart in time."""
+        last, cache.last = cache.last, _Fix(live.t_ns, submap, position.copy())
+        if last is None or last.submap != submap:
+            return np.zeros(3)
+        dt_s = (live.t_ns - last.t_ns) * 1e-9
+        if not 0.0 < dt_s <= 4.0 * self._config.period_s:
+            return np.zeros(3)
+        return (position - last.position) / dt_s
 
-    def _wanted(self, agent: AgentId, reader: _Reader, here: F64, submap: SubmapId) -> list[KeyframeId]:
-        """Keyframes that the agent lacks, those first of which it will see most."""
+    def _needed(
+        self, agent: AgentId, cache: _AgentCache, T_w_c: F64, predicted: F64, submap: SubmapId
+    ) -> list[KeyframeId]:  # fmt: skip
+        """Keyframes that the agent lacks, those with most landmarks in view first. predicted: T_w_c (4,4) soon."""
         rows = self._lacking(agent, submap)
         if not len(rows):
             return []
         table, keypoints = self._map.keyframes, self._map.keypoints
-        ahead = here.copy()
-        ahead[:3, 3] += self._config.horizon_s * reader.velocity
-        reach = self._config.max_distance_ratio * self._depth_m(submap, here)
-        places, axes = table.T_w_k[rows, :3, 3], table.T_w_k[rows, :3, 2]
+        reach = self._config.max_distance_ratio * self._depth_m(submap)
+        positions, axes = table.T_w_k[rows, :3, 3], table.T_w_k[rows, :3, 2]
         distance = np.minimum(
-            np.linalg.norm(places - here[:3, 3], axis=1), np.linalg.norm(places - ahead[:3, 3], axis=1)
+            np.linalg.norm(positions - T_w_c[:3, 3], axis=1), np.linalg.norm(positions - predicted[:3, 3], axis=1)
         )
-        turn = axes @ here[:3, 2]
-        likely = np.flatnonzero((distance < reach) & (turn > self._config.min_cosine))
-        cost = distance[likely] / reach + 1.0 - turn[likely]
+        cosine = axes @ T_w_c[:3, 2]
+        likely = np.flatnonzero((distance < reach) & (cosine > self._config.min_cosine))
+        cost = distance[likely] / reach + 1.0 - cosine[likely]
         rows = rows[likely[np.lexsort((table.id[rows[likely]], cost))[: self._config.max_candidates]]]
         if not len(rows):
             return []
-        points = np.concatenate([self._points(KeyframeId(int(table.id[row]))) for row in rows])
-        xyz, known = self._map.positions(points)
-        points, xyz = points[known], xyz[known]
-        seen = self._in_view(agent, here, xyz) | self._in_view(agent, ahead, xyz)
-        counts = np.bincount(keypoints.row[points[seen]], minlength=len(table.id))[rows].astype(np.float64)
-        held = np.array([int(k) in reader.lent for k in table.id[rows]], np.bool_)
+        landmarks = np.concatenate([self._landmarks(KeyframeId(int(table.id[row]))) for row in rows])
+        xyz, known = self._map.positions(landmarks)
+        landmarks, xyz = landmarks[known], xyz[known]
+        visible = self._in_view(agent, T_w_c, xyz) | self._in_view(agent, predicted, xyz)
+        counts = np.bincount(keypoints.row[landmarks[visible]], minlength=len(table.id))[rows].astype(np.float64)
+        held = np.array([int(k) in cache.cached for k in table.id[rows]], np.bool_)
         enough = counts >= np.where(held, 0.5, 1.0) * self._config.min_landmarks
         counts[held] *= self._config.hysteresis
         order = np.lexsort((table.id[rows], -counts))
@@ -120,7 +128,7 @@ class MapCachePlanner:
         return [KeyframeId(int(k)) for k in table.id[rows[chosen]]]
 
     def _lacking(self, agent: AgentId, submap: SubmapId) -> NDArray[np.int64]:
-        """Rows of the keyframes in the map of a submap that an agent may know and does not remember itself."""
+        """Rows of keyframes of the map that are shared with the agent and not in its local map."""
         rows: list[int] = []
         boot = submap >> SUBMAP_BITS
         own = [s for s in self._map.submaps if s >> SUBMAP_BITS == boot]
@@ -129,21 +137,21 @@ class MapCachePlanner:
             for s in own
             for k in self._map.submaps[s][-self._config.local_keyframes :]
         )
-        remembered = {k for _, k in newest[-self._config.local_keyframes :]}
+        local = {k for _, k in newest[-self._config.local_keyframes :]}
         for other in self._map.submaps_of_map(submap):
             if self._sharing.allows(agent, agent_of_submap(other)):
-                rows += [self._map.rows[k] for k in self._map.submaps.get(other, []) if k not in remembered]
+                rows += [self._map.rows[k] for k in self._map.submaps.get(other, []) if k not in local]
         return np.array([r for r in rows if self._map.keyframes.pose_source[r]], np.int64)
 
-    def _depth_m(self, submap: SubmapId, here: F64) -> float:
-        """How far the points of the agent's newest keyframes are, roughly."""
+    def _depth_m(self, submap: SubmapId) -> float:
+        """Median depth in w of the landmarks of the agent's newest keyframes."""
         slots = np.concatenate([self._map.slots_of(k) for k in self._map.submaps[submap][-3:]])
         inverse = self._map.inverse_depths(slots) / self._map.scale(submap)
         inverse = inverse[inverse > 0.0]
         return 1.0 / float(np.median(inverse)) if len(inverse) else 1.0
 
-    def _points(self, keyframe: KeyframeId) -> I32:
-        """The points that hang on a keyframe and can be found again: live ones with a depth and a descriptor."""
+    def _landmarks(self, keyframe: KeyframeId) -> I32:
+        """Root landmarks anchored in a keyframe that have a depth and a descriptor."""
         slots, table = self._map.slots_of(keyframe), self._map.keypoints
         live = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
         live &= (self._map.inverse_depths(slots) > 0.0) & table.descriptor[slots].any(axis=1)
@@ -157,97 +165,96 @@ class MapCachePlanner:
         inside = (u >= 0.0) & (v >= 0.0) & (u < camera.width) & (v < camera.height)
         return np.asarray(inside & (local[:, 2] > 0.1))
 
-    def _take_back(
-        self, reader: _Reader, wanted: list[KeyframeId], submap: SubmapId, channel: RecordChannel
+    def _remove(
+        self, cache: _AgentCache, needed: list[KeyframeId], submap: SubmapId, channel: RecordChannel
     ) -> None:  # fmt: skip
-        """What is no longer of one map with the submap in which it was lent, or no longer wanted before it arrived;
-        then, for want of room, what is not wanted, the oldest first.
-        """
+        """Remove keyframes of another map or scale, those not needed before they arrived, and the oldest for room."""
         map_id = self._map.map_id
         gone = [
             k
-            for k, lent in reader.lent.items()
-            if map_id(submap_of_keyframe(k)) != map_id(lent.copy.submap)
-            or abs(self._length(k, submap) / lent.length - 1.0) > self._config.max_scale_change
-            or (k not in wanted and not _arrived(lent, channel))
+            for k, entry in cache.cached.items()
+            if map_id(submap_of_keyframe(k)) != map_id(entry.record.submap)
+            or abs(self._scale(k, submap) / entry.scale - 1.0) > self._config.max_scale_change
+            or (k not in needed and not _arrived(entry, channel))
         ]
-        new = sum(k not in reader.lent for k in wanted)
-        idle = [k for k in reader.lent if k not in wanted and k not in gone]
-        spare = self._config.max_keyframes - len(reader.lent) + len(gone)
+        new = sum(k not in cache.cached for k in needed)
+        idle = [k for k in cache.cached if k not in needed and k not in gone]
+        spare = self._config.max_keyframes - len(cache.cached) + len(gone)
         gone += idle[: max(0, min(new, channel.profile.cached_ahead) - spare)]
         for keyframe in gone:
-            for key in reader.lent.pop(keyframe).keys:
+            for key in cache.cached.pop(keyframe).keys:
                 channel.remove(key)
 
-    def _tell_moves(self, reader: _Reader, submap: SubmapId, channel: RecordChannel) -> None:
-        """Copies stand where the map has them now, said in the submap in which the agent flies now."""
-        for keyframe, lent in reader.lent.items():
+    def _send_moved(self, cache: _AgentCache, submap: SubmapId, channel: RecordChannel) -> None:
+        """Send new poses of cached keyframes that moved, or are in the frame of another submap than the agent's."""
+        for keyframe, entry in cache.cached.items():
             if self._map.map_id(submap_of_keyframe(keyframe)) != self._map.map_id(submap):
                 continue
-            now = self._copy(keyframe, submap)
-            if lent.copy.submap == submap:
-                change = se3.inverse(lent.copy.T_m_k) @ now.T_m_k
+            now = self._record(keyframe, submap)
+            if entry.record.submap == submap:
+                change = se3.inverse(entry.record.T_m_k) @ now.T_m_k
                 moved, turned = np.linalg.norm(change[:3, 3]), np.linalg.norm(change[:3, :3] - np.eye(3)) / np.sqrt(2.0)
                 if moved <= self._config.pose_m and turned <= self._config.pose_rad:
                     continue
             channel.put(now)
-            lent.copy = now
+            entry.record = now
 
-    def _lend(
-        self, agent: AgentId, reader: _Reader, wanted: list[KeyframeId], submap: SubmapId, channel: RecordChannel
+    def _send_new(
+        self, agent: AgentId, cache: _AgentCache, needed: list[KeyframeId], submap: SubmapId, channel: RecordChannel
     ) -> None:  # fmt: skip
-        """The best of what is wanted, as far as there is room here and on the link."""
-        ahead = channel.profile.cached_ahead - sum(not _arrived(lent, channel) for lent in reader.lent.values())
-        room = self._config.max_keyframes - len(reader.lent)
-        for keyframe in [k for k in wanted if k not in reader.lent][: max(0, min(ahead, room))]:
-            copy = self._copy(keyframe, submap)
-            points, strength = self._copied(agent, keyframe, self._length(keyframe, submap))
-            records: list[CachedKeyframe | CachedLandmarks] = [copy, *channel.profile.cached_sections(points, strength)]
-            for record in records:
-                channel.put(record)
-            keys = [messages.key(record) for record in records]
-            reader.lent[keyframe] = _Lent(copy, keys, self._length(keyframe, submap))
+        """Send the most needed keyframes, as far as the cache and the link have room."""
+        ahead = channel.profile.cached_ahead - sum(not _arrived(entry, channel) for entry in cache.cached.values())
+        room = self._config.max_keyframes - len(cache.cached)
+        for keyframe in [k for k in needed if k not in cache.cached][: max(0, min(ahead, room))]:
+            record, scale = self._record(keyframe, submap), self._scale(keyframe, submap)
+            landmarks, views = self._landmarks_record(agent, keyframe, scale)
+            records: list[CachedKeyframe | CachedLandmarks] = [
+                record, *channel.profile.cached_sections(landmarks, views)
+            ]  # fmt: skip
+            for r in records:
+                channel.put(r)
+            cache.cached[keyframe] = _Cached(record, [messages.key(r) for r in records], scale)
 
-    def _copy(self, keyframe: KeyframeId, submap: SubmapId) -> CachedKeyframe:
+    def _record(self, keyframe: KeyframeId, submap: SubmapId) -> CachedKeyframe:
+        """A keyframe with its pose in a submap."""
         T_w_k = self._map.world_pose(keyframe)
         assert T_w_k is not None
-        return CachedKeyframe(
-            keyframe, submap, se3.orthonormalise(sim3.place(sim3.inverse(self._map.submap_pose(submap)), T_w_k))
-        )
+        T_m_k = se3.orthonormalise(sim3.place(sim3.inverse(self._map.submap_pose(submap)), T_w_k))
+        return CachedKeyframe(keyframe, submap, T_m_k)
 
-    def _length(self, keyframe: KeyframeId, submap: SubmapId) -> float:
-        """How many units of a submap one of a keyframe's is."""
+    def _scale(self, keyframe: KeyframeId, submap: SubmapId) -> float:
+        """Unit of length of a keyframe in units of a submap."""
         return self._map.scale(submap_of_keyframe(keyframe)) / self._map.scale(submap)
 
-    def _copied(self, agent: AgentId, keyframe: KeyframeId, length: float) -> tuple[CachedLandmarks, F64]:
-        """A keyframe's points as the reader's camera would see them, its lengths so many times as long, and how often
-        each was seen.
+    def _landmarks_record(self, agent: AgentId, keyframe: KeyframeId, scale: float) -> tuple[CachedLandmarks, F64]:
+        """Landmarks of a keyframe as the agent's camera would see them, and their numbers of observations (n,).
+
+        scale: factor on lengths.
         """
-        points, table = self._points(keyframe), self._map.keypoints
+        landmarks, table = self._landmarks(keyframe), self._map.keypoints
         fx, fy, cx, cy = self._map.keyframes.camera[self._map.rows[keyframe], :4]
         camera = self._map.cameras[agent]
-        at = (table.uv[points] + table.offset[points] - (cx, cy)) / (fx, fy)
-        uv = at * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        inside = (uv > -60.0).all(axis=1) & (uv < 4000.0).all(axis=1)  # what the code holds
-        points, uv = points[inside], uv[inside]
-        starts, _ = self._map.observations(points)
-        points_seen = np.diff(starts).astype(np.float64)
+        bearing = (table.uv[landmarks] + table.offset[landmarks] - (cx, cy)) / (fx, fy)
+        uv = bearing * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        codable = (uv > -60.0).all(axis=1) & (uv < 4000.0).all(axis=1)  # range of the code
+        landmarks, uv = landmarks[codable], uv[codable]
+        starts, _ = self._map.observations(landmarks)
         return CachedLandmarks(
             keyframe,
             0,
-            self._map.keypoint_of(points).astype(np.uint16),
+            self._map.keypoint_of(landmarks).astype(np.uint16),
             uv.astype(np.float32),
-            (self._map.inverse_depths(points) / length).astype(np.float32),
-            table.octave[points].copy(),
-            table.angle[points].copy(),
-            table.descriptor[points].copy(),
-        ), points_seen
+            (self._map.inverse_depths(landmarks) / scale).astype(np.float32),
+            table.octave[landmarks].copy(),
+            table.angle[landmarks].copy(),
+            table.descriptor[landmarks].copy(),
+        ), np.diff(starts).astype(np.float64)
 
 
-def _arrived(lent: _Lent, channel: RecordChannel) -> bool:
-    return all(channel.arrived(key) for key in lent.keys)
+def _arrived(entry: _Cached, channel: RecordChannel) -> bool:
+    return all(channel.arrived(key) for key in entry.keys)
 
 
-def is_copy(key: Key) -> bool:
-    """Whether a key is one of a copy: those are lent anew by each base."""
+def is_cached_key(key: Key) -> bool:
+    """True for keys of cached keyframes, which each base process sends anew."""
     return key.kind in CACHED_KINDS

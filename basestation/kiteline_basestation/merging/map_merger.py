@@ -155,8 +155,8 @@ class MapMerger:
             return NOTHING
         map_id, window, agents = bundle.map_id, bundle.window, bundle.calibrated
         result: BundleResult = without_odometry_factors(window, done.result)
-        if agents and not disparity.stands_out(result, self._config.disparity):
-            disparity.forget(self._map, agents)
+        if agents and not disparity.is_significant(result, self._config.disparity):
+            disparity.reset_offsets(self._map, agents)
             self._corrections.uncertain_at[map_id] = len(keyframes_of(self._map, map_id))
             self._corrections.request_bundle(map_id, calibrate=False)
             return NOTHING
@@ -168,7 +168,7 @@ class MapMerger:
         changed = self._apply_full_bundle(map_id, window, result)
         if agents:
             self._corrections.uncertain_at.pop(map_id, None)
-            disparity.take(self._map, agents, window.problem, result, self._config.disparity)
+            disparity.set_offsets(self._map, agents, window.problem, result, self._config.disparity)
         return changed
 
     def search_overlap(self, newer: SubmapId, older: SubmapId) -> None:

@@ -1,4 +1,4 @@
-"""Takes the result of a bundle into the map: poses, points, and the observations that did not agree."""
+"""Applies the result of a bundle to the map: poses, landmark positions, rejected observations."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from kiteline_core.optimisation.bundle import BundleResult
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-_AROUND = 8  # keyframes of a submap before which its agent flies, or where it began
-_ENOUGH = 20  # points that tell how much lengths have grown there
+_ENDS = 8  # keyframes at the begin or the end of a submap where the change of scale is measured
+_MIN_LANDMARKS = 20  # landmarks for that
 
 
 def apply_bundle(
     sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, cull: CullConfig,
     publish: PublishConfig,
 ) -> None:  # fmt: skip
-    """Write what a bundle found where it differs enough from what both sides hold."""
+    """Write the results that differ enough from what both sides hold; a result that is not finite is dropped."""
     if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
         return
     before = sparse_map.keyframes.T_w_k[window.rows].copy()
     _poses(sparse_map, window, result, publisher, publish)
-    _culled_follow(sparse_map, window, before, publisher)
+    _move_culled(sparse_map, window, before, publisher)
     dropped = _observations(sparse_map, window, result, publisher, cull)
     _points(sparse_map, window, result, dropped, publisher, cull, publish)
 
@@ -47,15 +47,15 @@ def _poses(
         new = np.linalg.inv(result.T_c_m[i])
         old = sparse_map.keyframes.T_w_k[row]
         moved = float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
-        turned = float(np.linalg.norm(new[:3, :3] - old[:3, :3])) / np.sqrt(2.0)  # chord: the angle when small
-        first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # said once, so that an older base's value goes
-        if first or moved > publish.pose_m or turned > publish.pose_rad:
+        rotated = float(np.linalg.norm(new[:3, :3] - old[:3, :3])) / np.sqrt(2.0)  # chord: the angle when small
+        first = sparse_map.keyframes.pose_source[row] != REFINED_POSE  # replaces the value of an earlier base
+        if first or moved > publish.pose_m or rotated > publish.pose_rad:
             sparse_map.set_world_pose(keyframe, new)
             publisher.mark_changed(KeyframePose.KIND, keyframe)
 
 
-def _culled_follow(sparse_map: SparseMap, window: BundleWindow, before: F64, publisher: Publisher) -> None:
-    """A culled keyframe sees nothing that could move it: it goes with the one from which it was measured."""
+def _move_culled(sparse_map: SparseMap, window: BundleWindow, before: F64, publisher: Publisher) -> None:
+    """Move culled keyframes, which have no observations, along with their nearest ancestor in the window."""
     table = sparse_map.keyframes
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     for row in np.flatnonzero(table.culled[: len(sparse_map)]).tolist():
@@ -74,11 +74,11 @@ def _culled_follow(sparse_map: SparseMap, window: BundleWindow, before: F64, pub
 def _observations(
     sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, cull: CullConfig
 ) -> NDArray[np.bool_]:
-    """Remove outliers. Returns which points of the window (n,) have too few observations left, and drops them."""
+    """Remove outliers, and cull landmarks with too few observations left. Returns which of the window (n,)."""
     table = sparse_map.keypoints
     starts = window.problem.starts
     which = np.repeat(np.arange(len(window.points)), np.diff(starts))
-    current = table.root[window.slots] == window.points[which]  # else it was fused or taken away meanwhile
+    current = table.root[window.slots] == window.points[which]  # else it was fused or removed meanwhile
     bad = window.slots[~result.inlier & current]
     if len(bad):
         sparse_map.set_flags(bad, REMOVED)
@@ -97,9 +97,9 @@ def _points(
     alive = ~dropped & (table.root[window.points] == window.points) & (table.flags[window.points] & CULLED == 0)
     points, positions = window.points[alive], result.points[alive]
     inv, offset, ahead = sparse_map.project_into_anchor(points, positions)
-    far_off = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > cull.max_offset_px * np.exp2(table.octave[points]))
-    cull_landmarks(sparse_map, points[far_off], publisher)
-    points, inv, offset = points[~far_off], inv[~far_off], offset[~far_off]
+    too_far = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > cull.max_offset_px * np.exp2(table.octave[points]))
+    cull_landmarks(sparse_map, points[too_far], publisher)
+    points, inv, offset = points[~too_far], inv[~too_far], offset[~too_far]
     bf = sparse_map.keyframes.camera[table.row[points], 4]
     change = np.maximum(
         np.abs(inv - sparse_map.inverse_depths(points)) * bf,
@@ -114,44 +114,47 @@ def _points(
 def keep_scales(
     sparse_map: SparseMap, map_id: SubmapId, window: BundleWindow, result: BundleResult
 ) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
-    """What a bundle of a whole map did to the units of one eye's submaps is said by their scale, as far as it did it
-    before the newest keyframes: lengths there stay as the agent has them. In a map without a metre, lengths before the
-    oldest keyframes stay as they were in w. Returns the result so, and by what units grew.
+    """Move the change of scale that a full bundle found into the scale of monocular submaps.
+
+    It is measured at each submap's newest keyframes, so that the agent's lengths there do not change. In a map without
+    metric scale, lengths at the oldest keyframes do not change in w. Returns the result, and the factors by submap.
     """
     own = [submap for submap in sparse_map.submaps_of_map(map_id) if sparse_map.is_up_to_scale(submap)]
-    growth = {s: _growth(sparse_map, sparse_map.submaps[s][-_AROUND:], window, result) for s in own}
-    eldest = sparse_map.map_id(map_id)
-    if eldest in growth:
-        whole = _growth(sparse_map, sparse_map.submaps[eldest][:_AROUND], window, result)
-        centre = sim3.place(sparse_map.submap_pose(eldest), sparse_map.first_pose(eldest))[:3, 3]
+    factors = {s: _scale_change(sparse_map, sparse_map.submaps[s][-_ENDS:], window, result) for s in own}
+    root = sparse_map.map_id(map_id)
+    if root in factors:
+        whole = _scale_change(sparse_map, sparse_map.submaps[root][:_ENDS], window, result)
+        centre = sim3.place(sparse_map.submap_pose(root), sparse_map.first_pose(root))[:3, 3]
         poses = np.linalg.inv(result.T_c_m)
         poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
-        growth = {submap: more / whole for submap, more in growth.items()}
-    for submap, more in growth.items():
-        sparse_map.scale_submap(submap, more)
-    return result, growth
+        factors = {submap: factor / whole for submap, factor in factors.items()}
+    for submap, factor in factors.items():
+        sparse_map.scale_submap(submap, factor)
+    return result, factors
 
 
-def _growth(sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult) -> float:
-    """By what a bundle stretched depths before keyframes: the median."""
+def _scale_change(
+    sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult
+) -> float:
+    """Median factor by which a bundle changed depths in keyframes; 1 if too few landmarks are known."""
     table = sparse_map.keyframes
     rows = [sparse_map.rows[k] for k in keyframes]
     anchors = sparse_map.keypoints.row[window.points]
     number = np.full(len(sparse_map), -1, np.int64)
     number[window.rows] = np.arange(len(window.rows))
     here = np.isin(anchors, rows) & (number[anchors] >= 0)
-    if np.count_nonzero(here) < _ENOUGH:
+    if np.count_nonzero(here) < _MIN_LANDMARKS:
         return 1.0
     T = result.T_c_m[number[anchors[here]]]
     after = np.einsum("nj,nj->n", T[:, 2, :3], result.points[here]) + T[:, 2, 3]
     inverse = sparse_map.inverse_depths(window.points[here]) / table.scale[anchors[here]]
     good = (after > 0.0) & (inverse > 0.0)
-    return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _ENOUGH else 1.0
+    return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _MIN_LANDMARKS else 1.0
 
 
 def cull_landmarks(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:
-    """Cull points (n,) by their slots."""
+    """Cull landmarks (n,)."""
     points = points[sparse_map.keypoints.kind[points] == LANDMARK]
     if len(points):
         sparse_map.set_flags(points, CULLED)

@@ -1,4 +1,4 @@
-"""Which keyframes see the same points, and the part of the map that a local bundle adjusts."""
+"""The part of the map that a bundle adjusts, as a bundle problem."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class BundleWindow:
-    """A part of the map as rows and slots, and the problem made of it: same order, same lengths."""
+    """A part of the map as rows and slots, and its bundle problem in the same order."""
 
     rows: I32  # (k,) keyframe rows
-    points: I32  # (n,) slots of roots
+    points: I32  # (n,) slots of root landmarks
     slots: I32  # (m,) slots of the observations
     problem: BundleProblem
 
@@ -32,10 +32,10 @@ class BundleWindow:
 def local_bundle_window(
     sparse_map: SparseMap, keyframe: KeyframeId, config: BundleWindowConfig, measurement: MeasurementConfig
 ) -> BundleWindow | None:
-    """The keyframe, its most covisible ones, all they see, and the keyframes that hold these points in place."""
+    """A keyframe and its most covisible ones, their landmarks, and fixed keyframes that observe these."""
     free = [keyframe, *sparse_map.covisible_keyframes(keyframe, config.min_shared)[: config.max_free - 1]]
     parent = keyframe
-    while len(free) < config.max_free // 2:  # few points are known: go on along the way that the agent came
+    while len(free) < config.max_free // 2:  # few shared landmarks: add ancestors
         parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[parent]]))
         if parent not in sparse_map or sparse_map.pose(parent) is None:
             break
@@ -48,8 +48,9 @@ def bundle_window(
     sparse_map: SparseMap, free: list[KeyframeId], config: BundleWindowConfig, measurement: MeasurementConfig,
     held: set[KeyframeId] | None = None,
 ) -> BundleWindow | None:  # fmt: skip
-    """The bundle problem that moves the keyframes `free`, all of one map, but none of `held`, which is the first one
-    of each submap unless it is said.
+    """Bundle problem with `free` keyframes of one map; None if it is too small.
+
+    held: keyframes that stay fixed; by default the first one of each submap.
     """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     submaps = sparse_map.submaps_of_map(submap_of_keyframe(free[0]))
@@ -60,7 +61,7 @@ def bundle_window(
     starts, slots = sparse_map.observations(points)
     which = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(starts))
 
-    # Keep the free keyframes, and of the others those that see most.
+    # Keep the free keyframes, and of the others those that observe most.
     free_rows = np.array([sparse_map.rows[k] for k in free], np.int32)
     counts = np.bincount(table.row[slots], minlength=len(sparse_map))
     rows_inside = np.array([sparse_map.rows[k] for s in submaps for k in sparse_map.submaps[s]], np.int32)
@@ -78,7 +79,7 @@ def bundle_window(
     number[rows] = np.arange(len(rows))
     keep = number[table.row[slots]] >= 0
 
-    # Points need two views to say anything about poses.
+    # A landmark needs two views to constrain poses.
     seen = np.bincount(which[keep], minlength=len(points))
     keep &= seen[which] >= 2
     points = points[seen >= 2]
@@ -87,33 +88,33 @@ def bundle_window(
     slots = slots[keep]
     starts = np.concatenate([[0], np.cumsum(seen[seen >= 2])]).astype(np.int32)
 
-    moves = np.isin(rows, free_rows) & ~np.isin(keyframes.id[rows], np.array(sorted(held), np.int64))
-    if moves.all():
-        moves[0] = False
-    if not moves.any():
+    is_free = np.isin(rows, free_rows) & ~np.isin(keyframes.id[rows], np.array(sorted(held), np.int64))
+    if is_free.all():
+        is_free[0] = False
+    if not is_free.any():
         return None
     positions, _ = sparse_map.positions(points)
     measured, sigma = measurements(sparse_map, slots, measurement)
     problem = BundleProblem(
-        _inverted(keyframes.T_w_k[rows]), keyframes.camera[rows], moves, positions, starts,
+        _inverted(keyframes.T_w_k[rows]), keyframes.camera[rows], is_free, positions, starts,
         number[table.row[slots]], measured, sigma,
     )  # fmt: skip
     return BundleWindow(rows, points, slots, problem)
 
 
 def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -> tuple[F64, F64]:
-    """What observations measured, (m,3) u, v, disparity (-1 none) in px, and how well, (m,2) sigma in px."""
+    """Measurements (m,3) u, v, disparity in px (-1 none), and standard deviations (m,2) of pixel and disparity in px."""
     table = sparse_map.keypoints
     rows = table.row[slots]
-    deep = np.zeros(len(sparse_map), bool)
+    has_depth = np.zeros(len(sparse_map), bool)
     sigma = np.full(len(sparse_map), config.sigma_disparity_px)
     for row in np.unique(rows).tolist():
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
         if agent in sparse_map.disparity_calibrated:
             sigma[row] = config.sigma_calibrated_px
-        deep[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
-    ranged = (table.inv_depth[slots] > 0) & deep[rows]
+        has_depth[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
+    ranged = (table.inv_depth[slots] > 0) & has_depth[rows]
     measured = np.empty((len(slots), 3))
     measured[:, :2] = table.uv[slots]
     disparity = sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots] - offsets(sparse_map, slots)

@@ -1,4 +1,4 @@
-"""Drops points that later keyframes should have seen and did not, and keyframes that tell nothing new (ORB-SLAM2)."""
+"""Culls landmarks that too few later keyframes observe, and redundant keyframes (ORB-SLAM2)."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from kiteline_codec.schema import CulledLandmarks
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 
 
-def cull_weak(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher) -> int:
-    """Judge the points born `age` keyframes before this one. Returns how many were dropped."""
+def cull_weak_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher) -> int:
+    """Test the landmarks first observed `landmark_age` keyframes before this one. Returns how many were culled."""
     same = sparse_map.submaps[submap_of_keyframe(keyframe)]
     number = same.index(keyframe)
     if number < config.landmark_age:
         return 0
-    judged = same[number - config.landmark_age]
+    anchor = same[number - config.landmark_age]
     table = sparse_map.keypoints
-    slots = sparse_map.slots_of(judged)
+    slots = sparse_map.slots_of(anchor)
     own = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
-    points = slots[own]
+    landmarks = slots[own]
     visible = np.zeros(sparse_map.slots, np.int32)
     for later in same[number - config.landmark_age + 1 : number + 1]:
         if sparse_map.pose(later) is not None:
-            visible[predict_projections(sparse_map, points, later)[0]] += 1
-    found = np.diff(sparse_map.observations(points)[0]) - 1
-    weak = (visible[points] >= config.min_visible) & (found < config.min_found * visible[points])
-    cull_landmarks(sparse_map, points[weak], publisher)
+            visible[predict_projections(sparse_map, landmarks, later)[0]] += 1
+    found = np.diff(sparse_map.observations(landmarks)[0]) - 1
+    weak = (visible[landmarks] >= config.min_visible) & (found < config.min_found * visible[landmarks])
+    cull_landmarks(sparse_map, landmarks[weak], publisher)
     return int(np.count_nonzero(weak))
 
 
-def cull_redundant(
+def cull_redundant_keyframes(
     sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher
 ) -> list[KeyframeId]:
-    """Judge the keyframes around this one: nearly all that they see, others see as well. Returns those dropped."""
+    """Cull covisible keyframes whose landmarks other keyframes observe as well. Returns them."""
     out: list[KeyframeId] = []
     for other in sparse_map.covisible_keyframes(keyframe, 15):
         same = sparse_map.submaps[submap_of_keyframe(other)]
@@ -57,9 +57,9 @@ def cull_redundant(
 def _redundant(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig) -> bool:
     table, row = sparse_map.keypoints, sparse_map.rows[keyframe]
     mine = sparse_map.observations_of(keyframe)
-    points = table.root[mine]
-    starts, slots = sparse_map.observations(points)
-    which = np.repeat(np.arange(len(points)), np.diff(starts))
+    landmarks = table.root[mine]
+    starts, slots = sparse_map.observations(landmarks)
+    which = np.repeat(np.arange(len(landmarks)), np.diff(starts))
     finer = table.octave[slots].astype(np.int64) <= table.octave[mine[which]].astype(np.int64) + 1
-    others = np.bincount(which[finer & (table.row[slots] != row)], minlength=len(points))
-    return len(points) > 0 and float(np.mean(others >= config.keyframe_others)) >= config.keyframe_share
+    others = np.bincount(which[finer & (table.row[slots] != row)], minlength=len(landmarks))
+    return len(landmarks) > 0 and float(np.mean(others >= config.keyframe_others)) >= config.keyframe_share

@@ -1,8 +1,7 @@
-"""What an agent's disparities are off by: its calibration is good to a tenth of a pixel or so.
+"""Estimates each agent's disparity offset in full bundles: stereo calibrations are good to a tenth of a pixel or so.
 
-Depths follow from motion up to a scale. An error of the disparities spoils that scale, and then near and far points,
-points here and there in the image, cannot all agree with what stereo measured. So bundles of a whole map find the
-error (`disparity_offset`) along with all else.
+Motion gives depths up to scale. With a disparity offset, stereo depths of near and far landmarks, and of different
+parts of the image, cannot agree with them at one scale; so the offset (`disparity_offset`) is observable.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ I64 = NDArray[np.int64]
 
 
 def at_keypoints(sparse_map: SparseMap, slots: I32) -> F64:
-    """The terms (n,5) of an offset at keypoints."""
+    """Terms (n,5) of a disparity offset at keypoints (n,)."""
     camera = sparse_map.keyframes.camera[sparse_map.keypoints.row[slots]]
     return terms((sparse_map.keypoints.uv[slots] - camera[:, 2:4]) / np.maximum(camera[:, :2], 1e-9))
 
 
 def offsets(sparse_map: SparseMap, slots: I32) -> F64:
-    """What the disparities of keypoints (n,) are too large by in px, as far as that is known."""
+    """Known excess of the disparities of keypoints (n,), px."""
     out = np.zeros(len(slots))
     agents = _agents(sparse_map, slots)
     for agent, offset in sparse_map.disparity_offset_px.items():
@@ -42,9 +41,9 @@ def offsets(sparse_map: SparseMap, slots: I32) -> F64:
 def with_border(
     sparse_map: SparseMap, slots: I32, problem: BundleProblem, config: DisparityConfig
 ) -> tuple[BundleProblem, tuple[AgentId, ...]]:  # fmt: skip
-    """A problem in which the offsets of all its agents' disparities are unknown too, and these agents, in order.
+    """Add the disparity offsets of all agents of a problem as unknowns. Returns it and these agents, in order.
 
-    slots: (m,) the problem's observations.
+    slots: (m,) of the problem's observations.
     """
     table = sparse_map.keypoints
     rows = table.row[slots]
@@ -63,15 +62,15 @@ def with_border(
     return replace(problem, measured=measured, border=border), agents
 
 
-def forget(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:
-    """Nothing is known to be off."""
+def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:
+    """Set the offsets of agents to zero, where set before."""
     for agent in agents:
         if agent in sparse_map.disparity_offset_px:
             sparse_map.disparity_offset_px[agent] = none()
 
 
-def stands_out(result: BundleResult, config: DisparityConfig) -> bool:
-    """Whether what a bundle found is more than chance for one of the agents."""
+def is_significant(result: BundleResult, config: DisparityConfig) -> bool:
+    """True if the estimated offset of at least one agent is significant (Mahalanobis distance)."""
     for g, offset in enumerate(result.offset):
         cov = config.inflation**2 * result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > config.min_significance**2 * TERMS:
@@ -79,11 +78,11 @@ def stands_out(result: BundleResult, config: DisparityConfig) -> bool:
     return False
 
 
-def take(
+def set_offsets(
     sparse_map: SparseMap, agents: tuple[AgentId, ...], problem: BundleProblem, result: BundleResult,
     config: DisparityConfig,
 ) -> None:  # fmt: skip
-    """Remember what a bundle found of its agents' disparities. Agents whose offset is known well are trusted more."""
+    """Set the offsets of agents from a bundle; an accurate one makes the agent's disparities count more."""
     border = problem.border
     if border is None or not (np.isfinite(result.offset).all() and np.isfinite(result.offset_cov).all()):
         return

@@ -1,8 +1,7 @@
-"""When whole maps are bundled: whenever one has grown since, as far as the worker's time allows.
+"""Schedules full bundles: a map is bundled as a whole when it has grown and the worker has time.
 
-Local bundles look no further than a window, and the offsets of disparities show in whole maps alone. So that a map
-depends on what was seen, and not on the moment at which it is asked for, none stays long without such a bundle; in a
-quiet moment the last one sees all keyframes.
+Local bundles see a window only, and disparity offsets are observable in whole maps only. The last full bundle of a
+quiet base includes all keyframes, so that the map does not depend on when it is read.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from kiteline_core.ids import SubmapId
 
 
 class FullBundleSchedule:
-    """Which map is next, and when. Maps are named by their eldest submap, their size is their number of keyframes."""
+    """Chooses the next map. The size of a map is its number of keyframes."""
 
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
-        self.bundled: dict[SubmapId, int] = {}  # the size of each when it was last asked for
+        self.bundled: dict[SubmapId, int] = {}  # size of each map at its last full bundle
         self._rest_until_ns = 0
 
     def next(self, sizes: Mapping[SubmapId, int], busy: Collection[SubmapId], now_ns: int) -> SubmapId | None:
-        """The map that has grown by the largest share, if one has and the worker may be asked. busy: not these."""
+        """The map, none of `busy`, that has grown by the largest share; None if none has or the worker shall rest."""
         waiting = [m for m in self.waiting(sizes) if m not in busy]
         if not waiting or now_ns < self._rest_until_ns:
             return None
@@ -31,9 +30,9 @@ class FullBundleSchedule:
         return chosen
 
     def waiting(self, sizes: Mapping[SubmapId, int]) -> list[SubmapId]:
-        """Maps that are not as they were when they were last asked for."""
+        """Maps whose size has changed since their last full bundle."""
         return [m for m in sorted(sizes) if sizes[m] >= self._config.first_full and sizes[m] != self.bundled.get(m, 0)]
 
     def done(self, cost_ops: int, now_ns: int) -> None:
-        """A bundle of a whole map has come back: the worker has other things to do for a while."""
+        """Let the worker rest from full bundles in proportion to the cost of the one that is done."""
         self._rest_until_ns = now_ns + round(cost_ops / self._config.full_share)

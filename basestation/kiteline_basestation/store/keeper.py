@@ -11,7 +11,7 @@ import sys
 import threading
 from pathlib import Path
 
-from kiteline_basestation.exchange.map_cache_planner import is_copy
+from kiteline_basestation.exchange.map_cache_planner import is_cached_key
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import StateWriter, texts_of
@@ -117,7 +117,7 @@ def snapshot(station: Station, before: SavedMap) -> SavedMap:
         if isinstance(channel, CodedChannel):
             end = channel.endpoint
             old = before.agents.get(agent, SavedValues({}, {}))
-            own = {key: code for key, code in end.own_values().items() if not is_copy(key)}
+            own = {key: code for key, code in end.own_values().items() if not is_cached_key(key)}
             changed = (station.changed or {}).items()
             imported = {key: code for (a, _, key), code in changed if a == agent and code is not None}
             agents[agent] = SavedValues({**old.received, **imported, **end.earlier_values(), **end.peer_values()}, own)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kiteline_basestation.exchange.map_cache_planner import is_copy
+from kiteline_basestation.exchange.map_cache_planner import is_cached_key
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import Checked, check, contradictions
 from kiteline_basestation.store.saved_map import SavedMap
@@ -46,7 +46,7 @@ def _restore(station: Station, checked: Checked, now_ns: int) -> Restored:
         mapper.restore(agent, received, (), now_ns)
     for agent, values in sorted(saved.agents.items()):  # after all received: fused landmarks may be of several agents
         channel = station.join(agent)
-        own = [key for key in sorted(values.own) if not is_copy(key)]  # the map cache is planned anew
+        own = [key for key in sorted(values.own) if not is_cached_key(key)]  # the map cache is planned anew
         mapper.restore(agent, (), tuple(channel.put(messages.decode(key, values.own[key])) for key in own), now_ns)
     mapper.restore_state(state_of(saved.texts))
     wrong = contradictions(mapper)

@@ -40,7 +40,7 @@ def _together(bench: Bench, first: str, second: str) -> list[Bar]:
     scenarios = [Scenario(first, 0, parts=(Part(0.0, 30.0),)), Scenario(second, 1, begin_s=27.0)]
     with_, without = _both(bench, "MH_03 in the map of MH_01", scenarios)
     there = with_.agent(1)
-    sent = {agent_of_keyframe(k) for k in with_.flight.station.supply.lent(AgentId(1))}
+    sent = {agent_of_keyframe(k) for k in with_.flight.station.map_cache_planner.cached(AgentId(1))}
     tracked = sum(e.tracked for e in there.found)
     return [
         is_true("MH_03 begins in the hall that MH_01 mapped", "one map, keyframes sent",
