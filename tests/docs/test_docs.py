@@ -85,6 +85,24 @@ def test_the_architecture_names_every_subpackage(room: str) -> None:
     assert set(re.findall(r"`(\w+)`", outside_brackets)) == packages
 
 
+@pytest.mark.parametrize(
+    ("module", "heading"),
+    [
+        ("agent/kiteline_agent/agent.py", "**Agent.**"),
+        ("basestation/kiteline_basestation/mapper.py", "**Base.**"),
+    ],
+)
+def test_the_architecture_has_the_numbered_steps_of_the_code(module: str, heading: str) -> None:
+    steps = re.findall(r"^ *# (\d\. .*)$", (ROOT / module).read_text(encoding="utf-8"), re.MULTILINE)
+    assert [int(step[0]) for step in steps] == list(range(1, len(steps) + 1))
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").partition(heading)[2]
+    listed = re.findall(r"^(\d\. (?:.*\n)(?: {3}.*\n)*)", text.partition("\n**")[0], re.MULTILINE)
+    written = [" ".join(item.split()) for item in listed]
+    assert len(written) == len(steps) > 5
+    for item, step in zip(written, steps, strict=True):
+        assert item.startswith(step.rstrip(".")), (item, step)
+
+
 def test_api_pages_name_modules_and_objects_that_exist() -> None:
     names = [
         n for p in (ROOT / "docs/reference/api").glob("*.md") for n in re.findall(r"^::: (\S+)$", p.read_text(), re.M)
@@ -100,4 +118,9 @@ def test_every_glossary_entry_is_a_sentence_with_its_place_in_the_code() -> None
     for row in rows:
         term, meaning, place = (cell.strip() for cell in row.strip("|").split("|"))
         assert meaning.endswith("."), term
-        assert re.search(r"`[\w./-]+`", place), term
+        named = re.fullmatch(r"`([\w./-]+)`", place)
+        assert named, term
+        for name in re.findall(r"`(\w+)`", term):
+            assert re.search(rf"^class {name}\b", (ROOT / named[1]).read_text(), re.MULTILINE), (
+                f"{name} is not in {named[1]}"
+            )
