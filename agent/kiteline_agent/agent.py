@@ -73,9 +73,7 @@ class Agent:
             self.map, self._tracker, config, vocabulary, self.map_cache, self._is_consistent_place, self.work
         )
         maker = KeyframeMaker(self.map, channel, self.work)
-        self._keyframes = KeyframeStage(
-            self._camera, maker, self.map_cache, self._relocaliser, self._governor, channel, self.work
-        )
+        self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
         self._submaps = SubmapStage(

@@ -200,12 +200,7 @@ class MapCacheConfig:
     octave_gap: float = 1.2  # octaves between the size foreseen and the size found
     corner_px: float = 1.0  # one standard deviation of a corner's place at octave 0, found twice
     radius_px: float = 6.0  # px at octave 0 around where a lost frame's points are foreseen: what P3P leaves
-    hold_radius_px: float = 4.0  # the same of a keyframe that is tracked: more is no drift, but another corner
     min_met: int = 12  # lent points that agree with one pose; chance matches reach 8
-    min_hold: int = 20  # of them before a keyframe yields to them
-    doubt_depth: float = 0.0015  # of the depth in view, that a keyframe may have drifted since the last one yielded
-    doubt_rad: float = 0.00075  # rad, likewise
-    hold_px: float = 2.0  # px that points in view may move by it: more is no drift, and for the base to judge
     min_found: int = 30  # of them that find a lost frame
     min_share: float = 0.15  # of those that should be in view; not every point is a corner again
     candidates: int = 3  # copies tried in a lost frame

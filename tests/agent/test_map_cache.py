@@ -97,13 +97,13 @@ def ring(world: World, box: MapCache, copies: int = 12, submap: SubmapId = HERE)
             box.store(record)
 
 
-def test_corners_meet_lent_points_and_say_where_the_camera_is(world: World) -> None:
+def test_corners_match_cached_landmarks_and_give_the_camera_pose(world: World) -> None:
     box, rng = window(), np.random.default_rng(0)
     ring(world, box)
     true = look(0.7, (0.2, -0.1))
     guess = true @ se3.exp(np.array([0.005, -0.004, 0.005, 0.001, 0.001, -0.0005]))
     seen = world.seen(true, rng)
-    met = box.match_landmarks(se3.inverse(guess), HERE, seen, 6.0)
+    met = box.match_landmarks(se3.inverse(guess), HERE, seen)
     assert met is not None
     assert len(met.corner) > 40
     error = se3.log(met.T_c_m @ true)
@@ -112,26 +112,13 @@ def test_corners_meet_lent_points_and_say_where_the_camera_is(world: World) -> N
     assert np.all(met.corner < len(seen.uv) // 2), "a corner of noise"
     truth = CAMERA.bf / seen.disparity[met.corner]
     assert np.median(np.abs(met.depth_m - truth) / truth) < 0.01
-    # A keyframe yields as far as it is in doubt, and not at all to few points or over a long way.
-    errors = [float(np.linalg.norm(se3.log(se3.inverse(guess) @ true)[:3]))]
-    for doubt in (1e-5, 5e-4, 1.0):
-        goal = window(doubt_depth=doubt, doubt_rad=0.5 * doubt).corrected_pose(se3.inverse(guess), met)
-        assert goal is not None
-        errors.append(float(np.linalg.norm(se3.log(goal @ true)[:3])))
-    assert errors[1] > 0.9 * errors[0]
-    assert 0.2 * errors[0] < errors[2] < 0.9 * errors[0]
-    assert errors[3] < 0.5 * errors[0]
-    assert window(min_hold=1000).corrected_pose(se3.inverse(guess), met) is None
-    assert window(hold_px=0.01).corrected_pose(se3.inverse(guess), met) is None
 
 
 def test_copies_of_another_submap_are_not_met(world: World) -> None:
     box, rng = window(), np.random.default_rng(1)
     ring(world, box, submap=THERE)
-    assert box.covers(THERE)
-    assert not box.covers(HERE)
     true = look(0.7)
-    assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng), 6.0) is None
+    assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng)) is None
 
 
 @pytest.mark.parametrize("turn", [0.3, 2.0, 4.5])
@@ -165,7 +152,6 @@ def test_what_is_taken_back_is_gone_and_the_number_is_bounded(world: World) -> N
     assert box.find(world.seen(true, rng), {HERE}, 0) is not None
     box.remove([Key(CachedKeyframe.KIND, int(keyframe_id(THERE, k))) for k in range(4, 12)])
     assert len(box) == 0
-    assert not box.covers(HERE)
     assert box.find(world.seen(true, rng), {HERE}, 0) is None
 
 
@@ -175,6 +161,6 @@ def test_points_without_their_copy_wait_for_it(world: World) -> None:
     for part in reversed(parts):
         box.store(part)
     true = look(0.0)
-    assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng), 6.0) is None
+    assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng)) is None
     box.store(head)
-    assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng), 6.0) is not None
+    assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng)) is not None

@@ -71,8 +71,7 @@ class KeyframeMaker:
             self._channel.put(section)
         rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         T_m_k = self._pose_of(header)
-        cached_rho = np.zeros(len(order)) if points.cached_rho is None else points.cached_rho[order]
-        self._store(ctx, header, T_m_k, uv, rho, cached_rho, landmarks)
+        self._store(ctx, header, T_m_k, uv, rho, landmarks)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         return T_m_k
 
@@ -128,8 +127,7 @@ class KeyframeMaker:
         return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(header.parent)] @ header.T_p_k)
 
     def _store(
-        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, cached_rho: F64,
-        landmarks: NewLandmarks,
+        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, landmarks: NewLandmarks
     ) -> None:  # fmt: skip
         """Cut the templates, and add the keyframe to the local map."""
         octave, config = landmarks.octave, ctx.config
@@ -139,9 +137,6 @@ class KeyframeMaker:
         sigma = config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
         if ctx.images.depth_m is not None and not self._camera.stereo:
             sigma = np.maximum(sigma, _DEPTH_CAMERA_SIGMA_RHO)
-        cached = cached_rho > 0.0
-        rho = np.where(cached, cached_rho, rho)
-        sigma[cached] = np.minimum(sigma[cached], config.window.sigma_px / self._camera.bf)
         self._map.add(
             header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number
         )  # fmt: skip

@@ -23,7 +23,6 @@ class NewPoints:
     """New landmarks of a keyframe, strongest first.
 
     uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32).
-    cached_rho: (n,) 1/m, inverse depths of matched landmarks of the map cache, 0 none; or None.
     """
 
     uv: F64
@@ -31,7 +30,6 @@ class NewPoints:
     octave: NDArray[np.uint8]
     angle: NDArray[np.uint8]
     descriptor: NDArray[np.uint8]
-    cached_rho: F64 | None = None
 
 
 def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:

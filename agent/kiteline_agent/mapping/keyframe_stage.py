@@ -10,8 +10,6 @@ from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.mapping.camera_state import CameraState
-from kiteline_agent.relocalisation.frame_features import features_of
-from kiteline_agent.relocalisation.map_cache import MapCache, with_depths
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
@@ -26,12 +24,11 @@ class KeyframeStage:
     """Keyframe policy, with what the link carries and CPU time allows, and the making of keyframes."""
 
     def __init__(
-        self, camera: CameraState, maker: KeyframeMaker, cache: MapCache, relocaliser: Relocaliser, governor: Governor,
+        self, camera: CameraState, maker: KeyframeMaker, relocaliser: Relocaliser, governor: Governor,
         channel: RecordChannel, work: Work,
     ) -> None:  # fmt: skip
         self._camera = camera
         self._maker = maker
-        self._cache = cache
         self._relocaliser = relocaliser
         self._governor = governor
         self._channel = channel
@@ -53,8 +50,6 @@ class KeyframeStage:
     def add(self, ctx: FrameContext, track: Track) -> None:
         """Make a keyframe of a tracked frame, with new landmarks where the image has room."""
         points = self._maker.points_beside(ctx, track)
-        if self._cache.covers(self._camera.submaps.active):
-            points = self._match_cached_landmarks(ctx, points)
         self.make(ctx, track, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
 
     def extend_map_by_dead_reckoning(self, ctx: FrameContext) -> tuple[bool, list[str]]:
@@ -86,17 +81,3 @@ class KeyframeStage:
         if ctx.images.right is not None and ctx.images.right.needs_rectification:
             self._work.rectified_px += ctx.images.left[1].size
         return keyframe
-
-    def _match_cached_landmarks(self, ctx: FrameContext, points: NewPoints) -> NewPoints:
-        """Give corners that match cached landmarks their depths, and move the map a little towards the cached one."""
-        pose, limits = self._camera.pose, ctx.config.window
-        matches = self._cache.match_landmarks(
-            pose.T_c_m, self._camera.submaps.active, features_of(points), limits.hold_radius_px
-        )
-        self._work.projected += len(self._cache) * limits.points
-        if matches is None:
-            return points
-        T_c_m = self._cache.corrected_pose(pose.T_c_m, matches)
-        if T_c_m is not None:
-            self._camera.move_map(se3.inverse(T_c_m))
-        return with_depths(points, matches)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig
-from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.tracking.frame_images import FrameImages
 
 F64 = NDArray[np.float64]
@@ -36,8 +35,3 @@ def frame_features(images: FrameImages, detector: DetectorConfig, min_corners: i
         return None
     angle, descriptor = features.describe(images.left, corners.uv, corners.octave)
     return FrameFeatures(corners.uv, np.full(len(corners.uv), -1.0), corners.octave, angle, descriptor)
-
-
-def features_of(points: NewPoints) -> FrameFeatures:
-    """The corners of a keyframe that is being made."""
-    return FrameFeatures(points.uv, points.disparity, points.octave, points.angle, points.descriptor)

@@ -1,19 +1,17 @@
 """Cache of keyframes sent by the base: seen by other agents, or evicted here.
 
-They have landmarks and descriptors but no image, so they are matched by descriptor: to relocalise, and to initialise
-depths in new keyframes, which are then moved a little towards the cached map.
+They have landmarks and descriptors but no image, so a lost frame is matched with them by descriptor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import MapCacheConfig
-from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.relocalisation.frame_features import FrameFeatures
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
@@ -38,17 +36,13 @@ _NO_SUBMAP = -1  # in the array of submaps: the keyframe's pose has not arrived
 class CacheMatches:
     """Cached landmarks matched with corners of a frame, and the pose from them alone.
 
-    T_c_m: (4,4). corner: (n,) indices of corners. depth_m: (n,) in the camera. xyz, ray, observed, sigma_px: (n,3),
-    (n,3), (n,3), (n,) as in `optimise_pose`. in_view: number of cached landmarks that should be in view.
+    T_c_m: (4,4). corner: (n,) indices of corners. depth_m: (n,) in the camera. in_view: number of cached landmarks that
+    should be in view.
     """
 
     T_c_m: F64
     corner: I64
     depth_m: F64
-    xyz: F64
-    ray: F64
-    observed: F64
-    sigma_px: F64
     in_view: int
 
 
@@ -102,10 +96,6 @@ class MapCache:
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self.keyframe != NO_KEYFRAME))
-
-    def covers(self, submap: SubmapId) -> bool:
-        """True if any cached keyframe has a pose in a submap."""
-        return bool((self._submap == submap).any())
 
     def store(self, record: CachedKeyframe | CachedLandmarks) -> None:
         """Take over the pose of a cached keyframe, or some of its landmarks."""
@@ -161,16 +151,14 @@ class MapCache:
         self._angle[rows] = np.concatenate([part.angle for part in parts])[keep]
         self._descriptor[rows] = np.concatenate([part.descriptor for part in parts])[keep]
 
-    def match_landmarks(
-        self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures, radius_px: float
-    ) -> CacheMatches | None:
+    def match_landmarks(self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures) -> CacheMatches | None:
         """Match cached landmarks of a submap with a frame at about T_c_m (4,4); None if too few agree on a pose."""
         projected = self._project(T_c_m, submap, _MARGIN_PX)
         if len(projected.rows) < self._config.min_met or len(seen.uv) < self._config.min_met:
             return None
         offered, wanted = comparable(seen.descriptor, self._descriptor[projected.rows])
         found = match_near(
-            projected.uv, np.full(len(projected.rows), radius_px), projected.octave, wanted, seen.uv, seen.octave, offered,
+            projected.uv, np.full(len(projected.rows), self._config.radius_px), projected.octave, wanted, seen.uv, seen.octave, offered,
             (self._camera.width, self._camera.height), self._config.octave_gap, self._matching,
         )  # fmt: skip
         return self._consistent(T_c_m, projected, found, seen)
@@ -193,30 +181,7 @@ class MapCache:
             return None
         T = se3.orthonormalise(T)
         depth = se3.transform(T, xyz[inlier])[:, 2]
-        return CacheMatches(
-            T, found.b[inlier].astype(np.int64), depth, xyz[inlier], ray[inlier], observed[inlier], sigma_px[inlier],
-            len(projected.rows),
-        )  # fmt: skip
-
-    def corrected_pose(self, T_c_m: F64, matches: CacheMatches) -> F64 | None:
-        """The tracked pose T_c_m (4,4) moved towards the cached map, weighted by both uncertainties.
-
-        None if the matches are few, or the correction is too large to be drift.
-        """
-        config, n = self._config, len(matches.corner)
-        if n < config.min_hold:
-            return None
-        sigma = np.repeat([config.doubt_depth * float(np.median(matches.depth_m)), config.doubt_rad], 3)
-        T = T_c_m.copy()
-        optimise_pose(
-            T, matches.xyz, matches.ray, matches.observed, matches.sigma_px, self._intrinsics, T_c_m, sigma**-2.0, 1, 4,
-            self._ransac.chi2, np.ones(n, np.bool_), np.zeros((6, 6)),
-        )  # fmt: skip
-        before, after = (se3.transform(pose, matches.xyz) for pose in (T_c_m, T))
-        if not np.isfinite(T).all() or after[:, 2].min() <= 0.0:
-            return None
-        moved_px = self._camera.fx * np.linalg.norm(after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:], axis=1)
-        return se3.orthonormalise(T) if float(np.median(moved_px)) <= config.hold_px else None
+        return CacheMatches(T, found.b[inlier].astype(np.int64), depth, len(projected.rows))
 
     def _project(self, T_c_m: F64, submap: SubmapId, margin_px: float) -> _Projections:
         slots = np.flatnonzero(self._submap == submap)
@@ -241,7 +206,7 @@ class MapCache:
             slot = int(np.flatnonzero(self.keyframe == key)[0])
             submap = SubmapId(int(self._submap[slot]))
             T_c_m = self._pose_from(slot, submap, seen, frame_number)
-            matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen, self._config.radius_px)
+            matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen)
             if matches is not None and len(matches.corner) >= max(
                 self._config.min_found, self._config.min_share * matches.in_view
             ):
@@ -279,10 +244,3 @@ class MapCache:
         if key in self._indexed and self._index is not None:
             self._index.remove(key)
             self._indexed.discard(key)
-
-
-def with_depths(points: NewPoints, matches: CacheMatches) -> NewPoints:
-    """The same new landmarks, those that were matched with the depths of the cached ones."""
-    rho = np.zeros(len(points.uv))
-    rho[matches.corner] = 1.0 / matches.depth_m
-    return replace(points, cached_rho=rho)

@@ -24,7 +24,13 @@ Rules = Mapping[str, Rule]
 
 # dotted TOML name of an option, or of a section with all that it holds
 CONFIG: dict[str, Rules] = {
-    "agent": {},
+    "agent": {
+        "window.hold_radius_px": None,
+        "window.min_hold": None,
+        "window.doubt_depth": None,
+        "window.doubt_rad": None,
+        "window.hold_px": None,
+    },
     "base": {
         "measurement.sigma_settled_px": "measurement.sigma_calibrated_px",
         "measurement.fused_px": "measurement.sigma_fused_px",
