@@ -7,7 +7,8 @@ from pathlib import Path
 
 from kiteline_bench.agent.stages import STAGES, profile, table
 from kiteline_bench.harness.profiler import Profiler, locate
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
 
 
 def spin(ms: float) -> None:

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from kiteline_hw.logs.mcap_log_read import LogReader
-from kiteline_lab.flights.flight_report import check_contract, without_timing
-from kiteline_lab.flights.fly import Options, fly, main
+from kiteline_lab.flights.contract import check_contract
+from kiteline_lab.flights.flight_report import without_timing
+from kiteline_lab.flights.fly import fly, main
+from kiteline_lab.flights.plan import Options
 
 
 @pytest.mark.parametrize("mode", ["tracker", "local", "monolith"])

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_lab.flights import flight_report
-from kiteline_lab.flights.flight_report import check_contract, compose, statistic, table, without_timing, write_tum
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.contract import check_contract
+from kiteline_lab.flights.flight_report import statistic, table, without_timing, write_tum
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
+from kiteline_lab.flights.refined_path import refined_path
 
 F64 = NDArray[np.float64]
 
@@ -48,7 +51,7 @@ def flown(t_ns: int, T_m_k: F64, T_k_c: F64, keyframe: int, submap: int = 0, tra
 def test_frames_follow_their_refined_keyframe() -> None:
     refined = at(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
     near = at(0.05, 0.0, 0.02, 0.0, 0.01, 0.0)
-    ((t_ns, T_w_b),) = compose([flown(5, at(0, 0, 0, 0, 0, 0), near, 7)], {7: refined}, T_b_c)
+    ((t_ns, T_w_b),) = refined_path([flown(5, at(0, 0, 0, 0, 0, 0), near, 7)], {7: refined}, T_b_c)
     assert t_ns == 5
     np.testing.assert_allclose(T_w_b, refined @ near @ T_c_b, atol=1e-12)
 
@@ -57,7 +60,7 @@ def test_one_eye_s_frames_are_as_long_as_the_world_says_and_the_arm_stays_in_met
     refined, near = at(1.0, 2.0, 3.0, 0.1, 0.2, 0.3), at(0.05, 0.0, 0.02, 0.0, 0.01, 0.0)
     begin, late = at(0, 0, 0, 0, 0, 0), at(0.3, 0, 0, 0, 0, 0.1)
     frames = [flown(5, begin, near, 7), flown(6, late, near, 8), flown(7, late, near, 9)]
-    poses = dict(compose(frames, {7: sim3.of(2.5, refined), 8: sim3.of(2.5, refined @ late)}, T_b_c))
+    poses = dict(refined_path(frames, {7: sim3.of(2.5, refined), 8: sim3.of(2.5, refined @ late)}, T_b_c))
     np.testing.assert_allclose(poses[5], sim3.place(sim3.of(2.5, refined), near) @ T_c_b, atol=1e-12)
     for T in poses.values():
         assert sim3.scale_of(T) == 1.0
@@ -70,17 +73,17 @@ def test_frames_bend_towards_the_next_keyframe_and_the_path_has_no_step() -> Non
     eye, moved = np.eye(4), at(0.03, -0.01, 0.02, 0.01, 0.0, -0.02)  # what the base makes of the second keyframe
     frames = [flown(10 * i, eye, se3.exp(step * i), 7) for i in range(10)]
     frames += [flown(100 + 10 * i, se3.exp(step * 10), se3.exp(step * i), 8) for i in range(3)]
-    plain = dict(compose(frames, {7: eye, 8: se3.exp(step * 10)}, T_b_c))
+    plain = dict(refined_path(frames, {7: eye, 8: se3.exp(step * 10)}, T_b_c))
     for i in range(13):
         np.testing.assert_allclose(plain[10 * i], se3.exp(step * i) @ T_c_b, atol=1e-9)
-    bent = dict(compose(frames, {7: eye, 8: se3.exp(step * 10) @ moved}, T_b_c))
+    bent = dict(refined_path(frames, {7: eye, 8: se3.exp(step * 10) @ moved}, T_b_c))
     np.testing.assert_allclose(bent[0], T_c_b, atol=1e-12)
     np.testing.assert_allclose(bent[100], se3.exp(step * 10) @ moved @ T_c_b, atol=1e-9)
     ways = [np.linalg.norm((se3.inverse(bent[10 * i]) @ bent[10 * i + 10])[:3, 3]) for i in range(12)]
     assert max(ways) < 1.2 * min(ways)
     # A gap, or a keyframe of old, is no next keyframe: nothing bends.
     lost = [*frames[:10], flown(95, eye, eye, 7, tracked=False), *frames[10:]]
-    apart = dict(compose(lost, {7: eye, 8: moved}, T_b_c))
+    apart = dict(refined_path(lost, {7: eye, 8: moved}, T_b_c))
     np.testing.assert_allclose(apart[90], plain[90], atol=1e-9)
 
 
@@ -88,14 +91,14 @@ def test_a_keyframe_that_is_under_way_hangs_on_the_last_one_that_arrived() -> No
     believed, later = at(0.2, 0, 0, 0, 0, 0), at(0.6, 0.1, 0, 0, 0, 0.1)
     refined = at(0.3, 0.05, 0, 0, 0, 0.02)
     frames = [flown(1, believed, np.eye(4), 7), flown(2, later, np.eye(4), 8)]
-    poses = dict(compose(frames, {7: refined}, T_b_c))
+    poses = dict(refined_path(frames, {7: refined}, T_b_c))
     moved = refined @ se3.inverse(believed)  # what the base did to the neighbour, it does to this one too
     np.testing.assert_allclose(poses[2], moved @ later @ T_c_b, atol=1e-12)
 
 
 def test_frames_before_the_first_known_keyframe_hang_on_that_one() -> None:
     first, second, refined = np.eye(4), at(1.0, 0, 0, 0, 0, 0), at(0.0, 5.0, 0, 0, 0, 0)
-    poses = compose([flown(1, first, np.eye(4), 7), flown(2, second, np.eye(4), 8)], {8: refined}, T_b_c)
+    poses = refined_path([flown(1, first, np.eye(4), 7), flown(2, second, np.eye(4), 8)], {8: refined}, T_b_c)
     assert [t for t, _ in poses] == [1, 2]
     np.testing.assert_allclose(poses[0][1], refined @ se3.inverse(second) @ first @ T_c_b, atol=1e-12)
 
@@ -103,7 +106,7 @@ def test_frames_before_the_first_known_keyframe_hang_on_that_one() -> None:
 def test_lost_frames_and_unknown_submaps_have_no_place() -> None:
     eye = np.eye(4)
     frames = [flown(1, eye, eye, 7, tracked=False), flown(2, eye, eye, 9, submap=3), flown(3, eye, eye, 7)]
-    assert [t for t, _ in compose(frames, {7: eye}, T_b_c)] == [3]
+    assert [t for t, _ in refined_path(frames, {7: eye}, T_b_c)] == [3]
 
 
 def test_statistics_and_their_absence() -> None:

@@ -11,7 +11,8 @@ import pytest
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.ports import LinkError, SourceError, SourceReport
-from kiteline_lab.flights.fly import Options, clear, flight_starts, fly, link_bytes, options
+from kiteline_lab.flights.fly import clear, fly, link_bytes, options
+from kiteline_lab.flights.plan import Options, flight_starts
 
 
 class Stamps:

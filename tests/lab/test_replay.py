@@ -15,7 +15,8 @@ from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
 from kiteline_lab.replay.replay import main, replay_agent
 
 

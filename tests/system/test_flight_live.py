@@ -25,9 +25,10 @@ from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, read_frame
 from kiteline_hw.logs.rig_json import rig_from_json
-from kiteline_lab.flights.flight import free_endpoint
-from kiteline_lab.flights.flight_report import check_contract
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.contract import check_contract
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
+from kiteline_lab.flights.processes import free_endpoint
 from kiteline_lab.replay.replay import main as replay
 
 STOP_S = 2.0  # s in which a program told to stop has to be gone

@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from kiteline_hw.ports import LinkError, SourceError
-from kiteline_lab.flights.flight import free_endpoint
-from kiteline_lab.flights.flight_report import check_contract, without_timing
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.contract import check_contract
+from kiteline_lab.flights.flight_report import without_timing
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
+from kiteline_lab.flights.processes import free_endpoint
 from kiteline_lab.replay.replay import main as replay
 
 

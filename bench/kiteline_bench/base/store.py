@@ -57,7 +57,7 @@ def _killed(bench: Bench, source: Path, seed: int) -> FlownProcesses:
     at_s = np.sort(random.uniform(_FIRST_S, 0.97 * length_s(source), _DEATHS))
     deaths = tuple(zip(at_s.tolist(), random.uniform(0.0, _DELAY_S, _DEATHS).tolist()))
     store = _store(bench, f"store_of_killed{seed}")
-    return bench.fly(source, f"store_killed{seed}", store=str(store), base_deaths=deaths)
+    return bench.fly(source, f"store_killed{seed}", store=str(store), base_kills=deaths)
 
 
 def _completeness_bars(bench: Bench, killed: FlownProcesses) -> list[Bar]:

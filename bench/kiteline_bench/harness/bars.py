@@ -12,7 +12,8 @@ from typing import Any
 
 from kiteline_bench.harness.result import FlownProcesses
 from kiteline_hw.ports import SourceError
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
 
 
 @dataclass(frozen=True, slots=True)

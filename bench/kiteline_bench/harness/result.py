@@ -16,7 +16,7 @@ from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics, trajectories
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment
-from kiteline_lab.flights.flight import Outcome
+from kiteline_lab.flights.outcome import FlightOutcome
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -187,7 +187,7 @@ class FlownProcesses:
 
     folder: Path
     report: dict[str, Any]
-    outcome: Outcome
+    outcome: FlightOutcome
 
     @property
     def base(self) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from kiteline_hw.sim.links.relay import UdpController, UdpRelay
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.sim.links.telemetry_radio import RoutingController, TelemetryConfig
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.flights.flight import free_endpoint
-from kiteline_lab.flights.fly import flight_starts
+from kiteline_lab.flights.plan import flight_starts
+from kiteline_lab.flights.processes import free_endpoint
 
 TITLE = "The thin line"
 

@@ -17,8 +17,10 @@ import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, FlightFailed, at_most, is_true, run_command
 from kiteline_bench.harness.result import FlownProcesses
-from kiteline_lab.flights.flight_report import check_contract, without_timing
-from kiteline_lab.flights.fly import Options, fly
+from kiteline_lab.flights.contract import check_contract
+from kiteline_lab.flights.flight_report import without_timing
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
 from kiteline_lab.replay.replay import main as replay
 
 TITLE = "First flight"

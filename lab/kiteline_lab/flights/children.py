@@ -1,9 +1,4 @@
-"""The processes of one flight on this machine: started, listened to, and never left behind.
-
-with Crew() as crew:
-    crew.start("base", "kiteline_basestation", spec, folder)
-    for event in crew.events(): ...
-"""
+"""Child processes of one flight: started, read line by line, and ended with it."""
 
 from __future__ import annotations
 
@@ -22,13 +17,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-_TERM_WAIT_S = 3.0  # s that a child has to close its log and session before it is killed
-_STDERR_LINES = 12  # of a dead child's last words
+_TERM_WAIT_S = 3.0  # s after SIGTERM until a child is killed
+_STDERR_LINES = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What a child said, or that it ended (kind "exit", values {"code": …})."""
+    """A line of JSON from a child, or its end (kind "exit", values {"code": …})."""
 
     child: str
     kind: str
@@ -37,15 +32,15 @@ class Event:
 
 @dataclass(slots=True)
 class Child:
-    """A running process of the flight."""
+    """A child process; plain_lines: its output that is no event."""
 
     name: str
     process: subprocess.Popen[str]
     stderr: Path
-    listener: threading.Thread | None = None
+    reader: threading.Thread | None = None
     plain_lines: list[str] = field(default_factory=list)
 
-    def last_words(self) -> str:
+    def stderr_tail(self) -> str:
         """The end of what the child wrote to stderr."""
         try:
             lines = self.stderr.read_text(errors="replace").strip().splitlines()
@@ -62,11 +57,11 @@ def ended_by(code: int) -> str:
     return f"ended with status {code}"
 
 
-class Crew:
+class ChildProcesses:
     """Child processes; leaving the `with` block ends those that still run."""
 
     def __init__(self) -> None:
-        self.children: dict[str, Child] = {}
+        self.processes: dict[str, Child] = {}
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
 
     def start(self, name: str, module: str, spec: Mapping[str, Any], folder: Path) -> Child:
@@ -80,20 +75,20 @@ class Crew:
         with stderr.open("w") as errors:
             process = subprocess.Popen(
                 [sys.executable, "-m", module, "--spec", json.dumps(spec)],
-                stdin=subprocess.PIPE,  # held open: a child ends when it closes, that is, when we are gone
+                stdin=subprocess.PIPE,  # held open: a child ends when it closes, that is, with this process
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
                 env=environment,
-                start_new_session=True,  # Ctrl-C reaches us alone; we end the children in order
+                start_new_session=True,  # Ctrl-C reaches this process alone, which ends the children in order
             )
         child = Child(name, process, stderr)
-        self.children[name] = child
-        child.listener = threading.Thread(target=self._listen, args=(child,), name=f"listen-{name}", daemon=True)
-        child.listener.start()
+        self.processes[name] = child
+        child.reader = threading.Thread(target=self._read, args=(child,), name=f"read-{name}", daemon=True)
+        child.reader.start()
         return child
 
-    def _listen(self, child: Child) -> None:
+    def _read(self, child: Child) -> None:
         assert child.process.stdout is not None
         for line in child.process.stdout:
             try:
@@ -110,26 +105,26 @@ class Crew:
         except queue.Empty:
             return None
 
-    def say(self, name: str, word: str) -> None:
+    def send_line(self, name: str, line: str) -> None:
         """Write a line to a child's stdin."""
-        pipe = self.children[name].process.stdin
+        pipe = self.processes[name].process.stdin
         if pipe is not None:
             with contextlib.suppress(OSError, ValueError):
-                pipe.write(word + "\n")
+                pipe.write(line + "\n")
                 pipe.flush()
 
-    def ask_to_end(self, name: str) -> None:
-        """Tell a child to end in its own way."""
+    def terminate(self, name: str) -> None:
+        """Send SIGTERM: a child then closes its log and ends."""
         with contextlib.suppress(ProcessLookupError):
-            self.children[name].process.terminate()
+            self.processes[name].process.terminate()
 
     def running(self) -> list[str]:
         """Names of the children that have not ended."""
-        return [name for name, child in self.children.items() if child.process.poll() is None]
+        return [name for name, child in self.processes.items() if child.process.poll() is None]
 
     def close(self) -> None:
         """End every child: first by SIGTERM, then for good."""
-        alive = [child for child in self.children.values() if child.process.poll() is None]
+        alive = [child for child in self.processes.values() if child.process.poll() is None]
         for child in alive:
             with contextlib.suppress(ProcessLookupError):
                 child.process.terminate()
@@ -140,9 +135,9 @@ class Crew:
             except subprocess.TimeoutExpired:
                 child.process.kill()
                 child.process.wait()
-        for child in self.children.values():
-            if child.listener is not None:
-                child.listener.join()
+        for child in self.processes.values():
+            if child.reader is not None:
+                child.reader.join()
             for pipe in (child.process.stdin, child.process.stdout):
                 if pipe is not None:
                     with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""The frames of an agent's log flown anew under a CPU limit: the kernel's where it lets us, else a modelled core."""
+"""Fly the frames of an agent's log anew under a CPU limit: the kernel's where it is allowed, else a modelled core."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system.cpu import CpuQuota
-from kiteline_lab.flights.children import Crew, ended_by
-from kiteline_lab.flights.flight import Flight, fly_here
+from kiteline_lab.flights.children import ChildProcesses, ended_by
 from kiteline_lab.flights.flight_report import statistic
-from kiteline_lab.flights.fly import flight_starts
+from kiteline_lab.flights.in_process import fly_in_process
+from kiteline_lab.flights.plan import FlightPlan, flight_starts
 from kiteline_lab.flights.progress import Progress
 
 
 def refly(log: Path, percent: float, out: Path | None, virtual: bool) -> int:
-    """Fly the log's frames with `percent` of a core and print what came of it; the exit status."""
+    """Fly the log's frames with `percent` of a core and print the outcome; the exit status."""
     with LogReader(log) as reader:
         if reader.metadata.get("role") not in ("agent", None):
             raise SourceError(f"{log}: --cpu flies an agent's log anew, this is a {reader.metadata['role']}'s")
@@ -42,19 +42,19 @@ def _modelled(log: Path, percent: float, folder: Path) -> dict[str, Any]:
     source = open_source(f"mcap:{log}")
     with contextlib.closing(source):
         start_ns = flight_starts([source])[0]
-        spec = AgentOptions(source=f"mcap:{log}", folder=str(folder), start_ns=start_ns, cpu_percent=percent)
-        report = fly_here(Flight([spec], None, source.frame_count), [source], "tracker").agents[0]
+        options = AgentOptions(source=f"mcap:{log}", folder=str(folder), start_ns=start_ns, cpu_percent=percent)
+        report = fly_in_process(FlightPlan([source], [options], frames=source.frame_count), "tracker").agents[0]
     assert report is not None
     return report
 
 
 def _limited(log: Path, percent: float, folder: Path) -> dict[str, Any]:
-    spec = AgentOptions(source=f"mcap:{log}", folder=str(folder), cpu_percent=percent)
-    with Crew() as crew, Progress("flying", None, "frames") as progress:
-        child = crew.start("agent0", "kiteline_agent", asdict(spec), folder)
+    options = AgentOptions(source=f"mcap:{log}", folder=str(folder), cpu_percent=percent)
+    with ChildProcesses() as children, Progress("flying", None, "frames") as progress:
+        child = children.start("agent0", "kiteline_agent", asdict(options), folder)
         report: dict[str, Any] | None = None
         error = ""
-        while (event := crew.next_event(300.0)) is not None and event.kind != "exit":
+        while (event := children.next_event(300.0)) is not None and event.kind != "exit":
             if event.kind == "progress":
                 progress.update(event.values["frames"])
             elif event.kind == "result":
@@ -63,5 +63,5 @@ def _limited(log: Path, percent: float, folder: Path) -> dict[str, Any]:
                 error = event.values["text"]
         if report is None:
             code = event.values["code"] if event is not None else -9
-            raise SourceError(f"the agent {ended_by(code)}: {error or child.last_words()}")
+            raise SourceError(f"the agent {ended_by(code)}: {error or child.stderr_tail()}")
     return report

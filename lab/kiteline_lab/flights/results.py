@@ -1,4 +1,4 @@
-"""From the outcome of a flight to its folder: refined trajectories, accuracy against the truth, plot, report.json."""
+"""Results of a flight: refined trajectories, accuracy against the truth, plot, report.json."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from kiteline_agent.runtime.flight_log import ESTIMATE, estimate_from_json
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
-from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.step import Estimate
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry.cameras import Rectifier
@@ -18,61 +17,57 @@ from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment
-from kiteline_lab.flights.flight import Outcome
-from kiteline_lab.flights.flight_report import Report, compose, statistic, write_report, write_tum
+from kiteline_lab.flights.flight_report import Report, statistic, write_report, write_tum
+from kiteline_lab.flights.outcome import FlightOutcome
+from kiteline_lab.flights.plan import FlightPlan
+from kiteline_lab.flights.refined_path import refined_path
 from kiteline_lab.plots.plot import Line, plot_trajectories
 
 F64 = NDArray[np.float64]
 
 
-def judge(
-    out: Path,
-    sources: Sequence[FrameSource],
-    agents: Sequence[AgentOptions],
-    outcome: Outcome,
-    align_scale: bool = False,
-) -> Report:
-    """Write what the processes themselves did not, and report.json; the report."""
+def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome, align_scale: bool = False) -> Report:
+    """Write what the processes themselves did not, and report.json; returns the report."""
     alignment = TrajectoryAlignment.SIM3 if align_scale else TrajectoryAlignment.SE3
     report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": sorted(outcome.notes)}
     lines: list[Line] = []
-    for k, (source, spec) in enumerate(zip(sources, agents, strict=True)):
+    for k, (source, spec) in enumerate(zip(plan.sources, plan.agents, strict=True)):
         estimates = read_estimates(Path(spec.folder) / "log.mcap")
         part = outcome.agents[k]
         mine: Report = _with_statistics(part) if part is not None else _from_log(source, estimates)
         mine.pop("drain", None)
         truth = source.ground_truth
         live = [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]
-        if part is None:  # it may have died between a line of its trajectories and its log: the log counts
+        if part is None:  # it may have ended between writing its trajectories and its log: the log counts
             write_tum(out / f"agent{k}" / "live.tum", live)
             write_tum(out / f"agent{k}" / "odometry.tum", [(e.t_ns, e.T_o_b) for e in estimates])
         mine["accuracy"] = {
             "live": _accuracy(live, truth, alignment),
             "odometry": _accuracy([(e.t_ns, e.T_o_b) for e in estimates], truth, alignment),
         }
-        label = f"agent {k}" if len(sources) > 1 else ""
+        label = f"agent {k}" if len(plan.sources) > 1 else ""
         lines.append(Line(f"{label} live".strip(), _trajectory(live)))
         drained: Report = dict(part["drain"]) if part is not None else {}
         if outcome.base is not None:
             T_b_c = Rectifier(source.rig).camera.T_b_c
-            refined = compose(estimates, outcome.flown, T_b_c)
+            refined = refined_path(estimates, outcome.at_last_frame, T_b_c)
             write_tum(out / "base" / f"agent{k}.tum", refined)
             mine["accuracy"]["base"] = _accuracy(refined, truth, alignment)
             lines.append(Line(f"{label} base".strip(), _trajectory(refined)))
-            drained["accuracy"] = _accuracy(compose(estimates, outcome.drained, T_b_c), truth, alignment)
+            drained["accuracy"] = _accuracy(refined_path(estimates, outcome.drained, T_b_c), truth, alignment)
         report["agents"].append(mine)
         report["drain"]["agents"].append(drained)
     if outcome.base is not None:
         base = _with_statistics(outcome.base)
         report["drain"]["base"] = base.pop("drain")
         report["base"] = base
-    _plot(out / "trajectory.png", lines, sources, align=True)
+    _plot(out / "trajectory.png", lines, plan.sources)
     write_report(out / "report.json", report)
     return report
 
 
 def read_estimates(log: Path) -> list[Estimate]:
-    """Every estimate in an agent's log, also in one that was cut. Empty when there is no log."""
+    """All estimates in an agent's log, even in one that was cut; empty without a log."""
     if not log.exists():
         return []
     try:
@@ -88,12 +83,12 @@ def _with_statistics(part: Report) -> Report:
 
 
 def _from_log(source: FrameSource, estimates: Sequence[Estimate]) -> Report:
-    """The report of an agent that ended without one: what its log says."""
-    tally = FrameCounts()
+    """The report of an agent that ended without one, from its log."""
+    counts = FrameCounts()
     for estimate in estimates:
-        tally.count(estimate)
+        counts.count(estimate)
     timing = {"cpu_ms_per_frame": statistic([]), "decode_ms": statistic([]), "rss_mib": 0.0}
-    return {"source": source.name, **tally.as_report(), "ended_early": True, "timing": timing}
+    return {"source": source.name, **counts.as_report(), "ended_early": True, "timing": timing}
 
 
 def _trajectory(poses: Sequence[tuple[int, F64]]) -> Trajectory:
@@ -118,8 +113,8 @@ def _accuracy(
     return out
 
 
-def _plot(path: Path, lines: Sequence[Line], sources: Sequence[FrameSource], align: bool) -> None:
+def _plot(path: Path, lines: Sequence[Line], sources: Sequence[FrameSource]) -> None:
     truth = sources[0].ground_truth if len(sources) == 1 else None
     drawn = [line for line in lines if len(line.trajectory.t_ns)]
     title = sources[0].name if len(sources) == 1 else f"{len(sources)} agents"
-    plot_trajectories(path, drawn, truth, title, align=align)
+    plot_trajectories(path, drawn, truth, title, align=True)

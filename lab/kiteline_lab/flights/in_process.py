@@ -1,0 +1,76 @@
+"""Fly a plan in lock-step in this process."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.runtime.agent_runtime import AgentRuntime
+from kiteline_basestation.runtime.base_runtime import BaseRuntime
+from kiteline_basestation.runtime.options import coded_channels
+from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
+from kiteline_hw.links.kinds import link_traits
+from kiteline_hw.lockstep.messages import Down, Phase
+from kiteline_hw.logs.spill_file import SpillFile
+from kiteline_lab.flights.outcome import FlightOutcome, poses_from_json
+from kiteline_lab.flights.plan import FlightPlan
+from kiteline_lab.flights.progress import Progress
+
+
+def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
+    """Fly in lock-step in this process. mode: tracker, local or monolith."""
+    ours: dict[int, RecordChannel] = {}
+    theirs: dict[int, RecordChannel] = {}
+    for spec in plan.agents:
+        if mode == "monolith":
+            ours[spec.agent], theirs[spec.agent] = plain_pair()
+        elif mode == "local":
+            ours[spec.agent] = coded_channel(
+                spec.boot + 1, spec.up_bytes_s, spec.profile, spill=SpillFile(Path(spec.folder)), bounded=True
+            )
+        else:
+            ours[spec.agent] = NoBaseChannel()
+    with contextlib.ExitStack() as stack:
+        agents = {}
+        for spec, source in zip(plan.agents, plan.sources, strict=True):
+            agents[spec.agent] = AgentRuntime(spec, source, ours[spec.agent], whole_process=False)
+            stack.callback(agents[spec.agent].close)
+        progress = stack.enter_context(Progress("flying", plan.frames, "frames")) if not plan.quiet else None
+        outcome = FlightOutcome([None] * len(plan.agents))
+        if plan.base is None:
+            _fly_alone(agents, progress)
+        else:
+            open_channel = theirs.__getitem__ if theirs else coded_channels(plan.base, link_traits(plan.base.link))
+            base = BaseRuntime(plan.base, open_channel, plain=bool(theirs))
+            stack.callback(base.close)
+            _fly_joined(agents, base, progress)
+            outcome.base = base.report()
+            assert base.at_last_frame is not None
+            outcome.at_last_frame = poses_from_json(base.at_last_frame.keyframes)
+            outcome.drained = poses_from_json(base.summary().keyframes)
+        outcome.agents = [agents[spec.agent].report() for spec in plan.agents]
+    return outcome
+
+
+def _fly_alone(agents: Mapping[int, AgentRuntime], progress: Progress | None) -> None:
+    for agent in agents.values():
+        while agent.next_ns is not None:
+            agent.tick(Down(agent.next_ns, Phase.FLY, ()))
+            _show(agents, progress)
+
+
+def _fly_joined(agents: Mapping[int, AgentRuntime], base: BaseRuntime, progress: Progress | None) -> None:
+    ups = {number: agent.first_message() for number, agent in agents.items()}
+    while True:
+        downs = base.tick(ups)
+        if base.phase is Phase.END:
+            return
+        ups = {number: agent.tick(downs[number]) for number, agent in agents.items()}
+        _show(agents, progress)
+
+
+def _show(agents: Mapping[int, AgentRuntime], progress: Progress | None) -> None:
+    if progress is not None:
+        progress.update(sum(agent.counts.frames for agent in agents.values()))
