@@ -78,7 +78,7 @@ class Agent:
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
         self._submaps = SubmapStage(
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
-            self._two_view_start, self._corrections, self._governor, channel,
+            self._two_view_start, self._governor, channel,
         )  # fmt: skip
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
@@ -294,4 +294,4 @@ class Agent:
         Always for monocular maps, each of which has a unit of its own.
         """
         submaps = self._camera.submaps
-        return not self._has_depth or submaps.active == submaps.first or self._corrections.has_placed(submaps.active)
+        return not self._has_depth or submaps.active == submaps.first or self._corrections.is_recognised(submaps.active)

@@ -335,6 +335,7 @@ def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) 
     left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
     assert left is not None and begin is not None
     assert np.allclose(placement.S_w_m @ begin, left @ live.T_k_c, atol=1e-9)
+    assert not placement.recognised
 
 
 def test_a_submap_that_begins_long_after_the_last_was_left_has_no_place(make_flight: MakeFlight) -> None:

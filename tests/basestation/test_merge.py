@@ -67,6 +67,8 @@ def test_two_agents_in_one_room_get_one_map(make_flight: MakeFlight, words: Any)
     published = feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
+    placed = [r for r in published if isinstance(r, SubmapPlacement)]
+    assert {r.submap for r in placed if r.recognised} == {submap_of_keyframe(b.keyframes[0])}
     last = [r for r in published if isinstance(r, SubmapPlacement) and r.submap == submap_of_keyframe(b.keyframes[0])][
         -1
     ]

@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
-from kiteline_codec.schema import RECORD_TYPES, Key, Record, messages
+from kiteline_codec.schema import RECORD_TYPES, Key, Record, SubmapPlacement, WireError, messages
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.packet import PROTOCOL_VERSION
 from kiteline_core.geometry import se3
+from kiteline_core.ids import submap_id
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -115,6 +117,7 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         S = np.array(s.pose())
         S[:3, :3] *= scale
         out["S_w_m"] = S
+        out["recognised"] = s.at < len(data) and s.u8() == 1
     elif kind == 23:
         out["submap"] = s.varint()
         out["T_m_k"] = s.pose()
@@ -173,6 +176,20 @@ def test_records() -> None:
         kind, id_, _ = entry["key"]
         code = bytes.fromhex(entry["code"])
         assert_agree(read_code(kind, id_, code), messages.decode(Key(*entry["key"]), code))
+
+
+def test_a_recognised_placement_has_one_byte_more() -> None:
+    S_w_m = se3.exp(np.array([0.4, 0.1, -0.2, 0.3, 0.0, 0.05]))
+    plain, recognised = (SubmapPlacement(submap_id(1, 1, 2), S_w_m, known) for known in (False, True))
+    code = messages.encode(recognised)
+    assert code == messages.encode(plain) + b"\1"
+    key = messages.key(recognised)
+    assert_agree(read_code(key.kind, key.id, code), messages.decode(key, code))
+    assert messages.encode(messages.decode(key, code)) == code
+    with pytest.raises(WireError, match="must be 1"):
+        messages.decode(key, code[:-1] + b"\0")
+    with pytest.raises(WireError, match="too many"):
+        messages.decode(key, code + b"\1")
 
 
 def exchange() -> list[tuple[str, bytes]]:

@@ -27,12 +27,9 @@ from kiteline_codec.schema import (
     SubmapPlacement,
 )
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import MAX_SUBMAPS, SubmapId
+from kiteline_core.ids import SubmapId
 
 F64 = NDArray[np.float64]
-
-_MOVED_M = 5e-3  # a placement that differs by less is the same one, coded anew
-_GUESSED_M = 0.5  # by which a base that has only the odometry's word differs from it: a frame's motion
 
 
 class Corrections:
@@ -43,10 +40,7 @@ class Corrections:
         self._cache = cache
         self._smoothing = Smoothing(smoothing)
         self._S_w_m: dict[SubmapId, F64] = {}
-        self._guessed: dict[SubmapId, F64] = {}  # where the odometry, and then a base, had submaps begin: T_first_m
-        self._told: set[SubmapId] = set()  # those of which a base has spoken
-        self._heard = False  # a base has just spoken of some
-        self._placed: set[SubmapId] = set()  # those that a base has put where nobody had guessed them
+        self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self.tiles: dict[tuple[int, int], GridTile] = {}
 
     def take(self, records: Sequence[Record], removed: Sequence[Key]) -> tuple[bool, list[str]]:
@@ -59,7 +53,10 @@ class Corrections:
                 touched |= self._map.apply(record)
             elif isinstance(record, SubmapPlacement):
                 self._S_w_m[record.submap] = record.S_w_m
-                self._heard = True
+                if record.recognised:
+                    self._recognised.add(record.submap)
+                else:
+                    self._recognised.discard(record.submap)
             elif isinstance(record, CachedKeyframe | CachedLandmarks):
                 self._cache.store(record)
             elif isinstance(record, DisparityCalibration) and self._map.camera.stereo:
@@ -67,41 +64,18 @@ class Corrections:
                 events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
             elif isinstance(record, GridTile):
                 self.tiles[record.column, record.row] = record
-        if self._heard:
-            self._compare()
         self._cache.remove(removed)
         for key in removed:
             if key.kind == SubmapPlacement.KIND:  # the map was taken out of a larger one, and has no place any more
                 self._S_w_m.pop(SubmapId(key.id), None)
-                self._placed.discard(SubmapId(key.id))
+                self._recognised.discard(SubmapId(key.id))
         if touched:
             self._map.compose_unplaced()
         return touched, events
 
-    def begins(self, submap: SubmapId, T_first_m: F64) -> None:
-        """A submap begins, which lies at T_first_m (4,4) in the flight's first by odometry."""
-        self._guessed[submap] = T_first_m
-
-    def has_placed(self, submap: SubmapId) -> bool:
-        """Whether a base knows by more than odometry how a submap lies to the flight's first: it was recognised."""
-        return submap in self._placed
-
-    def _compare(self) -> None:
-        """A base that has recognised nothing says what the odometry says, and from then on the same."""
-        self._heard = False
-        for submap in self._guessed.keys() & self._S_w_m.keys():
-            first = SubmapId(submap - submap % MAX_SUBMAPS)
-            if first not in self._S_w_m:
-                continue
-            T_first_m = np.linalg.inv(self._S_w_m[first]) @ self._S_w_m[submap]
-            apart_m = float(np.linalg.norm(T_first_m[:3, 3] - self._guessed[submap][:3, 3]))
-            if submap not in self._told and apart_m < _GUESSED_M:
-                self._guessed[submap], apart_m = T_first_m, 0.0
-            self._told.add(submap)
-            if apart_m > _MOVED_M:
-                self._placed.add(submap)
-            else:
-                self._placed.discard(submap)
+    def is_recognised(self, submap: SubmapId) -> bool:
+        """True if the base merged a submap with another one: its pose there rests on more than odometry."""
+        return submap in self._recognised
 
     def set_upright(self, level: GravityAlignment) -> None:
         """Where a submap lies until the base says so, who sets it upright too; over a thin link that takes seconds."""

@@ -29,7 +29,7 @@ F64 = NDArray[np.float64]
 class CameraState:
     """Owner of all that is known of the camera's pose. Each method is one event of a flight.
 
-    T_c_b: (4,4) body in the camera. T_o_first: (4,4) first submap in the odometry frame, as the camera left it last.
+    T_c_b: (4,4) body in the camera.
     """
 
     def __init__(
@@ -39,7 +39,6 @@ class CameraState:
         has_depth = rig.right is not None or rig.has_depth
         self._map = local_map
         self.T_c_b = se3.inverse(camera.T_b_c)
-        self.T_o_first: F64 = np.eye(4)
         self.pose = PoseState()
         self.motion = MotionModel(camera, imu, config.inertial, config.odometer, self.pose, metric=has_depth)
         self.covariance = PoseCovariance(
@@ -107,8 +106,6 @@ class CameraState:
 
     def leave_map(self) -> None:
         """Carry the covariance over to the odometry frame, before the map changes under the camera."""
-        if self.submaps.active == self.submaps.first:
-            self.T_o_first = self.pose.T_o_m
         self.covariance.before_map_change(self.pose, self.T_c_b, self.submaps.active)
 
     def move_map(self, T_m_c: F64) -> None:

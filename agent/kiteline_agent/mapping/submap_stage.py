@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
@@ -38,7 +37,7 @@ class SubmapStage:
     def __init__(
         self, camera: CameraState, local_map: LocalMap, tracker: Tracker, maker: KeyframeMaker,
         keyframes: KeyframeStage, relocaliser: Relocaliser, depth: DepthFromMotion, two_view_start: TwoViewStart | None,
-        corrections: Corrections, governor: Governor, channel: RecordChannel,
+        governor: Governor, channel: RecordChannel,
     ) -> None:  # fmt: skip
         self._camera = camera
         self._map = local_map
@@ -48,7 +47,6 @@ class SubmapStage:
         self._relocaliser = relocaliser
         self._depth = depth
         self._two_view_start = two_view_start
-        self._corrections = corrections
         self._governor = governor
         self._channel = channel
 
@@ -68,17 +66,14 @@ class SubmapStage:
         if points is None:
             return None
         camera = self._camera
-        first = not camera.submaps.any
-        if first:
+        if not camera.submaps.any:
             camera.set_first_pose(ctx.imu)
         else:
             camera.leave_submap()
             self._relocaliser.start_joining(ctx.number)
-        submap = camera.open_submap()
+        camera.open_submap()
         camera.pose.reset_motion()
         self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)
-        if not first:
-            self._corrections.begins(submap, se3.inverse(camera.T_o_first))
         return OpenedSubmap(True, ["submap: opened"])
 
     def _open_from_two_views(self, ctx: FrameContext, start: TwoViewStart) -> OpenedSubmap | None:

@@ -41,9 +41,9 @@ class Publisher:
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
             self.mark_changed(kind, KeyframeId(keyframe))
 
-    def publish_placement(self, submap: SubmapId, S_w_m: F64) -> None:
+    def publish_placement(self, submap: SubmapId, S_w_m: F64, recognised: bool) -> None:
         """Send where a submap lies in w, as a similarity (4,4)."""
-        self._records.append((agent_of_submap(submap), SubmapPlacement(submap, S_w_m)))
+        self._records.append((agent_of_submap(submap), SubmapPlacement(submap, S_w_m, recognised)))
 
     def withdraw_placement(self, submap: SubmapId) -> None:
         """Drop placements of a submap that have not been sent yet."""

@@ -29,6 +29,7 @@ class PlacementState:
 
     S_w_m: Mapping[SubmapId, F64] = field(default_factory=dict)
     unmerged: Mapping[SubmapId, F64] = field(default_factory=dict)
+    recognised: frozenset[SubmapId] = frozenset()
 
 
 class SubmapPlacements:
@@ -41,6 +42,7 @@ class SubmapPlacements:
         self._publisher = publisher
         self.S_w_m: dict[SubmapId, F64] = {}  # the first submap of all comes first
         self.unmerged: dict[SubmapId, F64] = {}  # S_w_m of submaps that have a placement without a merge
+        self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge with another submap
 
     @property
     def first(self) -> SubmapId | None:
@@ -108,6 +110,7 @@ class SubmapPlacements:
         """Move submaps that were split from a map back to where they lay before. Returns those without placement."""
         withdrawn = []
         for submap in sorted(set(split) & self.S_w_m.keys() - {self.first}):
+            self._recognised.discard(submap)
             if submap in self.unmerged:
                 self._set(submap, self.unmerged[submap])
             else:
@@ -119,6 +122,7 @@ class SubmapPlacements:
     def delete(self, submap: SubmapId) -> None:
         """Drop the placement of a submap."""
         self.S_w_m.pop(submap, None)
+        self._recognised.discard(submap)
 
     def update_map(self, map_id: SubmapId) -> None:
         """Place all submaps of a map as they lie to each other, if one of them is placed.
@@ -142,21 +146,25 @@ class SubmapPlacements:
         for submap in submaps:
             S_w_m = sim3.normalise(S_w_map @ self._map.submap_pose(submap))
             held = self.S_w_m.get(submap)
-            if held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
+            newly = submap != anchor and submap not in self._recognised
+            if newly:
+                self._recognised.add(submap)
+            if newly or held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
                 self._set(submap, S_w_m)
 
     def state(self) -> PlacementState:
         """State to be saved."""
-        return PlacementState(dict(self.S_w_m), dict(self.unmerged))
+        return PlacementState(dict(self.S_w_m), dict(self.unmerged), frozenset(self._recognised))
 
     def restore(self, state: PlacementState) -> None:
         """Continue from a saved state; nothing is published."""
         self.S_w_m.update(state.S_w_m)
         self.unmerged = dict(state.unmerged)
+        self._recognised = set(state.recognised)
 
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
         self.S_w_m[submap] = S_w_m
-        self._publisher.publish_placement(submap, S_w_m)
+        self._publisher.publish_placement(submap, S_w_m, submap in self._recognised)
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
         """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale."""

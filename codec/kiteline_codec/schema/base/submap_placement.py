@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding.packing import Reader, Writer
+from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.poses import read_pose, read_scale, write_pose, write_scale
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
 from kiteline_core.geometry import sim3
@@ -18,7 +18,11 @@ from kiteline_core.ids import SubmapId
 @register
 @dataclass(frozen=True, slots=True)
 class SubmapPlacement(Record):
-    """A submap's pose and unit of length in the world. S_w_m: (4,4) similarity, rigid if both units are the same."""
+    """A submap's pose and unit of length in the world.
+
+    S_w_m: (4,4) similarity, rigid if both units are the same. recognised: the submap's pose rests on a merge with
+    another submap, not on the odometry of its agent alone.
+    """
 
     KIND = 21
     ID = IdOf.SUBMAP
@@ -27,14 +31,21 @@ class SubmapPlacement(Record):
 
     submap: SubmapId
     S_w_m: NDArray[np.float64]
+    recognised: bool = False
 
     def write(self, out: Writer) -> None:
-        """Append scale and pose."""
+        """Append scale, pose and, if the submap was recognised, one byte more."""
         write_scale(out, sim3.scale_of(self.S_w_m))
         write_pose(out, sim3.rigid(self.S_w_m))
+        if self.recognised:
+            out.u8(1)
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
         """The record of a key and a code."""
         scale = read_scale(source)
-        return cls(SubmapId(key.id), sim3.of(scale, read_pose(source)))
+        S_w_m = sim3.of(scale, read_pose(source))
+        recognised = source.left > 0
+        if recognised and source.u8() != 1:
+            raise WireError("the last byte of a placement must be 1")
+        return cls(SubmapId(key.id), S_w_m, recognised)
