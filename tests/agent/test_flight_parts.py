@@ -14,7 +14,7 @@ from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.flight_log import estimate_from_json, estimate_to_json
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
 from kiteline_agent.runtime.frame_reader import FrameReader, joined
-from kiteline_agent.runtime.options import AgentOptions, agent_config, from_json
+from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.step import Estimate
 from kiteline_core.config import ConfigError
 from kiteline_core.frame import Frame, ImuBatch
@@ -154,9 +154,9 @@ def test_a_limited_core_is_busy_for_longer_than_a_whole_one() -> None:
 
 def test_a_spec_travels_as_json() -> None:
     spec = AgentOptions(source="a", folder="b", seconds=2.5)
-    assert from_json(json.dumps({name: getattr(spec, name) for name in AgentOptions.__slots__})) == spec
+    assert configuration.from_json(AgentOptions, json.dumps({name: getattr(spec, name) for name in AgentOptions.__slots__})) == spec
     with pytest.raises(ValueError, match="speed"):
-        from_json('{"source": "a", "folder": "b", "speed": 1}')
+        configuration.from_json(AgentOptions, '{"source": "a", "folder": "b", "speed": 1}')
 
 
 def test_configuration_files_name_their_mistakes(tmp_path: object) -> None:
