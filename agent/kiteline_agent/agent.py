@@ -61,7 +61,7 @@ class Agent:
         self._has_depth = rig.right is not None or rig.has_depth
         self.work = Work()  # operations of the last step
         self.map = LocalMap(camera, config.local_map, config.depth_filter)
-        self.map_cache = MapCache(camera, config.window, config.matching, config.ransac, vocabulary)
+        self.map_cache = MapCache(camera, config.map_cache, config.matching, config.ransac, vocabulary)
         self._governor = Governor(config.governor, inertial=imu is not None)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
@@ -196,7 +196,7 @@ class Agent:
             return []
         self._channel.put(alignment)
         self._corrections.set_upright(alignment)
-        return [f"submap lies {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees askew"]
+        return [f"submap tilted by {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees"]
 
     def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
         """Whether to track the frame, at the effort that the governor decides; its IMU samples are kept. And events."""
@@ -265,7 +265,7 @@ class Agent:
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
         )
         carried = camera.submaps.any and camera.motion.measures_motion
-        if not tracked and (not carried or quality < ctx.config.certainty.flagged_below):
+        if not tracked and (not carried or quality < ctx.config.covariance.flagged_below):
             quality = -1
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
         if keyframe != NO_KEYFRAME:

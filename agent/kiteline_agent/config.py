@@ -18,144 +18,144 @@ class PyramidConfig:
     """Image pyramids."""
 
     levels: int = 4  # each halves the size; three detected octaves and one above for convergence
-    first: int = 0  # finest level that is made; 1: a third of the work, twice the error
+    first: int = 0  # finest level that is computed; 1: a third of the work, twice the error
 
 
 @dataclass(frozen=True, slots=True)
 class StereoConfig:
-    """Depth along the row."""
+    """Depth from disparities along the image row."""
 
-    min_depth_m: float = 0.25  # nearest surface; bounds the search along the row
-    uniqueness: float = 1.15  # second-best cost over best: below it, the row repeats itself
-    min_ncc: float = 0.85  # correlation of the two patches; lower ones are occlusions and edges of depth
-    search_px: float = 3.0  # px of the level: how far stereo may lie from the predicted disparity
+    min_depth_m: float = 0.25  # m: nearest surface; bounds the search along the row
+    uniqueness: float = 1.15  # second-best cost over best; below it the row repeats itself
+    min_ncc: float = 0.85  # correlation of the two patches; lower at occlusions and depth edges
+    search_px: float = 3.0  # px of the level: range around the predicted disparity
     iterations: int = 6  # Gauss-Newton steps; it converges in 3
-    points: int = 240  # of a frame, spread over those that were found
-    sigma_px: float = 0.25  # one standard deviation of a disparity at octave 0
+    points: int = 240  # disparities measured in a frame, spread over the landmarks found; 0: none
+    sigma_px: float = 0.25  # px at octave 0: standard deviation of a disparity
 
 
 @dataclass(frozen=True, slots=True)
 class AlignConfig:
     """Template alignment."""
 
-    coarse_points: int = 80  # points of the first, coarse pass that mends the motion model
-    points: int = 240  # points of the fine pass; more cost time and gain little
-    cell_px: int = 32  # one candidate at a time is taken from each cell
+    coarse_points: int = 80  # landmarks of the coarse pass, which corrects the prediction
+    points: int = 240  # landmarks of the fine pass; more cost time and gain little
+    cell_px: int = 32  # px: candidates are spread over cells of this size
     iterations: int = 8  # Gauss-Newton steps a level
-    fine_from: int = 1  # template level at which the fine pass begins; 0 is cheaper and forgives less
+    fine_from: int = 1  # template level at which the fine pass begins; 0 is cheaper and converges from less far
     coarse_step_px: float = 7.0  # px of the coarse level: half a template
-    fine_step_px: float = 3.0  # px of the fine level: what the coarse pass leaves
+    fine_step_px: float = 3.0  # px of the fine level: error that the coarse pass leaves
     min_ncc: float = 0.80  # correlation of template and patch
-    sigma_px: float = 0.30  # one standard deviation of an aligned pixel coordinate at octave 0
-    max_scale: float = 2.5  # how much nearer or farther than its template a point may be
+    sigma_px: float = 0.30  # px at octave 0: standard deviation of an aligned coordinate
+    max_scale: float = 2.5  # change of distance since the template was cut, as a factor
 
 
 @dataclass(frozen=True, slots=True)
 class PoseConfig:
     """Motion-only optimisation."""
 
-    rounds: int = 3  # each ends with a new verdict on outliers
+    rounds: int = 3  # outliers are chosen anew after each
     iterations: int = 4  # Gauss-Newton steps a round
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom
-    min_inliers: int = 15  # below it a pose is not to be trusted
-    min_share: float = 0.3  # of the points looked for: good tracks find half, ones that began elsewhere a tenth
+    min_inliers: int = 15  # with fewer a pose is not trusted
+    min_share: float = 0.3  # inliers of the landmarks searched for; good tracks have half, wrong ones a tenth
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeConfig:
-    """When a frame becomes a keyframe; see keyframes.RULES."""
+    """When a frame becomes a keyframe; see keyframes.policy.RULES."""
 
-    min_gap_frames: int = 2  # leaves the tracker time to spread a keyframe's work
-    max_gap_s: float = 3.0  # a standing vehicle still proves that it is alive
+    min_gap_frames: int = 2  # frames: the tracker uses a new keyframe before the next one is made
+    max_gap_s: float = 3.0  # s: the base hears at least so often from a vehicle at rest
     min_share: float = 0.65  # inliers relative to those of the reference keyframe
-    min_inliers: int = 90  # absolute number of inliers that a comfortable track has
-    min_cover: float = 0.45  # share of 96 px image cells that hold a tracked point
+    min_inliers: int = 90  # inliers of a comfortable track
+    min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
-    rotation_rad: float = 0.30  # a turn that has replaced a quarter of the view
-    thin: float = 3.0  # times the fewest inliers of a pose: below it a keyframe cannot wait for CPU time
+    rotation_rad: float = 0.30  # rad: a rotation that has replaced a quarter of the view
+    thin: float = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
 
 @dataclass(frozen=True, slots=True)
 class LocalMapConfig:
-    """What the agent remembers."""
+    """Size of the local map."""
 
-    keyframes: int = 48  # slots; older and farther keyframes are forgotten (the base has them)
-    births: int = 200  # points a keyframe can bear
-    searched: int = 48  # keyframes whose points are looked for: those seen last
-    max_far_ratio: float = 400.0  # depth over baseline beyond which stereo says nothing
-    first_points: int = 40  # with depth, that a first keyframe must have
+    keyframes: int = 48  # slots; older and farther keyframes are evicted (the base keeps them)
+    landmarks: int = 200  # new landmarks a keyframe, at most
+    searched: int = 48  # keyframes whose landmarks are searched for: those seen last
+    max_far_ratio: float = 400.0  # depth over baseline beyond which stereo gives no depth
+    first_points: int = 40  # landmarks with depth that the first keyframe of a submap needs
 
 
 @dataclass(frozen=True, slots=True)
 class DepthFilterConfig:
-    """How new sightings sharpen a point's depth until the base sends a better one."""
+    """How observations sharpen a landmark's depth until the base sends a better one."""
 
-    refined_sigma_px: float = 0.08  # virtual disparity error of a depth that the base refined
-    floor_px: float = 0.06  # virtual disparity error that the filter never claims to beat
-    inflation: float = 6.0  # successive sightings share the template's error: so many count as one
+    refined_sigma_px: float = 0.08  # px: virtual disparity error of a depth that the base refined
+    floor_px: float = 0.06  # px: smallest virtual disparity error of the filter
+    inflation: float = 6.0  # factor on variances: successive observations share the template's error
 
 
 @dataclass(frozen=True, slots=True)
 class TwoViewStartConfig:
-    """How one eye begins a map."""
+    """How a monocular camera begins a map."""
 
-    median_depth_m: float = 4.0  # of the first points: the convention that sets the scale; that of a room
-    corners: int = 400  # followed from the first frame; half of them are lost or have no parallax
-    cell_px: int = 22  # one corner a cell
-    window_px: int = 15  # px of the flow's window: the cheapest that holds on to corners
-    min_flow: float = 0.02  # of the focal length, median: below it two views are hardly two
+    median_depth_m: float = 4.0  # m: convention that sets the scale of the first landmarks; that of a room
+    corners: int = 400  # corners followed from the first frame; half of them are lost or have no parallax
+    cell_px: int = 22  # px: one corner a cell
+    window_px: int = 15  # px: window of the optical flow; the smallest that keeps hold of corners
+    min_flow: float = 0.02  # of the focal length, median: with less flow two views have no parallax
     min_share: float = 0.4  # of the first corners; with fewer left a new first frame is taken
-    max_frames: int = 40  # after which a new first frame is taken: the view has changed too much
-    scale_every: int = 10  # frames between two looks at the scale that an IMU gives
-    scale_sigma: float = 0.02  # relative deviation at which that scale is believed
+    max_frames: int = 40  # frames after which a new first frame is taken: the view has changed too much
+    scale_every: int = 10  # frames between two tests of the metric scale
+    scale_sigma: float = 0.02  # relative deviation below which the metric scale is used
     two_view: TwoViewConfig = field(default_factory=TwoViewConfig)
 
 
 @dataclass(frozen=True, slots=True)
 class DepthFromMotionConfig:
-    """How bearings get their depth from motion."""
+    """How landmarks without depth (seeds) get one from motion."""
 
-    per_frame: int = 150  # bearings looked for in a frame; each costs about 10 us
-    per_frame_stereo: int = 24  # the same beside stereo, which leaves only far and doubtful points
-    nearer: float = 2.0  # how much nearer than the nearest twentieth of the points a bearing may be
-    reach: float = 2.5  # deviations of inverse depth that are searched
-    step_px: float = 0.7  # px of the level between two tries: half of what correlation bears
+    per_frame: int = 150  # seeds searched in a frame; each costs about 10 us
+    per_frame_stereo: int = 24  # the same with stereo, which leaves only far and doubtful ones
+    nearer: float = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
+    reach: float = 2.5  # standard deviations of inverse depth that are searched
+    step_px: float = 0.7  # px of the level between two tries: half the width of the correlation peak
     max_steps: int = 40  # tries on a segment; longer ones are searched on a smaller image
     min_search_ncc: float = 0.7  # correlation at a try, up to half a step from the peak
     distinct: float = 0.93  # share of the best correlation that nothing else on the segment may reach
-    off_line_px: float = 1.5  # px at octave 0 that alignment may leave the segment's line
-    gate: float = 3.0  # deviations between what is measured and what is held
-    sigma_px: float = 0.5  # one deviation of an aligned pixel, with the pose's own error
-    inflation: float = 2.0  # successive frames share the template's error: so many count as one
-    known: float = 0.12  # deviation over inverse depth at which a bearing becomes a point
-    far_share: float = 0.4  # of the typical inverse depth: a farther point needs only be known as well as one there
+    off_line_px: float = 1.5  # px at octave 0 between the aligned pixel and the epipolar line
+    gate: float = 3.0  # standard deviations between measured and held inverse depth
+    sigma_px: float = 0.5  # px: standard deviation of an aligned pixel, with the pose's own error
+    inflation: float = 2.0  # factor on variances: successive frames share the template's error
+    known: float = 0.12  # deviation over inverse depth below which a seed becomes a landmark
+    far_share: float = 0.4  # of the typical inverse depth: `known` counts from there for farther landmarks
     min_hits: int = 3  # frames that agree
-    max_misses: int = 6  # frames in which nothing alike is there: it moved, or was the edge of something
-    max_tries: int = 60  # frames in view without a depth: there is none to be had
+    max_misses: int = 6  # frames without a match: it moved, or was an occlusion edge
+    max_tries: int = 60  # frames in view without a depth
 
 
 @dataclass(frozen=True, slots=True)
 class RelocalisationConfig:
-    """Finding the old map again."""
+    """Relocalisation in the local map, and how the map goes on without it."""
 
-    cell_px: int = 16  # one corner a cell; four times as many as a keyframe bears, so that its own are among them
+    cell_px: int = 16  # px: one corner a cell; four times as many as in a keyframe, so that its own are among them
     max_corners: int = 600  # 0.5 ms of descriptors
-    min_corners: int = 60  # fewer: there is no texture in view, and a try would prove nothing
+    min_corners: int = 60  # with fewer there is no texture in view, and a search would prove nothing
     candidates: int = 3  # places tried in a frame; each costs about 1 ms
-    beyond_px: float = 150.0  # px beyond a keyframe's border of which points are matched too: a fifth of the image
+    beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
     min_pnp_inliers: int = 12  # of P3P; chance matches reach 8
     min_inliers: int = 30  # of the tracker from that pose
-    min_share: float = 0.4  # of the points that the tracker looked for: a place that only resembles has fewer
-    carried_m: float = 0.08  # deviation of a pose by the IMU alone up to which the map goes on: well below what is good
-    carried_rad: float = 0.02  # likewise: a degree
-    failures: int = 2  # tries, with texture in view, to find the old map before a new one opens
-    beside_frames: int = 20  # how long the search goes on beside a young submap: 1 s
-    agree_ratio: float = 0.05  # of the depth: two results beside a young submap may differ by so much
-    agree_rad: float = 0.035  # 2 degrees, the same for the turn
-    twins: int = 2  # further places of the same submap that are tried when one was found; each costs about 1 ms
-    twin_share: float = 0.6  # of its matches, with which another place is as likely
-    twin_ratio: float = 0.2  # of the depth, that two results of one place may differ: P3P by points of one side only
-    twin_rad: float = 0.15  # the same for the turn
+    min_share: float = 0.4  # of the landmarks the tracker searched for; a place that only looks similar has fewer
+    dead_reckoning_m: float = 0.08  # m: standard deviation up to which dead reckoning extends the map; below good_m
+    dead_reckoning_rad: float = 0.02  # rad: the same for the rotation, a degree
+    failures: int = 2  # failed searches in frames with texture before a new submap is opened
+    join_frames: int = 20  # frames for which older submaps are searched beside a new one: 1 s
+    agree_ratio: float = 0.05  # of the depth: difference between two results beside a new submap
+    agree_rad: float = 0.035  # rad: the same for the rotation, 2 degrees
+    ambiguous_candidates: int = 2  # further places of the same submap that are tried; each costs about 1 ms
+    ambiguous_share: float = 0.6  # of the inliers: with so many another place is as likely
+    ambiguous_ratio: float = 0.2  # of the depth: difference up to which two results are the same place
+    ambiguous_rad: float = 0.15  # rad: the same for the rotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,29 +191,29 @@ class CovarianceConfig:
 
 @dataclass(frozen=True, slots=True)
 class MapCacheConfig:
-    """Copies of keyframes that the base lends, and what is made of them."""
+    """Cached keyframes sent by the base, and how they are matched."""
 
-    copies: int = 32  # slots; the base lends fewer, an earlier base's may still be here
-    points: int = 128  # of a copy
-    sigma_px: float = 0.15  # virtual disparity error of a lent point: many views made it
-    max_scale: float = 2.5  # how much nearer or farther than in its keyframe a point may be
-    octave_gap: float = 1.2  # octaves between the size foreseen and the size found
-    corner_px: float = 1.0  # one standard deviation of a corner's place at octave 0, found twice
-    radius_px: float = 6.0  # px at octave 0 around where a lost frame's points are foreseen: what P3P leaves
-    min_met: int = 12  # lent points that agree with one pose; chance matches reach 8
-    min_found: int = 30  # of them that find a lost frame
-    min_share: float = 0.15  # of those that should be in view; not every point is a corner again
-    candidates: int = 3  # copies tried in a lost frame
-    beyond_px: float = 150.0  # px beyond a copy's border of which points are matched too
+    keyframes: int = 32  # slots; the base sends fewer, but those of an earlier base may still be there
+    landmarks: int = 128  # of a cached keyframe
+    sigma_px: float = 0.15  # px: virtual disparity error of a cached landmark, which rests on many views
+    max_scale: float = 2.5  # change of distance since the cached keyframe, as a factor
+    octave_gap: float = 1.2  # octaves between predicted and matched size
+    corner_px: float = 1.0  # px at octave 0: standard deviation of a corner that was detected twice
+    radius_px: float = 6.0  # px at octave 0: search radius around a projection, the error that P3P leaves
+    min_matches: int = 12  # that agree with one pose; chance matches reach 8
+    min_relocalisation_matches: int = 30  # with which a lost frame is relocalised
+    min_share: float = 0.15  # of the landmarks that should be in view; not every one is a corner again
+    candidates: int = 3  # cached keyframes tried in a lost frame
+    beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothingConfig:
-    """How corrections reach the live pose in the world. They never touch the odometry frame."""
+    """How corrections reach the live pose in the world. They never move the odometry frame."""
 
-    max_m_s: float = 0.2  # m/s at which the odometry frame moves in w: no jump, and told within a second; 0: at once
-    max_rad_s: float = 0.0  # rad/s at which it turns; 0: at once
-    snap_m: float = 0.3  # farther than this two maps were joined: taken at once
+    max_m_s: float = 0.2  # m/s at which the odometry frame moves in w: no jump, done within a second; 0: at once
+    max_rad_s: float = 0.0  # rad/s at which it rotates; 0: at once
+    snap_m: float = 0.3  # m: larger corrections are map merges and taken at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,12 +256,12 @@ class AgentConfig:
     inertial: InertialConfig = field(default_factory=InertialConfig)
     controller_imu: ControllerImuConfig = field(default_factory=ControllerImuConfig)
     odometer: OdometerConfig = field(default_factory=OdometerConfig)
-    certainty: CovarianceConfig = field(default_factory=CovarianceConfig)
+    covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)
-    motion: DepthFromMotionConfig = field(default_factory=DepthFromMotionConfig)
-    mono_start: TwoViewStartConfig = field(default_factory=TwoViewStartConfig)
-    recovery: RelocalisationConfig = field(default_factory=RelocalisationConfig)
-    window: MapCacheConfig = field(default_factory=MapCacheConfig)
+    depth_from_motion: DepthFromMotionConfig = field(default_factory=DepthFromMotionConfig)
+    two_view_start: TwoViewStartConfig = field(default_factory=TwoViewStartConfig)
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
+    map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
     matching: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)

@@ -16,6 +16,7 @@ from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry
 from kiteline_agent.runtime.frame_reader import FrameReader, joined
 from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.step import Estimate
+from kiteline_core import config as configuration
 from kiteline_core.config import ConfigError
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
@@ -154,7 +155,12 @@ def test_a_limited_core_is_busy_for_longer_than_a_whole_one() -> None:
 
 def test_a_spec_travels_as_json() -> None:
     spec = AgentOptions(source="a", folder="b", seconds=2.5)
-    assert configuration.from_json(AgentOptions, json.dumps({name: getattr(spec, name) for name in AgentOptions.__slots__})) == spec
+    assert (
+        configuration.from_json(
+            AgentOptions, json.dumps({name: getattr(spec, name) for name in AgentOptions.__slots__})
+        )
+        == spec
+    )
     with pytest.raises(ValueError, match="speed"):
         configuration.from_json(AgentOptions, '{"source": "a", "folder": "b", "speed": 1}')
 

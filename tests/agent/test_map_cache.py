@@ -87,7 +87,7 @@ def world() -> World:
 
 def window(**limits: float) -> MapCache:
     config = AgentConfig()
-    return MapCache(CAMERA, replace(config.window, **limits), config.matching, config.ransac, shipped_vocabulary())
+    return MapCache(CAMERA, replace(config.map_cache, **limits), config.matching, config.ransac, shipped_vocabulary())
 
 
 def ring(world: World, box: MapCache, copies: int = 12, submap: SubmapId = HERE) -> None:
@@ -144,7 +144,7 @@ def test_a_frame_of_elsewhere_is_not_found(world: World) -> None:
 
 
 def test_what_is_taken_back_is_gone_and_the_number_is_bounded(world: World) -> None:
-    box, rng = window(copies=8), np.random.default_rng(5)
+    box, rng = window(keyframes=8), np.random.default_rng(5)
     ring(world, box, copies=12)
     assert len(box) == 8
     assert set(box.keyframe.tolist()) == {keyframe_id(THERE, k) for k in range(4, 12)}, "the oldest make room"

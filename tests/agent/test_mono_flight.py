@@ -117,7 +117,7 @@ def test_a_room_is_followed_at_a_scale_of_its_own() -> None:
     scale, error_m = similar(found, true)
     assert error_m < 0.01
     typical_m = float(np.median(room(path(first))[1]))
-    assert scale == pytest.approx(typical_m / AgentConfig().mono_start.median_depth_m, rel=0.25)
+    assert scale == pytest.approx(typical_m / AgentConfig().two_view_start.median_depth_m, rel=0.25)
     # What flies must not jump when the map begins.
     moves = np.diff([e.T_o_b[:3, 3] for e in estimates], axis=0)
     assert np.linalg.norm(moves, axis=1).max() < 0.15 / scale

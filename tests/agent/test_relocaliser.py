@@ -155,7 +155,7 @@ def test_out_of_the_wall_at_another_place(room: Recording, words: Vocabulary, re
     assert flown.said("submap: joined") == []
     assert room.error_m(flown, shown, 1) < 0.04
     young = [e.quality for e in flown.estimates if e.tracked and e.submap % MAX_SUBMAPS == 1]
-    assert max(young) < AgentConfig().certainty.flagged_below, "nobody knows how it lies to where the flight began"
+    assert max(young) < AgentConfig().covariance.flagged_below, "nobody knows how it lies to where the flight began"
     opened = next(h for h in flown.heads if h.keyframe >> 20 == flown.estimates[-1].submap)
     assert opened.parent == NO_KEYFRAME
 
@@ -263,6 +263,6 @@ def test_a_place_that_nothing_can_have_flown_to_is_not_believed(room: Recording,
     assert all(e.tracked for e in flown.estimates[37:]) and flown.submaps[-1] == 1
     frames = room.show([*BEFORE, *WALL, *range(200, 226)], 120.0)  # within half a second: nearly one g
     flown = fly(room.rig, frames, words)
-    limit = AgentConfig().certainty.flagged_below
+    limit = AgentConfig().covariance.flagged_below
     assert set(flown.submaps) == {0} and all(0 < e.quality < limit for e in flown.estimates[41:60])
     assert flown.estimates[-1].quality > limit

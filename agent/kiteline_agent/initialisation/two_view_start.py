@@ -62,10 +62,10 @@ class TwoViewStart:
         self._config = config
         self._work = work
         self._detector = replace(
-            config.detector, cell_px=config.mono_start.cell_px, max_corners=config.mono_start.corners
+            config.detector, cell_px=config.two_view_start.cell_px, max_corners=config.two_view_start.corners
         )
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        self._median_depth_m = config.mono_start.median_depth_m
+        self._median_depth_m = config.two_view_start.median_depth_m
         self._first: FrameImages | None = None
         self._first_t_ns = 0
         self._frames = 0
@@ -89,7 +89,7 @@ class TwoViewStart:
     def add(self, ctx: FrameContext) -> TwoViewMap | None:
         """Take in a frame. Returns a map once this frame and the first one give enough landmarks."""
         self._work.searches += 1
-        config = self._config.mono_start
+        config = self._config.two_view_start
         if self._first is None:
             self._begin(ctx)
             return None
@@ -119,7 +119,7 @@ class TwoViewStart:
 
     def _follow(self, images: FrameImages) -> None:
         """Follow the corners by pyramidal optical flow from the last frame, checked backwards."""
-        image, window = images.left[0], self._config.mono_start.window_px
+        image, window = images.left[0], self._config.two_view_start.window_px
         if len(self._uv):
             before = self._uv.astype(np.float32)
             size = {"winSize": (window, window), "maxLevel": 3}
@@ -134,7 +134,7 @@ class TwoViewStart:
 
     def _reconstruct(self, first: FrameImages, images: FrameImages) -> TwoViewMap | None:
         """Align the corners with their templates, and solve for motion and depth."""
-        align, config = self._config.align, self._config.mono_start
+        align, config = self._config.align, self._config.two_view_start
         uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
         warp = np.tile(self._mean_warp(), (len(uv), 1, 1))
         alignment_kernels.align(
@@ -148,7 +148,7 @@ class TwoViewStart:
         factor = self._median_depth_m / float(np.median(seen.points[seen.good, 2]))
         T_a_b = se3.inverse(seen.T_b_a)
         T_a_b[:3, 3] *= factor
-        rows = np.flatnonzero(seen.good)[: self._config.local_map.births]
+        rows = np.flatnonzero(seen.good)[: self._config.local_map.landmarks]
         place, octave = self._uv0[rows], self._octave[rows]
         angle, descriptor = features.describe(first.left, place, octave)
         disparity = self._camera.bf / (seen.points[rows, 2] * factor)

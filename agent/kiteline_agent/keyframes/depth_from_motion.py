@@ -42,7 +42,7 @@ class DepthFromMotion:
 
     def search_seeds(self, images: FrameImages, track: Track) -> int:
         """Search seeds in a tracked frame, and update their depths. Returns how many became landmarks."""
-        config = self._config.motion
+        config = self._config.depth_from_motion
         near = 1.0 / track.depth_m[track.inlier]
         if len(near) < self._config.pose.min_inliers:
             return 0
@@ -71,7 +71,11 @@ class DepthFromMotion:
 
     def _choose(self, seeds: Candidates, first: int) -> I64:
         """The seeds to search in this frame: most hits first, then the newest. first: finest pyramid level."""
-        limit = self._config.motion.per_frame_stereo if self._map.camera.stereo else self._config.motion.per_frame
+        limit = (
+            self._config.depth_from_motion.per_frame_stereo
+            if self._map.camera.stereo
+            else self._config.depth_from_motion.per_frame
+        )
         order = np.lexsort((-seeds.rows, self._map.tried[seeds.rows], -self._map.hits[seeds.rows]))
         order = order[self._map.octave[seeds.rows[order]] >= first]
         return np.sort(order[:limit])
@@ -95,7 +99,7 @@ class DepthFromMotion:
 
     def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
         """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,): 1 found, 0 not."""
-        config, align = self._config.motion, self._config.align
+        config, align = self._config.depth_from_motion, self._config.align
         octave = self._map.octave[rows]
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
         search_segments(
@@ -123,7 +127,7 @@ class DepthFromMotion:
         p = direction + centre * rho[:, None]
         z = np.maximum(p[:, 2], 1e-3)
         slope = f * (centre[:, :2] - p[:, :2] / z[:, None] * centre[:, 2:]) / z[:, None]  # px per 1/m
-        sigma = self._config.motion.sigma_px * (1 << self._map.octave[rows])
+        sigma = self._config.depth_from_motion.sigma_px * (1 << self._map.octave[rows])
         with np.errstate(divide="ignore"):
             variance = np.where(p[:, 2] > 0.05, sigma**2 / np.einsum("ni,ni->n", slope, slope), np.inf)
         off = np.linalg.norm(p[:, :2] / z[:, None] * f + c - uv, axis=1)
@@ -131,7 +135,7 @@ class DepthFromMotion:
 
     def _count(self, rows: I64, hit: Bool, failed: Bool) -> None:
         """Count tries and hits; drop seeds that keep failing or never get a depth."""
-        config = self._config.motion
+        config = self._config.depth_from_motion
         self._map.tried[rows] += 1
         self._map.hits[rows[hit]] += 1
         self._map.misses[rows[failed]] += 1
@@ -142,7 +146,7 @@ class DepthFromMotion:
 
     def _fuse(self, rows: I64, measured: F64, variance: F64, typical: float) -> int:
         """Average inverse depths. Returns how many seeds are known well enough and became landmarks."""
-        config = self._config.motion
+        config = self._config.depth_from_motion
         rho, sigma = self._map.rho.reshape(-1), self._map.sigma_rho.reshape(-1)
         variance = variance * config.inflation
         prior = sigma[rows] ** 2

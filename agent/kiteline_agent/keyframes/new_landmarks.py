@@ -53,7 +53,7 @@ def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config:
         depth = depth_at(images.depth_m, corners.uv)
         disparity = np.where(depth > 0.0, camera.bf / np.maximum(depth, 1e-3), -1.0)
     # Corners with depth first: only they are tracked at once.
-    order = np.argsort(disparity < 0.0, kind="stable")[: config.local_map.births]
+    order = np.argsort(disparity < 0.0, kind="stable")[: config.local_map.landmarks]
     uv, octave = corners.uv[order], corners.octave[order]
     angle, descriptor = features.describe(images.left, uv, octave)
     return NewPoints(uv, disparity[order], octave, angle, descriptor)

@@ -51,7 +51,7 @@ class LocalMap:
     """Keyframes and points near the vehicle, bounded in number."""
 
     def __init__(self, camera: RectifiedCamera, config: LocalMapConfig, filtering: DepthFilterConfig) -> None:
-        k, b = config.keyframes, config.births
+        k, b = config.keyframes, config.landmarks
         self.camera = camera
         self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
@@ -94,7 +94,7 @@ class LocalMap:
     @property
     def births(self) -> int:
         """Rows a slot."""
-        return self._config.births
+        return self._config.landmarks
 
     def activate(self, submap: SubmapId) -> None:
         """Track the points of this submap from now on; those of the others stay remembered while there is room."""

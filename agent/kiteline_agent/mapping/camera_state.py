@@ -42,7 +42,7 @@ class CameraState:
         self.pose = PoseState()
         self.motion = MotionModel(camera, imu, config.inertial, config.odometer, self.pose, metric=has_depth)
         self.covariance = PoseCovariance(
-            local_map, camera.T_b_c, config.certainty, has_body=rig.has_body, has_depth=has_depth
+            local_map, camera.T_b_c, config.covariance, has_body=rig.has_body, has_depth=has_depth
         )  # fmt: skip
         self.gravity = GravityAligner(
             camera, self.motion.tracker, config.inertial.askew_rad, config.inertial.level_patience_s

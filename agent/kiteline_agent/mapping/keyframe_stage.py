@@ -41,7 +41,7 @@ class KeyframeStage:
             return []
         urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
-            return ["governor: keyframe put off"]
+            return ["governor: keyframe postponed"]
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             return []
         self.add(ctx, track)
@@ -57,17 +57,17 @@ class KeyframeStage:
 
         Returns whether the map goes on there, also if the keyframe has to wait for CPU time, and events.
         """
-        limits = ctx.config.recovery
-        if not self._camera.covariance.dead_reckoning_within(limits.carried_m, limits.carried_rad):
+        limits = ctx.config.relocalisation
+        if not self._camera.covariance.dead_reckoning_within(limits.dead_reckoning_m, limits.dead_reckoning_rad):
             return False, []
         if not self._governor.may(Extra.KEYFRAME, urgent=True):
-            return True, ["governor: keyframe put off"]
+            return True, ["governor: keyframe postponed"]
         points = self._maker.first_points(ctx)
         if points is None:
             return False, []
         self._camera.covariance.extend_map(self._camera.T_m_b)
         self.make(ctx, None, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
-        return True, ["keyframe: carried by the IMU"]
+        return True, ["keyframe: by dead reckoning"]
 
     def make(self, ctx: FrameContext, track: Track | None, points: NewPoints, T_m_c: F64, kind: Extra) -> KeyframeId:
         """Make a keyframe of a frame with the camera at T_m_c (4,4); it becomes the reference. track: see KeyframeMaker."""

@@ -74,7 +74,7 @@ class LossStage:
         if not camera.submaps.any:
             return None
         if not self._governor.may(Extra.SEARCH):
-            events.append("governor: search put off")
+            events.append("governor: search postponed")
             self.failed_searches = max(self.failed_searches, 1)
             return None
         found = self._relocaliser.relocalise(ctx, camera.reference.keyframe)
@@ -84,7 +84,7 @@ class LossStage:
         camera.return_to(found, ctx.number)
         camera.pose.reset_motion()
         self.failed_searches = 0
-        events.append("recovered by copies" if found.from_cache else "recovered")
+        events.append("relocalised by the map cache" if found.from_cache else "relocalised")
         if found.from_cache:  # none of its landmarks is in the local map yet
             self._keyframes.add(ctx, found.track)
         else:

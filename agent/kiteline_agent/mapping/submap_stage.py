@@ -55,7 +55,7 @@ class SubmapStage:
         submaps = self._camera.submaps
         if not submaps.any:
             return True
-        tried = failed_searches >= ctx.config.recovery.failures
+        tried = failed_searches >= ctx.config.relocalisation.failures
         return tried and submaps.room and self._governor.may(Extra.SUBMAP)
 
     def open(self, ctx: FrameContext) -> OpenedSubmap | None:
@@ -132,7 +132,7 @@ class SubmapStage:
 
     def restart_in_metres(self, ctx: FrameContext, track: Track) -> list[str]:
         """Continue a monocular map in a new submap in metres, once IMU or odometer tell its scale. Returns events."""
-        limits, camera = ctx.config.mono_start, self._camera
+        limits, camera = ctx.config.two_view_start, self._camera
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
         unit_m = camera.motion.metres_per_unit(limits.scale_sigma)

@@ -58,17 +58,18 @@ class _Projections:
 
 
 class MapCache:
-    """Cached keyframes, bounded in number: slot k holds a keyframe, row k * points + i one of its landmarks."""
+    """Cached keyframes, bounded in number: slot k holds a keyframe, row k * landmarks + i one of its landmarks."""
 
     def __init__(
         self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig, ransac: RansacConfig,
         vocabulary: Vocabulary | None,
     ) -> None:  # fmt: skip
-        k, p = config.copies, config.points
+        k, p = config.keyframes, config.landmarks
         self._camera = camera
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
         self._config = config
+        self._beyond_px = float(round(config.beyond * camera.width))
         self._matching = matching
         self._ransac = ransac
         self._vocabulary = vocabulary
@@ -137,9 +138,9 @@ class MapCache:
         """Store the landmarks of all parts that arrived, up to the capacity."""
         self._remove_from_index(slot)
         parts = [self._parts[slot][k] for k in sorted(self._parts[slot])]
-        keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[: self._config.points]
+        keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[: self._config.landmarks]
         n, c = len(keep), self._camera
-        rows = slice(slot * self._config.points, slot * self._config.points + n)
+        rows = slice(slot * self._config.landmarks, slot * self._config.landmarks + n)
         uv = np.concatenate([part.uv for part in parts]).astype(np.float64)[keep]
         self._bearing[slot, :n] = (uv - (c.cx, c.cy)) / (c.fx, c.fy)
         self._rho[slot, :n] = np.concatenate([part.inv_depth for part in parts])[keep]
@@ -154,7 +155,7 @@ class MapCache:
     def match_landmarks(self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures) -> CacheMatches | None:
         """Match cached landmarks of a submap with a frame at about T_c_m (4,4); None if too few agree on a pose."""
         projected = self._project(T_c_m, submap, _MARGIN_PX)
-        if len(projected.rows) < self._config.min_met or len(seen.uv) < self._config.min_met:
+        if len(projected.rows) < self._config.min_matches or len(seen.uv) < self._config.min_matches:
             return None
         offered, wanted = comparable(seen.descriptor, self._descriptor[projected.rows])
         found = match_near(
@@ -167,7 +168,7 @@ class MapCache:
         self, T_c_m: F64, projected: _Projections, found: Matches, seen: FrameFeatures
     ) -> CacheMatches | None:
         """The matches that agree with one pose."""
-        if len(found.a) < self._config.min_met:
+        if len(found.a) < self._config.min_matches:
             return None
         xyz, ray = projected.xyz[found.a], projected.ray[found.a]
         observed = np.column_stack([seen.uv[found.b], seen.disparity[found.b]])
@@ -177,7 +178,7 @@ class MapCache:
             T, xyz, ray, observed, sigma_px, self._intrinsics, T_c_m.copy(), np.zeros(6), 3, 4, self._ransac.chi2,
             inlier, np.zeros((6, 6)),
         )  # fmt: skip
-        if inliers < self._config.min_met or not np.isfinite(T).all():
+        if inliers < self._config.min_matches or not np.isfinite(T).all():
             return None
         T = se3.orthonormalise(T)
         depth = se3.transform(T, xyz[inlier])[:, 2]
@@ -208,24 +209,24 @@ class MapCache:
             T_c_m = self._pose_from(slot, submap, seen, frame_number)
             matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen)
             if matches is not None and len(matches.corner) >= max(
-                self._config.min_found, self._config.min_share * matches.in_view
+                self._config.min_relocalisation_matches, self._config.min_share * matches.in_view
             ):
                 return submap, matches
         return None
 
     def _pose_from(self, slot: int, submap: SubmapId, seen: FrameFeatures, frame_number: int) -> F64 | None:
         """P3P on matches with the landmarks in view of a cached keyframe, or a little beyond its border."""
-        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._config.beyond_px)
+        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._beyond_px)
         wanted, offered = comparable(self._descriptor[projected.rows], seen.descriptor)
         found = match(wanted, self._angle[projected.rows], offered, seen.angle, self._matching)
-        if len(found.a) < self._config.min_met:
+        if len(found.a) < self._config.min_matches:
             return None
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         fit = solve_pnp(
             projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics, frame_number,
             self._ransac,
         )  # fmt: skip
-        return None if fit is None or fit.inliers < self._config.min_met else fit.T_c_m
+        return None if fit is None or fit.inliers < self._config.min_matches else fit.T_c_m
 
     def _fill_index(self) -> None:
         """Index the cached keyframes that arrived since the last search; most flights never search."""

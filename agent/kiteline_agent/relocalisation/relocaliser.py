@@ -65,8 +65,9 @@ class Relocaliser:
         self._cache = cache
         self._config = config
         self._work = work
+        self._beyond_px = float(round(config.relocalisation.beyond * local_map.camera.width))
         self._detector = replace(
-            config.detector, cell_px=config.recovery.cell_px, max_corners=config.recovery.max_corners
+            config.detector, cell_px=config.relocalisation.cell_px, max_corners=config.relocalisation.max_corners
         )
         self._index = None if vocabulary is None else PlaceIndex(vocabulary)
         self._join_until: int | None = None  # last frame of the search for an older submap
@@ -90,7 +91,7 @@ class Relocaliser:
 
     def start_joining(self, frame_number: int) -> None:
         """A new submap was opened at this frame: search for older ones for a while."""
-        self._join_until = frame_number + self._config.recovery.beside_frames
+        self._join_until = frame_number + self._config.relocalisation.join_frames
         self._unconfirmed = None
 
     def relocalise(self, ctx: FrameContext, reference: KeyframeId) -> Relocalisation | None:
@@ -112,7 +113,7 @@ class Relocaliser:
         before, self._unconfirmed = self._unconfirmed, (found.submap, T_old_new)
         if before is None or before[0] != found.submap:
             return None
-        limits = self._config.recovery
+        limits = self._config.relocalisation
         change = found.T_c_m @ T_old_new @ se3.inverse(before[1]) @ se3.inverse(found.T_c_m)  # at the camera
         angle = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
         if np.linalg.norm(change[:3, 3]) > limits.agree_ratio * found.depth_m or angle > limits.agree_rad:
@@ -123,7 +124,7 @@ class Relocaliser:
     def _search(self, ctx: FrameContext, reference: KeyframeId, exclude: SubmapId | None) -> Relocalisation | None:
         """Try the reference keyframe, the most similar places, and the map cache, in this order."""
         # 1. Corners and descriptors.
-        seen = frame_features(ctx.images, self._detector, self._config.recovery.min_corners)
+        seen = frame_features(ctx.images, self._detector, self._config.relocalisation.min_corners)
         self.has_texture = seen is not None
         if seen is None:
             return None
@@ -145,16 +146,16 @@ class Relocaliser:
         candidates = [reference] if self._map.slot_of(reference) >= 0 and reference != NO_KEYFRAME else []
         if self._index is not None:
             out = [k for k in self._index.keys if k == reference or submap_of_keyframe(KeyframeId(k)) == exclude]
-            places = self._index.query(seen.descriptor, out, self._config.recovery.candidates)
+            places = self._index.query(seen.descriptor, out, self._config.relocalisation.candidates)
             candidates += [KeyframeId(k) for k in places.keys.tolist() if self._map.slot_of(k) >= 0]
         return candidates
 
     def _pose_from(self, keyframe: KeyframeId, seen: FrameFeatures, seed: int) -> PoseFit | None:
         """P3P on matches with the landmarks in view of a keyframe, or a little beyond its border."""
-        limits = self._config.recovery
+        limits = self._config.relocalisation
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
         around = self._map.candidates(
-            se3.inverse(T_m_k), -limits.beyond_px, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
+            se3.inverse(T_m_k), -self._beyond_px, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
         )
         matches = matching.match(
             self._map.descriptor[around.rows], self._map.angle[around.rows], seen.descriptor, seen.angle,
@@ -171,7 +172,7 @@ class Relocaliser:
 
     def _confirmed(self, ctx: FrameContext, T_c_m: F64, submap: SubmapId) -> Track | None:
         """Track from a pose (4,4) in a submap; None if the templates do not agree with it."""
-        limits = self._config.recovery
+        limits = self._config.relocalisation
         active = self._map.active
         self._map.activate(submap)
         track = self._tracker.track(ctx, T_c_m)
@@ -184,16 +185,16 @@ class Relocaliser:
         """True if another place of the same submap matches about as well."""
         if self._index is None:
             return False
-        limits = self._config.recovery
+        limits = self._config.relocalisation
         near = self._map.keyframe[np.unique(found.track.rows[found.track.inlier] // self._map.births)].tolist()
         out = [k for k in self._index.keys if k in near or submap_of_keyframe(KeyframeId(k)) != found.submap]
-        for key in self._index.query(seen.descriptor, out, limits.twins).keys.tolist():
+        for key in self._index.query(seen.descriptor, out, limits.ambiguous_candidates).keys.tolist():
             fit = self._pose_from(KeyframeId(key), seen, seed)
-            if fit is None or fit.inliers < limits.twin_share * inliers:
+            if fit is None or fit.inliers < limits.ambiguous_share * inliers:
                 continue
             apart = fit.T_c_m @ se3.inverse(found.T_c_m)
             angle = float(np.linalg.norm(se3.so3_log(se3.orthonormalise(apart)[:3, :3])))
-            if np.linalg.norm(apart[:3, 3]) > limits.twin_ratio * found.depth_m or angle > limits.twin_rad:
+            if np.linalg.norm(apart[:3, 3]) > limits.ambiguous_ratio * found.depth_m or angle > limits.ambiguous_rad:
                 return True
         return False
 

@@ -8,7 +8,7 @@ from kiteline_agent.step import StepOutput
 _SUMMARY_NS = 10_000_000_000  # between two summaries
 _SHOWN = (
     "submap",
-    "recovered",
+    "relocalised",
     "mono",
     "disparities",
     "governor: level",

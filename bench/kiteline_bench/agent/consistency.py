@@ -42,7 +42,7 @@ class _Counts:
     good_flagged: int = 0
 
     def add(self, errors: list[PoseError]) -> None:
-        limits = AgentConfig().certainty
+        limits = AgentConfig().covariance
         for error in errors:
             flagged = error.estimate.quality < limits.flagged_below
             if error.position_m > limits.good_m or error.rotation_rad > limits.good_rad:

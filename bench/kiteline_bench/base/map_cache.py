@@ -90,8 +90,8 @@ def _lost(bench: Bench, first: str) -> list[Bar]:
         at_most("black for 1.5 s, then a place evicted since: frames until it is found",
                 sum(not e.tracked for e in flown.found[-180:]), 3, "frames", 0),
         is_true("found by cached keyframes, in the old submap", "no new one",
-                bool(flown.frames_with_event("recovered by copies")) and opened == 1,
-                f"{opened} submaps, relocalised {len(flown.frames_with_event('recovered'))} times"),
+                bool(flown.frames_with_event("relocalised by the map cache")) and opened == 1,
+                f"{opened} submaps, relocalised {len(flown.frames_with_event('relocalised'))} times"),
         at_most("its live error in w from then on", found.live_m(0, -170), 0.03, "m", 4),
     ]  # fmt: skip
 

@@ -92,7 +92,9 @@ def _places(number: int, scene: str, path: str) -> list[_Place]:
     source = open_sim(scene, seed=7, trajectory=path, imu=False, depth=True)
     rectifier, eyes, truth = Rectifier(source.rig), source.cameras(), source.ground_truth
     config = AgentConfig()
-    detector = features.DetectorConfig(cell_px=config.recovery.cell_px, max_corners=config.recovery.max_corners)
+    detector = features.DetectorConfig(
+        cell_px=config.relocalisation.cell_px, max_corners=config.relocalisation.max_corners
+    )
     c = rectifier.camera
     out = []
     for k in range(0, source.frame_count or 0, _EVERY):

@@ -22,6 +22,25 @@ from kiteline_hw.logs.mcap_log import CHUNK_BYTES
 Rule = str | tuple[str, Callable[[Any], Any]] | None
 Rules = Mapping[str, Rule]
 
+
+def _share_of_width(px: float) -> float:
+    """Pixels of a 752 px wide image as a share of its width."""
+    return round(px / 752.0, 3)
+
+
+def _agent_events(events: list[str]) -> list[str]:
+    """Events of an agent's step in today's words."""
+    return [next((re.sub(old, new, e) for old, new in _AGENT_EVENTS if re.match(old, e)), e) for e in events]
+
+
+_AGENT_EVENTS = (
+    (r"recovered by copies$", "relocalised by the map cache"),
+    (r"recovered$", "relocalised"),
+    (r"governor: (search|keyframe) put off$", r"governor: \1 postponed"),
+    (r"keyframe: carried by the IMU$", "keyframe: by dead reckoning"),
+    (r"submap lies (.*) degrees askew$", r"submap tilted by \1 degrees"),
+)  # patterns of old texts, and today's
+
 # dotted TOML name of an option, or of a section with all that it holds
 CONFIG: dict[str, Rules] = {
     "agent": {
@@ -30,6 +49,25 @@ CONFIG: dict[str, Rules] = {
         "window.doubt_depth": None,
         "window.doubt_rad": None,
         "window.hold_px": None,
+        "window.copies": "map_cache.keyframes",
+        "window.points": "map_cache.landmarks",
+        "window.min_met": "map_cache.min_matches",
+        "window.min_found": "map_cache.min_relocalisation_matches",
+        "window.beyond_px": ("map_cache.beyond", _share_of_width),
+        "window": "map_cache",
+        "local_map.births": "local_map.landmarks",
+        "certainty": "covariance",
+        "motion": "depth_from_motion",
+        "mono_start": "two_view_start",
+        "recovery.carried_m": "relocalisation.dead_reckoning_m",
+        "recovery.carried_rad": "relocalisation.dead_reckoning_rad",
+        "recovery.beside_frames": "relocalisation.join_frames",
+        "recovery.twins": "relocalisation.ambiguous_candidates",
+        "recovery.twin_share": "relocalisation.ambiguous_share",
+        "recovery.twin_ratio": "relocalisation.ambiguous_ratio",
+        "recovery.twin_rad": "relocalisation.ambiguous_rad",
+        "recovery.beyond_px": ("relocalisation.beyond", _share_of_width),
+        "recovery": "relocalisation",
     },
     "base": {
         "measurement.sigma_settled_px": "measurement.sigma_calibrated_px",
@@ -68,7 +106,7 @@ CONFIG: dict[str, Rules] = {
     },
 }
 # by topic (the base's without "/agentN"): field of the JSON message
-FIELDS: dict[str, Rules] = {}
+FIELDS: dict[str, Rules] = {"/events": {"events": ("events", _agent_events)}}
 # option of the process, in the `spec` metadata
 SPEC: dict[str, Rules] = {
     "agent": {},
