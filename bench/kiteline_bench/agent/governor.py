@@ -1,4 +1,4 @@
-"""The governor's bars: flights under a share of their own load, modelled and by the kernel, with it and without it."""
+"""The governor's bars: flights on a share of their own load, modelled and by the kernel, governor on and off."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SHARES = (1.0, 0.5, 0.25, 0.12)  # of the flight's own load without a governor
 _ATE_RATIO = {0.5: 1.5, 0.25: 3.0}  # that the governor may cost
 _FRAMES = 440  # of a flight on the virtual core
 _REAL_FRAMES = 300  # of one that takes as long as it lasts
-_BEGINS = (0, 12, 24, 36, 48)  # frames of a recording before a flight: what a limit does to one error is a draw
+_BEGINS = (0, 12, 24, 36, 48)  # first frames of the flights: the effect of a limit on one flight's error is chance
 _REAL_BEGINS = (0, 12, 24)
 
 Fly = Callable[[float, bool], LimitedFlight]  # at a percentage of a core, with the governor or without
@@ -59,7 +59,7 @@ def _limited(source: str, begin: int) -> Fly:
 
 
 def _flown(bench: Bench, what: str, flown: Fly) -> list[tuple[float, LimitedFlight]]:
-    """Each share with the governor and without it, below the flight that has no limit."""
+    """The flight without a limit, then each share with the governor and without it."""
     bench.say(f"flying {what}: no limit")
     free = flown(0.0, False)
     rows = [(1.0, free)]
@@ -72,7 +72,7 @@ def _flown(bench: Bench, what: str, flown: Fly) -> list[tuple[float, LimitedFlig
 
 
 def _bars(bench: Bench, what: str, rows: Sequence[tuple[float, LimitedFlight]], others: Sequence[Fly]) -> list[Bar]:
-    """rows: of the first start. others: further starts, of which the ATE is asked as well."""
+    """rows: flights of the first start. others: further starts, whose ATE counts too."""
     free, found = rows[0][1], []
     bench.say(f"flying {what}: {len(others)} further starts")
     pairs: dict[float, list[tuple[float, float]]] = {share: [] for share in _ATE_RATIO}

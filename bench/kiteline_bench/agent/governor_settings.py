@@ -69,7 +69,7 @@ class FixedEffortFlight:
 
 
 def fly_at(recording: Recording, config: AgentConfig, every: int) -> FixedEffortFlight:
-    """Fly at one effort, on a core that is never busy; after the first second only every so-manieth frame."""
+    """Fly at one effort, on a core that is never busy; after the first second only every `every`-th frame."""
     agent = FlyingAgent(recording.rig, recording.imu, config, vocabulary=False)
     spent_ns = 0
     for k, item in enumerate(recording.items):

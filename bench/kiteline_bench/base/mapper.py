@@ -1,4 +1,4 @@
-"""The base's bars: accuracy of one map and of joined ones, loops, losses, and what it costs."""
+"""The base's bars: accuracy of single and merged maps, loops, losses, CPU and memory."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _hall(bench: Bench) -> list[Bar]:
         at_most("MH_03 in the hall: ATE base", apart[1].ate_m(), 0.02, "m", 4),
         is_true("MH_01 and MH_03 as two agents", "merged", together.base["merges"] == 1,
                 f"{together.base['merges']} merges"),
-        at_most("their joint ATE", together.joint_ate_m(both), 0.025, "m", 4),
+        at_most("MH_01 and MH_03 as two agents: joint ATE", together.joint_ate_m(both), 0.025, "m", 4),
         is_true(f"MH_03 cut in {_PIECES} agents, overlaps of {_CUT_OVERLAP:.0%}", "one map",
                 in_three.base["merges"] == _PIECES - 1, f"{in_three.base['merges']} merges"),
         joint,
@@ -118,7 +118,7 @@ def _flown_ate(bench: Bench, sources: Sequence[Path], folder: str, mode: str) ->
 
 
 def _with_losses(bench: Bench, source: Path) -> Path:
-    """The same flight with three holes of 6 s, after which the camera is somewhere else."""
+    """The same flight with three gaps of 6 s, after which the camera is somewhere else."""
     length = length_s(source)
     holes = [length * part for part in (0.25, 0.5, 0.75)]
     begins, ends = [0.0, *(hole + 6.0 for hole in holes)], [*holes, length]
@@ -150,7 +150,7 @@ def _work(bench: Bench, room: FlownProcesses) -> list[Bar]:
 
 
 def _least_ms(work: Any) -> float:
-    """CPU of the quickest of three runs after one that compiles."""
+    """CPU of the fastest of three runs after one that compiles."""
     work()
     took = []
     for _ in range(3):
@@ -161,7 +161,7 @@ def _least_ms(work: Any) -> float:
 
 
 def row_of_cameras(cameras: int, points: int, free: int, seed: int = 0) -> BundleProblem:
-    """Cameras that pass a wall, disturbed: each point is seen by its nearest few. The last `free` may move."""
+    """Perturbed cameras along a wall; each point is seen by the nearest few. The last `free` may move."""
     rng = np.random.default_rng(seed)
     lens = np.tile([420.0, 420.0, 376.0, 240.0, 46.0], (cameras, 1))
     true = np.tile(np.eye(4), (cameras, 1, 1))
@@ -188,7 +188,7 @@ def row_of_cameras(cameras: int, points: int, free: int, seed: int = 0) -> Bundl
 
 
 def ring_of_poses(count: int, loops: int, seed: int = 0) -> GraphInputs:
-    """Four turns of drifting odometry with loops between them."""
+    """Four rounds of drifting odometry on a circle, with loop edges between them."""
     rng = np.random.default_rng(seed)
     turn = count // 4
     angle = 2 * np.pi * np.arange(count) / turn
@@ -215,7 +215,7 @@ def ring_of_poses(count: int, loops: int, seed: int = 0) -> GraphInputs:
 
 
 def queue_p95_s(cost_s: F64, seed: int = 0) -> float:
-    """Wait and work of a keyframe at one server, 95 % of them: each agent sends one a second, at its own moment."""
+    """95th percentile of a keyframe's wait and work at one server; each agent sends one a second, at its own phase."""
     rng = np.random.default_rng(seed)
     at = np.sort((rng.random(len(cost_s))[:, None] + np.arange(_SECONDS)).ravel())
     free_s, took = 0.0, []
@@ -226,9 +226,7 @@ def queue_p95_s(cost_s: F64, seed: int = 0) -> float:
 
 
 def further_kb(short: dict[str, Any], long: dict[str, Any]) -> float:
-    """Resident memory of the base's process, all that it holds included, by which a longer flight's base is larger, in
-    kB for each keyframe more.
-    """
+    """Growth of the base's resident memory from a short to a long flight, in kB a keyframe."""
     more = (long["timing"]["rss_mib"] - short["timing"]["rss_mib"]) * 2**20 / 1000.0
     return float(more / (long["keyframes"] - short["keyframes"]))
 

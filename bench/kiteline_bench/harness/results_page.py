@@ -29,7 +29,7 @@ HEADLINES = (
     ("The thin line", "radio: bytes a keyframe"),
     ("The thin line", "radio: ATE base over that of wifi"),
     ("The base's mapper: a street, a loop", "KITTI 06 in the street: ATE base"),
-    ("The base's mapper: a hall, two agents", "their joint ATE"),
+    ("The base's mapper: a hall, two agents", "MH_01 and MH_03 as two agents: joint ATE"),
     ("The base's store", "final ATE of killed flights"),
     ("Consistent poses", "NEES of"),
 )

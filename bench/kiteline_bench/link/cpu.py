@@ -1,4 +1,4 @@
-"""CPU of the codec and of the endpoint, on a keyframe of usual size."""
+"""CPU of the codec and of the endpoint, on keyframes of usual size."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
 
-_BIRTHS = 170
-_SIGHTINGS = 190
-_BACK = 10  # keyframes whose births are seen again
+_NEW_LANDMARKS = 170  # of a keyframe
+_OBSERVATIONS = 190
+_BACK = 10  # keyframes whose landmarks are observed again
 
 
 def flight(keyframes: int) -> list[list[Record]]:
@@ -36,41 +36,43 @@ def flight(keyframes: int) -> list[list[Record]]:
     camera = RectifiedCamera(752, 480, 430.0, 430.0, 370.0, 240.0, 0.11, True, np.eye(4))
     submap = submap_id(0, 0, 0)
     out: list[list[Record]] = [[CameraIntrinsics(AgentId(0), camera)]]
-    born: list[tuple[np.ndarray, np.ndarray]] = []  # pixels and inverse depths of each keyframe's births
+    created: list[tuple[np.ndarray, np.ndarray]] = []  # pixels and inverse depths of each keyframe's new landmarks
     step = 0.05  # m along x between keyframes
     for k in range(keyframes):
         keyframe = keyframe_id(submap, k)
-        n = _SIGHTINGS if k else 0
+        n = _OBSERVATIONS if k else 0
         back = np.sort(k - 1 - np.minimum(rng.integers(0, _BACK, n), k - 1)) if k else np.zeros(0, np.int64)
-        point = np.unique(keyframe_id(submap, 0) + back << 11 | rng.integers(0, _BIRTHS, n))
+        point = np.unique(keyframe_id(submap, 0) + back << 11 | rng.integers(0, _NEW_LANDMARKS, n))
         rows = [(int(p >> 11) - keyframe_id(submap, 0), int(p & 2047)) for p in point]
-        uv = np.array([born[a][0][i] - (step * (k - a) * 430.0 * born[a][1][i], 0.0) for a, i in rows]).reshape(-1, 2)
-        rho = np.array([born[a][1][i] for a, i in rows])
+        uv = np.array([created[a][0][i] - (step * (k - a) * 430.0 * created[a][1][i], 0.0) for a, i in rows]).reshape(
+            -1, 2
+        )
+        rho = np.array([created[a][1][i] for a, i in rows])
         inside = (uv > -50).all(axis=1) if len(rows) else np.zeros(0, bool)
         point, uv, rho = point[inside], uv[inside], rho[inside]
         noise = rng.normal(0, 0.3, uv.shape)
         T = se3.from_rt(np.eye(3), np.array([step if k else 0.0, 0.0, 0.0]))
         parent = KeyframeId(keyframe - 1) if k else NO_KEYFRAME
-        new_uv = np.rint(rng.uniform(20, (730, 460), (_BIRTHS, 2)))
+        new_uv = np.rint(rng.uniform(20, (730, 460), (_NEW_LANDMARKS, 2)))
         new_uv = new_uv[np.argsort(new_uv[:, 1] // 32, kind="stable")]
-        new_rho = rng.uniform(0.1, 0.6, _BIRTHS)
-        births = NewLandmarks(
-            keyframe, 0, np.arange(_BIRTHS, dtype=np.uint16), new_uv.astype(np.float32), new_rho.astype(np.float32),
-            rng.integers(0, 3, _BIRTHS).astype(np.uint8), rng.integers(0, 256, _BIRTHS).astype(np.uint8),
-            rng.integers(0, 256, (_BIRTHS, 32)).astype(np.uint8),
+        new_rho = rng.uniform(0.1, 0.6, _NEW_LANDMARKS)
+        landmarks = NewLandmarks(
+            keyframe, 0, np.arange(_NEW_LANDMARKS, dtype=np.uint16), new_uv.astype(np.float32), new_rho.astype(np.float32),
+            rng.integers(0, 3, _NEW_LANDMARKS).astype(np.uint8), rng.integers(0, 256, _NEW_LANDMARKS).astype(np.uint8),
+            rng.integers(0, 256, (_NEW_LANDMARKS, 32)).astype(np.uint8),
         )  # fmt: skip
-        seen = Observations(
-            keyframe, 0, np.arange(_BIRTHS, _BIRTHS + len(point), dtype=np.uint16), (uv + noise).astype(np.float32),
+        observations = Observations(
+            keyframe, 0, np.arange(_NEW_LANDMARKS, _NEW_LANDMARKS + len(point), dtype=np.uint16), (uv + noise).astype(np.float32),
             (rho * rng.normal(1, 0.01, len(rho))).astype(np.float32), np.zeros(len(point), np.uint8), point,
         )  # fmt: skip
-        parts = WIFI.choose(births, rng.uniform(size=_BIRTHS), seen)
-        out.append([KeyframeHeader(keyframe, k, parent, T, _BIRTHS + len(point)), *parts[0], *parts[1]])
-        born.append((new_uv, new_rho))
+        parts = WIFI.choose(landmarks, rng.uniform(size=_NEW_LANDMARKS), observations)
+        out.append([KeyframeHeader(keyframe, k, parent, T, _NEW_LANDMARKS + len(point)), *parts[0], *parts[1]])
+        created.append((new_uv, new_rho))
     return out
 
 
 def coding_ms() -> float:
-    """CPU ms of a keyframe's records to codes, to tight forms, and back again on the other side; the median."""
+    """CPU ms to code a keyframe's records, compress the codes, and reverse both on the other side; the median."""
     held: dict[Key, tuple[int, bytes]] = {}
     ours, theirs = ResidualCoder(), ResidualCoder()
     took = []

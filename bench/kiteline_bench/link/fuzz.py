@@ -34,8 +34,8 @@ Target = Callable[[bytes, random.Random], None]
 
 
 @dataclass(slots=True)
-class Fuzzed:
-    """What a run found. failures: one line an input that did something else than refuse; with the input's hex."""
+class FuzzResult:
+    """Outcome of a run. failures: a line for each input that raised anything but WireError, with its bytes in hex."""
 
     inputs: int
     accepted: int
@@ -46,12 +46,12 @@ class Fuzzed:
 
 
 def read_corpus(folder: Path) -> list[bytes]:
-    """The inputs kept: every file of a folder, in order of name."""
+    """The inputs in the .bin files of a folder, in order of name."""
     return [path.read_bytes() for path in sorted(folder.glob("*.bin"))]
 
 
 class Targets:
-    """The decoders under test, with state as a long-running process has it."""
+    """The decoders under test, with the state of a long-running process."""
 
     def __init__(self, values: Sequence[tuple[Key, bytes]]) -> None:
         self.accepted = 0
@@ -67,8 +67,8 @@ class Targets:
         self._age = 0
 
     def all(self) -> tuple[Target, ...]:
-        """Each takes bytes and raises WireError or nothing."""
-        return (self.record, self.packet, self.endpoint, self.tight, self.stream, self.sealed)
+        """All decoders; each takes bytes and raises WireError or nothing."""
+        return (self.record, self.packet, self.endpoint, self.residual, self.stream, self.sealed)
 
     def record(self, data: bytes, draw: random.Random) -> None:
         """A code under a key."""
@@ -83,7 +83,7 @@ class Targets:
         self.accepted += 1
 
     def endpoint(self, data: bytes, draw: random.Random) -> None:
-        """The same, to an endpoint that lives on."""
+        """The same, given to an endpoint that keeps its state."""
         self._age += 1
         if self._age > 2000:
             self._renew()
@@ -95,8 +95,8 @@ class Targets:
         if refused == self._endpoint.stats.rejected:
             self.accepted += 1
 
-    def tight(self, data: bytes, draw: random.Random) -> None:
-        """A tight form whose checksum does not matter."""
+    def residual(self, data: bytes, draw: random.Random) -> None:
+        """A residual code, whatever its checksum."""
         key = draw.choice([k for k in self._held if k.kind in (4, 5)] or [Key(4, 1)])
         if draw.random() < 0.2:
             key = Key(17, key.id)
@@ -116,7 +116,7 @@ class Targets:
 
 
 def mutate(data: bytes, draw: random.Random) -> bytes:
-    """Bytes that differ from sound ones in a few places, or are cut, doubled or random."""
+    """Valid bytes changed in a few places: flipped, cut, inserted, removed, repeated."""
     out = bytearray(data)
     for _ in range(draw.choice((1, 1, 2, 3, 8))):
         what = draw.randrange(7)
@@ -141,8 +141,8 @@ def mutate(data: bytes, draw: random.Random) -> bytes:
 def fuzz(
     corpus: Sequence[bytes], values: Sequence[tuple[Key, bytes]], inputs: int, seed: int,
     say: Callable[[int], None] | None = None,
-) -> Fuzzed:  # fmt: skip
-    """Feed so many inputs, drawn from a corpus, in turn to each decoder."""
+) -> FuzzResult:  # fmt: skip
+    """Feed inputs drawn from a corpus to each decoder in turn."""
     draw = random.Random(seed)
     targets = Targets(values)
     todo = targets.all()
@@ -174,7 +174,7 @@ def fuzz(
         if say is not None and i % 100_000 == 0:
             say(i)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    return Fuzzed(inputs, targets.accepted, refused, failures, slowest, grown)
+    return FuzzResult(inputs, targets.accepted, refused, failures, slowest, grown)
 
 
 def _one(target: Target, data: bytes, draw: random.Random) -> str:
@@ -199,7 +199,7 @@ def run(bench: Bench) -> list[Bar]:
     for failure in found.failures:
         bench.say(failure)
     return [
-        at_most("inputs that did anything but be read or refused", len(found.failures), 0, "", 0),
+        at_most("inputs that were neither read nor refused", len(found.failures), 0, "", 0),
         at_most("memory grown", found.grown_mib, 64, "MiB", 1),
         at_most("slowest input", found.slowest_s * 1e3, 1000, "ms", 1),
         Bar("read and refused", f"{INPUTS:,} inputs", f"{found.accepted:,} read, {found.refused:,} refused", True),

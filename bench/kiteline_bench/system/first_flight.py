@@ -25,7 +25,7 @@ from kiteline_lab.replay.replay import main as replay
 
 TITLE = "First flight"
 
-_SPAWN_S = 120.0  # s that a command with bad input may take before it counts as hung
+_SPAWN_S = 120.0  # s after which a command with bad input counts as hung
 _DEMO_S = 60.0
 
 

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: written under another name and renamed at the end."""
+"""Files that are either complete or absent: written under another name and renamed at the end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kiteline_hw.ports import SourceError
 
 @contextmanager
 def whole_file(path: Path, force: bool) -> Iterator[Path]:
-    """Gives the name to write to; it becomes `path` when the block ends well, and is removed when it does not.
+    """Give a name to write to; the file becomes `path` when the block succeeds, and is removed when it fails.
 
     Raises SourceError when `path` is there already (unless force) or its folder is not.
     """

@@ -1,4 +1,4 @@
-"""How far a long task is: a bar on a terminal, a plain line every few seconds anywhere else."""
+"""Progress of a long task: a bar on a terminal, else a plain line every few seconds."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import time
 from typing import TextIO
 
 BAR_WIDTH = 28  # cells; leaves room for counts and a note in 80 columns
-BAR_PERIOD_S = 0.1  # redrawn no more often: a terminal over ssh is slow
-LINE_PERIOD_S = 5.0  # a log file wants few lines
+BAR_PERIOD_S = 0.1  # a terminal over ssh is slow
+LINE_PERIOD_S = 5.0  # few lines in a log file
 
 
 class Progress:
@@ -35,7 +35,7 @@ class Progress:
             self._stream.flush()
 
     def update(self, done: int, note: str = "") -> None:
-        """Tell that `done` units are behind us; drawn only when it is time to."""
+        """Report that `done` units are done; drawn at most once a period."""
         self._done, self._note = done, note
         now_s = time.monotonic()
         if now_s - self._shown_s >= (BAR_PERIOD_S if self._tty else LINE_PERIOD_S):

@@ -19,7 +19,7 @@ from kiteline_hw.sim.world.world import World, occupancy, write_occupancy
 from kiteline_lab.flights.out_file import whole_file
 from kiteline_lab.flights.progress import Progress
 
-GRID_LOW_M, GRID_HIGH_M = 0.1, 2.0  # above the floor: what stands in the way of a small vehicle
+GRID_LOW_M, GRID_HIGH_M = 0.1, 2.0  # above the floor: obstacles for a small vehicle
 GRID_CELL_M = 0.05
 JPEG_QUALITY = 92
 COURSE = "course"  # in place of a trajectory: the scene's own course
@@ -42,8 +42,8 @@ def main(argv: list[str]) -> int:
     p.add_argument("--seconds", type=float, help="length of the flight (default: all of F, or 20 of the course)")
     p.add_argument("--start", type=float, help="s into the trajectory (default 0)")
     p.add_argument("--lens", choices=("radtan", "equidistant", "none"), help="default radtan")
-    p.add_argument("--mono", action="store_true", default=None, help="no right eye")
-    p.add_argument("--depth", action="store_true", default=None, help="true depth in place of the right eye")
+    p.add_argument("--mono", action="store_true", default=None, help="no right camera")
+    p.add_argument("--depth", action="store_true", default=None, help="true depth in place of the right camera")
     p.add_argument("--no-imu", dest="imu", action="store_false", default=None, help="no inertial samples")
     p.add_argument("--odometry", metavar="HZ", type=float, help="record an odometer's velocities at this rate; options "
                    "of SCENE make it worse: room?odometry_scale=1.05&odometry_slip=0.2&odometry_noise=0.1, or that of "
@@ -78,7 +78,7 @@ def cell_m(config: SimConfig) -> float:
 
 
 def record(source: SimSource, path: Path, png: bool = False) -> int:
-    """Write a flight as a log; how many inertial samples it has. Raises SourceError."""
+    """Write a flight as a log; returns the number of inertial samples. Raises SourceError."""
     truth = source.ground_truth
     assert truth is not None
     frames = samples = 0
@@ -105,7 +105,7 @@ def record(source: SimSource, path: Path, png: bool = False) -> int:
 
 
 def encode(frame: Frame, png: bool) -> tuple[EncodedImage, ...]:
-    """The images of a frame as a log holds them: left, right, depth, as far as there are any."""
+    """Encode the images of a frame for a log: left, then right and depth if it has them."""
     images = [image for image in (frame.left, frame.right) if image is not None]
     coded = []
     for image in images:
