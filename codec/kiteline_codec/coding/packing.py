@@ -1,4 +1,4 @@
-"""Bytes from numbers and back: variable-length integers, floats, and columns of integers."""
+"""Numbers to bytes and back: variable-length integers, floats, and columns of integers."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def unzigzag(value: int) -> int:
 
 
 def varint_bytes(value: int) -> int:
-    """How many bytes `Writer.varint` takes for a value."""
+    """Bytes that `Writer.varint` takes for a value."""
     return max(1, (value.bit_length() + 6) // 7)
 
 
 class Writer:
-    """Grows a code from its front to its end."""
+    """Appends numbers to a code."""
 
     __slots__ = ("_out",)
 
@@ -49,11 +49,11 @@ class Writer:
         return len(self._out)
 
     def u8(self, value: int) -> None:
-        """One byte. Raises ValueError when it does not fit."""
+        """Append one byte. Raises ValueError when it does not fit."""
         self._out.append(value)
 
     def varint(self, value: int) -> None:
-        """An unsigned number in groups of seven bits, lowest first; the top bit says that more follow."""
+        """Append an unsigned number in groups of seven bits, lowest first; the top bit is set if more follow."""
         if value < 0:
             raise ValueError(f"an unsigned number is expected, found {value}")
         out = self._out
@@ -63,30 +63,30 @@ class Writer:
         out.append(value)
 
     def signed(self, value: int) -> None:
-        """A signed number, zigzag then varint."""
+        """Append a signed number: zigzag, then varint."""
         self.varint(zigzag(value))
 
     def f64(self, value: float) -> None:
-        """A float, IEEE double, little endian."""
+        """Append an IEEE double, little endian."""
         self._out += _F64.pack(value)
 
     def f32(self, value: float) -> None:
-        """A float, IEEE single, little endian."""
+        """Append an IEEE single, little endian."""
         self._out += _F32.pack(value)
 
     def raw(self, data: bytes) -> None:
-        """Bytes as they are."""
+        """Append bytes."""
         self._out += data
 
     def columns(self, values: I64) -> None:
-        """Columns (c, n) of integers, |value| < 2^38; nothing is written for n = 0."""
+        """Append columns (c, n) of integers, |value| < 2^38; nothing for n = 0."""
         c, n = values.shape
         if n and c:
             out = np.zeros(c * (5 * n + 16) + 8, np.uint8)
             self._out += out[: pack_columns(values, out)].tobytes()
 
     def residual_columns(self, values: I64) -> None:
-        """Columns (c, n) of integers, |value| < 2^30, as short as can be; nothing is written for n = 0."""
+        """Append columns (c, n) of integers, |value| < 2^30, Golomb-Rice coded; nothing for n = 0."""
         c, n = values.shape
         if n and c:
             if max(int(values.max()), -int(values.min())) >= LIMIT:
@@ -100,7 +100,7 @@ class Writer:
 
 
 class Reader:
-    """Takes a code apart from its front. Every method raises WireError, and nothing else, on bytes that do not fit."""
+    """Reads numbers from the front of a code. Every method raises WireError, and nothing else, on invalid bytes."""
 
     __slots__ = ("_at", "_data")
 
@@ -110,7 +110,7 @@ class Reader:
 
     @property
     def left(self) -> int:
-        """How many bytes remain."""
+        """Bytes that remain."""
         return len(self._data) - self._at
 
     def u8(self) -> int:
@@ -181,7 +181,7 @@ class Reader:
         return values
 
     def end(self) -> None:
-        """Nothing may follow."""
+        """Raise WireError if anything is left."""
         if self.left:
             raise WireError(f"{self.left} bytes too many")
 

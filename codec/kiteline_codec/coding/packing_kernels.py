@@ -11,12 +11,13 @@ I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
 MAX_WIDTH = 40  # bits of one packed number: wider than any column needs
-_MAX_VARINT = 1 << 42  # keeps sums of 2048 deltas far from the limits of int64
+_MAX_VARINT = 1 << 42  # keeps sums of 2048 differences far from the limits of int64
+_MAX_SHIFT = 42
 
 
 @njit
 def first_outside(values: I64, low: I64, high: I64) -> int:
-    """The first of the columns (c, n) that holds a number below low or above high (c,); -1 where none does."""
+    """The first of the columns (c, n) with a number outside low..high (c,); -1 if there is none."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             if values[i, j] < low[i] or values[i, j] > high[i]:
@@ -25,7 +26,8 @@ def first_outside(values: I64, low: I64, high: I64) -> int:
 
 
 @njit
-def _put_varint(out: U8, at: int, value: int) -> int:
+def put_varint(out: U8, at: int, value: int) -> int:
+    """Write an unsigned number in groups of seven bits. Returns the position after it."""
     while value >= 128:
         out[at] = np.uint8((value & 127) | 128)
         value >>= 7
@@ -35,7 +37,8 @@ def _put_varint(out: U8, at: int, value: int) -> int:
 
 
 @njit
-def _varint_bytes(value: int) -> int:
+def varint_bytes(value: int) -> int:
+    """Bytes that `put_varint` takes."""
     n = 1
     while value >= 128:
         value >>= 7
@@ -44,8 +47,37 @@ def _varint_bytes(value: int) -> int:
 
 
 @njit
-def _zigzag(value: int) -> int:
+def zigzag(value: int) -> int:
+    """0, -1, 1, -2 to 0, 1, 2, 3."""
     return 2 * value if value >= 0 else -2 * value - 1
+
+
+@njit
+def put_bits(out: U8, bit: int, value: int, width: int) -> int:
+    """Or a number of `width` bits into zeroed bytes, lowest bit first. Returns the position after it."""
+    left = width
+    while left > 0:
+        offset = bit & 7
+        take = min(8 - offset, left)
+        out[bit >> 3] |= np.uint8((value & ((1 << take) - 1)) << offset)
+        value >>= take
+        bit += take
+        left -= take
+    return bit
+
+
+@njit
+def get_bits(data: U8, bit: int, width: int) -> int:
+    """The number of `width` bits at a position."""
+    value = 0
+    got = 0
+    while got < width:
+        offset = bit & 7
+        take = min(8 - offset, width - got)
+        value |= ((int(data[bit >> 3]) >> offset) & ((1 << take) - 1)) << got
+        bit += take
+        got += take
+    return value
 
 
 @njit
@@ -61,8 +93,8 @@ def _width(value: int) -> int:
 def pack_columns(values: I64, out: U8) -> int:
     """Pack values (c, n) int64, n >= 1, |value| < 2^38, into `out` (zeroed, at least c * (5 * n + 16) + 8 bytes).
 
-    Returns the number of bytes written. Each column is coded by offsets from its least value, or by differences of
-    neighbours when that is shorter.
+    Returns the number of bytes written. Each column is coded as offsets from its least value, or as differences of
+    neighbours if that is shorter.
     """
     c, n = values.shape
     shape = np.zeros((c, 2), np.int64)  # subtracted number and width of each column
@@ -86,18 +118,18 @@ def pack_columns(values: I64, out: U8) -> int:
         width = _width(high - low)
         width_d = _width(high_d - low_d)
         first = int(values[i, 0])
-        bits = 8 * _varint_bytes(_zigzag(low)) + width * n
-        bits_d = 8 * (_varint_bytes(_zigzag(first)) + _varint_bytes(_zigzag(low_d))) + width_d * (n - 1)
+        bits = 8 * varint_bytes(zigzag(low)) + width * n
+        bits_d = 8 * (varint_bytes(zigzag(first)) + varint_bytes(zigzag(low_d))) + width_d * (n - 1)
         if bits_d < bits:
             delta[i] = True
             out[at] = np.uint8(64 | width_d)
-            at = _put_varint(out, at + 1, _zigzag(first))
-            at = _put_varint(out, at, _zigzag(low_d))
+            at = put_varint(out, at + 1, zigzag(first))
+            at = put_varint(out, at, zigzag(low_d))
             shape[i, 0] = low_d
             shape[i, 1] = width_d
         else:
             out[at] = np.uint8(width)
-            at = _put_varint(out, at + 1, _zigzag(low))
+            at = put_varint(out, at + 1, zigzag(low))
             shape[i, 0] = low
             shape[i, 1] = width
     bit = 8 * at
@@ -109,23 +141,19 @@ def pack_columns(values: I64, out: U8) -> int:
             v = int(values[i, j]) - base
             if delta[i]:
                 v -= int(values[i, j - 1])
-            left = width
-            while left > 0:
-                shift = bit & 7
-                take = min(8 - shift, left)
-                out[bit >> 3] |= np.uint8((v & ((1 << take) - 1)) << shift)
-                v >>= take
-                bit += take
-                left -= take
+            bit = put_bits(out, bit, v, width)
     return (bit + 7) >> 3
 
 
 @njit
-def _get_varint(data: U8, at: int) -> tuple[int, int]:
-    """(value, position after it); position -1 when the bytes end or the number is too large or not the shortest."""
+def get_varint(data: U8, at: int, max_shift: int) -> tuple[int, int]:
+    """(value, position after it); position -1 when the bytes end or the number is too large or not in shortest form.
+
+    max_shift: of the last group of seven bits.
+    """
     value = 0
     shift = 0
-    while at < data.size and shift <= 42:
+    while at < data.size and shift <= max_shift:
         b = np.int64(data[at])
         at += 1
         value |= int(b & 127) << shift
@@ -152,7 +180,7 @@ def unpack_columns(data: U8, at: int, values: I64) -> int:
         width = head & 63
         if mode > 1 or width > MAX_WIDTH:
             return -1
-        z, at = _get_varint(data, at)
+        z, at = get_varint(data, at, _MAX_SHIFT)
         if at < 0:
             return -1
         first = (z >> 1) ^ -(z & 1)
@@ -161,7 +189,7 @@ def unpack_columns(data: U8, at: int, values: I64) -> int:
         shape[i, 2] = first
         shape[i, 3] = width
         if mode == 1:
-            z, at = _get_varint(data, at)
+            z, at = get_varint(data, at, _MAX_SHIFT)
             if at < 0:
                 return -1
             shape[i, 2] = (z >> 1) ^ -(z & 1)
@@ -177,15 +205,8 @@ def unpack_columns(data: U8, at: int, values: I64) -> int:
         if mode == 1:
             values[i, 0] = shape[i, 1]
         for j in range(mode, n):
-            v = np.int64(0)
-            got = 0
-            while got < width:
-                shift = bit & 7
-                take = min(8 - shift, width - got)
-                v |= ((np.int64(data[bit >> 3]) >> shift) & ((1 << take) - 1)) << got
-                bit += take
-                got += take
-            values[i, j] = v + base
+            values[i, j] = get_bits(data, bit, width) + base
+            bit += width
             if mode == 1:
                 values[i, j] += values[i, j - 1]
     if bit & 7 and (np.int64(data[bit >> 3]) >> (bit & 7)) != 0:

@@ -1,6 +1,6 @@
-"""From measured values to integers and back. Each pair is idempotent: encoding a decoded value gives the same integer.
+"""Measured values to integers and back. Each pair is idempotent: encoding a decoded value gives the same integer.
 
-Only +, -, *, / and the square root of IEEE arithmetic are used on the way back, so every machine decodes the same bits.
+Decoding uses only +, -, *, / and the square root of IEEE arithmetic, so every machine gets the same bits.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-PIXEL_STEPS = 16  # per px: error <= 1/32 px, below what a corner can be measured to
+PIXEL_STEPS = 16  # per px: error <= 1/32 px, below a corner's measurement error
 PIXEL_ORIGIN = -64.0  # px: refined keypoints may lie a little outside the image
 PIXEL_CODES = 1 << 16  # up to 4032 px
 
 OFFSET_STEPS = 32  # per px: error <= 1/64 px, finer than keypoints since the base averages many
-OFFSET_CODES = 1 << 12  # +-128 px: an offset beyond that is another point
+OFFSET_CODES = 1 << 12  # +-128 px: a larger offset is another point
 
-CALIBRATION_STEPS = 1024  # per px: a tenth of what an offset can be known to
+CALIBRATION_STEPS = 1024  # per px: a tenth of the estimate's error
 CALIBRATION_CODES = 1 << 14  # +-8 px; real ones are below two pixels, half a pixel in the middle
 
 DEPTH_SCALE = 2.0**-7  # 1/m: nearly linear below (farther than 128 m), nearly logarithmic above
@@ -92,15 +92,15 @@ def pose_codes(pose: F64) -> tuple[int, ...]:
     rotation = pose[:3, :3]
     if not (np.isfinite(pose).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3):
         raise ValueError(f"a rigid motion (4,4) is expected, found\n{pose}")
-    moved = [round(float(x) * TRANSLATION_STEPS) for x in pose[:3, 3]]
-    if max(map(abs, moved)) >= TRANSLATION_CODES:
+    translation = [round(float(x) * TRANSLATION_STEPS) for x in pose[:3, 3]]
+    if max(map(abs, translation)) >= TRANSLATION_CODES:
         raise ValueError(f"a translation within +-1e8 m is expected, found {pose[:3, 3]}")
     w, x, y, z = (float(c) for c in se3.quaternion_from_rotation(rotation))
-    turned = [round(c / (1.0 + w) * ROTATION_STEPS) for c in (x, y, z)]
-    while sum(c * c for c in turned) > _ROTATION_LIMIT:
-        i = max(range(3), key=lambda k: abs(turned[k]))
-        turned[i] -= 1 if turned[i] > 0 else -1
-    return (*moved, *turned)
+    rotated = [round(c / (1.0 + w) * ROTATION_STEPS) for c in (x, y, z)]
+    while sum(c * c for c in rotated) > _ROTATION_LIMIT:
+        i = max(range(3), key=lambda k: abs(rotated[k]))
+        rotated[i] -= 1 if rotated[i] > 0 else -1
+    return (*translation, *rotated)
 
 
 def pose(codes: tuple[int, ...]) -> F64:

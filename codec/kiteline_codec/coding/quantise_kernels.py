@@ -1,4 +1,4 @@
-"""Quantisers of whole arrays. The codes are described in SPEC.md, "Quantisers"; `quantise` hands the constants in."""
+"""Quantisers of arrays. The codes are in SPEC.md, "Quantisers"; `quantise` passes the constants."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_LARGEST = 1e6  # 1/m: what is nearer takes the last code anyhow
+_LARGEST = 1e6  # 1/m: nearer than this takes the last code
 
 
 @njit

@@ -1,4 +1,4 @@
-"""Integer columns as few bits as their spread asks for. The layout is described in SPEC.md, "Residual columns".
+"""Integer columns in as few bits as their spread needs. The layout is in SPEC.md, "Residual columns".
 
 Numbers are Golomb-Rice coded with a parameter that follows their size (M. Weinberger, G. Seroussi, G. Sapiro, "The
 LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixed width where that is shorter.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_codec.coding.packing_kernels import get_bits, get_varint, put_bits, put_varint, varint_bytes, zigzag
 from kiteline_core.jit import njit
 
 I64 = NDArray[np.int64]
@@ -18,36 +19,11 @@ FIXED, ABOVE_LEAST, STEPS, AROUND_ZERO = 0, 1, 2, 3  # modes
 MAX_WIDTH = 30  # bits of one number in fixed width
 MAX_START = 15  # of the Rice parameter
 MAX_SHIFT = 4  # trailing zero bits that a column may leave out
-ESCAPE = 20  # so many ones announce a number of RAW_BITS bits
+ESCAPE = 20  # so many ones precede a number of RAW_BITS bits
 RAW_BITS = 32
 LIMIT = 1 << 30  # magnitude of values
 _HALVE = 16  # numbers after which older ones count half
-
-
-@njit
-def _put(out: U8, bit: int, value: int, width: int) -> int:
-    left = width
-    while left > 0:
-        offset = bit & 7
-        take = min(8 - offset, left)
-        out[bit >> 3] |= np.uint8((value & ((1 << take) - 1)) << offset)
-        value >>= take
-        bit += take
-        left -= take
-    return bit
-
-
-@njit
-def _get(data: U8, bit: int, width: int) -> int:
-    value = 0
-    got = 0
-    while got < width:
-        offset = bit & 7
-        take = min(8 - offset, width - got)
-        value |= ((int(data[bit >> 3]) >> offset) & ((1 << take) - 1)) << got
-        bit += take
-        got += take
-    return value
+_MAX_NUMBER_SHIFT = 28  # a column's number takes at most 5 bytes
 
 
 @njit
@@ -60,7 +36,7 @@ def _parameter(total: int, count: int) -> int:
 
 @njit
 def _symbol(values: I64, j: int, mode: int, shift: int, low: int) -> int:
-    """The number that stands for values[j]; of STEPS from j = 1 on."""
+    """The number that codes values[j]; in mode STEPS from j = 1 on."""
     v = values[j] >> shift
     if mode < STEPS:
         return int(v - low)
@@ -88,16 +64,6 @@ def _rice_bits(values: I64, mode: int, shift: int, low: int, start: int) -> int:
 
 
 @njit
-def _varint_bits(value: int) -> int:
-    z = 2 * value if value >= 0 else -2 * value - 1
-    n = 8
-    while z >= 128:
-        z >>= 7
-        n += 8
-    return n
-
-
-@njit
 def _shape(values: I64, out: I64) -> None:
     """Mode, shift, first number and width or start of the shortest form of a column (n,), n >= 1, into out (4,)."""
     n = values.size
@@ -114,10 +80,10 @@ def _shape(values: I64, out: I64) -> None:
     while span >> width:
         width += 1
     out[0], out[1], out[2], out[3] = FIXED, shift, low, width
-    best = n * width + _varint_bits(low)
+    best = n * width + 8 * varint_bytes(zigzag(low))
     for mode in (ABOVE_LEAST, STEPS, AROUND_ZERO):
         number = low if mode == ABOVE_LEAST else first if mode == STEPS else 0
-        rest = 0 if mode == AROUND_ZERO else _varint_bits(number)
+        rest = 0 if mode == AROUND_ZERO else 8 * varint_bytes(zigzag(number))
         last = 1 << 60
         for start in range(MAX_START + 1):
             bits = rest + _rice_bits(values, mode, shift, low, start)
@@ -144,14 +110,7 @@ def pack_residuals(values: I64, out: U8) -> int:
         out[at + 1] = np.uint8(shape[i, 3])
         at += 2
         if shape[i, 0] != AROUND_ZERO:
-            number = int(shape[i, 2])
-            z = 2 * number if number >= 0 else -2 * number - 1
-            while z >= 128:
-                out[at] = np.uint8(z & 127 | 128)
-                z >>= 7
-                at += 1
-            out[at] = np.uint8(z)
-            at += 1
+            at = put_varint(out, at, zigzag(int(shape[i, 2])))
     bit = 8 * at
     for i in range(c):
         mode, shift, low, start = int(shape[i, 0]), int(shape[i, 1]), int(shape[i, 2]), int(shape[i, 3])
@@ -160,16 +119,16 @@ def pack_residuals(values: I64, out: U8) -> int:
         for j in range(1 if mode == STEPS else 0, n):
             s = _symbol(values[i], j, mode, shift, low)
             if mode == FIXED:
-                bit = _put(out, bit, s, start)
+                bit = put_bits(out, bit, s, start)
                 continue
             k = _parameter(total, count)
             q = s >> k
             if q < ESCAPE:
-                bit = _put(out, bit, (1 << q) - 1, q + 1)
-                bit = _put(out, bit, s, k)
+                bit = put_bits(out, bit, (1 << q) - 1, q + 1)
+                bit = put_bits(out, bit, s, k)
             else:
-                bit = _put(out, bit, (1 << ESCAPE) - 1, ESCAPE)
-                bit = _put(out, bit, s, RAW_BITS)
+                bit = put_bits(out, bit, (1 << ESCAPE) - 1, ESCAPE)
+                bit = put_bits(out, bit, s, RAW_BITS)
             total += s
             count += 1
             if count == _HALVE:
@@ -192,18 +151,9 @@ def unpack_residuals(data: U8, at: int, values: I64) -> int:
             return -1
         number = 0
         if mode != AROUND_ZERO:
-            moved = 0
-            while True:
-                if at >= data.size or moved > 28:
-                    return -1
-                b = int(data[at])
-                at += 1
-                number |= (b & 127) << moved
-                if b < 128:
-                    if b == 0 and moved > 0:
-                        return -1
-                    break
-                moved += 7
+            number, at = get_varint(data, at, _MAX_NUMBER_SHIFT)
+            if at < 0:
+                return -1
         shape[i, 0], shape[i, 1], shape[i, 2], shape[i, 3] = mode, shift, (number >> 1) ^ -(number & 1), start
     bit = 8 * at
     end = 8 * data.size
@@ -219,7 +169,7 @@ def unpack_residuals(data: U8, at: int, values: I64) -> int:
             if mode == FIXED:
                 if bit + start > end:
                     return -1
-                v = low + _get(data, bit, start)
+                v = low + get_bits(data, bit, start)
                 bit += start
             else:
                 k = _parameter(total, count)
@@ -235,7 +185,7 @@ def unpack_residuals(data: U8, at: int, values: I64) -> int:
                 width = k if q < ESCAPE else RAW_BITS
                 if bit + width > end:
                     return -1
-                s = _get(data, bit, width)
+                s = get_bits(data, bit, width)
                 bit += width
                 if q < ESCAPE:
                     s |= q << k

@@ -11,7 +11,7 @@ class SlidingBudget:
     """Bytes within the last second, both ends included, of which `burst_bytes` at once. A limit of None means unlimited.
 
     The window alone would let a sender spend a second's bytes at once and then wait for a second; the bucket, which
-    fills at the rate of the limit, spreads them, so that a new value waits for no longer than a packet takes.
+    fills at the rate of the limit, spreads them, so that a new value waits no longer than a packet takes.
     """
 
     def __init__(self, limit_bytes: int | None, burst_bytes: int) -> None:
@@ -19,11 +19,11 @@ class SlidingBudget:
         self._burst = min(burst_bytes, limit_bytes or 0)
         self._spent: deque[tuple[int, int]] = deque()
         self._sum = 0
-        self._bucket = self._burst * WINDOW_NS  # byte nanoseconds: whole numbers, so that nothing depends on rounding
+        self._bucket = self._burst * WINDOW_NS  # byte nanoseconds, integers: exact
         self._filled_ns: int | None = None
 
     def left(self, now_ns: int) -> int:
-        """How many bytes may be sent now."""
+        """Bytes that may be sent now."""
         if self._limit is None:
             return 1 << 30
         while self._spent and now_ns - self._spent[0][0] > WINDOW_NS:
@@ -35,7 +35,7 @@ class SlidingBudget:
         return min(self._limit - self._sum, self._bucket // WINDOW_NS)
 
     def spend(self, now_ns: int, n_bytes: int) -> None:
-        """Book bytes that are sent now."""
+        """Note bytes that are sent now."""
         if self._limit is None:
             return
         self._sum += n_bytes

@@ -1,4 +1,4 @@
-"""How fast a link delivers, measured by what is acknowledged. Pure."""
+"""The throughput of a link, measured by acknowledgements. Pure."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ class Throughput:
         self._busy_since_ns: int | None = None
 
     def acked(self, n_bytes: int, now_ns: int) -> None:
-        """So many bytes are known to have arrived."""
+        """Note bytes that are known to have arrived."""
         self._acked.append((now_ns, n_bytes))
         self._sum += n_bytes
 
     def busy(self, backlog: bool, now_ns: int) -> None:
-        """Whether more waits to be sent than is on its way."""
+        """Note whether values wait to be sent."""
         if not backlog:
             self._busy_since_ns = None
         elif self._busy_since_ns is None:
             self._busy_since_ns = now_ns
 
     def bytes_s(self, now_ns: int) -> int | None:
-        """What the link delivers; None while it is not known, since nothing had to wait."""
+        """Bytes per second that the link delivers; None while unknown, because nothing had to wait."""
         while self._acked and now_ns - self._acked[0][0] > _WINDOW_NS:
             self._sum -= self._acked.popleft()[1]
         if self._busy_since_ns is None or now_ns - self._busy_since_ns < _WINDOW_NS:

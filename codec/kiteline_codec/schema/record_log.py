@@ -1,4 +1,4 @@
-"""Shared values as they stand in an agent's log, so that what no link carried can be read there after landing."""
+"""Shared values in an agent's log, from which a base imports what no link carried."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _HEAD = struct.Struct("<BBqH")  # agent, kind, id, part
 
 
 def write_record(agent: AgentId, key: Key, code: bytes) -> bytes:
-    """One value with its name."""
+    """The bytes of one value with its agent and key."""
     return _HEAD.pack(agent, key.kind, key.id, key.part) + code
 
 
 def read_record(data: bytes) -> tuple[AgentId, Key, bytes]:
-    """What `write_record` was given. Raises WireError."""
+    """The inverse of `write_record`. Raises WireError."""
     if len(data) < _HEAD.size:
         raise WireError(f"a logged record of {len(data)} bytes, expected at least {_HEAD.size}")
     agent, kind, number, part = _HEAD.unpack_from(data)
