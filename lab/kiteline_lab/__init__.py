@@ -1,1 +1,1 @@
-"""Experiments: fly, evaluate, benchmark, plot."""
+"""What users call: fly, replay, evaluate, plot, and tools for logs, maps and machines."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,11 @@ def test_every_plain_dependency_is_checked() -> None:
     assert set(doctor.PLAIN) == names(project["dependencies"])
     for extra, packages in doctor.EXTRAS.items():
         assert set(packages) == names(project["optional-dependencies"][extra])
+
+
+@pytest.mark.parametrize("module", doctor.WARMING)
+def test_every_room_that_has_kernels_is_warmed(module: str) -> None:
+    assert callable(importlib.import_module(module).warm)
 
 
 def test_this_machine_can_run_the_tests_so_python_and_packages_are_fine() -> None:
