@@ -11,13 +11,13 @@ from kiteline_core.pose.pnp import RansacConfig
 
 @dataclass(frozen=True, slots=True)
 class IntakeConfig:
-    """When a keyframe is taken up."""
+    """When a received keyframe is used."""
 
-    patience_s: float = 2.0  # a keyframe whose sections are still under way is used as it is after this long
-    orphan_s: float = 10.0  # a submap whose first keyframes never come is begun at the oldest known one after this long
-    carry_s: float = 1.5  # a submap that begins so soon after the last one was left begins there: odometry carried on
-    per_step: int = 4  # keyframes taken up in one step, so that a backlog does not hold up the rest
-    max_pending: int = 20_000  # sections kept without their header; more are a broken peer
+    patience_s: float = 2.0  # s; after this long a keyframe is used without its missing sections
+    missing_root_s: float = 10.0  # s; after this long a submap without its first keyframe begins at its oldest one
+    odometry_gap_s: float = 1.5  # s; a submap that begins within this time of the last one is placed by odometry
+    max_per_step: int = 4  # keyframes; used in one step, so that a backlog does not delay the rest
+    max_pending: int = 20_000  # sections kept without their header: only a faulty agent has more
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,81 +87,81 @@ class TriangulationConfig:
 
 @dataclass(frozen=True, slots=True)
 class LoopConfig:
-    """What proves that a place was seen before. A wrong proof is worse than a missed one."""
+    """Detection of loop closures and map merges. A wrong closure does more harm than a missed one."""
 
-    share: str = "all"  # agents whose maps may become one: "all", "none", or groups such as "0 1, 1 2"
-    enabled: bool = True
-    candidates: int = 4  # most alike keyframes of other maps that are looked at
-    candidates_here: int = 3  # of the same map
-    min_gap: int = 12  # keyframes of the same submap between two that may close a loop
-    loop_gap: int = 30  # keyframes back that points have to be seen again for it to count as a loop
-    max_shared: int = 15  # points that two keyframes share already: more are no news
-    min_likeness: float = 0.02  # of the bags of words: below it two places have little in common
-    min_of_neighbours: float = 0.1  # share of the likeness that a keyframe has to the one before it
+    share: str = "all"  # agents whose maps may be merged: "all", "none", or groups such as "0 1, 1 2"
+    enabled: bool = True  # False: no loops are closed and no maps merged
+    candidates: int = 4  # most similar keyframes of other maps that are verified
+    candidates_same_map: int = 3  # most similar keyframes of the same map that are verified
+    min_gap: int = 12  # keyframes of one submap between two that are matched
+    loop_gap: int = 30  # keyframes; landmarks observed again after so many count as a loop
+    max_shared: int = 15  # landmarks that a candidate may share with the keyframe already
+    min_likeness: float = 0.02  # similarity of bags of words, 0..1: unrelated places stay below it
+    min_neighbour_ratio: float = 0.1  # of the similarity to the previous keyframe
     match: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
-    sigma_disparity_px: float = 0.4  # one deviation of the disparities from which points hang on their rays
-    neighbours: int = 8  # covisible keyframes whose points are looked for as well
-    radius_px: float = 10.0  # px at octave 0 around where a point is foreseen, halved at the second look
-    octave_gap: float = 1.5  # octaves between the size foreseen and the size found
-    min_inliers: int = 20  # points that agree between the two keyframes alone
-    min_inliers_all: int = 35  # the same with the neighbours' points: to join maps
-    min_inliers_loop: int = 40  # the same, within one map
-    min_share: float = 0.25  # of what both maps should see here: less is a thing that stands in two places
-    scale_points: int = 20  # with depth in both maps, that tell the scale between maps of which one has its own unit
-    scale_spread: float = 0.2  # of the logarithm of a ratio of depths, within which
-    scale_share: float = 0.7  # of them have to say the same: two things that lie unlike each other say no scale
-    scale_sigma: float = 0.02  # deviation of what they say together: the bundle after it is good to a few percent
-    columns: int = 6  # parts of the image: a poster that hangs twice fills few of them
-    rows: int = 4
-    cell_points: int = 2  # inliers that fill a part
-    min_cells: int = 8  # of the 24 parts
-    votes: int = 3  # keyframes that say the same
-    memory: int = 24  # keyframes of a submap among which votes are counted
-    ask_before: int = 4  # keyframes before one that was proved, asked of the same place: their views still overlap
-    against: int = 3  # votes for, for each vote against
-    agree_m: float = 0.10  # between two votes, and
-    agree_depth: float = 0.04  # of the median depth, and
-    agree_path: float = 0.02  # of the way between the two keyframes
-    agree_rad: float = 0.05  # between two votes
-    agree_scale: float = 0.05  # of the logarithms of the scales of two votes
-    drift_m: float = 0.3  # correction of a loop that drift explains: this, and
-    drift_path: float = 0.02  # this share of the way flown since
-    drift_rad: float = 0.1  # this turn, and
-    drift_rad_m: float = 0.002  # this turn for each metre
-    own_drift_path: float = 0.05  # the same share where the unit of length drifts as well, by one eye, and beside it
-    own_drift_scale: float = 0.4  # logarithm by which that unit may drift along a loop; it says how far the way is off
-    small_m: float = 0.02  # correction that needs no pose graph: fusing points is enough
-    small_rad: float = 0.005
-    small_scale: float = 0.005  # of its logarithm
-    off_plane: float = 0.03  # of the median depth: so far from a plane lies what is no part of it
-    min_off_plane: float = 0.15  # share of the points that join maps and lie off their plane: a wallpaper has copies
-    twin_m: float = 1.0  # places of one map that look the same and lie further apart than this are twins
+    sigma_disparity_px: float = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
+    max_neighbours: int = 8  # covisible keyframes whose landmarks are matched too
+    radius_px: float = 10.0  # px at octave 0; search radius around predicted projections, halved in the second round
+    octave_gap: float = 1.5  # octaves between the predicted and the detected scale
+    min_inliers: int = 20  # landmarks that agree between the two keyframes alone
+    min_inliers_all: int = 35  # landmarks that agree, with those of the neighbours, to merge maps
+    min_inliers_loop: int = 40  # landmarks that agree, with those of the neighbours, to close a loop in one map
+    min_matched_share: float = 0.25  # of the landmarks expected in view: less is an object that stands in two places
+    min_scale_points: int = 20  # landmarks with depth in both maps, from which a scale is estimated
+    scale_spread: float = 0.2  # of the logarithm of depth ratios; ratios within it agree
+    scale_share: float = 0.7  # of the depth ratios that must agree: two different objects fix no scale
+    scale_sigma: float = 0.02  # standard error of the scale's logarithm: the bundle corrects a few percent
+    columns: int = 6  # cells across the image: a poster that hangs twice fills few of them
+    rows: int = 4  # cells down the image
+    cell_inliers: int = 2  # inliers that fill a cell
+    min_cells: int = 8  # filled cells, of 24
+    min_keyframes: int = 3  # keyframes that agree on a correction
+    recent_keyframes: int = 24  # keyframes of a submap within which matches are counted together
+    predecessors: int = 4  # keyframes before a matched one that are verified too: their views still overlap
+    against: int = 3  # agreeing keyframes needed more for each one that contradicts
+    agree_m: float = 0.10  # m; between two corrections that agree
+    agree_depth: float = 0.04  # added share of the median depth
+    agree_path: float = 0.02  # added share of the path between the two keyframes
+    agree_rad: float = 0.05  # rad; between two corrections that agree
+    agree_scale: float = 0.05  # difference of the logarithms of two scales that agree
+    drift_m: float = 0.3  # m; correction of a loop that drift explains
+    drift_path: float = 0.02  # added share of the path between the two keyframes
+    drift_rad: float = 0.1  # rad; correction of a loop that drift explains
+    drift_rad_m: float = 0.002  # rad/m; added for each metre of the path
+    monocular_drift_path: float = 0.05  # share of the path instead of drift_path if the scale drifts too
+    max_scale_drift: float = 0.4  # logarithm of the scale drift along a loop
+    fuse_m: float = 0.02  # m; smaller corrections need no pose graph: landmarks are fused at once
+    fuse_rad: float = 0.005  # rad; the same of rotations
+    fuse_scale: float = 0.005  # the same of the logarithm of a scale
+    off_plane: float = 0.03  # of the median depth; landmarks farther from the common plane lie off it
+    min_off_plane: float = 0.15  # share of landmarks off the plane to merge maps: a wallpaper has copies
+    ambiguous_m: float = 1.0  # m; similar places of one map that lie farther apart make it ambiguous
 
 
 @dataclass(frozen=True, slots=True)
 class GraphConfig:
-    """Corrections of whole maps: the pose graph and the bundle after it."""
+    """Corrections of whole maps: pose graphs and full bundles."""
 
-    min_shared: int = 100  # points that make two covisible keyframes an edge
-    sigma_m: float = 0.005  # of an edge between neighbours, and
-    sigma_path: float = 0.01  # this share of its length
-    sigma_rad: float = 0.003
-    sigma_scale: float = 0.003  # of an edge between neighbours whose unit of length may drift
-    loop_sigma_scale: float = 0.01
-    loop_sigma_depth: float = 0.005  # of a loop's edge: this share of the median depth
-    loop_sigma_rad: float = 0.003
-    huber: float = 3.0  # deviations beyond which an edge counts less
-    iterations: int = 8
-    scaled_iterations: int = 30  # with scales, in which the graph is bent farther
-    stop: float = 1e-4  # relative gain below which more iterations change nothing
-    first_full: int = 12  # keyframes after which a whole map is first bundled
-    full_share: float = 0.03  # of the worker's time that bundles of whole maps may take: for 100 keyframes every 3 s
-    max_full: int = 800  # keyframes that a full bundle moves, in 0.4 s; of a larger map, those around the loop
-    robust_trials: int = 6  # of the full bundle before the outlier test
-    final_trials: int = 6  # after it
-    revisits: int = 2  # keyframes a step that look again for what joined maps know
-    min_kept: float = 0.5  # share of the points fused by a merge that the bundle must keep, else it was wrong
+    min_shared: int = 100  # landmarks of two covisible keyframes joined by an edge
+    sigma_m: float = 0.005  # m; standard deviation of an edge between neighbours
+    sigma_path: float = 0.01  # added share of the edge's length
+    sigma_rad: float = 0.003  # rad; of an edge between neighbours
+    sigma_scale: float = 0.003  # of the logarithm of the scale between neighbours in a monocular submap
+    loop_sigma_scale: float = 0.01  # of the logarithm of the scale of a loop edge
+    loop_sigma_depth: float = 0.005  # of a loop edge: added share of the median depth
+    loop_sigma_rad: float = 0.003  # rad; of a loop edge
+    huber: float = 3.0  # standard deviations; loop edges with larger residuals weigh less
+    iterations: int = 8  # of Gauss-Newton
+    scale_iterations: int = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther
+    stop: float = 1e-4  # relative decrease of the error below which the solver stops
+    first_full: int = 12  # keyframes of a map at its first full bundle
+    full_share: float = 0.03  # of the worker's time for scheduled full bundles: one of 100 keyframes every 3 s
+    max_full: int = 800  # keyframes of a full bundle, which takes 0.4 s; of a larger map, those around the loop
+    robust_trials: int = 6  # trial steps of a full bundle before the outlier test
+    final_trials: int = 6  # trial steps of a full bundle after the outlier test
+    requeries: int = 2  # keyframes of merged maps that are matched to the other map in one step
+    min_kept: float = 0.5  # share of inliers among observations that a merge fused: below it the merge is undone
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,7 +105,7 @@ class Intake:
         out: list[KeyframeId] = []
         patience_ns = round(self._config.patience_s * 1e9)
         for keyframe, since_ns in sorted(self._waiting.items()):
-            if len(out) == self._config.per_step:
+            if len(out) == self._config.max_per_step:
                 break
             if not self._is_usable(keyframe):
                 continue
@@ -116,7 +116,9 @@ class Intake:
                     self._partial.add(keyframe)
         for keyframe in out:
             del self._waiting[keyframe]
-        late = [k for k in sorted(self._partial) if k not in out and self._map.is_complete(k)][: self._config.per_step]
+        late = [k for k in sorted(self._partial) if k not in out and self._map.is_complete(k)][
+            : self._config.max_per_step
+        ]
         self._partial.difference_update(late)
         return sorted(out + late)
 
@@ -171,7 +173,7 @@ class Intake:
 
     def _place_orphans(self, now_ns: int) -> None:
         """Root a submap at its oldest keyframe if its first never comes (the base lost its store)."""
-        orphan_ns = round(self._config.orphan_s * 1e9)
+        orphan_ns = round(self._config.missing_root_s * 1e9)
         late = [k for k, since_ns in self._waiting.items() if now_ns - since_ns >= orphan_ns]
         for submap in sorted({submap_of_keyframe(k) for k in late}):
             keyframes = self._map.submaps[submap]

@@ -89,7 +89,7 @@ class SubmapPlacements:
             if live is None or S_w_before is None or T_before_k is None or T_m_first is None:
                 return
             tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
-            if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > self._config.carry_s * 1e9:
+            if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > self._config.odometry_gap_s * 1e9:
                 return  # too long without images: a loop closure has to place it
             T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
             scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0

@@ -1,7 +1,7 @@
-"""The essential graph: keyframes held together by their spanning tree, by strong covisibility and by loops.
+"""Pose graph optimisation over the essential graph: spanning tree, strong covisibility and loop edges.
 
 Source: H. Strasdat et al., "Double window optimisation for constant time visual SLAM", and the essential graph of
-ORB-SLAM2; solved by Gauss-Newton in gtsam. Loops count less the more they contradict the rest (Huber).
+ORB-SLAM2; solved by Gauss-Newton in gtsam, with a Huber kernel on loop edges.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class GraphInputs:
-    """A pose graph. keyframes: (n,) ids. T_w_k: (n,4,4) the start. held: (n,) which do not move.
+    """A pose graph. keyframes: (n,) ids. T_w_k: (n,4,4) initial poses. held: (n,) True for fixed keyframes.
 
-    edges: (m,2) rows a, b. T_a_b: (m,4,4). sigma: (m,2) m and rad. loop: (m,) which may be wrong. scaled: where the
-    unit of length may drift along the way, else None.
+    edges: (m,2) rows a, b. T_a_b: (m,4,4). sigma: (m,2) m and rad. loop: (m,) True for loop edges. scaled: None unless
+    scale may drift.
     """
 
     keyframes: I64
@@ -44,8 +44,9 @@ class GraphInputs:
 
 @dataclass(frozen=True, slots=True)
 class Scaled:
-    """Seven degrees of freedom. free: (n,) keyframes before which lengths may grow. scale: (m,) of an edge, how much
-    longer a has what b has. sigma: (m,) of its logarithm.
+    """Scales of a graph over similarities. free: (n,) keyframes of monocular submaps, whose scale is unknown.
+
+    scale: (m,) of each edge, the scale at a over that at b. sigma: (m,) of its logarithm.
     """
 
     free: Bools
@@ -55,8 +56,8 @@ class Scaled:
 
 @dataclass(frozen=True, slots=True)
 class GraphResult:
-    """T_w_k: (n,4,4). scale: (n,) by which lengths before each keyframe grow. residual: (m,) deviations by which each
-    edge is off. cost_ops: arithmetic operations.
+    """T_w_k: (n,4,4). scale: (n,) factors on lengths near each keyframe. residual: (m,) of each edge, in standard
+    deviations. cost_ops: arithmetic operations.
     """
 
     keyframes: I64
@@ -67,7 +68,7 @@ class GraphResult:
 
 
 def optimise(inputs: GraphInputs) -> GraphResult:
-    """Where the keyframes lie when all edges are heard."""
+    """Optimise the poses, and the scales where they may drift."""
     return _with_scale(inputs, inputs.scaled) if inputs.scaled is not None else _rigid(inputs)
 
 
@@ -86,9 +87,9 @@ def _rigid(inputs: GraphInputs) -> GraphResult:
     for i, pose in enumerate(inputs.T_w_k):
         start.insert(i, gtsam.Pose3(pose))
     graph = gtsam.NonlinearFactorGraph()
-    firm = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    fixed = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     for i in np.flatnonzero(inputs.held).tolist():
-        graph.add(gtsam.PriorFactorPose3(i, gtsam.Pose3(inputs.T_w_k[i]), firm))
+        graph.add(gtsam.PriorFactorPose3(i, gtsam.Pose3(inputs.T_w_k[i]), fixed))
     keys = np.column_stack([inputs.sigma, inputs.loop]).tolist()
     for (a, b), T, key in zip(inputs.edges.tolist(), inputs.T_a_b, keys):
         graph.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T), noises[tuple(key)]))
@@ -109,7 +110,7 @@ def _rigid(inputs: GraphInputs) -> GraphResult:
 
 
 def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
-    """The same over similarities (H. Strasdat et al., "Scale drift-aware large scale monocular SLAM", 2010)."""
+    """Over similarities (H. Strasdat et al., "Scale drift-aware large scale monocular SLAM", 2010)."""
     import gtsam
 
     config = inputs.config
@@ -124,17 +125,17 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
         noises[tuple(row.tolist())] = noise
     start = gtsam.Values()
     graph = gtsam.NonlinearFactorGraph()
-    firm = gtsam.noiseModel.Isotropic.Sigma(7, 1e-6)
-    one = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e6] * 6 + [1e-6]))
+    fixed = gtsam.noiseModel.Isotropic.Sigma(7, 1e-6)
+    unit_scale = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e6] * 6 + [1e-6]))
     for i, pose in enumerate(inputs.T_w_k):
-        here = _similarity(pose, 1.0)
-        start.insert(i, here)
+        S_w_k = _similarity(pose, 1.0)
+        start.insert(i, S_w_k)
         if inputs.held[i] or not scaled.free[i]:
-            graph.add(gtsam.PriorFactorSimilarity3(i, here, firm if inputs.held[i] else one))
+            graph.add(gtsam.PriorFactorSimilarity3(i, S_w_k, fixed if inputs.held[i] else unit_scale))
     for (a, b), T, scale, key in zip(inputs.edges.tolist(), inputs.T_a_b, scaled.scale.tolist(), rows.tolist()):
         graph.add(gtsam.BetweenFactorSimilarity3(a, b, _similarity(T, scale), noises[tuple(key)]))
     params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(config.scaled_iterations)
+    params.setMaxIterations(config.scale_iterations)
     params.setRelativeErrorTol(config.stop)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
     values = optimiser.optimize()
@@ -146,33 +147,33 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
     poses[inputs.held], scale[inputs.held] = inputs.T_w_k[inputs.held], 1.0
     scale[~scaled.free] = 1.0
     work = int(optimiser.iterations()) * (12_000 * len(inputs.edges) + 9_000 * len(poses))
-    off = residuals(inputs, poses, scale)
-    return GraphResult(inputs.keyframes, poses, scale, off, 300_000 + 9_000 * len(inputs.edges) + work // 4)
+    residual = residuals(inputs, poses, scale)
+    return GraphResult(inputs.keyframes, poses, scale, residual, 300_000 + 9_000 * len(inputs.edges) + work // 4)
 
 
 def _similarity(T: F64, scale: float) -> gtsam.Similarity3:
-    """gtsam's p -> scale (R p + t)."""
+    """The similarity of gtsam, which maps p to scale (R p + t)."""
     import gtsam
 
     return gtsam.Similarity3(gtsam.Rot3(T[:3, :3]), T[:3, 3] / scale, scale)
 
 
 def residuals(inputs: GraphInputs, T_w_k: F64, scale: F64 | None = None) -> F64:
-    """By how many deviations (m,) each edge is off. scale: (n,) by which lengths before the keyframes grew."""
+    """Residuals (m,) of the edges in standard deviations. scale: (n,) factors on lengths near the keyframes."""
     if len(inputs.edges) == 0:
         return np.empty(0)
     T_a_b = _inverses(T_w_k[inputs.edges[:, 0]]) @ T_w_k[inputs.edges[:, 1]]
     if scale is not None and inputs.scaled is not None:
         T_a_b[:, :3, 3] /= scale[inputs.edges[:, 0], None]
-        grown = scale[inputs.edges[:, 1]] / scale[inputs.edges[:, 0]]
-        stretch = np.log(grown / inputs.scaled.scale) / inputs.scaled.sigma
+        ratio = scale[inputs.edges[:, 1]] / scale[inputs.edges[:, 0]]
+        scale_error = np.log(ratio / inputs.scaled.scale) / inputs.scaled.sigma
     else:
-        stretch = np.zeros(len(T_a_b))
+        scale_error = np.zeros(len(T_a_b))
     error = _inverses(inputs.T_a_b) @ T_a_b
     shift = np.linalg.norm(error[:, :3, 3], axis=1) / inputs.sigma[:, 0]
     chord = np.linalg.norm(error[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
-    turn = 2.0 * np.arcsin(np.minimum(chord, 1.0)) / inputs.sigma[:, 1]
-    return np.asarray(np.sqrt(shift**2 + turn**2 + stretch**2))
+    rotation = 2.0 * np.arcsin(np.minimum(chord, 1.0)) / inputs.sigma[:, 1]
+    return np.asarray(np.sqrt(shift**2 + rotation**2 + scale_error**2))
 
 
 def _inverses(poses: F64) -> F64:

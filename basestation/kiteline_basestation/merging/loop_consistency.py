@@ -44,14 +44,14 @@ def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> b
     path = path_length(sparse_map, edge.old, edge.new)
     share = config.drift_path
     if any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (edge.new, edge.old)):
-        share = config.own_drift_path + abs(
+        share = config.monocular_drift_path + abs(
             float(np.log(sim3.scale_of(X)))
         )  # scale drift displaces the end of the path
     moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
     return (
         moved <= config.drift_m + share * path
         and _rotation_between(np.eye(4), X) <= config.drift_rad + config.drift_rad_m * path
-        and abs(float(np.log(sim3.scale_of(X)))) <= config.own_drift_scale
+        and abs(float(np.log(sim3.scale_of(X)))) <= config.max_scale_drift
     )
 
 

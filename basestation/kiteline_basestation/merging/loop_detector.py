@@ -155,13 +155,13 @@ class LoopDetector:
         before = [k for k in near if k < keyframe][-1:]
         enough = config.min_likeness
         if before and keyframe in self._index and before[0] in self._index:
-            enough = max(enough, config.min_of_neighbours * float(self._index.likeness(keyframe, before)[0]))
+            enough = max(enough, config.min_neighbour_ratio * float(self._index.likeness(keyframe, before)[0]))
         places = self._index.query(
             observations.descriptor, known | set(near) | {keyframe}, _QUERIED * config.candidates
         )  # fmt: skip
         out: list[KeyframeId] = []
         taken: set[int] = set()
-        left = {True: config.candidates_here, False: config.candidates}
+        left = {True: config.candidates_same_map, False: config.candidates}
         map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
         for key, score in zip(places.keys.tolist(), places.score.tolist()):
             old = KeyframeId(key)
@@ -200,19 +200,19 @@ class LoopDetector:
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):
             self.rejected += 1
-            if new == old or len(supporters) < config.votes:
+            if new == old or len(supporters) < config.min_keyframes:
                 return None
             self._contradicted[key] = self._contradicted.get(key, 0) + 1
             return Contradiction(key)
         if same_map and match.inliers < config.min_inliers_loop:
             return None
         against = {m.new for m in matches} - supporters
-        needed = config.votes * (1 + 2 * self._contradicted.get(key, 0)) + config.against * len(against)
+        needed = config.min_keyframes * (1 + 2 * self._contradicted.get(key, 0)) + config.against * len(against)
         if _pair(self._map.map_id(new), self._map.map_id(old)) in self.requested:
             needed = 1
         if len(supporters) < needed or not (same_map or consistency.has_depth_relief(self._map, chosen, config)):
             return None
-        if not same_map and any(self._is_ambiguous(k) for m in chosen[-config.votes :] for k in (m.old, m.new)):
+        if not same_map and any(self._is_ambiguous(k) for m in chosen[-config.min_keyframes :] for k in (m.old, m.new)):
             self.rejected += 1
             return None
         if same_map:
@@ -226,7 +226,7 @@ class LoopDetector:
             return None
         same = self._map.submaps[new]
         at = same.index(match.new)
-        for keyframe in reversed(same[max(0, at - self._config.ask_before) : at]):
+        for keyframe in reversed(same[max(0, at - self._config.predecessors) : at]):
             if any(m.new == keyframe for m in self._matches[_pair(new, old)]):
                 continue
             other = verify_loop(self._map, keyframe, match.old, self._config)
@@ -252,7 +252,7 @@ class LoopDetector:
         if submap_of_keyframe(match.new) != submap_of_keyframe(newest.new):
             return True
         same = self._map.submaps[submap_of_keyframe(match.new)]
-        return abs(same.index(match.new) - same.index(newest.new)) <= self._config.memory
+        return abs(same.index(match.new) - same.index(newest.new)) <= self._config.recent_keyframes
 
     def _is_ambiguous(self, keyframe: KeyframeId) -> bool:
         """True if the map of a keyframe shows the same place elsewhere too."""
@@ -261,7 +261,11 @@ class LoopDetector:
         assert T is not None
         observations = observations_of(sparse_map, keyframe)
         map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
-        share = config.own_drift_path if sparse_map.is_up_to_scale(submap_of_keyframe(keyframe)) else config.drift_path
+        share = (
+            config.monocular_drift_path
+            if sparse_map.is_up_to_scale(submap_of_keyframe(keyframe))
+            else config.drift_path
+        )
         tried = 0
         places = self._index.query(observations.descriptor, {keyframe}, _QUERIED * config.candidates)
         for key in places.keys.tolist():
@@ -269,7 +273,7 @@ class LoopDetector:
             T_other = sparse_map.world_pose(other)
             if sparse_map.map_id(submap_of_keyframe(other)) != map_id or T_other is None:
                 continue
-            limit = config.twin_m + share * consistency.path_length(sparse_map, other, keyframe)
+            limit = config.ambiguous_m + share * consistency.path_length(sparse_map, other, keyframe)
             near = float(np.linalg.norm(T_other[:3, 3] - T[:3, 3])) <= limit
             if near and (T_other[:3, 2] @ T[:3, 2]) > _SAME_VIEW_COSINE:
                 continue

@@ -100,7 +100,7 @@ def verify_loop(
     if found is None:
         return None
     T_c_w, which, points, share = found
-    if len(which) < config.min_inliers_all or share < config.min_share:
+    if len(which) < config.min_inliers_all or share < config.min_matched_share:
         return None
     if not spread_out(sparse_map, new, mine.uv[which], config):
         return None
@@ -176,7 +176,7 @@ def _depths_in_own_map(sparse_map: SparseMap, new: KeyframeId, mine: KeyframeObs
 
 def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
     """Scale of the other map over its own, from depths (n,) of the same points; None if it is too uncertain."""
-    if len(own) < config.scale_points:
+    if len(own) < config.min_scale_points:
         return None
     ratio = np.log(np.maximum(other, 1e-3) / np.maximum(own, 1e-3))
     middle = float(np.median(ratio))
@@ -207,7 +207,7 @@ def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: Loo
     column = np.clip(uv[:, 0] * (config.columns / camera.width), 0, config.columns - 1).astype(np.int64)
     row = np.clip(uv[:, 1] * (config.rows / camera.height), 0, config.rows - 1).astype(np.int64)
     filled = np.bincount(row * config.columns + column, minlength=config.rows * config.columns)
-    return int(np.count_nonzero(filled >= config.cell_points)) >= config.min_cells
+    return int(np.count_nonzero(filled >= config.cell_inliers)) >= config.min_cells
 
 
 def _match_neighbours(
@@ -219,7 +219,7 @@ def _match_neighbours(
     scale: of the old over the new map. Returns the pose, rows of `mine` and landmark slots (k,) that agree, and their
     share of the landmarks expected in view.
     """
-    around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.neighbours]]
+    around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.max_neighbours]]
     points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
     _, known = sparse_map.positions(points)
     points = points[known]

@@ -116,7 +116,7 @@ class MapMerger:
 
     def requery(self) -> MergeResult:
         """Match a few keyframes of merged maps to the landmarks of the other map, and search their place again."""
-        count = self._config.graph.revisits
+        count = self._config.graph.requeries
         now, self._requery = self._requery[:count], self._requery[count:]
         result = MergeResult(requeried=tuple(now))
         for keyframe in now:
@@ -308,11 +308,11 @@ class MapMerger:
         for match in closure.matches:
             S_w_new = similarity(self._map, match.new)
             error = sim3.inverse(S_w_new) @ similarity(self._map, match.old) @ sim3.of(match.scale, match.T_old_new)
-            if sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]) > limits.small_m:
+            if sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]) > limits.fuse_m:
                 return True
-            if np.linalg.norm(se3.so3_log(sim3.rigid(error)[:3, :3])) > limits.small_rad:
+            if np.linalg.norm(se3.so3_log(sim3.rigid(error)[:3, :3])) > limits.fuse_rad:
                 return True
-            if abs(np.log(sim3.scale_of(error))) > limits.small_scale:
+            if abs(np.log(sim3.scale_of(error))) > limits.fuse_scale:
                 return True
         return False
 
@@ -347,7 +347,7 @@ class MapMerger:
         seen: set[KeyframeId] = set()
         for match in matches:
             around = self._map.covisible_keyframes(match.new, self._config.bundle_window.min_shared)
-            for keyframe in [match.new, *around[: self._config.loops.neighbours]]:
+            for keyframe in [match.new, *around[: self._config.loops.max_neighbours]]:
                 if keyframe not in seen:
                     seen.add(keyframe)
                     landmark_matching.match_landmarks(

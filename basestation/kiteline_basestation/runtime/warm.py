@@ -39,7 +39,7 @@ def warm(config: BaseConfig | None = None, words: Vocabulary | None = None) -> N
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
     if words is not None:
         submap = submap_id(0, 0, 0)
-        easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_share=0.0)
+        easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
         sparse_map, last, first = station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
         verify_loop(sparse_map, last, first, easy)
         sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))

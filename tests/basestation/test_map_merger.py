@@ -98,13 +98,15 @@ def test_agents_in_a_corridor_that_repeats_stay_apart(make_flight: MakeFlight, c
     assert mapper.summary()["merges"] == 0
 
 
-@pytest.mark.parametrize(("ask_before", "merges"), [(0, 0), (4, 1)])
+@pytest.mark.parametrize(("predecessors", "merges"), [(0, 0), (4, 1)])
 def test_where_one_keyframe_finds_another_map_those_before_it_are_asked(
-    make_flight: MakeFlight, words: Any, ask_before: int, merges: int
+    make_flight: MakeFlight, words: Any, predecessors: int, merges: int
 ) -> None:
     first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
     second = make_flight(keyframes=24, turns=0.45, T_w_m=ELSEWHERE)
-    loops = replace(BaseConfig().loops, ask_before=ask_before, min_likeness=0.34)  # words alone tell of one keyframe
+    loops = replace(
+        BaseConfig().loops, predecessors=predecessors, min_likeness=0.34
+    )  # words alone tell of one keyframe
     mapper = Mapper(replace(BaseConfig(), loops=loops), words)
     feed(mapper, [first, second], [0, 24])
     assert mapper.summary()["merges"] == merges

@@ -1,0 +1,89 @@
+"""The mapper's state as texts: it comes back as it was, and only changed parts are written."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.intake.intake import IntakeState
+from kiteline_basestation.intake.placements import PlacementState
+from kiteline_basestation.mapper_state import MapperState, MapState
+from kiteline_basestation.merging.loop_detector import DetectorState
+from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch
+from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_basestation.merging.merges import MapMerge
+from kiteline_basestation.store.state_texts import StateWriter, state_of, texts_of
+from kiteline_codec.schema import LivePose
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId
+
+T = se3.exp(np.array([0.3, -0.2, 0.1, 0.4, 0.1, -0.7]))
+S = sim3.of(1.7, T)
+A, B = SubmapId(4096), SubmapId(67112960)
+
+
+def full_state() -> MapperState:
+    """A state in which every kind of field is set."""
+    edge = LoopEdge(KeyframeId(70), KeyframeId(5), T, 41, 3.25, 1.1)
+    match = LoopMatch(KeyframeId(71), KeyframeId(6), T, 40, 2.5, 1.0, np.array([3, 9]), np.array([4, 2**50]))
+    merger = MergerState(
+        loops=2, last_return={A: 30}, graphs_due=(A,), requery=(KeyframeId(9),), edges=(edge, edge),
+        unfused={B: (match,)}, merges=(MapMerge(B, A, {B: S}), MapMerge(A, B, {A: T}, np.array([[1, 2], [3, 4]]))),
+        detector=DetectorState({(A, B): (match, match)}, {(A, B): 1}, (B, A), ((frozenset({A}), frozenset({B})),)),
+    )  # fmt: skip
+    return MapperState(
+        names={A: 'hall "7"'}, unbundled={A: (KeyframeId(1), KeyframeId(2))},
+        map=MapState({B: A}, {B: S}, {AgentId(1): np.array([0.1, 0, 0, 0, 0])}, frozenset({AgentId(1)})),
+        intake=IntakeState({A: LivePose(AgentId(0), 5, KeyframeId(2), T, 80)}, {A: 5}, (KeyframeId(3),), (B,)),
+        placements=PlacementState({B: S, A: T}, {A: T}, frozenset({B})), merger=merger,
+    )  # fmt: skip
+
+
+def test_a_state_comes_back_to_the_last_bit() -> None:
+    texts = texts_of(full_state())
+    again = state_of(texts)
+    assert texts_of(again) == texts
+    assert list(again.placements.S_w_m) == [B, A]  # the first submap of all stays the first
+    assert np.array_equal(again.placements.S_w_m[B], S)
+    assert again.merger.merges[0].fused.shape == (0, 2)
+    assert again.merger.detector.matches[A, B][1].old_landmarks.tolist() == [4, 2**50]
+    assert texts_of(state_of({})) == texts_of(MapperState())
+
+
+def test_only_changed_parts_are_written() -> None:
+    writer, state = StateWriter(), full_state()
+    assert set(writer.changes(state)) == set(texts_of(state))
+    assert writer.changes(state) == {}
+    copied = replace(state.merger, merges=tuple(replace(m) for m in state.merger.merges))
+    assert writer.changes(replace(state, merger=copied)) == {}
+    copied.merges[0].fused = np.array([[5, 6]])
+    less = replace(copied, edges=copied.edges[:1])
+    assert set(writer.changes(replace(state, merger=less))) == {
+        "mapper.merger.merges/000000",
+        "mapper.merger.edges/000001",
+    }
+    assert writer.changes(replace(state, merger=less)) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "value"),
+    [
+        ("mapper.merger.edges/000000", ("T_old_new", 1, 0), 2.0),
+        ("mapper.merger.edges/000000", ("inliers",), "many"),
+        ("mapper.placements", ("S_w_m", 0, 1, 1, 0), float("nan")),
+        ("mapper.intake.last_pose/4096", ("T_k_c", 1, 15), 0.0),
+        ("mapper.merger", ("loops",), None),
+    ],
+)
+def test_values_of_another_type_are_refused(name: str, path: tuple[str | int, ...], value: object) -> None:
+    texts = texts_of(full_state())
+    changed = json.loads(texts[name])
+    inner = changed
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises((TypeError, ValueError)):
+        state_of({**texts, name: json.dumps(changed)})
