@@ -19,6 +19,7 @@ import zenoh
 from kiteline_hw.ports import LinkError
 
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
+CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
 _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
 
@@ -41,7 +42,7 @@ def session_config(endpoint: str, role: Role, lease_ms: int) -> zenoh.Config:
         "mode": "client" if role == "client" else "peer",
         "connect/endpoints": [endpoint] if role == "client" else [],
         "listen/endpoints": [endpoint] if role == "base" else [],
-        "connect/timeout_ms": 4000,  # two round trips over a link with 900 ms of delay each way
+        "connect/timeout_ms": CONNECT_TIMEOUT_MS,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -68,66 +69,40 @@ class SimSource:
 
     def __init__(self, config: SimConfig, workers: int = 1, world: World | None = None) -> None:
         self.config = config
+        self.name = f"sim:{config.scene}?seed={config.seed}"
+        self.report = SourceReport()  # stays empty
+        self.imu = ImuCalibration(rate_hz=1e9 / IMU_NS) if config.imu else None
         stereo = not (config.mono or config.depth)
-        self._rig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale)
+        self.rig: CameraRig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale)
         rng = np.random.default_rng([config.seed * 64 + config.agent, 41])
-        self._true_rig = perturb(self._rig, rng, config.miscalibration)
+        self._true_rig = perturb(self.rig, rng, config.miscalibration)
         self.path = self._choose_path()
-        self.world = world if world is not None else build_world(config, self._rig.T_b_c)
+        self.world = world if world is not None else build_world(config, self.rig.T_b_c)
         seconds = self.path.duration_s if not config.seconds else min(config.seconds, self.path.duration_s)
-        self._frames = int(seconds * 1e9) // FRAME_NS + (1 if not config.seconds else 0)
-        if self._frames < 1:
+        self.frame_count = int(seconds * 1e9) // FRAME_NS + (1 if not config.seconds else 0)
+        if self.frame_count < 1:
             raise SourceError(f"a flight of {seconds:.2f} s has no frame: expected at least {FRAME_NS * 1e-9} s")
-        self._stamps = START_NS + FRAME_NS * np.arange(self._frames, dtype=np.int64)
+        self._stamps = START_NS + FRAME_NS * np.arange(self.frame_count, dtype=np.int64)
         self._motion: Motion = self.path.motion(flight_s(self._stamps, START_NS))
-        self._gains = _gains(self._frames, config.seed * 64 + config.agent)
+        self._gains = _gains(self.frame_count, config.seed * 64 + config.agent)
         self._workers = workers
-        self._report = SourceReport()
-        self._truth: Trajectory | None = None
 
     def _choose_path(self) -> Path:
         c = self.config
         file = (c.trajectory, *c.also)[c.agent]
         if file:
-            path = read_trajectory(FilePath(file), self._rig.T_b_c)
+            path = read_trajectory(FilePath(file), self.rig.T_b_c)
             if c.start >= path.length_s - 0.5:
                 raise SourceError(f"start {c.start} s lies behind the end of {file}, which lasts {path.length_s:.1f} s")
         else:
-            path = built_in_path(c.scene, (c.seconds or 20.0) + c.start, self._rig.T_b_c, c.agent)
+            path = built_in_path(c.scene, (c.seconds or 20.0) + c.start, self.rig.T_b_c, c.agent)
         end = path.length_s if file else (c.seconds or 20.0) + c.start
         return Path(path.coefficients, path.knot_s, end, c.start, c.rest)
 
-    @property
-    def name(self) -> str:
-        """The name for logs."""
-        return f"sim:{self.config.scene}?seed={self.config.seed}"
-
-    @property
-    def rig(self) -> CameraRig:
-        """The cameras, as calibrated: the true ones differ a little."""
-        return self._rig
-
-    @property
-    def imu(self) -> ImuCalibration | None:
-        """Noise of the simulated IMU, or None without one."""
-        return ImuCalibration(rate_hz=1e9 / IMU_NS) if self.config.imu else None
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
+    @cached_property
+    def ground_truth(self) -> Trajectory:
         """True body poses at the stamps of the frames."""
-        if self._truth is None:
-            self._truth = to_trajectory(self.path, self._stamps, START_NS)
-        return self._truth
-
-    @property
-    def report(self) -> SourceReport:
-        """Always empty: no frame of a simulated flight is skipped."""
-        return self._report
-
-    @property
-    def frame_count(self) -> int | None:
-        """The number of frames."""
-        return self._frames
+        return to_trajectory(self.path, self._stamps, START_NS)
 
     def imu_samples(self) -> ImuBatch:
         """All inertial samples of the flight."""
@@ -140,7 +115,7 @@ class SimSource:
         if self.config.odometry <= 0.0:
             return None
         stamps = np.arange(START_NS, int(self._stamps[-1]) + 1, round(1e9 / self.config.odometry), dtype=np.int64)
-        return odometer.measure(self.path, stamps, START_NS, self.config, self._rig.T_b_c)
+        return odometer.measure(self.path, stamps, START_NS, self.config, self.rig.T_b_c)
 
     def cameras(self) -> list[SimCamera]:
         """New cameras in the world, left first. Each thread needs its own."""
@@ -181,7 +156,7 @@ class SimSource:
     def _images(self) -> Iterator[Frame]:
         if self._workers <= 1:
             cameras = self.cameras()
-            for k in range(self._frames):
+            for k in range(self.frame_count):
                 yield self.render(k, cameras)
             return
         free = deque(self.cameras() for _ in range(self._workers))
@@ -195,7 +170,7 @@ class SimSource:
 
         waiting: deque[Future[Frame]] = deque()
         with ThreadPoolExecutor(self._workers) as pool:
-            for k in range(self._frames):
+            for k in range(self.frame_count):
                 waiting.append(pool.submit(work, k))
                 if len(waiting) > 2 * self._workers:
                     yield waiting.popleft().result()

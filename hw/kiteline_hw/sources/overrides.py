@@ -8,46 +8,27 @@ from dataclasses import replace
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.geometry.se3 import F64
-from kiteline_hw.ports import FrameSource, SourceReport
+from kiteline_hw.ports import FrameSource
 
 
 class SourceView:
-    """A FrameSource that passes another one on, without right image and depth (mono) or without IMU."""
+    """A FrameSource that passes another one on: mono without right image and depth, imu=False without IMU."""
 
     def __init__(self, source: FrameSource, mono: bool, imu: bool) -> None:
-        self._source, self._mono, self._imu = source, mono, imu
-
-    @property
-    def name(self) -> str:
-        return self._source.name
-
-    @property
-    def rig(self) -> CameraRig:
-        rig = self._source.rig
-        return replace(rig, right=None, T_c_r=None, has_depth=False) if self._mono else rig
-
-    @property
-    def imu(self) -> ImuCalibration | None:
-        return self._source.imu if self._imu else None
+        self._source, self._mono, self._passes_imu = source, mono, imu
+        self.name, self.report, self.frame_count = source.name, source.report, source.frame_count
+        self.rig = replace(source.rig, right=None, T_c_r=None, has_depth=False) if mono else source.rig
+        self.imu = source.imu if imu else None
 
     @property
     def ground_truth(self) -> Trajectory | None:
         return self._source.ground_truth
 
-    @property
-    def report(self) -> SourceReport:
-        return self._source.report
-
-    @property
-    def frame_count(self) -> int | None:
-        return self._source.frame_count
-
     def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
         for item in self._source:
             if isinstance(item, ImuBatch):
-                if self._imu:
+                if self._passes_imu:
                     yield item
             elif self._mono and isinstance(item, Frame):
                 yield Frame(item.t_ns, item.left, encoded=item.encoded[:1])
@@ -61,28 +42,23 @@ class SourceView:
 class _OtherImuView(SourceView):
     def __init__(self, source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> None:
         super().__init__(source, mono=False, imu=False)
-        self._calibration, self._T_b_c = imu, T_b_c
-
-    @property
-    def rig(self) -> CameraRig:
-        rig = self._source.rig
-        return rig if self._T_b_c is None else replace(rig, T_b_c=self._T_b_c, has_body=True)
-
-    @property
-    def imu(self) -> ImuCalibration | None:
-        return self._calibration
+        self.imu = imu
+        self._T_new_old: F64 | None = None  # the body frame of the source in the new one; None: it stays
+        if T_b_c is not None:
+            self._T_new_old = T_b_c @ se3.inverse(source.rig.T_b_c)
+            self.rig = replace(source.rig, T_b_c=T_b_c, has_body=True)
 
     @property
     def ground_truth(self) -> Trajectory | None:
         truth = self._source.ground_truth
-        if truth is None or self._T_b_c is None:
+        if truth is None or self._T_new_old is None:
             return truth
-        return Trajectory(truth.t_ns, truth.T_w_b @ self._source.rig.T_b_c @ se3.inverse(self._T_b_c))
+        return Trajectory(truth.t_ns, truth.T_w_b @ self._source.rig.T_b_c @ se3.inverse(self.rig.T_b_c))
 
     def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
         for item in super().__iter__():
-            if self._T_b_c is not None and isinstance(item, OdometryBatch):
-                yield odometry.in_body(item, self._T_b_c @ se3.inverse(self._source.rig.T_b_c))
+            if self._T_new_old is not None and isinstance(item, OdometryBatch):
+                yield odometry.in_body(item, self._T_new_old)
             else:
                 yield item
 

@@ -1,0 +1,243 @@
+"""Zenoh links: they come and go with either side, never block their caller, and never keep a process from ending."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from kiteline_hw.links import zenoh_session
+from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, QueuedLink
+from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
+from kiteline_hw.links.zenoh_session import open_session
+from kiteline_hw.ports import LinkError
+
+ROOT = Path(__file__).parents[3]
+
+
+def free_endpoint() -> str:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{s.getsockname()[1]}"
+
+
+def start(code: str, *args: object) -> subprocess.Popen[str]:
+    path = os.pathsep.join([str(ROOT / "core"), str(ROOT / "hw"), os.environ.get("PYTHONPATH", "")])
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, args)],
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 8.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "nothing happened in time"
+        time.sleep(0.01)
+
+
+def test_two_agents_and_a_base_that_starts_late_and_restarts() -> None:
+    endpoint = free_endpoint()
+    with ZenohLink(endpoint, 1) as one, ZenohLink(endpoint, 2) as two:
+        assert not one.send(b"nobody listens")
+        for life in range(2):
+            with ZenohHub(endpoint) as hub:
+                wait_for(lambda: one.connected and two.connected and hub.alive() == {1, 2})
+                assert one.send(b"up one %d" % life) and two.send(b"up two %d" % life)
+                links = hub.links()
+                assert list(links) == [1, 2]
+                received: dict[int, list[bytes]] = {1: [], 2: []}
+
+                def collect() -> bool:
+                    for agent, link in links.items():  # noqa: B023
+                        received[agent] += link.receive()  # noqa: B023
+                    return all(received.values())  # noqa: B023
+
+                wait_for(collect)
+                assert received == {1: [b"up one %d" % life], 2: [b"up two %d" % life]}
+                assert links[2].send(b"down two %d" % life)
+                down: list[bytes] = []
+                wait_for(lambda: down.extend(two.receive()) or down)  # type: ignore[func-returns-value]  # noqa: B023
+                assert down == [b"down two %d" % life]
+                assert one.receive() == []
+            wait_for(lambda: not one.connected and not two.connected)
+        assert one.counters.reconnects == 2
+        assert one.counters.sent_packets == 2 and one.counters.callback_errors == 0
+
+
+def test_an_agent_that_leaves_is_noticed_and_its_link_stays() -> None:
+    endpoint = free_endpoint()
+    with ZenohHub(endpoint) as hub:
+        with ZenohLink(endpoint, 7):
+            wait_for(lambda: hub.alive() == {7})
+        wait_for(lambda: hub.alive() == frozenset())
+        assert not hub.links()[7].send(b"nobody")
+        with ZenohLink(endpoint, 7) as again:
+            wait_for(lambda: hub.alive() == {7} and again.connected)
+            assert hub.links()[7].send(b"welcome back")
+            wait_for(lambda: again.receive() == [b"welcome back"])
+
+
+def test_through_a_router(monkeypatch: pytest.MonkeyPatch) -> None:
+    locator = free_endpoint()
+    config = zenoh.Config()
+    options = {"mode": '"router"', "listen/endpoints": f'["{locator}"]', "scouting/multicast/enabled": "false"}
+    for name, value in options.items():
+        config.insert_json5(name, value)
+    with monkeypatch.context() as patch:
+        patch.setattr(zenoh_session, "CONNECT_TIMEOUT_MS", 200)
+        with pytest.raises(LinkError, match="no router answers"):
+            open_session(f"router/{locator}", "base", connect_timeout_s=0.2)
+    with zenoh.open(config), ZenohHub(f"router/{locator}") as hub, ZenohLink(f"router/{locator}", 4) as link:
+        wait_for(lambda: link.connected and hub.alive() == {4})
+        assert link.send(b"up") and hub.links()[4].send(b"down")
+        wait_for(lambda: hub.links()[4].receive() == [b"up"])
+        wait_for(lambda: link.receive() == [b"down"])
+
+
+def test_packets_stay_in_order_and_whole() -> None:
+    endpoint = free_endpoint()
+    packets = [bytes([i % 251]) * (1 + 37 * i) for i in range(200)]
+    with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3) as link:
+        wait_for(lambda: link.connected and hub.alive())
+        received: list[bytes] = []
+
+        def collect(count: int) -> bool:
+            received.extend(hub.links()[3].receive())
+            return len(received) >= count
+
+        for begin in range(0, len(packets), 20):  # more at once, and a busy machine may drop some: so it is meant
+            for packet in packets[begin : begin + 20]:
+                assert link.send(packet)
+            wait_for(lambda: collect(begin + 20))  # noqa: B023
+        assert received == packets
+
+
+def test_a_callback_that_raises_is_counted() -> None:
+    endpoint = free_endpoint()
+    with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3) as link:
+        wait_for(lambda: link.connected and hub.alive())
+
+        def broken(packet: bytes) -> None:
+            raise RuntimeError(packet)
+
+        link.deliver = broken  # type: ignore[method-assign]
+        hub.links()[3].send(b"x")
+        wait_for(lambda: link.counters.callback_errors == 1)
+
+
+class AlwaysConnected(QueuedLink):
+    connected = True  # type: ignore[assignment]
+
+
+def test_queues_stay_bounded() -> None:
+    link = AlwaysConnected()
+    for i in range(INBOX_PACKETS + 50):
+        link.deliver(b"%d" % i)
+    assert link.receive() == [b"%d" % i for i in range(50, INBOX_PACKETS + 50)]  # the newest are kept
+    assert link.counters.overrun_packets == 50 and link.receive() == []
+    assert [link.send(b"%d" % i) for i in range(OUTBOX_PACKETS + 1)] == [True] * OUTBOX_PACKETS + [False]
+    assert link.next_packet() == b"0" and link.pending()
+    link.clear_outbox()
+    assert link.next_packet() is None and link.counters.failed_packets == OUTBOX_PACKETS - 1
+
+
+BASE = """
+import sys, time
+from kiteline_hw.links.zenoh_link import ZenohHub
+hub = ZenohHub(sys.argv[1])
+print("up", flush=True)
+time.sleep(30)
+"""
+
+
+def test_a_frozen_base_never_blocks_the_sender_nor_close() -> None:
+    endpoint = free_endpoint()
+    base = start(BASE, endpoint)
+    try:
+        link = ZenohLink(endpoint, 1)
+        wait_for(lambda: link.connected)
+        base.send_signal(signal.SIGSTOP)
+        longest_s, refused, packet = 0.0, 0, bytes(100_000)
+        end_s = time.monotonic() + 0.7
+        while time.monotonic() < end_s:
+            began = time.monotonic()
+            refused += not link.send(packet)
+            time.sleep(0.0002)
+            longest_s = max(longest_s, time.monotonic() - began)
+        assert longest_s < 0.1
+        assert link.counters.sent_packets + refused > 100
+        wait_for(lambda: not link.connected, 5.0)  # the lease ran out
+        began = time.monotonic()
+        link.close()
+        link.close()
+        assert time.monotonic() - began < 2.0
+    finally:
+        base.kill()
+        base.communicate()
+
+
+AGENT = """
+import signal, sys, time
+from kiteline_hw.system.process import StopSignal
+from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
+from kiteline_hw.links.zenoh_session import open_session
+way = sys.argv[2]
+if way == "handler":
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+if way == "flag":
+    stop = StopSignal()
+link = ZenohLink(sys.argv[1], 1)
+hub = ZenohHub(sys.argv[3])
+while not link.connected:
+    time.sleep(0.01)
+print("connected", flush=True)
+if way == "end":
+    sys.exit(0)
+if way == "raise":
+    raise RuntimeError("on purpose")
+while not (way == "flag" and stop.wait(0.05)):
+    link.send(b"x")
+    link.receive()
+    time.sleep(0.01)
+"""
+
+
+@pytest.mark.parametrize(
+    ("way", "status"), [("end", 0), ("raise", 1), ("default", -signal.SIGTERM), ("handler", 0), ("flag", 0)]
+)
+def test_a_process_with_an_open_link_ends(way: str, status: int) -> None:
+    endpoint = free_endpoint()
+    with ZenohHub(endpoint) as hub:
+        process = start(AGENT, endpoint, way, free_endpoint())
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "connected\n"
+            wait_for(lambda: hub.alive() == {1})
+            for i in range(100):
+                hub.links()[1].send(b"%d" % i)  # callbacks are running while the process ends
+            if way not in ("end", "raise"):
+                process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=5)
+            assert process.returncode == status
+            wait_for(lambda: hub.alive() == frozenset())
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def test_bad_numbers_and_names() -> None:
+    with pytest.raises(LinkError, match="expected 0 to 63"):
+        ZenohLink("tcp/127.0.0.1:1", 64)
+    with pytest.raises(LinkError, match="one word"):
+        ZenohLink("tcp/127.0.0.1:1", 1, group="a/b")

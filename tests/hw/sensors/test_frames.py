@@ -1,0 +1,77 @@
+"""Pairing by time and the sieve of inertial samples, against plain statements of what they promise."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_hw.ports import SourceReport
+from kiteline_hw.sensors.frames import pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.imu_buffer import ImuStream, ImuTable
+
+STAMPS = st.lists(st.integers(0, 300), max_size=25, unique=True).map(sorted)
+
+
+@given(STAMPS, STAMPS, st.integers(0, 12))
+def test_pairs_are_within_tolerance_ordered_and_complete(left: list[int], right: list[int], tolerance: int) -> None:
+    report = SourceReport()
+    items = sorted([(t, 0, ("l", t)) for t in left] + [(t, 1, ("r", t)) for t in right])
+    pairs = list(pair_by_time(items, tolerance, ("left", "right"), report))
+    lefts, rights = [p[1][1] for p in pairs], [p[2][1] for p in pairs]
+    assert all(p[0] == p[1][1] and p[1][0] == "l" and p[2][0] == "r" for p in pairs)
+    assert all(abs(a - b) <= tolerance for a, b in zip(lefts, rights, strict=True))
+    assert lefts == sorted(set(lefts)) and rights == sorted(set(rights))
+    # Every item is either paired or counted.
+    assert report.skipped.get("missing right", 0) == len(left) - len(pairs)
+    assert report.skipped.get("missing left", 0) == len(right) - len(pairs)
+    # An item whose partner is the nearest from both sides, and alone within reach, is never left out.
+    for t in left:
+        near = [r for r in right if abs(r - t) <= tolerance]
+        if len(near) == 1 and [a for a in left if abs(a - near[0]) <= tolerance] == [t]:
+            assert (t, near[0]) in list(zip(lefts, rights, strict=True))
+    # Equal stamps always find each other.
+    assert set(left) & set(right) <= {a for a, b in zip(lefts, rights, strict=True) if a == b}
+
+
+def test_the_nearer_of_two_candidates_is_paired() -> None:
+    items = [(0, 0, "l0"), (4, 1, "r4"), (5, 0, "l5"), (100, 0, "l100")]
+    report = SourceReport()
+    assert list(pair_by_time(items, 6, ("left", "right"), report)) == [(5, "l5", "r4")]
+    assert report.skipped == {"missing right": 2}
+
+
+def test_tolerance_is_half_a_period_at_most() -> None:
+    assert pair_tolerance_ns(np.array([0, 50_000_000, 100_000_000])) == 5_000_000
+    assert pair_tolerance_ns(np.array([0, 5_000_000, 10_000_000])) == 2_500_000
+    assert pair_tolerance_ns(np.array([7])) == 5_000_000
+
+
+@given(st.lists(st.tuples(st.integers(0, 100), st.booleans()), max_size=40), st.integers(0, 110))
+def test_stream_and_table_keep_the_same_samples(samples: list[tuple[int, bool]], until: int) -> None:
+    times = np.array([t for t, _ in samples], np.int64)
+    gyro = np.array([[np.nan if bad else 0.5] * 3 for _, bad in samples]).reshape(-1, 3)
+    accel = np.arange(3.0 * len(samples)).reshape(-1, 3)
+    reports = SourceReport(), SourceReport()
+    table, stream = ImuTable(times, gyro, accel, reports[0]), ImuStream(reports[1])
+    for t, g, a in zip(times, gyro, accel, strict=True):
+        stream.add(int(t), (*g, *a))
+    got = [b for b in (table.take_until(until), table.take_until(1000), table.take_until(2000)) if b is not None]
+    kept = np.concatenate([b.t_ns for b in got]) if got else np.zeros(0, np.int64)
+    best, expected = -1, []
+    for t, bad in samples:
+        if not bad and t > best:
+            best = t
+            expected.append(t)
+    assert kept.tolist() == expected
+    batch = stream.take_until(1000)
+    assert (batch.t_ns.tolist() if batch is not None else []) == expected
+    assert reports[0].skipped == reports[1].skipped
+    assert sum(reports[0].skipped.values()) == len(samples) - len(expected)
+    assert all((np.diff(b.t_ns) > 0).all() and np.isfinite(b.gyro).all() for b in got)
+
+
+def test_one_stamp_far_ahead_is_dropped_alone() -> None:
+    times = np.arange(10, dtype=np.int64) * 5_000_000
+    times[4] += 3600 * 10**9
+    report = SourceReport()
+    batch = ImuTable(times, np.zeros((10, 3)), np.zeros((10, 3)), report).take_until(10**12)
+    assert batch is not None and len(batch.t_ns) == 9 and report.skipped == {"imu stamp not increasing": 1}

@@ -1,0 +1,530 @@
+"""Recordings of messages: ROS 2 bags in every storage form, Foxglove's schemas in both encodings, and their faults."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+from mcap_ros2.writer import Writer as Ros2Writer
+
+from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Lens
+from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_hw.sensors.odometry_buffer import VELOCITY_SIGMA_M_S
+from kiteline_hw.sources.open import open_source
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 50_000_000
+LEAVES = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+================================================================================
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+================================================================================
+MSG: geometry_msgs/PoseWithCovariance
+geometry_msgs/Pose pose
+float64[36] covariance
+================================================================================
+MSG: geometry_msgs/Twist
+geometry_msgs/Vector3 linear
+geometry_msgs/Vector3 angular
+================================================================================
+MSG: geometry_msgs/TwistWithCovariance
+geometry_msgs/Twist twist
+float64[36] covariance
+================================================================================
+MSG: sensor_msgs/RegionOfInterest
+uint32 x_offset
+uint32 y_offset
+uint32 height
+uint32 width
+bool do_rectify
+"""
+ROS2 = {
+    "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n"
+    "uint8 is_bigendian\nuint32 step\nuint8[] data",
+    "sensor_msgs/msg/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
+    "sensor_msgs/msg/CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n"
+    "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
+    "sensor_msgs/RegionOfInterest roi",
+    "sensor_msgs/msg/Imu": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+    "float64[9] orientation_covariance\n"
+    "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+    "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance",
+    "nav_msgs/msg/Odometry": "std_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist",
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+}
+T_B_L = se3.exp(np.array([0.02, -0.06, 0.01, 1.2, -1.2, 1.2]))
+T_L_R = se3.exp(np.array([0.11, 0.0, 0.0, 0.001, -0.002, 0.003]))
+D = (-0.28, 0.07, 0.0002, 1.8e-05)
+
+
+def picture(i: int) -> np.ndarray:
+    return np.random.default_rng(i).integers(0, 255, (48, 64), np.uint8)
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def read(source: FrameSource) -> tuple[list[Frame], list[ImuBatch]]:
+    items = list(source)
+    frames, batches = [i for i in items if isinstance(i, Frame)], [i for i in items if isinstance(i, ImuBatch)]
+    assert all(b.t_ns > a.t_ns for a, b in pairwise(frames))
+    stamps = np.concatenate([b.t_ns for b in batches]) if batches else np.zeros(0)
+    assert (np.diff(stamps) > 0).all()
+    return frames, batches
+
+
+def xyz(v: np.ndarray) -> dict[str, float]:
+    return {"x": float(v[0]), "y": float(v[1]), "z": float(v[2])}
+
+
+def quaternion(t: np.ndarray) -> dict[str, float]:
+    q = se3.quaternion_from_rotation(t[:3, :3])
+    return {"w": float(q[0]), "x": float(q[1]), "y": float(q[2]), "z": float(q[3])}
+
+
+class Bag:
+    """Collects ROS 2 messages (log time, topic, type, value) and writes them in the order given."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[int, str, str, dict[str, Any]]] = []
+
+    def add(self, t_ns: int, topic: str, kind: str, frame: str, lag_ns: int = 0, **value: Any) -> None:
+        stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+        header = {"header": {"stamp": stamp, "frame_id": frame}} if kind != "tf2_msgs/msg/TFMessage" else {}
+        self.messages.append((t_ns + lag_ns, topic, kind, {**header, **value}))
+
+    def info(
+        self, t_ns: int, side: str, *, d: tuple[float, ...] = D, model: str = "plumb_bob", tx: float = 0.0
+    ) -> None:
+        k = [60.0, 0, 32, 0, 61, 24, 0, 0, 1]
+        p = [60.0, 0, 32, tx, 0, 61, 24, 0, 0, 0, 1, 0]
+        self.add(
+            t_ns, f"/{side}/info", "sensor_msgs/msg/CameraInfo", f"{side}_optical", height=48, width=64,
+            distortion_model=model, d=list(d), k=k, r=np.eye(3).ravel().tolist(), p=p, binning_x=0, binning_y=0,
+            roi={"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+        )  # fmt: skip
+
+    def image(self, t_ns: int, side: str, i: int, lag_ns: int = 0) -> None:
+        self.add(
+            t_ns, f"/{side}/picture", "sensor_msgs/msg/CompressedImage", f"{side}_optical", lag_ns, format="mono8; png",
+            data=png(picture(i)),
+        )  # fmt: skip
+
+    def raw(self, t_ns: int, side: str, encoding: str, image: np.ndarray, frame: str = "", pad: int = 0) -> None:
+        rows = image.reshape(image.shape[0], -1).view(np.uint8)
+        data = np.pad(rows, ((0, 0), (0, pad))).tobytes()
+        self.add(
+            t_ns, f"/{side}/pixels", "sensor_msgs/msg/Image", frame or f"{side}_optical", height=image.shape[0],
+            width=image.shape[1], encoding=encoding, is_bigendian=0, step=rows.shape[1] + pad, data=data,
+        )  # fmt: skip
+
+    def imu(self, t_ns: int, lag_ns: int = 0, accel: float = 9.8) -> None:
+        zero = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+        for name in ("orientation_covariance", "angular_velocity_covariance", "linear_acceleration_covariance"):
+            zero[name] = [0.0] * 9  # type: ignore[assignment]
+        self.add(
+            t_ns, "/sensors/imu", "sensor_msgs/msg/Imu", "imu", lag_ns, angular_velocity=xyz(np.array([0.1, 0.2, 0.3])),
+            linear_acceleration=xyz(np.array([0.0, 0.0, accel])), **zero,
+        )  # fmt: skip
+
+    def odometry(self, t_ns: int, topic: str, child: str, velocity: list[float], rate: list[float]) -> None:
+        covariance = [0.0] * 36
+        covariance[0], covariance[7], covariance[35] = 0.04, 1e9, 0.0025  # ahead, sideways (not measured), yaw
+        pose = {"position": xyz(np.zeros(3)), "orientation": quaternion(np.eye(4))}
+        twist = {"linear": xyz(np.array(velocity)), "angular": xyz(np.array(rate))}
+        self.add(
+            t_ns, topic, "nav_msgs/msg/Odometry", "odom", child_frame_id=child,
+            pose={"pose": pose, "covariance": [0.0] * 36}, twist={"twist": twist, "covariance": covariance},
+        )  # fmt: skip
+
+    def tf(self, t_ns: int, parent: str, child: str, t: np.ndarray) -> None:
+        header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": parent}
+        transform = {"translation": xyz(t[:3, 3]), "rotation": quaternion(t)}
+        item = {"header": header, "child_frame_id": child, "transform": transform}
+        self.add(t_ns, "/tf_static", "tf2_msgs/msg/TFMessage", "", transforms=[item])
+
+    def write(self, path: Path, **options: Any) -> Path:
+        with path.open("wb") as stream:
+            writer = Ros2Writer(stream, chunk_size=4096)
+            if options:
+                writer._writer = Writer(stream, chunk_size=4096, **options)
+                stream.seek(0)
+                stream.truncate()
+                writer._writer.start("ros2", "test")
+            kinds = {
+                kind: writer.register_msgdef(kind, ROS2[kind] + LEAVES) for kind in {m[2]: 0 for m in self.messages}
+            }
+            for t_ns, topic, kind, value in self.messages:
+                writer.write_message(topic, kinds[kind], value, t_ns, t_ns)
+            writer.finish()
+        return path
+
+
+def stereo_bag(n: int = 6, *, tf: bool = True, info: Callable[[Bag], None] | None = None) -> Bag:
+    bag = Bag()
+    if tf:
+        bag.tf(START_NS, "imu", "left_optical", T_B_L)
+        bag.tf(START_NS, "left_optical", "right_optical", T_L_R)
+    if info is None:
+        bag.info(START_NS, "left")
+        bag.info(START_NS, "right")
+    else:
+        info(bag)
+    for i in range(n):
+        for j in range(10):
+            bag.imu(START_NS + i * STEP_NS + j * 5_000_000)
+        bag.image(START_NS + i * STEP_NS, "right", 100 + i)
+        bag.image(START_NS + i * STEP_NS, "left", i)
+    return bag
+
+
+def check_stereo(source: FrameSource, n: int = 6) -> None:
+    frames, batches = read(source)
+    assert [f.t_ns for f in frames] == [START_NS + i * STEP_NS for i in range(n)]
+    for i, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.left, picture(i))
+        assert frame.right is not None and len(frame.encoded) == 2
+        np.testing.assert_array_equal(frame.right, picture(100 + i))
+    assert sum(len(b.t_ns) for b in batches) == (n - 1) * 10 + 1
+    np.testing.assert_array_equal(batches[0].gyro[0], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(source.rig.T_b_c, T_B_L, atol=1e-12)
+    assert source.rig.T_c_r is not None
+    np.testing.assert_allclose(source.rig.T_c_r, T_L_R, atol=1e-12)
+    assert source.rig.left.lens is Lens.RADTAN and source.rig.left.distortion == D
+
+
+def test_room_recording(data_dir: Path) -> None:
+    source = open_source(str(data_dir / "room_flight.mcap"))
+    frames, batches = read(source)
+    assert len(frames) == source.frame_count == 440
+    assert (frames[0].t_ns, frames[-1].t_ns) == (1_700_000_018_000_000_000, 1_700_000_039_950_000_000)
+    assert sum(len(b.t_ns) for b in batches) == 4391 and len(batches) == 440
+    assert [e.format for e in frames[0].encoded] == ["jpeg", "jpeg"]
+    assert source.rig.left.fx == 458.654 and source.rig.right is not None and source.rig.right.fx == 457.587
+    assert source.rig.T_c_r is not None and source.rig.T_c_r[0, 3] == pytest.approx(0.110074, abs=1e-6)
+    assert source.rig.has_body and source.imu is not None and source.imu.rate_hz == pytest.approx(200, abs=0.5)
+    assert source.ground_truth is not None and len(source.ground_truth.t_ns) == 1100
+    assert source.ground_truth.T_w_b[0, :3, 3] == pytest.approx([-2.060154, -1.404402, 1.913249])
+    assert not source.report.skipped
+    source.close()
+
+
+# A rover's axle (forward, left, up) as its camera's IMU (right, down, forward) sees it: below it and behind it.
+AXLE = se3.from_rt(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, 0.2, -0.5]))
+
+
+def driven_bag(*topics: str, child: str = "base_link", tf: bool = True) -> Bag:
+    """1 m/s ahead and 0.5 rad/s to the left, told every 20 ms; a second topic says something else."""
+    bag = stereo_bag()
+    if tf:
+        bag.tf(START_NS, "imu", "base_link", AXLE)
+    for i in range(12):
+        for k, topic in enumerate(topics):
+            bag.odometry(START_NS + i * 20_000_000, topic, child, [1.0 + k, 0.0, 0.0], [0.0, 0.0, 0.5])
+    bag.messages.sort(key=lambda m: m[0])
+    return bag
+
+
+def test_wheel_odometry_of_a_bag_in_the_body_frame(tmp_path: Path) -> None:
+    source = open_source(str(driven_bag("/wheels/odom").write(tmp_path / "a.mcap")))
+    items = list(source)
+    told = [item for item in items if isinstance(item, OdometryBatch)]
+    assert [len(b.t_ns) for b in told] == [1, 2, 3, 2, 3, 1]  # up to each frame
+    assert isinstance(items[items.index(told[0]) + 1], Frame)
+    # Half a metre ahead of the axle the camera moves to the left as well: right -0.25, down 0, forward 1 m/s.
+    np.testing.assert_allclose(told[1].velocity, [[-0.25, 0.0, 1.0]] * 2, atol=1e-4)
+    np.testing.assert_allclose(told[1].rate, [[0.0, -0.5, 0.0]] * 2, atol=1e-12)
+    # forward was stated, sideways is not measured, the rest is not known
+    assert told[1].velocity_cov[0, 2, 2] == pytest.approx(0.04, abs=3e-3)
+    assert told[1].velocity_cov[0, 0, 0] == pytest.approx(UNMEASURED, rel=1e-3)
+    assert told[1].velocity_cov[0, 1, 1] == pytest.approx(VELOCITY_SIGMA_M_S**2, rel=0.2)
+    assert told[1].rate_cov[0, 1, 1] == pytest.approx(0.0025)
+    assert "odometry is that of /wheels/odom" in source.report.notes
+    check_stereo(source)
+
+
+@pytest.mark.parametrize(
+    ("topics", "speed"),
+    [
+        (("/wheels/odom", "/vins/odometry"), 1.0),
+        (("/vio/odom", "/odom"), 2.0),
+        (("/ground_truth/odom", "/odom"), 2.0),
+        (("/odom", "/wheel/odometry"), 2.0),
+    ],
+)
+def test_wheels_are_preferred_to_other_odometry_and_truth_is_never_used(
+    tmp_path: Path, topics: tuple[str, ...], speed: float
+) -> None:
+    source = open_source(str(driven_bag(*topics).write(tmp_path / "a.mcap")))
+    told = [item for item in source if isinstance(item, OdometryBatch)]
+    assert told[0].velocity[0, 2] == pytest.approx(speed, abs=1e-3)
+
+
+def test_ground_truth_is_no_odometry(tmp_path: Path) -> None:
+    source = open_source(str(driven_bag("/gt/odom").write(tmp_path / "a.mcap")))
+    assert not any(isinstance(item, OdometryBatch) for item in source)
+    assert source.ground_truth is not None
+
+
+def test_odometry_without_extrinsics_is_left_out_and_noted(tmp_path: Path) -> None:
+    source = open_source(str(driven_bag("/odom", tf=False).write(tmp_path / "a.mcap")))
+    assert not any(isinstance(item, OdometryBatch) for item in source)
+    assert any("odometry of /odom left out: no static transform" in note for note in source.report.notes)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE},
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE, "use_statistics": False},
+        {"index_types": IndexType.CHUNK},
+        {"repeat_channels": False, "repeat_schemas": False},
+    ],
+    ids=str,
+)
+def test_ros2_bag_in_every_storage_form(tmp_path: Path, options: dict[str, Any]) -> None:
+    check_stereo(open_source(str(stereo_bag().write(tmp_path / "a.mcap", **options))))
+
+
+def test_bag_in_a_folder(tmp_path: Path) -> None:
+    stereo_bag().write(tmp_path / "flight_0.mcap")
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    check_stereo(open_source(str(tmp_path)))
+    stereo_bag().write(tmp_path / "flight_1.mcap")
+    with pytest.raises(SourceError, match="kiteline log merge"):
+        open_source(str(tmp_path))
+
+
+def test_messages_written_out_of_order_come_in_order(tmp_path: Path) -> None:
+    bag = stereo_bag(20)
+    head, rest = bag.messages[:4], bag.messages[4:]
+    order = np.argsort(np.arange(len(rest)) + np.random.default_rng(0).uniform(0, 60, len(rest)))
+    bag.messages = head + [rest[i] for i in order]
+    check_stereo(open_source(str(bag.write(tmp_path / "a.mcap"))), 20)
+
+
+def test_late_recorded_samples_come_in_order_of_their_stamps(tmp_path: Path) -> None:
+    bag = Bag()
+    bag.tf(START_NS, "imu", "left_optical", T_B_L)
+    bag.info(START_NS, "left")
+    for i in range(40):
+        bag.image(START_NS + i * STEP_NS, "left", i)
+        for j in range(10):
+            bag.imu(START_NS + i * STEP_NS + j * 5_000_000, lag_ns=400_000_000)  # a slow serial line
+    bag.messages.sort(key=lambda m: m[0])
+    frames, batches = read(open_source(str(bag.write(tmp_path / "a.mcap"))))
+    assert len(frames) == 40 and [len(b.t_ns) for b in batches] == [1] + [10] * 39
+
+
+def test_a_cut_bag_yields_all_messages_before_the_cut(tmp_path: Path) -> None:
+    whole = stereo_bag(12).write(tmp_path / "whole.mcap").read_bytes()
+    counts = []
+    for size in np.linspace(len(whole) // 3, len(whole) - 1, 25).astype(int):
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(whole[:size])
+        source = open_source(str(path))
+        frames, _ = read(source)
+        assert source.report.skipped["file cut"] == 1 and "cut after" in source.report.notes[0]
+        counts.append(len(frames))
+    assert counts == sorted(counts) and counts[0] >= 1 and counts[-1] == 12
+
+
+def test_any_bytes_raise_only_source_errors(tmp_path: Path) -> None:
+    whole = stereo_bag(3).write(tmp_path / "whole.mcap", compression=CompressionType.NONE).read_bytes()
+    rng = np.random.default_rng(5)
+    path, read_some = tmp_path / "bad.mcap", 0
+    for _ in range(150):
+        data = bytearray(whole)
+        for at in rng.integers(8, len(data), rng.integers(1, 8)):
+            data[at] = rng.integers(256)
+        path.write_bytes(bytes(data[: rng.integers(9, len(data))] if rng.random() < 0.3 else data))
+        try:
+            source = open_source(str(path))
+            read_some += len(list(source)) > 0
+        except SourceError:
+            pass  # the one exception that is allowed
+    assert read_some > 20
+    path.write_bytes(b"")
+    with pytest.raises(SourceError, match="empty file"):
+        open_source(str(path))
+    path.write_bytes(b"\x89PNG rubbish")
+    with pytest.raises(SourceError, match="no MCAP file"):
+        open_source(f"mcap:{path}")
+
+
+def test_baseline_of_a_rectified_pair_comes_from_p(tmp_path: Path) -> None:
+    def info(bag: Bag) -> None:
+        bag.info(START_NS, "left", d=(0.0,) * 5)
+        bag.info(START_NS, "right", d=(0.0,) * 5, tx=-60 * 0.25)
+
+    source = open_source(str(stereo_bag(tf=False, info=info).write(tmp_path / "a.mcap")))
+    assert source.rig.left.lens is Lens.NONE and source.rig.T_c_r is not None
+    np.testing.assert_allclose(source.rig.T_c_r[:3, 3], [0.25, 0, 0])
+    assert not source.rig.has_body and source.imu is None
+    assert "imu left out" in (read(source), source.report.notes)[1][0]
+
+
+@pytest.mark.parametrize(
+    ("model", "d", "lens"),
+    [
+        ("equidistant", (0.1, 0.01, 0.0, 0.0), Lens.EQUIDISTANT),
+        ("rational_polynomial", (0.1,) * 8, Lens.RADTAN),
+        ("plumb_bob", (0.1, 0.2, 0.0, 0.0, 0.3), Lens.RADTAN),
+        ("", (), Lens.NONE),
+    ],
+)
+def test_lens_models(tmp_path: Path, model: str, d: tuple[float, ...], lens: Lens) -> None:
+    def info(bag: Bag) -> None:
+        for side in ("left", "right"):
+            bag.info(START_NS, side, d=d, model=model)
+
+    rig = open_source(str(stereo_bag(info=info).write(tmp_path / "a.mcap"))).rig
+    assert rig.left.lens is lens and rig.left.distortion == (d if lens is not Lens.NONE else ())
+
+
+def test_calibration_without_baseline_and_other_errors(tmp_path: Path) -> None:
+    path = stereo_bag(tf=False).write(tmp_path / "a.mcap")
+    with pytest.raises(
+        SourceError, match=r"no baseline\): expected static transforms between the frames 'left_optical'"
+    ):
+        open_source(str(path))
+    assert len(read(open_source(str(path), mono=True))[0]) == 6
+    bag = stereo_bag(tf=False)
+    bag.tf(START_NS, "left_optical", "right_optical", np.eye(4))
+    with pytest.raises(SourceError, match="baseline between left and right camera is 0 m"):
+        open_source(str(bag.write(tmp_path / "b.mcap")))
+    with pytest.raises(SourceError, match="no calibration for /left/picture, /right/picture"):
+        open_source(str(stereo_bag(info=lambda bag: None).write(tmp_path / "c.mcap")))
+    bag = Bag()
+    bag.imu(START_NS)
+    with pytest.raises(SourceError, match="no images: expected sensor_msgs"):
+        open_source(str(bag.write(tmp_path / "d.mcap")))
+
+
+def test_faults_in_a_bag_are_skipped_and_counted(tmp_path: Path) -> None:
+    bag = stereo_bag(8)
+    stamp = {START_NS + i * STEP_NS: i for i in range(8)}
+    kept = []
+    for t_ns, topic, kind, value in bag.messages:
+        i = stamp.get(t_ns, -1) if "picture" in topic else -1
+        if i == 1 and topic == "/left/picture":
+            value["data"] = b"not a picture"
+        if i == 2 and topic == "/right/picture":
+            value["data"] = png(np.zeros((40, 64), np.uint8))
+        if i == 3 and topic == "/right/picture":
+            continue
+        if kind == "sensor_msgs/msg/Imu" and t_ns == START_NS + 5_000_000:
+            value["linear_acceleration"]["x"] = float("nan")
+        kept.append((t_ns, topic, kind, value))
+        if kind == "sensor_msgs/msg/Imu" and t_ns == START_NS + 10_000_000:
+            kept.append(kept[-1])
+    bag.messages = kept
+    source = open_source(str(bag.write(tmp_path / "a.mcap")))
+    frames, batches = read(source)
+    assert [stamp[f.t_ns] for f in frames] == [0, 4, 5, 6, 7]
+    assert source.report.skipped == {
+        "unreadable image": 1, "image of another size": 1, "missing right image": 1, "imu sample not finite": 1,
+        "imu stamp not increasing": 1,
+    }  # fmt: skip
+    assert sum(len(b.t_ns) for b in batches) == 70  # what leads up to a skipped frame comes with the next
+
+
+def test_accelerations_in_g_become_metres_a_second_squared(tmp_path: Path) -> None:
+    bag = stereo_bag(2)
+    for _, _, kind, value in bag.messages:
+        if kind == "sensor_msgs/msg/Imu":
+            value["linear_acceleration"] = xyz(np.array([0.0, 0.0, 1.0]))
+    source = open_source(str(bag.write(tmp_path / "a.mcap")))
+    _, batches = read(source)
+    np.testing.assert_allclose(batches[-1].accel, [[0, 0, 9.80665]] * 10)
+    assert "in g" in source.report.notes[0]
+
+
+def test_raw_pixels_and_depth(tmp_path: Path) -> None:
+    bag = Bag()
+    bag.info(START_NS, "rgb", d=())
+    colour = np.dstack([picture(i) for i in range(3)])
+    for i in range(3):
+        t_ns = START_NS + i * STEP_NS
+        bag.raw(t_ns, "rgb", "rgb8", colour, pad=5)
+        bag.raw(t_ns + 4_000_000, "depth", "16UC1", np.full((48, 64), 1500, np.uint16), frame="rgb_optical")
+    source = open_source(str(bag.write(tmp_path / "a.mcap")))
+    frames, _ = read(source)
+    assert len(frames) == 3 and source.rig.has_depth and not source.rig.has_body and frames[0].encoded == ()
+    np.testing.assert_array_equal(frames[0].left, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY))
+    assert frames[0].depth_m is not None
+    np.testing.assert_allclose(frames[0].depth_m, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "grey"),
+    [
+        ("mono8", np.full((48, 64), 77, np.uint8), 77),
+        ("mono16", np.full((48, 64), 77 * 256 + 9, np.uint16), 77),
+        ("bgr8", np.full((48, 64, 3), (255, 0, 0), np.uint8), 29),
+        ("rgb8", np.full((48, 64, 3), (255, 0, 0), np.uint8), 76),
+        ("rgba8", np.full((48, 64, 4), (255, 0, 0, 9), np.uint8), 76),
+        ("yuv422", np.full((48, 64, 2), (1, 77), np.uint8), 77),
+        ("yuv422_yuy2", np.full((48, 64, 2), (77, 1), np.uint8), 77),
+        # A red scene: in RGGB the first pixel of each 2x2 block is bright.
+        ("bayer_rggb8", np.tile(np.array([[255, 0], [0, 0]], np.uint8), (24, 32)), 76),
+        ("bayer_bggr8", np.tile(np.array([[255, 0], [0, 0]], np.uint8), (24, 32)), 29),
+        ("bayer_gbrg8", np.tile(np.array([[0, 0], [255, 0]], np.uint8), (24, 32)), 76),
+        ("bayer_grbg8", np.tile(np.array([[0, 255], [0, 0]], np.uint8), (24, 32)), 76),
+    ],
+    ids=lambda v: v if isinstance(v, str) else "",
+)
+def test_pixel_encodings(tmp_path: Path, encoding: str, pixels: np.ndarray, grey: int) -> None:
+    bag = Bag()
+    bag.info(START_NS, "eye")
+    bag.raw(START_NS, "eye", encoding, pixels)
+    frames, _ = read(open_source(str(bag.write(tmp_path / "a.mcap"))))
+    np.testing.assert_allclose(frames[0].left[2:-2, 2:-2], grey, atol=1)
+
+
+# --- Foxglove

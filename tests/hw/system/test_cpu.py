@@ -1,0 +1,88 @@
+"""CPU time, clocks, and the kernel's CPU limit where it may be set."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from kiteline_hw.system.clock import MonotonicClock
+from kiteline_hw.system.cpu import CpuQuota, QuotaError, process_cpu_ns
+
+SPIN = "import time; e = time.process_time() + {}\nwhile time.process_time() < e: pass"
+
+
+def test_cpu_time_counts_other_threads_and_no_sleep() -> None:
+    before_ns = process_cpu_ns()
+    time.sleep(0.05)
+    assert process_cpu_ns() - before_ns < 40_000_000
+
+    def spin() -> None:
+        end_ns = time.thread_time_ns() + 50_000_000
+        while time.thread_time_ns() < end_ns:
+            pass
+
+    before_ns = process_cpu_ns()
+    thread = threading.Thread(target=spin)
+    thread.start()
+    thread.join()
+    assert process_cpu_ns() - before_ns >= 50_000_000
+
+
+def test_clocks() -> None:
+    clock = MonotonicClock()
+    assert 0 < clock.now_ns() <= clock.now_ns()
+
+
+def test_the_kernel_limits_a_process() -> None:
+    try:
+        quota = CpuQuota(20.0)
+    except QuotaError as error:
+        pytest.skip(str(error))
+    with quota:
+        code = f"import sys; sys.stdin.readline()\n{SPIN.format(0.15)}"
+        process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+        quota.add(process.pid)
+        began = time.monotonic()
+        process.communicate(b"\n")
+        assert time.monotonic() - began > 0.45  # 0.15 s of CPU at 20 percent take 0.75 s less the first period
+        group = quota._group
+    assert not group.exists()
+
+
+def test_limits_that_cannot_be_set(tmp_path: Path) -> None:
+    with pytest.raises(QuotaError, match="no cgroup v1"):
+        CpuQuota(50.0, root=tmp_path)
+    for percent in (0.0, -1.0, float("nan"), 0.1, 1e9):
+        with pytest.raises(ValueError, match=r"expected 0\.2 to 100 per core"):
+            CpuQuota(percent)
+
+
+@pytest.mark.parametrize(("percent", "period_us", "quota_us"), [(25.0, 50_000, 12_500), (1.0, 100_000, 1_000)])
+def test_small_limits_have_long_periods(percent: float, period_us: int, quota_us: int) -> None:
+    try:
+        quota = CpuQuota(percent)
+    except QuotaError as error:
+        pytest.skip(str(error))
+    with quota:
+        assert int((quota._group / "cpu.cfs_period_us").read_text()) == period_us
+        assert int((quota._group / "cpu.cfs_quota_us").read_text()) == quota_us
+
+
+def test_a_small_limit_holds_over_one_second() -> None:
+    try:
+        quota = CpuQuota(1.5)
+    except QuotaError as error:
+        pytest.skip(str(error))
+    with quota:
+        code = f"import sys; sys.stdin.readline()\n{SPIN.format(0.02)}"
+        process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+        time.sleep(0.3)  # it has started
+        quota.add(process.pid)
+        began = time.monotonic()
+        process.communicate(b"\n")
+        assert time.monotonic() - began > 0.7  # 20 ms of CPU at 1.5 percent take 1.3 s less a period or two
