@@ -216,7 +216,7 @@ class Mapper:
         self._placements.place_new(keyframe)
         self.counts.found += landmark_matching.match_landmarks(self.map, keyframe, config.landmark_matching, publisher)
         self.counts.triangulated += triangulation.triangulate_landmarks(
-            self.map, keyframe, config.triangulation, config.measurement, publisher
+            self.map, keyframe, config.triangulation, publisher
         )
         self.counts.culled += culling.cull_weak_landmarks(self.map, keyframe, config.cull, publisher)
         culled = culling.cull_redundant_keyframes(self.map, keyframe, config.cull, publisher)

@@ -1,8 +1,7 @@
-"""Recognises known points where the agent bore new ones, in both directions, and fuses them.
+"""Matches known landmarks with an agent's new ones by projection, and fuses them.
 
-Old points are looked for among a new keyframe's births, and its new points among the births of older keyframes
-("DS-PTAM: a distributed stereo PTAM", sections 2.4.4 and 3.1.2). Of two points that prove to be one, the older is the
-root.
+Known landmarks are projected into a new keyframe, and its new landmarks into older keyframes ("DS-PTAM: a distributed
+stereo PTAM", sections 2.4.4 and 3.1.2). The older landmark of a match becomes the root.
 """
 
 from __future__ import annotations
@@ -27,23 +26,23 @@ U64 = NDArray[np.uint64]
 def match_landmarks(
     sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig, publisher: Publisher
 ) -> int:
-    """Search both ways between a new keyframe and those that look at the same place. Returns how many points fused."""
+    """Match a new keyframe with those that view the same place. Returns the number of fused landmarks."""
     others = nearby_keyframes(sparse_map, keyframe, config)
     if not others:
         return 0
-    found = 0
+    fused = 0
     known = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in others]))
     known = known[~np.isin(known, sparse_map.landmarks_of(keyframe))]
-    found += _search(sparse_map, known, keyframe, config, publisher)
+    fused += _match_projected(sparse_map, known, keyframe, config, publisher)
     for other in others:
-        new = sparse_map.landmarks_of(keyframe)
-        born_here = new[sparse_map.keypoints.row[new] == sparse_map.rows[keyframe]]
-        found += _search(sparse_map, born_here, other, config, publisher)
-    return found
+        observed = sparse_map.landmarks_of(keyframe)
+        new = observed[sparse_map.keypoints.row[observed] == sparse_map.rows[keyframe]]
+        fused += _match_projected(sparse_map, new, other, config, publisher)
+    return fused
 
 
 def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig) -> list[KeyframeId]:
-    """Covisible keyframes, then those that stand near and look the same way; never ones without a pose."""
+    """Covisible keyframes, then those that are near and have a similar viewing direction."""
     covisible = sparse_map.covisible_keyframes(keyframe, 1)[: config.max_covisible]
     table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
     points = sparse_map.landmarks_of(keyframe)
@@ -65,10 +64,10 @@ def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: Landma
     return covisible + extra[: config.max_nearby]
 
 
-def _search(
+def _match_projected(
     sparse_map: SparseMap, points: I32, target: KeyframeId, config: LandmarkMatchingConfig, publisher: Publisher
 ) -> int:
-    """Match points (n,) (roots) with the births of a keyframe and fuse what is one."""
+    """Match root landmarks (n,) with the new landmarks of a keyframe and fuse the matches. Returns their number."""
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(target)
     slots = slots[(table.kind[slots] == LANDMARK) & (table.flags[slots] & (REMOVED | CULLED) == 0)]
@@ -84,26 +83,26 @@ def _search(
     measured = np.where(ranged, bf * table.inv_depth[slots], -1.0).astype(np.float64)
     best = np.empty(len(points), np.int32)
     distance = np.zeros(len(points), np.int32)
-    wanted, offered = descriptors(sparse_map, points, slots)
+    projected, detected = descriptors(sparse_map, points, slots)
     kernels.match_projected(
-        uv, octave, angle, disparity, wanted,
+        uv, octave, angle, disparity, projected,
         table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured,
-        offered,
+        detected,
         config.radius_px, config.octave_gap, config.angle_gap, config.disparity_px, config.max_hamming, config.ratio,
         best, distance,
     )  # fmt: skip
-    found = 0
+    fused = 0
     for i in np.flatnonzero(best >= 0).tolist():
-        found += fuse_landmarks(sparse_map, int(points[i]), int(table.root[slots[best[i]]]), publisher)
-    return found
+        fused += fuse_landmarks(sparse_map, int(points[i]), int(table.root[slots[best[i]]]), publisher)
+    return fused
 
 
 def predict_projections(
     sparse_map: SparseMap, points: I32, target: KeyframeId, T_w_k: F64 | None = None
 ) -> tuple[I32, F64, F64, NDArray[np.uint8], F64]:  # fmt: skip
-    """How a keyframe would see points (n,): those inside its image, with pixel, octave, angle and disparity.
+    """Predict pixel, octave, angle and disparity of landmarks (n,) in a keyframe; returns those inside its image.
 
-    T_w_k: (4,4) where the keyframe is thought to be, if not where the map has it.
+    T_w_k: (4,4) pose to assume for the keyframe; None: its pose in the map.
     """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[target]
@@ -120,21 +119,24 @@ def predict_projections(
     anchors = keyframes.T_w_k[table.row[points]]
     depth = np.einsum("ni,ni->n", anchors[:, :3, 2], xyz - anchors[:, :3, 3])
     octave = table.octave[points] + np.log2(np.maximum(depth, 1e-3) / z)
-    turn = np.einsum("ji,njk->nik", T[:3, :3], anchors[:, :3, :3])  # R_target_anchor
-    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    R_k_a = np.einsum("ji,njk->nik", T[:3, :3], anchors[:, :3, :3])  # anchor to target
+    roll = np.arctan2(R_k_a[:, 1, 0] - R_k_a[:, 0, 1], R_k_a[:, 0, 0] + R_k_a[:, 1, 1])
     angle = (table.angle[points].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
     return points, uv, octave, angle.astype(np.uint8), bf / z
 
 
 def descriptors(sparse_map: SparseMap, a: I32, b: I32) -> tuple[U64, U64]:
-    """Descriptors (n,4) and (m,4) uint64 of two sets of births, to be compared with each other."""
+    """Comparable descriptors (n,4) and (m,4) uint64 of two sets of landmarks."""
     of = sparse_map.keypoints.descriptor
     left, right = comparable(of[a], of[b])
     return np.ascontiguousarray(left).view(np.uint64), np.ascontiguousarray(right).view(np.uint64)
 
 
 def fuse_landmarks(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) -> bool:
-    """Make two roots one, the older the root, unless one keyframe sees both. A depth known to one is known to both."""
+    """Fuse two root landmarks into the older one, which gets a depth if only the other has one.
+
+    Returns False if a keyframe observes both.
+    """
     if a == b or sparse_map.observed_together(a, b):
         return False
     pair = np.array([a, b], np.int32)
@@ -151,7 +153,7 @@ def fuse_landmarks(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) 
     if sparse_map.keypoints.flags[child] & REFINED:
         publisher.mark_changed_slots(
             RefinedLandmarks.KIND, np.array([child], np.int32)
-        )  # it leaves its keyframe's table
+        )  # it leaves the RefinedLandmarks record of its keyframe
     for keyframe in sparse_map.fuse(int(child), int(parent)):
         publisher.mark_changed(FusedLandmarks.KIND, keyframe)
     return True

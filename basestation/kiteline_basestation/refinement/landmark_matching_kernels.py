@@ -1,4 +1,4 @@
-"""Kernels that match descriptors: of projected points in a circle, of keypoints along epipolar lines."""
+"""Kernels that match descriptors: of projected landmarks in a circle, of keypoints along epipolar lines."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def match_projected(
     radius_px: float, octave_gap: float, angle_gap: int, disparity_px: float, max_hamming: int, ratio: float,
     best: I32, distance: I32,
 ) -> None:  # fmt: skip
-    """The keypoint that shows each projected point, and the point that each keypoint shows, where both agree.
+    """Match projected landmarks one to one with keypoints.
 
-    Points: foreseen uv (n,2) px, octave (n,) float, angle (n,) 1/256 turns, disparity (n,) px, descriptor (n,4) uint64.
+    Landmarks: predicted uv (n,2) px, octave (n,) float, angle (n,) 1/256 turns, disparity (n,) px, descriptor (n,4) uint64.
     Keypoints: the same, measured; disparity2 (m,) negative where unknown. Writes best (n,), -1 none, and distance.
     """
     n, m = uv.shape[0], uv2.shape[0]
@@ -60,7 +60,7 @@ def match_epipolar(
     uv: F64, octave: U8, descriptor: U64, uv2: F64, octave2: U8, descriptor2: U64, fundamental: F64,
     epipolar_px: float, max_hamming: int, ratio: float, best: I32, distance: I32,
 ) -> None:  # fmt: skip
-    """The keypoint of a second view that lies on each keypoint's line and looks like it, each taken once.
+    """Match keypoints one to one with keypoints of a second view along epipolar lines.
 
     fundamental (3,3): line2 = fundamental @ (u, v, 1). Writes best (n,) int32, -1 none, and distance (n,) in bits.
     """

@@ -1,7 +1,7 @@
-"""Gives depth to points that stereo could not measure: from their sightings, and from births along epipolar lines.
+"""Triangulates landmarks without depth, from their observations and from epipolar matches of new landmarks.
 
-Source: the analytical initialisation of "Monocular EKF-SLAM with delayed landmark initialisation" (the point nearest
-to all rays), with the tests of parallax and reprojection of ORB-SLAM2.
+Source: "Monocular EKF-SLAM with delayed landmark initialisation" (the point nearest to all rays), with the parallax and
+reprojection tests of ORB-SLAM2.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import MeasurementConfig, TriangulationConfig
+from kiteline_basestation.config import TriangulationConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -29,11 +29,10 @@ def triangulate_landmarks(
     sparse_map: SparseMap,
     keyframe: KeyframeId,
     config: TriangulationConfig,
-    measurement: MeasurementConfig,
     publisher: Publisher,
 ) -> int:
-    """Give depth to what a new keyframe sees and nobody could measure. Returns how many points got one."""
-    return _from_sightings(sparse_map, keyframe, config, publisher) + _from_births(
+    """Triangulate landmarks of a new keyframe that have no depth. Returns the number triangulated."""
+    return _from_observations(sparse_map, keyframe, config, publisher) + _from_epipolar_matches(
         sparse_map, keyframe, config, publisher
     )
 
@@ -43,10 +42,10 @@ def _without_depth(sparse_map: SparseMap, points: I32) -> I32:
     return points[~known]
 
 
-def _from_sightings(
+def _from_observations(
     sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher
 ) -> int:
-    """Points that several keyframes see: from the two outermost views, tested in all of them."""
+    """Landmarks that several keyframes observe, from the first and the last observation."""
     points = _without_depth(sparse_map, sparse_map.landmarks_of(keyframe))
     starts, slots = sparse_map.observations(points)
     several = np.diff(starts) >= 2
@@ -54,30 +53,33 @@ def _from_sightings(
     if len(points) == 0:
         return 0
     first, last = slots[starts[:-1][several]], slots[starts[1:][several] - 1]
-    return _make(sparse_map, points, first, last, config, publisher)
+    position, good = _intersect(sparse_map, first, last, config)
+    return _set_positions(sparse_map, points[good], position[good], publisher)
 
 
-def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher) -> int:
-    """Births without depth of this keyframe and of covisible ones that are one point."""
+def _from_epipolar_matches(
+    sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher
+) -> int:
+    """New landmarks without depth of this keyframe, matched with those of covisible ones."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     row = sparse_map.rows[keyframe]
-    made = 0
+    triangulated = 0
     seen = sparse_map.landmarks_of(keyframe)
     inverse = sparse_map.inverse_depths(seen) / keyframes.scale[table.row[seen]]
     inverse = inverse[inverse > 0]
-    here = _open_births(sparse_map, keyframe)
+    here = _new_without_depth(sparse_map, keyframe)
     for other in sparse_map.covisible_keyframes(keyframe, 1)[: config.max_covisible]:
         if len(here) == 0:
             break
-        there = _open_births(sparse_map, other)
+        there = _new_without_depth(sparse_map, other)
         if len(there) == 0:
             continue
-        T_m_a, T_m_b = keyframes.T_w_k[row], keyframes.T_w_k[sparse_map.rows[other]]
-        baseline = float(np.linalg.norm(T_m_a[:3, 3] - T_m_b[:3, 3]))
+        T_w_a, T_w_b = keyframes.T_w_k[row], keyframes.T_w_k[sparse_map.rows[other]]
+        baseline = float(np.linalg.norm(T_w_a[:3, 3] - T_w_b[:3, 3]))
         if len(inverse) and baseline * float(np.median(inverse)) < config.min_baseline_ratio:
             continue
-        rotation = T_m_b[:3, :3].T @ T_m_a[:3, :3]
-        essential = skew(T_m_b[:3, :3].T @ (T_m_a[:3, 3] - T_m_b[:3, 3])) @ rotation
+        rotation = T_w_b[:3, :3].T @ T_w_a[:3, :3]
+        essential = skew(T_w_b[:3, :3].T @ (T_w_a[:3, 3] - T_w_b[:3, 3])) @ rotation
         k_a, k_b = _matrix(keyframes.camera[row]), _matrix(keyframes.camera[sparse_map.rows[other]])
         fundamental = np.linalg.inv(k_b).T @ essential @ np.linalg.inv(k_a)
         best, distance = np.empty(len(here), np.int32), np.zeros(len(here), np.int32)
@@ -93,13 +95,13 @@ def _from_births(sparse_map: SparseMap, keyframe: KeyframeId, config: Triangulat
         for i in np.flatnonzero(good).tolist():
             if fuse_landmarks(sparse_map, int(a[i]), int(b[i]), publisher):
                 root = table.root[a[i : i + 1]]
-                made += _set(sparse_map, root, position[i : i + 1], publisher)
+                triangulated += _set_positions(sparse_map, root, position[i : i + 1], publisher)
         here = here[table.root[here] == here]
-    return made
+    return triangulated
 
 
-def _open_births(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
-    """Births of a keyframe that are their own root and have no depth."""
+def _new_without_depth(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
+    """Root landmarks of a keyframe that have no depth."""
     table = sparse_map.keypoints
     slots = sparse_map.slots_of(keyframe)
     own = (
@@ -108,14 +110,7 @@ def _open_births(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
     return _without_depth(sparse_map, slots[own])
 
 
-def _make(
-    sparse_map: SparseMap, points: I32, first: I32, last: I32, config: TriangulationConfig, publisher: Publisher
-) -> int:
-    position, good = _intersect(sparse_map, first, last, config)
-    return _set(sparse_map, points[good], position[good], publisher)
-
-
-def _set(sparse_map: SparseMap, points: I32, position: F64, publisher: Publisher) -> int:
+def _set_positions(sparse_map: SparseMap, points: I32, position: F64, publisher: Publisher) -> int:
     inverse, offset, ahead = sparse_map.project_into_anchor(points, position)
     sparse_map.set_depths(points[ahead], inverse[ahead], offset[ahead])
     publisher.mark_changed_slots(RefinedLandmarks.KIND, points[ahead])
@@ -123,7 +118,7 @@ def _set(sparse_map: SparseMap, points: I32, position: F64, publisher: Publisher
 
 
 def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: TriangulationConfig) -> tuple[F64, Bool]:
-    """Points from the rays of keypoints a and b (n,), and whether parallax, depth and reprojection allow them."""
+    """Positions (n,3) from the rays of keypoints a and b (n,), and whether parallax, depth and reprojection are good."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     views = []
     for slots in (a, b):
@@ -134,8 +129,8 @@ def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: TriangulationConfi
         np.stack([lines[0][0], lines[1][0]], 1), np.stack([lines[0][1], lines[1][1]], 1)
     )  # fmt: skip
     good &= parallax(lines[0][0], lines[1][0], position) < config.max_cosine
-    for slots, (uv, camera, T_m_k) in zip((a, b), views, strict=True):
-        pixel, depth = project(position, camera, T_m_k)
+    for slots, (uv, camera, T_w_k) in zip((a, b), views, strict=True):
+        pixel, depth = project(position, camera, T_w_k)
         limit = config.reprojection_px * np.exp2(table.octave[slots])
         good &= (depth > 0.05) & (np.linalg.norm(pixel - uv, axis=1) < limit)
     return position, good
