@@ -29,10 +29,10 @@ class Base:
         self.taken = 0
         cells = np.full((1, 32, 32), 3, np.int8)
         grid = GridMap(0.1, np.zeros((1, 2), np.int64), cells, np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
-        agent = web.AgentView(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
-        self.now = web.Snapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)
+        agent = web.AgentStatus(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
+        self.now = web.PageSnapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)
 
-    def snapshot(self) -> web.Snapshot:
+    def snapshot(self) -> web.PageSnapshot:
         self.taken += 1
         return self.now
 
@@ -66,12 +66,12 @@ def live(page: web.Handle, **options: object) -> ClientConnection:
 def test_the_page_and_its_parts_are_served_and_nothing_else(page: web.Handle) -> None:
     code, kind, body = get(page, "/")
     assert code == 200 and kind.startswith("text/html") and b"<canvas" in body
-    parts = [p for p in (b"/page.css", b"/page.js", b"/draw.js") if p in body + get(page, "/page.js")[2]]
+    parts = [p for p in (b"/page.css", b"/page.js", b"/map_canvas.js") if p in body + get(page, "/page.js")[2]]
     assert len(parts) == 3
     for part in parts:
         assert get(page, part.decode())[0] == 200
     assert b"://" not in body.replace(b"http://www.w3.org/2000/svg", b"")  # nothing from other machines
-    for path in ("/server.py", "/../view.py", "/..%2fview.py", "/web/", "//etc/passwd"):
+    for path in ("/server.py", "/../messages.py", "/..%2fmessages.py", "/web/", "//etc/passwd"):
         assert get(page, path)[0] == 404
 
 
@@ -84,7 +84,8 @@ def test_status_as_json(page: web.Handle) -> None:
 
 def test_a_viewer_gets_status_and_map_then_only_what_is_new(page: web.Handle, base: Base) -> None:
     with live(page) as viewer:
-        assert json.loads(viewer.recv(5))["points"] == 9
+        totals = {n["label"]: n["value"] for n in json.loads(viewer.recv(5))["totals"]}
+        assert totals["Landmarks"] == 9
         kinds = [viewer.recv(5)[0] for _ in range(3)]  # type: ignore[index]
         assert kinds == [3, 1, 2]
         assert isinstance(viewer.recv(5), str)  # the map has not changed

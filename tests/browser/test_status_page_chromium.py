@@ -98,7 +98,7 @@ def _targets(port: int) -> Iterator[dict[str, Any]]:
         time.sleep(0.1)
 
 
-def room() -> web.Snapshot:
+def room() -> web.PageSnapshot:
     """Two agents in a room: one flies, the other has been silent for half a minute."""
     rng = np.random.default_rng(4)
     floor = np.column_stack([rng.uniform([0, 0], [9, 6], (1500, 2)), rng.normal(0, 0.01, 1500)])
@@ -116,10 +116,10 @@ def room() -> web.Snapshot:
     away[:3, 3] = [2.0, 4.5, 1.0]
     s = 10**9
     agents = (
-        web.AgentView(AgentId(0), 999 * s, 86, pose, path, 60, 2100, 1, 410_000, 52_000),
-        web.AgentView(AgentId(1), 968 * s, -1, away, path[:9] * 0.5 + [1, 3, 0.5], 9, 380, 2, 61_000, 8_000),
+        web.AgentStatus(AgentId(0), 999 * s, 86, pose, path, 60, 2100, 1, 410_000, 52_000),
+        web.AgentStatus(AgentId(1), 968 * s, -1, away, path[:9] * 0.5 + [1, 3, 0.5], 9, 380, 2, 61_000, 8_000),
     )
-    return web.Snapshot(1000 * s, 246 * s, agents, points, grid.labels, grid, 1, loops=2, merges=1)
+    return web.PageSnapshot(1000 * s, 246 * s, agents, points, grid.labels, grid, 1, {"loops": 2, "merges": 1})
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -127,7 +127,7 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
     now = room()
     tick = 0
 
-    def snapshot() -> web.Snapshot:
+    def snapshot() -> web.PageSnapshot:
         nonlocal tick
         tick += 1
         agents = (replace(now.agents[0], bytes_up=410_000 + 1500 * tick), *now.agents[1:])
@@ -138,7 +138,7 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         browser.call("Page.navigate", url=handle.url)
         browser.wait("document.querySelectorAll('article').length", "2")
-        browser.wait("document.getElementById('t-points').textContent", "3,000")
+        browser.wait("document.querySelector('#totals [data-label=Landmarks]').textContent", "3,000")
         browser.wait("document.querySelector('article .quality output').textContent", "86 %")
         browser.wait("document.querySelectorAll('article .traffic dd')[0].textContent", "3.0 kB/s")
         browser.wait("getComputedStyle(document.getElementById('empty')).display", "none")

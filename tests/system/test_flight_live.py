@@ -106,17 +106,17 @@ def test_agent_and_base_meet_and_a_killed_base_resumes(recording: Path, tmp_path
                 agents = json.load(page)["agents"]
         except OSError:
             return {}
-        return dict(agents[0]) if agents else {}
+        return {n["label"]: n["value"] for n in agents[0]["counts"]} if agents else {}
 
     agent = start("agent", recording, "--link", f"zenoh:{endpoint}", "--log", tmp_path / "log")
     assert agent.wait(30.0) == 0  # a recording ends by itself, once the base has it all
     store = tmp_path / "store" / FILE
-    wait_for("the store", lambda: 3 <= heads(store) == seen().get("keyframes"))
+    wait_for("the store", lambda: 3 <= heads(store) == seen().get("Keyframes"))
     keyframes = heads(store)
     base.kill()
     base.wait()
     again = start("base", *words, "--log", tmp_path / "log")
-    wait_for("the next base to show what the last one knew", lambda: seen().get("keyframes", 0) == keyframes)
+    wait_for("the next base to show what the last one knew", lambda: seen().get("Keyframes", 0) == keyframes)
     stop(again)
     logs = sorted((tmp_path / "log").glob("session*.mcap"))
     assert len(logs) == 2

@@ -1,20 +1,16 @@
-"""The base's status page: what every agent does, and the map from above, in a browser.
+"""The status page: snapshots of the station enter; JSON, map messages and the page's files are served to browsers.
 
     page = serve(*address("127.0.0.1:8080"), lambda: latest)
-    ... once or twice a second, in the loop that steps the station:
-    if page.watched:
-        latest = overview(station, now_ns, started_ns)
-    ... at the end:
-    page.close()
+    ... in the loop that steps the station:
+    latest = take_snapshot(station, now_ns, started_ns)
 
-`latest` starts as `nothing(now_ns)`. A snapshot is frozen, and the page's own thread only reads it: the mapper never
-waits, and while nobody looks nothing is computed.
+A snapshot is frozen and the server's thread only reads it. A new number on the page is a line in `numbers.py`.
 """
 
 from __future__ import annotations
 
-from kiteline_basestation.web.page_snapshot import AgentView, Snapshot, status
+from kiteline_basestation.web.messages import status
 from kiteline_basestation.web.server import Handle, address, serve
-from kiteline_basestation.web.take_snapshot import nothing, overview
+from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot, empty_snapshot, take_snapshot
 
-__all__ = ["AgentView", "Handle", "Snapshot", "address", "nothing", "overview", "serve", "status"]
+__all__ = ["AgentStatus", "Handle", "PageSnapshot", "address", "empty_snapshot", "serve", "status", "take_snapshot"]

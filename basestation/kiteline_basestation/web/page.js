@@ -1,9 +1,9 @@
-// Connects to the base, writes its numbers into the page and hands the map to the drawing.
-import { MapView, agentColour } from "/draw.js";
+// Connects to the base, shows its numbers and passes the map to the canvas. Which numbers: see numbers.py.
+import { MapCanvas, agentColour } from "/map_canvas.js";
 
 const HISTORY = 120; // samples of the byte rate: a minute at two a second
 const $ = (id) => document.getElementById(id);
-const view = new MapView($("canvas"), $("where"), $("empty"));
+const view = new MapCanvas($("canvas"), $("where"), $("empty"));
 const cards = new Map(); // agent -> {node, rates}
 const number = new Intl.NumberFormat("en");
 let socket = null;
@@ -23,19 +23,19 @@ function connect() {
   socket.onclose = () => {
     socket = null;
     if (document.hidden) return;
-    state("lost", "base does not answer");
+    state("lost", "no connection to the base");
     setTimeout(connect, retry_ms);
     retry_ms = Math.min(retry_ms * 2, 5000);
   };
 }
 
-// A page in the background asks for nothing.
+// A page in the background is disconnected, so that it costs the base nothing.
 document.addEventListener("visibilitychange", () => {
   if (!document.hidden) connect();
   else if (socket) socket.close();
 });
 setInterval(() => {
-  if (socket && last_ms && performance.now() - last_ms > 4000) state("quiet", "base is silent");
+  if (socket && last_ms && performance.now() - last_ms > 4000) state("quiet", "no data from the base");
 }, 1000);
 
 function state(name, text) {
@@ -45,17 +45,29 @@ function state(name, text) {
 
 function show(status) {
   state("live", `running for ${duration(status.up_s)}`);
-  $("t-keyframes").textContent = number.format(status.keyframes);
-  $("t-points").textContent = number.format(status.points);
-  $("t-loops").textContent = number.format(status.loops);
-  $("t-merges").textContent = number.format(status.merges);
-  $("t-grid").textContent = `${number.format(Math.round(status.grid_m2))} m²`;
   const up = status.agents.reduce((sum, a) => sum + (a.rate_up ?? 0), 0);
-  $("t-up").textContent = `${bytes(up)}/s`;
+  showNumbers($("totals"), [...status.totals, { label: "Up", value: bytes(up), unit: "/s" }]);
   const many = status.agents.length;
   document.title = many ? `kiteline base · ${many} agent${many > 1 ? "s" : ""}` : "kiteline base";
   for (const agent of status.agents) fill(card(agent.agent), agent);
   view.agents(status.agents);
+}
+
+// One <div><dt>label</dt><dd>value</dd></div> for each number.
+function showNumbers(list, numbers) {
+  for (const { label, value, unit } of numbers) {
+    let dd = list.querySelector(`[data-label="${label}"]`);
+    if (!dd) {
+      const dt = document.createElement("dt");
+      dd = document.createElement("dd");
+      dt.textContent = dd.dataset.label = label;
+      const div = document.createElement("div");
+      div.append(dt, dd);
+      list.append(div);
+    }
+    const text = typeof value === "number" ? number.format(Math.round(value)) : value;
+    dd.textContent = unit && unit[0] !== "/" ? `${text} ${unit}` : `${text}${unit}`;
+  }
 }
 
 function card(agent) {
@@ -77,26 +89,26 @@ function card(agent) {
 function fill({ node, rates }, a) {
   const link = node.querySelector(".link");
   link.dataset.state = a.link;
-  link.textContent = a.link === "live" ? "live" : a.link === "never" ? "not heard yet" : `${a.link === "lost" ? "no word" : "silent"} for ${duration(a.silent_s)}`;
+  link.textContent = a.link === "live" ? "live" : a.link === "never" ? "no packet yet" : `${a.link === "lost" ? "lost" : "no packet"} for ${duration(a.silent_s)}`;
 
   const quality = node.querySelector(".quality");
-  quality.dataset.level = a.quality < 0 ? "failed" : a.quality < 40 ? "low" : "good";
-  quality.querySelector(".bar").setAttribute("aria-valuenow", Math.max(a.quality, 0));
-  quality.querySelector(".bar i").style.width = `${Math.max(a.quality, 0)}%`;
-  quality.querySelector("output").textContent = a.quality < 0 ? "failed" : a.quality === 0 ? "–" : `${a.quality} %`;
+  const failed = a.quality !== null && a.quality < 0, percent = Math.max(a.quality ?? 0, 0);
+  quality.dataset.level = failed ? "failed" : percent < 40 ? "low" : "good";
+  quality.querySelector(".bar").setAttribute("aria-valuenow", percent);
+  quality.querySelector(".bar i").style.width = `${percent}%`;
+  quality.querySelector("output").textContent = failed ? "failed" : a.quality === null ? "–" : `${percent} %`;
 
   const pose = [...node.querySelectorAll(".pose dd")];
   const values = a.position ? a.position.map((v) => v.toFixed(2)) : ["–", "–", "–"];
   values.push(a.heading_deg === null ? "–" : `${Math.round(a.heading_deg)}°`);
   pose.forEach((dd, i) => { dd.textContent = values[i]; });
 
-  const counts = [a.keyframes, a.points, a.submaps];
-  node.querySelectorAll(".counts dd").forEach((dd, i) => { dd.textContent = number.format(counts[i]); });
+  showNumbers(node.querySelector(".counts"), a.counts);
 
   const traffic = node.querySelectorAll(".traffic dd");
   traffic[0].textContent = a.rate_up === null ? bytes(a.bytes_up) : `${bytes(a.rate_up)}/s`;
   traffic[1].textContent = a.rate_down === null ? bytes(a.bytes_down) : `${bytes(a.rate_down)}/s`;
-  node.querySelector(".traffic").title = `in all ${bytes(a.bytes_up)} up, ${bytes(a.bytes_down)} down`;
+  node.querySelector(".traffic").title = `total: ${bytes(a.bytes_up)} up, ${bytes(a.bytes_down)} down`;
   if (a.rate_up !== null) rates.push(a.rate_up);
   if (rates.length > HISTORY) rates.shift();
   const top = Math.max(1, ...rates);

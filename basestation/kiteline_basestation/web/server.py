@@ -1,7 +1,7 @@
-"""The status page's server: a few static files, /status.json, and a websocket, in a thread of its own.
+"""The status page's server: static files, /status.json and a websocket, in a thread of its own.
 
-It listens on this machine only unless told otherwise, serves the files beside this one and nothing else, and answers
-neither pages of other sites (Origin) nor names that were bent to point here (Host).
+It listens on the loopback address by default, serves only the files beside this module, and refuses pages of other
+sites (Origin) and, on loopback, other host names (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from kiteline_basestation.grid.grid import GridMap
-from kiteline_basestation.web.page_snapshot import Snapshot, map_messages, status
+from kiteline_basestation.web.messages import map_messages, status
+from kiteline_basestation.web.snapshot import PageSnapshot
 
 STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read
 MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larger
-WATCHED_S = 3.0  # s since the last look for which a page counts as watched
+WATCHED_S = 3.0  # s since the last request for which a page counts as watched
 RATE_SPAN_S = 2.0  # s over which byte rates are taken: two heartbeats
 MAX_VIEWERS = 16  # browsers at a time; each costs up to 100 kB/s
 LIVE_PATH = "/live"
@@ -36,13 +37,13 @@ _FILES = {
     "/": ("page.html", "text/html; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
-    "/draw.js": ("draw.js", "text/javascript; charset=utf-8"),
+    "/map_canvas.js": ("map_canvas.js", "text/javascript; charset=utf-8"),
 }
 _POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'"
 
 
 def address(text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT, :PORT or PORT (then of this machine only). Raises ValueError."""
+    """Host and port of HOST:PORT, or of :PORT and PORT on loopback. Raises ValueError."""
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
         raise ValueError(f"{text!r} is no address: expected HOST:PORT, such as 127.0.0.1:8080")
@@ -59,17 +60,17 @@ class Handle:
 
     @property
     def watched(self) -> bool:
-        """Whether anybody looks: only then is a new snapshot worth making."""
+        """True if a browser shows the page; no snapshot is needed otherwise."""
         return self._page.watched
 
     def close(self) -> None:
-        """Close all connections and wait for the thread's end. May be called twice."""
+        """Close all connections and wait until the thread ends. May be called twice."""
         self._page.stop()
         self._thread.join(5.0)
 
 
-def serve(host: str, port: int, snapshot: Callable[[], Snapshot]) -> Handle:
-    """Serve the page until close(). Port 0 takes a free one; see Handle.url. Raises OSError when it cannot listen."""
+def serve(host: str, port: int, snapshot: Callable[[], PageSnapshot]) -> Handle:
+    """Serve the page until close(). Port 0: a free one, see Handle.url. Raises OSError if it cannot listen."""
     page = _Page(snapshot)
     thread = threading.Thread(target=page.run, args=(host, port), name="kiteline-web", daemon=True)
     thread.start()
@@ -82,7 +83,7 @@ def serve(host: str, port: int, snapshot: Callable[[], Snapshot]) -> Handle:
 
 
 class _Page:
-    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
+    def __init__(self, snapshot: Callable[[], PageSnapshot]) -> None:
         self.started = threading.Event()
         self.error: OSError | None = None
         self.port = 0
@@ -91,12 +92,12 @@ class _Page:
         self._end: asyncio.Event | None = None
         self._local = True
         self._viewers = 0
-        self._looked_s = -WATCHED_S
-        self._recent: list[tuple[float, Snapshot]] = []  # the last RATE_SPAN_S of snapshots, shared by all viewers
+        self._requested_s = -WATCHED_S
+        self._recent: list[tuple[float, PageSnapshot]] = []  # the last RATE_SPAN_S of snapshots, shared by all viewers
 
     @property
     def watched(self) -> bool:
-        return self._viewers > 0 or time.monotonic() - self._looked_s < WATCHED_S
+        return self._viewers > 0 or time.monotonic() - self._requested_s < WATCHED_S
 
     def run(self, host: str, port: int) -> None:
         """The thread."""
@@ -111,7 +112,7 @@ class _Page:
         self._loop = asyncio.get_running_loop()
         self._end = asyncio.Event()
         self._local = host == "localhost" or _is_loopback(host)
-        log = logging.Logger("kiteline.web", logging.CRITICAL)  # a port scan is no reason for a traceback
+        log = logging.Logger("kiteline.web", logging.CRITICAL)  # no traceback for a port scan
         try:
             server = await websocket_serve(
                 self._view, host, port, process_request=self._answer, compression=None, max_size=1024, logger=log,
@@ -137,12 +138,12 @@ class _Page:
         if path == LIVE_PATH:
             origin = request.headers.get("Origin")
             if origin is not None and origin.partition("://")[2] != host:
-                return _response(HTTPStatus.FORBIDDEN, b"another site's page may not look\n")
+                return _response(HTTPStatus.FORBIDDEN, b"pages of other sites are refused\n")
             if self._viewers >= MAX_VIEWERS:
                 return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many viewers\n")
             return None
         if path == "/status.json":
-            now, before = self._look()
+            now, before = self._snapshots()
             return _response(HTTPStatus.OK, _json(now, before), "application/json")
         if path in _FILES:
             name, kind = _FILES[path]
@@ -167,7 +168,7 @@ class _Page:
         held: GridMap | None = None
         map_s = -MAP_PERIOD_S
         while True:
-            now, before = self._look()
+            now, before = self._snapshots()
             await viewer.send(_json(now, before).decode())
             if now.map_revision != revision and time.monotonic() - map_s >= MAP_PERIOD_S:
                 revision, map_s = now.map_revision, time.monotonic()
@@ -176,14 +177,14 @@ class _Page:
                 held = now.grid if now.grid is not None else held
             try:
                 async with asyncio.timeout(STATUS_PERIOD_S):
-                    await viewer.recv()  # a page has nothing to say; this notices when it goes
+                    await viewer.recv()  # a page sends nothing; this notices when it closes
                     await asyncio.sleep(STATUS_PERIOD_S)
             except TimeoutError:
                 pass
 
-    def _look(self) -> tuple[Snapshot, Snapshot | None]:
-        """The newest snapshot, taken at most twice a period however many look, and an older one for rates."""
-        now_s = self._looked_s = time.monotonic()
+    def _snapshots(self) -> tuple[PageSnapshot, PageSnapshot | None]:
+        """The newest snapshot, taken at most twice a period for all viewers, and an older one for rates."""
+        now_s = self._requested_s = time.monotonic()
         if not self._recent or now_s - self._recent[-1][0] >= 0.5 * STATUS_PERIOD_S:
             self._recent.append((now_s, self._snapshot()))
         while len(self._recent) > 2 and now_s - self._recent[1][0] > RATE_SPAN_S:
@@ -198,7 +199,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _json(now: Snapshot, before: Snapshot | None) -> bytes:
+def _json(now: PageSnapshot, before: PageSnapshot | None) -> bytes:
     return json.dumps(status(now, before), separators=(",", ":"), allow_nan=False).encode()
 
 

@@ -1,34 +1,34 @@
-"""The status page of a running base. It shows a snapshot that the mapper's own loop renews: no lock is needed."""
+"""The status page of a running base; its loop replaces the snapshot, so that no lock is needed."""
 
 from __future__ import annotations
 
 from kiteline_basestation.station import Station
 from kiteline_basestation.web.server import address, serve
-from kiteline_basestation.web.take_snapshot import nothing, overview
+from kiteline_basestation.web.snapshot import empty_snapshot, take_snapshot
 from kiteline_hw.ports import LinkError
 
-_PERIOD_NS = 400_000_000  # ns between two snapshots: a little faster than the page asks for them
+_PERIOD_NS = 400_000_000  # ns between two snapshots: a little less than the page's period
 
 
 class StatusPage:
-    """A served page. where: HOST:PORT. Raises ValueError for another address, OSError when it cannot listen."""
+    """A served page. where: HOST:PORT. Raises ValueError for a bad address, OSError if it cannot listen."""
 
     def __init__(self, where: str, now_ns: int) -> None:
         self._started_ns = now_ns
         self._taken_ns = 0
-        self._snapshot = nothing(now_ns)
+        self._snapshot = empty_snapshot(now_ns)
         self._handle = serve(*address(where), lambda: self._snapshot)
 
     @property
     def url(self) -> str:
-        """Where it is."""
+        """The page's URL."""
         return self._handle.url
 
     def update(self, station: Station, now_ns: int) -> None:
-        """Take a new snapshot, if the last one is old enough."""
+        """Take a new snapshot if the last one is old enough."""
         if now_ns - self._taken_ns >= _PERIOD_NS:
             self._taken_ns = now_ns
-            self._snapshot = overview(station, now_ns, self._started_ns)
+            self._snapshot = take_snapshot(station, now_ns, self._started_ns)
 
     def close(self) -> None:
         """Stop serving."""

@@ -1,7 +1,7 @@
-// The map from above: grid tiles, points, paths and agents on a canvas, with pan and zoom. Metres in w, y up.
+// The map from above on a canvas: grid tiles, landmarks, paths and agents, with pan and zoom. Metres in w, y up.
 
 const TILE = 32; // cells along a side of a tile
-const POINTS = 1, TILES = 2, PATH = 3; // kinds of binary messages, see view.py
+const POINTS = 1, TILES = 2, PATH = 3; // kinds of binary messages, see messages.py
 const LIGHT = ["#2a78d6", "#c2417c", "#6a4fc9", "#0f8b8d", "#b5730a", "#7d5a3c", "#4a7a12", "#8b2fa8"];
 const DARK = ["#5a9cec", "#e46fa4", "#9a86ee", "#3fbfc0", "#e0a33c", "#c09a78", "#8dc04c", "#c77be0"];
 const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -10,19 +10,20 @@ export const agentColour = (agent) => (dark.matches ? DARK : LIGHT)[agent % LIGH
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 
-export class MapView {
-  constructor(canvas, where, empty) {
-    Object.assign(this, { canvas, where, empty });
+export class MapCanvas {
+  // cursor: element that shows the position under the pointer. empty: element shown while there is no map.
+  constructor(canvas, cursor, empty) {
+    Object.assign(this, { canvas, cursor, empty });
     this.context = canvas.getContext("2d");
     this.layers = { grid: true, points: true, paths: true };
     this.scale = 40; // px per m
-    this.middle = [0, 0]; // m
-    this.fitted = true; // until the user moves the map
+    this.centre = [0, 0]; // m
+    this.fitted = true; // the whole map is shown, until the user moves it
     this.following = null;
     this.clear();
     new ResizeObserver(() => this.redraw()).observe(canvas);
     dark.addEventListener("change", () => { this.paintTiles(); this.redraw(); });
-    this.listen();
+    this.addListeners();
   }
 
   clear() {
@@ -102,14 +103,14 @@ export class MapView {
     return isFinite(box[0]) ? box : [-5, -5, 5, 5];
   }
 
-  frame(width, height) {
+  updateView(width, height) {
     if (this.fitted) {
       const [x0, y0, x1, y1] = this.bounds();
-      this.middle = [(x0 + x1) / 2, (y0 + y1) / 2];
+      this.centre = [(x0 + x1) / 2, (y0 + y1) / 2];
       this.scale = Math.min((width - 60) / Math.max(x1 - x0, 2), (height - 120) / Math.max(y1 - y0, 2));
     } else if (this.following !== null) {
       const found = this.poses.find((a) => a.agent === this.following);
-      if (found) this.middle = found.position.slice(0, 2);
+      if (found) this.centre = found.position.slice(0, 2);
     }
   }
 
@@ -119,11 +120,11 @@ export class MapView {
     if (!width || !height) return;
     this.canvas.width = width * ratio;
     this.canvas.height = height * ratio;
-    this.frame(width, height);
+    this.updateView(width, height);
     const g = this.context, s = this.scale;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, width, height);
-    this.toScreen = (x, y) => [width / 2 + (x - this.middle[0]) * s, height / 2 - (y - this.middle[1]) * s];
+    this.toScreen = (x, y) => [width / 2 + (x - this.centre[0]) * s, height / 2 - (y - this.centre[1]) * s];
 
     if (this.layers.grid) {
       g.imageSmoothingEnabled = false;
@@ -134,29 +135,29 @@ export class MapView {
         if (x2 > 0 && y2 > 0 && x < width && y < height) g.drawImage(image, Math.round(x), Math.round(y), Math.round(x2) - Math.round(x), Math.round(y2) - Math.round(y));
       }
     }
-    this.lines(g, width, height);
+    this.drawGridLines(g, width, height);
     if (this.layers.points && this.points) this.drawPoints(g, width, height);
     if (this.layers.paths) for (const [agent, path] of this.paths) this.drawPath(g, agent, path);
     for (const a of this.poses) this.drawAgent(g, a);
-    this.ruler(g, width, height);
+    this.drawScaleBar(g, width, height);
   }
 
-  step() { // a round number of metres, about 90 px wide
+  gridStep() { // a round number of metres, about 90 px wide
     const raw = 90 / this.scale, power = 10 ** Math.floor(Math.log10(raw));
     return power * [1, 2, 5, 10].find((k) => k * power >= raw);
   }
 
-  lines(g, width, height) {
-    const step = this.step();
+  drawGridLines(g, width, height) {
+    const step = this.gridStep();
     g.strokeStyle = css("--lines");
     g.lineWidth = 1;
     g.beginPath();
-    const first = (middle, size) => Math.ceil((middle - size / 2 / this.scale) / step) * step;
-    for (let x = first(this.middle[0], width); this.toScreen(x, 0)[0] < width; x += step) {
+    const first = (centre, size) => Math.ceil((centre - size / 2 / this.scale) / step) * step;
+    for (let x = first(this.centre[0], width); this.toScreen(x, 0)[0] < width; x += step) {
       const at = Math.round(this.toScreen(x, 0)[0]) + 0.5;
       g.moveTo(at, 0); g.lineTo(at, height);
     }
-    for (let y = first(this.middle[1], height); this.toScreen(0, y)[1] > 0; y += step) {
+    for (let y = first(this.centre[1], height); this.toScreen(0, y)[1] > 0; y += step) {
       const at = Math.round(this.toScreen(0, y)[1]) + 0.5;
       g.moveTo(0, at); g.lineTo(width, at);
     }
@@ -196,14 +197,14 @@ export class MapView {
 
   drawAgent(g, a) {
     const [x, y] = this.toScreen(a.position[0], a.position[1]);
-    const away = a.link === "lost" || a.link === "never" || a.quality < 0;
+    const inactive = a.link === "lost" || a.link === "never" || (a.quality !== null && a.quality < 0);
     g.save();
     g.translate(x, y);
     g.save();
     g.rotate((-(a.heading_deg ?? 0) * Math.PI) / 180);
     g.beginPath();
     g.moveTo(14, 0); g.lineTo(-8, 8.5); g.lineTo(-4, 0); g.lineTo(-8, -8.5); g.closePath();
-    g.fillStyle = away ? css("--faint") : agentColour(a.agent);
+    g.fillStyle = inactive ? css("--faint") : agentColour(a.agent);
     g.strokeStyle = css("--page");
     g.lineWidth = 2.5;
     g.stroke();
@@ -219,8 +220,8 @@ export class MapView {
     g.restore();
   }
 
-  ruler(g, width, height) {
-    const step = this.step(), long = step * this.scale, right = width - 20, y = height - 20;
+  drawScaleBar(g, width, height) {
+    const step = this.gridStep(), long = step * this.scale, right = width - 20, y = height - 20;
     g.strokeStyle = g.fillStyle = css("--soft");
     g.lineWidth = 1.5;
     g.beginPath();
@@ -232,19 +233,19 @@ export class MapView {
     g.textAlign = "left";
   }
 
-  listen() {
+  addListeners() {
     const c = this.canvas;
     const held = new Map();
     const place = (event) => [event.offsetX - c.clientWidth / 2, event.offsetY - c.clientHeight / 2];
     const zoom = (factor, [px, py]) => {
       const next = Math.min(2000, Math.max(0.05, this.scale * factor));
-      this.middle = [this.middle[0] + px / this.scale - px / next, this.middle[1] - py / this.scale + py / next];
+      this.centre = [this.centre[0] + px / this.scale - px / next, this.centre[1] - py / this.scale + py / next];
       this.scale = next;
       this.fitted = false;
       this.redraw();
     };
     const move = (dx, dy) => {
-      this.middle = [this.middle[0] - dx / this.scale, this.middle[1] + dy / this.scale];
+      this.centre = [this.centre[0] - dx / this.scale, this.centre[1] + dy / this.scale];
       this.fitted = false;
       this.following = null;
       this.redraw();
@@ -253,7 +254,7 @@ export class MapView {
     c.addEventListener("pointerdown", (e) => { c.setPointerCapture(e.pointerId); held.set(e.pointerId, [e.offsetX, e.offsetY]); });
     c.addEventListener("pointermove", (e) => {
       const [px, py] = place(e);
-      this.where.textContent = `${(this.middle[0] + px / this.scale).toFixed(2)}, ${(this.middle[1] - py / this.scale).toFixed(2)} m`;
+      this.cursor.textContent = `${(this.centre[0] + px / this.scale).toFixed(2)}, ${(this.centre[1] - py / this.scale).toFixed(2)} m`;
       const old = held.get(e.pointerId);
       if (!old) return;
       const now = [e.offsetX, e.offsetY];
@@ -266,7 +267,7 @@ export class MapView {
       held.set(e.pointerId, now);
     });
     for (const name of ["pointerup", "pointercancel"]) c.addEventListener(name, (e) => held.delete(e.pointerId));
-    c.addEventListener("pointerleave", () => { this.where.textContent = ""; });
+    c.addEventListener("pointerleave", () => { this.cursor.textContent = ""; });
     c.addEventListener("dblclick", () => this.fit());
     c.addEventListener("keydown", (e) => {
       const step = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] }[e.key];

@@ -11,7 +11,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Station
-from kiteline_basestation.web import nothing, overview, status
+from kiteline_basestation.web import empty_snapshot, status, take_snapshot
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId
@@ -20,10 +20,11 @@ S = 1_000_000_000
 
 
 def test_a_fresh_base_has_nothing_to_show() -> None:
-    shown = status(nothing(5 * S))
-    assert (shown["agents"], shown["points"], shown["up_s"]) == ([], 0, 0.0)
+    shown = status(empty_snapshot(5 * S))
+    assert (shown["agents"], shown["up_s"]) == ([], 0.0)
+    assert [n["value"] for n in shown["totals"]] == [0] * len(shown["totals"])
     station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
-    assert status(overview(station, 5 * S, 5 * S)) == shown
+    assert status(take_snapshot(station, 5 * S, 5 * S)) == shown
 
 
 def test_overview_follows_a_flight(make_flight: Callable[..., Any]) -> None:
@@ -39,12 +40,13 @@ def test_overview_follows_a_flight(make_flight: Callable[..., Any]) -> None:
         done = tuple(run_job(job) for job in out.jobs)
         for _, packets in out.packets:
             agent.receive(packets, now_ns)
-    now = overview(station, 4 * S, 0)
+    now = take_snapshot(station, 4 * S, 0)
     shown = status(now)
     (only,) = shown["agents"]
-    assert only["agent"] == 0 and only["keyframes"] == 6 and only["submaps"] == 1
+    counts = {n["label"]: n["value"] for n in only["counts"]}
+    assert only["agent"] == 0 and counts["Keyframes"] == 6 and counts["Submaps"] == 1
     assert only["bytes_up"] > 10_000 and only["bytes_down"] > 0
-    assert only["points"] > 100
+    assert counts["Landmarks"] > 100
     assert now.agents[0].path.shape == (6, 3)
     radius = np.linalg.norm(now.agents[0].path - now.agents[0].path.mean(axis=0), axis=1)
     np.testing.assert_allclose(radius, 1.2, atol=0.1)

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_basestation.grid.grid import UNKNOWN, GridMap
-from kiteline_basestation.web import page_snapshot as view
-from kiteline_basestation.web.page_snapshot import AgentView, Snapshot
+from kiteline_basestation.web import messages
+from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
 from kiteline_core.ids import AgentId
 
 S = 1_000_000_000
 
 
-def agent(number: int = 0, **changes: object) -> AgentView:
-    plain = AgentView(AgentId(number), 99 * S, 80, np.eye(4), np.zeros((3, 3)), 3, 40, 1, 1000, 500)
+def agent(number: int = 0, **changes: object) -> AgentStatus:
+    plain = AgentStatus(AgentId(number), 99 * S, 80, np.eye(4), np.zeros((3, 3)), 3, 40, 1, 1000, 500)
     return replace(plain, **changes)  # type: ignore[arg-type]
 
 
@@ -32,8 +32,8 @@ def grid(*tiles: tuple[int, int], value: int = 10) -> GridMap:
     )
 
 
-def snapshot(*agents: AgentView, **changes: object) -> Snapshot:
-    plain = Snapshot(100 * S, 40 * S, agents, np.zeros((5, 3)), np.zeros(5, np.uint8), grid((0, 0)), 7)
+def snapshot(*agents: AgentStatus, **changes: object) -> PageSnapshot:
+    plain = PageSnapshot(100 * S, 40 * S, agents, np.zeros((5, 3)), np.zeros(5, np.uint8), grid((0, 0)), 7)
     return replace(plain, **changes)  # type: ignore[arg-type]
 
 
@@ -41,10 +41,12 @@ def test_status_says_what_the_snapshot_holds_in_json() -> None:
     turned = np.eye(4)
     turned[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]  # level, looking along y
     turned[:3, 3] = [1.23456, -2.0, -0.0]
-    out = view.status(snapshot(agent(0, T_w_c=turned), agent(3, T_w_c=None, heard_ns=-1, quality=-1)))
+    out = messages.status(snapshot(agent(0, T_w_c=turned), agent(3, T_w_c=None, last_packet_ns=None, quality=-1)))
     assert json.loads(json.dumps(out, allow_nan=False)) == out
-    assert (out["up_s"], out["keyframes"], out["points"]) == (60.0, 6, 5)
-    assert out["grid_m2"] == round(1023 * 0.25, 1)
+    assert out["up_s"] == 60.0
+    totals = {n["label"]: (n["value"], n["unit"]) for n in out["totals"]}
+    assert totals["Keyframes"] == (6, "") and totals["Landmarks"] == (5, "")
+    assert totals["Mapped"] == (round(1023 * 0.25, 1), "m²")
     first, second = out["agents"]
     assert first["position"] == [1.235, -2.0, 0.0] and first["heading_deg"] == 90.0
     assert (first["link"], first["silent_s"], first["rate_up"]) == ("live", 1.0, None)
@@ -53,20 +55,20 @@ def test_status_says_what_the_snapshot_holds_in_json() -> None:
 
 
 def test_a_pose_that_is_not_finite_is_no_pose() -> None:
-    assert view.status(snapshot(agent(T_w_c=np.full((4, 4), np.nan))))["agents"][0]["position"] is None
+    assert messages.status(snapshot(agent(T_w_c=np.full((4, 4), np.nan))))["agents"][0]["position"] is None
 
 
 @pytest.mark.parametrize(
     ("silent_s", "state"), [(None, "never"), (0.0, "live"), (1.4, "live"), (2.0, "quiet"), (11.0, "lost")]
 )
 def test_link_states(silent_s: float | None, state: str) -> None:
-    assert view.link_state(silent_s) == state
+    assert messages.link_state(silent_s) == state
 
 
 def test_rates_come_from_two_snapshots() -> None:
     before = snapshot(agent(0), now_ns=98 * S)
     now = snapshot(agent(0, bytes_up=5000, bytes_down=700), agent(1))
-    out = view.status(now, before)["agents"]
+    out = messages.status(now, before)["agents"]
     assert (out[0]["rate_up"], out[0]["rate_down"]) == (2000, 100)
     assert out[1]["rate_up"] is None  # it was not there before
 
@@ -82,9 +84,9 @@ def test_points_survive_within_half_a_step(seed: int, size: float, n: int) -> No
     rng = np.random.default_rng(seed)
     points = rng.uniform(-size, size, (n, 3))
     labels = rng.integers(0, 3, n).astype(np.uint8)
-    message = view.points_message(points, labels)
+    message = messages.points_message(points, labels)
     kind, _, count, scale = header(message)
-    assert (kind, count, len(message)) == (view.POINTS, n, 16 + 7 * n)
+    assert (kind, count, len(message)) == (messages.POINTS, n, 16 + 7 * n)
     back = np.frombuffer(message, "<i2", 3 * n, 16).reshape(n, 3) * scale
     np.testing.assert_allclose(back, points, atol=0.5001 * scale + 1e-9)
     assert scale <= max(size, 1.0) / 32766 * 1.001
@@ -92,11 +94,11 @@ def test_points_survive_within_half_a_step(seed: int, size: float, n: int) -> No
 
 
 def test_many_points_are_thinned_and_bad_ones_left_out() -> None:
-    points = np.zeros((3 * view.MAX_POINTS, 3))
+    points = np.zeros((3 * messages.MAX_POINTS, 3))
     points[::2] = np.nan
-    assert header(view.points_message(points, np.zeros(len(points), np.uint8)))[2] == view.MAX_POINTS
-    assert header(view.points_message(points[:5], np.zeros(5, np.uint8)))[2] == 2
-    assert header(view.path_message(4, np.zeros((10**5, 3))))[:3] == (view.PATH, 4, view.MAX_PATH)
+    assert header(messages.points_message(points, np.zeros(len(points), np.uint8)))[2] == messages.MAX_POINTS
+    assert header(messages.points_message(points[:5], np.zeros(5, np.uint8)))[2] == 2
+    assert header(messages.path_message(4, np.zeros((10**5, 3))))[:3] == (messages.PATH, 4, messages.MAX_PATH)
 
 
 def tiles(message: bytes) -> dict[tuple[int, int], np.ndarray]:
@@ -108,13 +110,13 @@ def tiles(message: bytes) -> dict[tuple[int, int], np.ndarray]:
 
 def test_a_viewer_gets_the_tiles_that_it_does_not_hold() -> None:
     old, new = grid((0, 0), (1, -1)), grid((0, 0), (5, 2))
-    first = view.map_messages(snapshot(agent(2), grid=old), None)
-    assert [header(m)[0] for m in first] == [view.PATH, view.POINTS, view.TILES]
+    first = messages.map_messages(snapshot(agent(2), grid=old), None)
+    assert [header(m)[0] for m in first] == [messages.PATH, messages.POINTS, messages.TILES]
     assert header(first[0])[1] == 2 and header(first[2])[3] == 0.5
     assert set(tiles(first[2])) == {(0, 0), (1, -1)}
-    second = tiles(view.map_messages(snapshot(grid=new), old)[-1])
+    second = tiles(messages.map_messages(snapshot(grid=new), old)[-1])
     assert set(second) == {(1, -1), (5, 2)}
     assert (second[1, -1] == UNKNOWN).all()
     assert np.array_equal(second[5, 2], new.cells[1])
-    assert [header(m)[0] for m in view.map_messages(snapshot(grid=new), new)] == [view.POINTS]
-    assert [header(m)[0] for m in view.map_messages(snapshot(grid=None), None)] == [view.POINTS]
+    assert [header(m)[0] for m in messages.map_messages(snapshot(grid=new), new)] == [messages.POINTS]
+    assert [header(m)[0] for m in messages.map_messages(snapshot(grid=None), None)] == [messages.POINTS]

@@ -1,0 +1,116 @@
+"""The snapshot of the station that the status page shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid import GridMap, empty
+from kiteline_basestation.mapper import Mapper
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel
+from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class AgentStatus:
+    """One agent. T_w_c: (4,4) newest camera pose in w, None if not placed. path: (k,3) its keyframes in w, by time, m.
+
+    quality: -1 tracking failed, 1..100, None unknown. bytes_up, bytes_down: totals on the link.
+    """
+
+    agent: AgentId
+    last_packet_ns: int | None  # time of the last packet on the clock of PageSnapshot.now_ns; None never
+    quality: int | None
+    T_w_c: F64 | None
+    path: F64
+    keyframes: int
+    landmarks: int
+    submaps: int
+    bytes_up: int
+    bytes_down: int
+
+
+@dataclass(frozen=True, slots=True)
+class PageSnapshot:
+    """The base at one instant. points: (m,3) in w, m. labels: (m,) uint8. Arrays are never written again.
+
+    map_revision: changes when points, paths or grid do. counts: the numbers of `Mapper.summary`.
+    """
+
+    now_ns: int
+    started_ns: int
+    agents: tuple[AgentStatus, ...]
+    points: F64
+    labels: U8
+    grid: GridMap | None
+    map_revision: int
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+def empty_snapshot(now_ns: int) -> PageSnapshot:
+    """A base that has just started."""
+    grid = empty(GridConfig())
+    return PageSnapshot(now_ns, now_ns, (), grid.points, grid.labels, None, 0)
+
+
+def take_snapshot(station: Station, now_ns: int, started_ns: int) -> PageSnapshot:
+    """The station now. Points and labels are those of the newest grid. now_ns: on the clock of its steps."""
+    mapper = station.mapper
+    summary: dict[str, Any] = mapper.summary()
+    landmarks = _landmarks_by_agent(mapper)
+    agents = []
+    for number, state in summary["agents"].items():
+        agent = AgentId(number)
+        channel = station.channels.get(agent)
+        stats = channel.stats if isinstance(channel, CodedChannel) else None
+        agents.append(
+            AgentStatus(
+                agent,
+                last_packet_ns=state["last_seen_ns"],
+                quality=state["quality"] or None,
+                T_w_c=None if state["T_w_c"] is None else np.array(state["T_w_c"]),
+                path=_path(mapper, agent),
+                keyframes=state["keyframes"],
+                landmarks=landmarks.get(agent, 0),
+                submaps=state["submaps"],
+                bytes_up=stats.bytes_received if stats is not None else 0,
+                bytes_down=stats.bytes_sent if stats is not None else 0,
+            )
+        )
+    counts = {name: value for name, value in summary.items() if isinstance(value, int)}
+    revision = counts["keyframes"] + counts["bundles"] + counts["grids"]
+    grid = mapper.grid.map
+    return PageSnapshot(now_ns, started_ns, tuple(agents), grid.points, grid.labels, grid, revision, counts)
+
+
+def _path(mapper: Mapper, agent: AgentId) -> F64:
+    """Positions (k,3) in w of an agent's keyframes in placed submaps, in order of id."""
+    parts = [np.zeros((0, 3))]
+    for submap in sorted(mapper.placements):
+        if agent_of_submap(submap) == agent:
+            poses = [mapper.map.pose(keyframe) for keyframe in mapper.map.submaps.get(submap, [])]
+            known = np.array([pose for pose in poses if pose is not None]).reshape(-1, 4, 4)
+            S_w_m = mapper.placements[submap]
+            parts.append(known[:, :3, 3] @ S_w_m[:3, :3].T + S_w_m[:3, 3])
+    return np.concatenate(parts)
+
+
+def _landmarks_by_agent(mapper: Mapper) -> dict[AgentId, int]:
+    """Number of root landmarks of each agent."""
+    submaps, count = np.unique(
+        mapper.map.landmark_ids(mapper.map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS), return_counts=True
+    )
+    out: dict[AgentId, int] = {}
+    for submap, n in zip(submaps.tolist(), count.tolist(), strict=True):
+        agent = agent_of_submap(SubmapId(submap))
+        out[agent] = out.get(agent, 0) + n
+    return out
