@@ -65,7 +65,7 @@ function showNumbers(list, numbers) {
       div.append(dt, dd);
       list.append(div);
     }
-    const text = typeof value === "number" ? number.format(Math.round(value)) : value;
+    const text = typeof value === "number" ? number.format(value) : value;
     dd.textContent = unit && unit[0] !== "/" ? `${text} ${unit}` : `${text}${unit}`;
   }
 }
