@@ -29,14 +29,15 @@ def fly_lockstep(options: AgentOptions, parent: process.Parent) -> None:
                     break
                 down = Down(runtime.next_ns, Phase.FLY, ())
             now_ns, phase = down.now_ns, down.phase
-            if 0 <= options.kill_at_s * 1e9 <= now_ns:
+            if options.kill_at_s is not None and options.kill_at_s * 1e9 <= now_ns:
                 os.kill(os.getpid(), signal.SIGKILL)
             if phase is Phase.END:
                 break
             up = runtime.tick(down)
             if runtime.counts.frames % PROGRESS_FRAMES == 0:
                 parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
-            if line.lost and (options.await_bases or 0 <= options.await_base_at_s * 1e9 <= now_ns):
+            await_ns = None if options.await_base_at_s is None else options.await_base_at_s * 1e9
+            if line.lost and (options.await_bases or (await_ns is not None and await_ns <= now_ns)):
                 parent.send_event("awaiting_base")
                 line.reconnect()
                 up = runtime.first_message()

@@ -42,8 +42,8 @@ class AgentOptions:
     axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
     odometry: str = ""  # what to take from the flight controller: controller, wheels, wheels:TRACK_M; "": nothing
     imu_of: str = ""  # whose inertial samples are used: controller; "": the source's, where it has any
-    kill_at_s: float = -1.0  # end like a crash at this flight time
-    await_base_at_s: float = -1.0  # look for a base again at this flight time
+    kill_at_s: float | None = None  # end like a crash at this flight time
+    await_base_at_s: float | None = None  # look for a base again at this flight time
     await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
 
 

@@ -27,11 +27,12 @@ def fly_lockstep(options: BaseOptions, parent: process.Parent) -> None:
     server = LockstepServer(options.link.removeprefix("lockstep:"))
     try:
         parent.send_event("ready")
-        agents, kill_is_due = set(options.agents), options.kill_at_s >= 0
+        agents = set(options.agents)
+        kill_ns = None if options.kill_at_s is None else options.kill_at_s * 1e9
         while base.phase is not Phase.END:
             ups = _collect(server, agents, base, parent)
-            if kill_is_due and base.now_ns is not None and options.kill_at_s * 1e9 <= base.now_ns:
-                kill_is_due = False
+            if kill_ns is not None and base.now_ns is not None and kill_ns <= base.now_ns:
+                kill_ns = None
                 threading.Timer(options.kill_delay_s, os.kill, (os.getpid(), signal.SIGKILL)).start()
             frames_were_over = base.at_last_frame is not None
             _answer(server, base.tick(ups))

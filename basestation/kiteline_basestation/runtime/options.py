@@ -33,7 +33,7 @@ class BaseOptions:
     loss: float = 0.0  # probability that a packet is lost
     disorder: float = 0.0  # probability that it is doubled, and that it is late
     seed: int = 0
-    kill_at_s: float = -1.0  # end like a crash at this flight time
+    kill_at_s: float | None = None  # end like a crash at this flight time
     kill_delay_s: float = 0.0  # s of real time after it, so that it strikes anywhere
     store: str = ""
     imports: tuple[str, ...] = ()

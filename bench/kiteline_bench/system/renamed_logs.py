@@ -129,8 +129,13 @@ CONFIG: dict[str, Rules] = {
 FIELDS: dict[str, Rules] = {"/events": {"events": ("events", _agent_events)}}
 # option of the process, in the `spec` metadata
 SPEC: dict[str, Rules] = {
-    "agent": {},
-    "base": {},
+    "agent": {
+        "kill_at_s": ("kill_at_s", lambda at_s: at_s if at_s >= 0 else None),
+        "await_base_at_s": ("await_base_at_s", lambda at_s: at_s if at_s >= 0 else None),
+    },
+    "base": {
+        "kill_at_s": ("kill_at_s", lambda at_s: at_s if at_s >= 0 else None),
+    },
 }
 TOPICS: dict[str, str] = {}  # without "/agentN"
 JOB_KINDS: dict[str, str] = {}  # name of a job's kind in the base's steps

@@ -50,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
     for hook in ("--kill-base-at", "--restart-base-at", "--kill-agent-at"):
-        p.add_argument(hook, metavar="S", type=float, default=-1.0, help=argparse.SUPPRESS)
+        p.add_argument(hook, metavar="S", type=float, help=argparse.SUPPRESS)
     return p
 
 

@@ -35,9 +35,9 @@ class Options:
     seed: int = 0
     seconds: float = 0.0
     store: str = ""
-    kill_base_at_s: float = -1.0
-    restart_base_at_s: float = -1.0
-    kill_agent_at_s: float = -1.0
+    kill_base_at_s: float | None = None
+    restart_base_at_s: float | None = None
+    kill_agent_at_s: float | None = None
     # when each base in turn is killed, s of flight time and s of real time after it; the next base follows
     base_kills: tuple[tuple[float, float], ...] = ()
 
@@ -80,7 +80,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,
-                kill_at_s=o.kill_agent_at_s if k == 0 else -1.0,
+                kill_at_s=o.kill_agent_at_s if k == 0 else None,
                 await_base_at_s=o.restart_base_at_s, await_bases=bool(o.base_kills),
             )
         )  # fmt: skip

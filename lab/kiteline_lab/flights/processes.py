@@ -157,9 +157,10 @@ class _Supervisor:
             self._flying.discard(event.child)
             if self._live and not self._flying:
                 self._children.terminate(self._base_name)
-            wanted = self._agents[agent].kill_at_s >= 0
+            kill_at_s = self._agents[agent].kill_at_s
+            wanted = kill_at_s is not None
             if wanted:
-                self.outcome.note(f"agent {agent} was ended at {self._agents[agent].kill_at_s:g} s of flight, as asked")
+                self.outcome.note(f"agent {agent} was ended at {kill_at_s:g} s of flight, as asked")
         if code == 0 or wanted:
             return
         why = self._errors.get(event.child) or self._children.processes[event.child].stderr_tail()
@@ -177,8 +178,8 @@ class _Supervisor:
         if self._base_up:
             return
         self.start_base()
-        when = f"at {self._agents[0].await_base_at_s:g} s of flight"
-        self.outcome.note(f"a new base began {when if not self._agents[0].await_bases else 'where one ended'}")
+        at_s = self._agents[0].await_base_at_s
+        self.outcome.note(f"a new base began {'where one ended' if at_s is None else f'at {at_s:g} s of flight'}")
 
     def start_base(self) -> None:
         """Start the first base, or the next one after one that ended."""
@@ -189,9 +190,9 @@ class _Supervisor:
             session = self._base.session + self._bases - 1
             if spec.store:
                 session = process.next_number(Path(spec.store) / "session")
-            spec = replace(spec, kill_at_s=-1.0, session=session, log_name=f"log-{self._bases}.mcap")
+            spec = replace(spec, kill_at_s=None, session=session, log_name=f"log-{self._bases}.mcap")
         if self._kills:
             at_s, delay_s = self._kills.pop(0)
             spec = replace(spec, kill_at_s=at_s, kill_delay_s=delay_s)
-        self._kill_wanted = spec.kill_at_s >= 0
+        self._kill_wanted = spec.kill_at_s is not None
         self._children.start(self._base_name, "kiteline_basestation", asdict(spec), Path(spec.folder))
