@@ -222,7 +222,7 @@ class Agent:
     def _count_images(self, frame: Frame, first: int) -> None:
         self.work.frames = 1
         share = 4 if first else 1
-        self.work.rectified_px += frame.left.size // share if self._rectifier.bends else 0
+        self.work.rectified_px += frame.left.size // share if self._rectifier.remaps else 0
         pair = frame.right is not None and self._config.stereo.points
         self.work.pyramid_px += frame.left.size * (2 if pair else 1)
 

@@ -1,1 +1,1 @@
-"""The shared vocabulary and computation of kiteline: no I/O, no clock, no thread, no randomness of its own."""
+"""Types and algorithms that both halves use; no I/O, clock, thread or randomness of its own."""

@@ -1,4 +1,4 @@
-"""What a sensor delivers: images at one instant, inertial samples, velocities of an odometer."""
+"""Sensor data: images at one instant, IMU samples, odometer velocities."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class EncodedImage:
-    """An image as its source holds it, so that a log can keep it without coding it again."""
+    """An encoded image from a source, so that a log can store it without encoding it again."""
 
     data: bytes
     format: str  # "png", "jpeg": what cv2.imdecode understands; depth "png/5000": 16-bit values / 5000 are metres
@@ -20,7 +20,7 @@ class EncodedImage:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Images captured at one instant, as the lens made them (not yet rectified).
+    """Images captured at one instant, not rectified.
 
     left: (h, w) uint8 grey. right: the same of the right camera, or None.
     depth_m: (h, w) float32 metres aligned with `left`, 0 where unknown, or None.
@@ -36,7 +36,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class ImuBatch:
-    """Inertial samples in order of time, in the body frame.
+    """IMU samples in order of time, in the body frame.
 
     t_ns: (n,) int64, strictly increasing. gyro: (n, 3) rad/s. accel: (n, 3) m/s^2 (specific force: +9.8 up at rest).
     """
@@ -57,17 +57,18 @@ class ImuCalibration:
     rate_hz: float = 200.0
 
 
-UNMEASURED = 1e6  # variance, (m/s)^2 or (rad/s)^2, of a direction in which an odometer measures nothing
+UNMEASURED = 1e6  # variance, (m/s)^2 or (rad/s)^2, of a direction that an odometer does not measure
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryBatch:
-    """Velocities that wheels or a flight controller measured, in order of time, of the body frame's origin and in the
-    axes of the body frame (whatever axes and place the device has: its source turns them, `odometry.in_body`).
+    """Velocities by wheels or a flight controller, in order of time, of the body frame's origin and in its axes.
 
-    t_ns: (n,) int64, strictly increasing. velocity: (n, 3) m/s. rate: (n, 3) rad/s, how the body turns. velocity_cov,
-    rate_cov: (n, 3, 3), (m/s)^2 and (rad/s)^2, with the variance UNMEASURED (or more) in directions in which nothing is
-    measured: the value along them says nothing.
+    Sources convert from the frame of the device (`odometry.in_body`).
+
+    t_ns: (n,) int64, strictly increasing. velocity: (n, 3) m/s. rate: (n, 3) rad/s of the body. velocity_cov,
+    rate_cov: (n, 3, 3), (m/s)^2 and (rad/s)^2, with variance UNMEASURED or more in unmeasured directions, in which the
+    value is meaningless.
     """
 
     t_ns: NDArray[np.int64]

@@ -1,8 +1,8 @@
 """Ids that carry their origin: (agent, boot, submap, sequence[, keypoint]) packed into one non-negative int64.
 
-Bit layout of a point id, most significant first: agent 6 | boot 14 | submap 12 | sequence 20 | keypoint 11.
-A keyframe id is a point id without the keypoint bits; a submap id is a keyframe id without the sequence bits.
-A point is named by the keyframe and keypoint of its birth, so a new point costs no bytes beyond its keypoint.
+Bit layout of a landmark id, most significant first: agent 6 | boot 14 | submap 12 | sequence 20 | keypoint 11.
+A keyframe id is a landmark id without the keypoint bits; a submap id is a keyframe id without the sequence bits. A
+landmark is named by the keyframe and keypoint at which it was new, so its id costs no bytes beyond its keypoint.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ def keyframe_id(submap: SubmapId, sequence: int) -> KeyframeId:
 
 
 def point_id(keyframe: KeyframeId, keypoint: int) -> LandmarkId:
-    """The id of the point born at `keypoint` of `keyframe`. Raises ValueError when the index does not fit its bits."""
+    """Pack the id of the landmark that is new at `keypoint` of `keyframe`. Raises ValueError for an index too large."""
     if not 0 <= keypoint < MAX_KEYPOINTS:
         raise ValueError(f"keypoint index out of range: {keypoint}")
     return LandmarkId(keyframe << KEYPOINT_BITS | keypoint)
 
 
 def keyframe_of_point(point: LandmarkId) -> KeyframeId:
-    """The keyframe on which a point hangs."""
+    """The keyframe to which a landmark is anchored."""
     return KeyframeId(point >> KEYPOINT_BITS)
 
 
 def keypoint_of_point(point: LandmarkId) -> int:
-    """The index of the keypoint at which a point was born."""
+    """The index of a landmark's keypoint in its anchor keyframe."""
     return point & (MAX_KEYPOINTS - 1)
 
 
 def submap_of_keyframe(keyframe: KeyframeId) -> SubmapId:
-    """The submap to which a keyframe belongs."""
+    """The submap of a keyframe."""
     return SubmapId(keyframe >> SEQUENCE_BITS)
 
 
@@ -76,5 +76,5 @@ def agent_of_submap(submap: SubmapId) -> AgentId:
 
 
 def agent_of_keyframe(keyframe: KeyframeId) -> AgentId:
-    """The agent that saw a keyframe."""
+    """The agent that made a keyframe."""
     return agent_of_submap(submap_of_keyframe(keyframe))

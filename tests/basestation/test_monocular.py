@@ -21,6 +21,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_consistency import within_drift
 from kiteline_basestation.merging.loop_edges import LoopEdge, similarity
 from kiteline_basestation.merging.loop_verification import depth_scale
+from kiteline_basestation.merging.similarity import align_points
 from kiteline_basestation.refinement.bundle_job import BundleInputs
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
@@ -38,7 +39,6 @@ from kiteline_codec.schema import (
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
-from kiteline_core.pose.pnp import align_points
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -53,7 +53,7 @@ def in_own_unit(flight: Any, unit: float, growth: float = 0.0) -> Any:
         head = records[0]
         assert isinstance(head, KeyframeHeader)
         grown = unit * (1.0 + growth) ** max(n - 0.5, 0.0)
-        records[0] = replace(head, T_p_k=sim3.stretched(head.T_p_k, grown))
+        records[0] = replace(head, T_p_k=sim3.with_scaled_translation(head.T_p_k, grown))
     return flight
 
 

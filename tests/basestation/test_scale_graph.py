@@ -31,7 +31,7 @@ def drifting_ring(
     start, edges, between, scale = [true[0]], [], [], []
     for i in range(1, n):
         noise = se3.exp(np.concatenate([rng.normal(0, 0.002, 3), rng.normal(0, 0.0002, 3)]))
-        between.append(sim3.stretched(se3.inverse(true[i - 1]) @ true[i] @ noise, unit[i - 1]))
+        between.append(sim3.with_scaled_translation(se3.inverse(true[i - 1]) @ true[i] @ noise, unit[i - 1]))
         edges.append((i - 1, i))
         start.append(start[-1] @ between[-1])
     for i in range(2, n, 2):
@@ -41,7 +41,7 @@ def drifting_ring(
     near = len(edges)
     for a in rng.integers(0, n - per_turn, loops).tolist():
         edges.append((a, a + per_turn))
-        between.append(sim3.stretched(se3.inverse(true[a]) @ true[a + per_turn], unit[a]))
+        between.append(sim3.with_scaled_translation(se3.inverse(true[a]) @ true[a + per_turn], unit[a]))
         scale.append(unit[a] / unit[a + per_turn])
     loop = np.arange(len(edges)) >= near
     scaled = Scaled(np.ones(n, np.bool_), np.array(scale), np.where(loop, 0.01, 0.003))

@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation import bundle_kernels as kernels
 from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle, pack, unpack
-from kiteline_core.optimisation.robust import huber_cost, huber_weight
 
 F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
@@ -71,6 +70,19 @@ def residuals(problem: BundleProblem, poses: F64, points: F64) -> F64:
 
 def bounds(problem: BundleProblem, config: BundleConfig) -> F64:
     return np.where(problem.measured[:, 2] >= 0, config.chi2_stereo, config.chi2_mono)
+
+
+def huber_cost(s: F64, bound: F64) -> F64:
+    """Huber's cost of squared residual norms s (n,): s up to `bound`, above it growing with sqrt(s)."""
+    outside = s > bound
+    root = np.sqrt(np.where(outside, s, 1.0))
+    return np.where(outside, 2.0 * np.sqrt(bound) * root - bound, s)
+
+
+def huber_weight(s: F64, bound: F64) -> F64:
+    """Derivative of `huber_cost` by s."""
+    outside = s > bound
+    return np.where(outside, np.sqrt(bound) / np.sqrt(np.where(outside, s, 1.0)), 1.0)
 
 
 def test_huber_is_smooth_and_its_weight_is_its_derivative() -> None:

@@ -54,7 +54,7 @@ def test_words_and_likeness_are_the_reference() -> None:
     assert found.keys.tolist() == sorted(expected, key=lambda k: -expected[k])
     assert np.allclose(found.score, [expected[k] for k in found.keys.tolist()], atol=1e-6)
     between = 1 - 0.5 * np.abs(plain_vector(v, places[5]) - plain_vector(v, places[17])).sum()
-    assert np.allclose(index.likeness(5, [17, 3]), [between, 0.0], atol=1e-6)
+    assert np.allclose(index.similarity(5, [17, 3]), [between, 0.0], atol=1e-6)
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 9)), max_size=40), st.integers(0, 1000))

@@ -1,10 +1,10 @@
-"""Absolute pose: P3P against constructed truth, alignment against a plain SVD, RANSAC among outliers."""
+"""Absolute pose: P3P against constructed truth, RANSAC among outliers."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from kiteline_core.geometry import se3
@@ -28,8 +28,7 @@ def test_p3p_contains_the_true_pose_and_only_poses_that_fit(seed: int) -> None:
     ray = np.column_stack([(uv - CAMERA[2:4]) / CAMERA[:2], np.ones(3)])
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     area = np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0]))
-    if area < 0.3:
-        return  # nearly on a line: no pose is sure
+    assume(area > 0.3)  # nearly on a line, no pose is certain
     found = np.empty((4, 4, 4))
     n = pnp_kernels.p3p(ray, points, found)
     for k in range(n):
@@ -82,52 +81,3 @@ def test_the_same_seed_gives_the_same_bits_and_draws_end_early() -> None:
         if again[0] == state[0]:
             return
     pytest.fail("draws went on although all points agreed")
-
-
-def svd_alignment(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Rotation and translation by SVD (S. Umeyama, 1991)."""
-    u, _, vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
-    r = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return se3.from_rt(r, a.mean(0) - r @ b.mean(0))
-
-
-@given(st.integers(0, 10**9), st.integers(4, 30))
-def test_alignment_is_that_of_an_svd(seed: int, n: int) -> None:
-    rng = np.random.default_rng(seed)
-    b = rng.normal(0, 2, (n, 3))
-    T = se3.exp(rng.normal(0, 1.5, 6))
-    a = se3.transform(T, b) + rng.normal(0, 0.02, b.shape)
-    found = pnp.align_points(a, b)
-    assert found is not None
-    assert np.allclose(found, svd_alignment(a, b), atol=1e-7)
-
-
-def test_scale_is_found_and_a_line_is_refused() -> None:
-    rng = np.random.default_rng(3)
-    b = rng.normal(0, 2, (9, 3))
-    T = se3.exp(rng.normal(0, 1.0, 6))
-    found = pnp.align_points(2.5 * se3.transform(T, b), b, with_scale=True)
-    assert found is not None and np.allclose(found[:3, :3], 2.5 * T[:3, :3])
-    line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
-    assert pnp.align_points(line, line) is None
-    assert pnp.align_points(b[:2], b[:2]) is None
-
-
-@pytest.mark.parametrize("with_scale", [False, True])
-def test_views_are_aligned_among_outliers(with_scale: bool) -> None:
-    rng = np.random.default_rng(4)
-    scale = 1.7 if with_scale else 1.0
-    points, T_a, uv_a = scene(rng, 80)
-    a = se3.transform(T_a, points)
-    move = se3.exp(np.array([0.4, -0.2, 0.3, 0.05, -0.1, 0.08]))
-    b = se3.transform(se3.inverse(move), a) / scale
-    uv_b = b[:, :2] / b[:, 2:] * CAMERA[:2] + CAMERA[2:4]
-    bad = rng.permutation(80)[:35]
-    b[bad], uv_b[bad] = b[np.roll(bad, 1)], uv_b[np.roll(bad, 1)]
-    octave = np.zeros(80, np.uint8)
-    noisy = a + rng.normal(0, 0.004, a.shape)
-    fit = pnp.align_views(noisy, uv_a, octave, CAMERA, b, uv_b, octave, CAMERA, with_scale, 1)
-    assert fit is not None
-    assert fit.inliers >= 43 and not fit.inlier[bad].any()
-    assert abs(fit.scale - scale) < 0.01 * scale
-    assert np.abs(fit.S_a_b[:3, 3] - move[:3, 3]).max() < 0.03

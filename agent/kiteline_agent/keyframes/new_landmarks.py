@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.imaging import features
+from kiteline_agent.imaging import features, stereo_kernels
 from kiteline_agent.tracking.frame_images import FrameImages, depth_at
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.imaging import stereo_kernels
 
 F64 = NDArray[np.float64]
 

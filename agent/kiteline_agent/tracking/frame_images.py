@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import PyramidConfig, StereoConfig
+from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import Rectifier
-from kiteline_core.imaging import stereo_kernels
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
@@ -38,14 +38,14 @@ class RightImage:
     @property
     def needs_rectification(self) -> bool:
         """True if the rectified image differs from the raw one."""
-        return self._rectifier.bends
+        return self._rectifier.remaps
 
     def coarse(self) -> Pyramid:
         """Pyramid of the rectified image; level 0 is blank if the camera needs rectification."""
         if self._coarse is None:
             raw = self._raw_pyramid()
             self._coarse = raw
-            if self._rectifier.bends:
+            if self._rectifier.remaps:
                 half = self._rectifier.halved(1, raw[1])
                 self._coarse = (self._rectifier.blank, *build_pyramid(half, self._levels - 1))
         return self._coarse
@@ -90,7 +90,7 @@ def frame_images(
     """
     right = None if frame.right is None else RightImage(frame.right, rectifier, config.levels, offset_px)
     depth_m = None if frame.depth_m is None else rectifier.depth(frame.depth_m)
-    if first == 0 or not rectifier.bends:
+    if first == 0 or not rectifier.remaps:
         return FrameImages(build_pyramid(rectifier.rectify(0, frame.left), config.levels), right, depth_m)
     half = rectifier.half(0, frame.left)
     return FrameImages((rectifier.blank, *build_pyramid(half, config.levels - 1)), right, depth_m, first)

@@ -102,9 +102,9 @@ class SubmapPlacements:
         for submap, factor in factors.items():
             first = self._map.first_pose(submap)
             if submap in self.S_w_m:
-                self._set(submap, sim3.grown(self.S_w_m[submap], factor, first))
+                self._set(submap, sim3.scaled_about(self.S_w_m[submap], factor, first))
             if submap in self.unmerged:
-                self.unmerged[submap] = sim3.grown(self.unmerged[submap], factor, first)
+                self.unmerged[submap] = sim3.scaled_about(self.unmerged[submap], factor, first)
 
     def separate(self, split: Collection[SubmapId]) -> list[SubmapId]:
         """Move submaps that were split from a map back to where they lay before. Returns those without placement."""

@@ -170,7 +170,7 @@ class SparseMap(MapView):
 
     def scale_submap(self, submap: SubmapId, factor: float) -> None:
         """Multiply the scale of a submap in w; its first keyframe does not move."""
-        self.move_submap(submap, sim3.grown(self.submap_pose(submap), factor, self.first_pose(submap)))
+        self.move_submap(submap, sim3.scaled_about(self.submap_pose(submap), factor, self.first_pose(submap)))
 
     def first_pose(self, submap: SubmapId) -> F64:
         """T_m_k (4,4) of the first keyframe of a submap; the identity if it has no pose."""

@@ -155,7 +155,7 @@ class LoopDetector:
         before = [k for k in near if k < keyframe][-1:]
         enough = config.min_likeness
         if before and keyframe in self._index and before[0] in self._index:
-            enough = max(enough, config.min_neighbour_ratio * float(self._index.likeness(keyframe, before)[0]))
+            enough = max(enough, config.min_neighbour_ratio * float(self._index.similarity(keyframe, before)[0]))
         places = self._index.query(
             observations.descriptor, known | set(near) | {keyframe}, _QUERIED * config.candidates
         )  # fmt: skip

@@ -71,7 +71,7 @@ def depth_of(sparse_map: SparseMap, edge: LoopEdge) -> float:
 def graph_edge_of(sparse_map: SparseMap, edge: LoopEdge) -> tuple[F64, float]:
     """T_old_new (4,4) in units of w, and the scale of the old keyframe over that of the new one in w."""
     unit_old, unit_new = (float(sparse_map.keyframes.scale[sparse_map.rows[k]]) for k in (edge.old, edge.new))
-    return sim3.stretched(edge.T_old_new, unit_old), edge.scale * unit_old / unit_new
+    return sim3.with_scaled_translation(edge.T_old_new, unit_old), edge.scale * unit_old / unit_new
 
 
 def rescaled(edge: Edge, factor: Mapping[KeyframeId, float]) -> Edge:
@@ -79,7 +79,7 @@ def rescaled(edge: Edge, factor: Mapping[KeyframeId, float]) -> Edge:
     old, new = factor.get(edge.old, 1.0), factor.get(edge.new, 1.0)
     if old == 1.0 and new == 1.0:
         return edge
-    T = sim3.stretched(edge.T_old_new, old)
+    T = sim3.with_scaled_translation(edge.T_old_new, old)
     return replace(edge, T_old_new=T, scale=edge.scale * old / new, depth_m=edge.depth_m * old)
 
 

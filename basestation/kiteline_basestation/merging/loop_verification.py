@@ -15,6 +15,7 @@ from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_edges import LoopMatch
+from kiteline_basestation.merging.similarity import align_views
 from kiteline_basestation.refinement.landmark_matching import predict_projections
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
@@ -117,7 +118,7 @@ def verify_loop(
         return None
     unit_new, unit_old = (float(sparse_map.keyframes.scale[sparse_map.rows[k]]) for k in (new, old))
     return LoopMatch(
-        new, old, sim3.stretched(T_old_new, 1.0 / unit_old), len(which), float(np.median(depth)) / unit_old,
+        new, old, sim3.with_scaled_translation(T_old_new, 1.0 / unit_old), len(which), float(np.median(depth)) / unit_old,
         scale * unit_new / unit_old, *ids,
     )  # fmt: skip
 
@@ -154,7 +155,7 @@ def _solve_similarity(
     rows = [sparse_map.rows[k] for k in (old, new)]
     T_old, T_new = sparse_map.keyframes.T_w_k[rows]
     lens_old, lens_new = sparse_map.keyframes.camera[rows]
-    fit = pnp.align_views(
+    fit = align_views(
         se3.transform(se3.inverse(T_old), theirs.xyz[b]), theirs.uv[b], theirs.octave[b], lens_old,
         se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
         True, _seed(new, old), config.ransac,

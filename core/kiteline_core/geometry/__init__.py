@@ -1,1 +1,1 @@
-"""TODO."""
+"""Calibrations and transforms enter; rectified images, poses and triangulated points leave."""

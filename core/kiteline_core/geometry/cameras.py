@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
-from kiteline_core.imaging.stereo_kernels import GRID_STEP
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 
-WIDEST = 1.75  # x/z at the side of a rectified image, 60 degrees: wider costs resolution in the middle
-LEAST_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 degrees little is seen by both eyes
-VIRTUAL_BASELINE_M = 0.1  # gives cameras without a right eye a scale for coded inverse depths
+GRID_STEP = 4  # px between the points of a rectification grid: interpolation errors are below 0.01 px
+VIRTUAL_BASELINE_M = 0.1  # scale of coded inverse depths of cameras without a right image
+_MAX_SLOPE = 1.75  # x/z at the side of a rectified image, 60 degrees: more costs resolution in the middle
+_MIN_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 degrees the views hardly overlap
 
 
 class CalibrationError(KitelineError, ValueError):
@@ -29,7 +29,7 @@ class CalibrationError(KitelineError, ValueError):
 
 
 class Lens(Enum):
-    """How a ray direction bends on its way to the sensor."""
+    """Distortion model of a lens."""
 
     NONE = "none"
     RADTAN = "radtan"  # k1 k2 p1 p2 [k3 [k4 k5 k6]], as OpenCV and EuRoC write them
@@ -38,7 +38,7 @@ class Lens(Enum):
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A pinhole camera behind a lens. Focal lengths and centre in px, size in px."""
+    """A pinhole camera with lens distortion. Focal lengths, centre and size in px."""
 
     width: int
     height: int
@@ -56,10 +56,10 @@ class CameraModel:
 
 @dataclass(frozen=True, slots=True)
 class CameraRig:
-    """What the vehicle carries: a left camera, perhaps a right one, perhaps depth aligned with the left.
+    """Cameras of a vehicle: a left one, optionally a right one or depth aligned with the left.
 
     T_b_c: (4,4) left camera in the body. T_c_r: (4,4) right camera in the left one, or None without a right camera.
-    has_body: False where the source knows no body frame (then T_b_c is the identity and poses are camera poses).
+    has_body: False if the source has no body frame (then T_b_c is the identity and poses are camera poses).
     """
 
     left: CameraModel
@@ -72,10 +72,10 @@ class CameraRig:
 
 @dataclass(frozen=True, slots=True)
 class RectifiedCamera:
-    """An ideal pinhole; a stereo partner lies at +baseline_m along x. T_b_c: (4,4) of the *rectified* left camera.
+    """An ideal pinhole; the right camera, if any, is at +baseline_m along x. T_b_c: (4,4) of the rectified left.
 
-    Without a right eye (`stereo` False) baseline_m is VIRTUAL_BASELINE_M: disparity = fx * baseline_m / depth is then
-    only a unit of inverse depth.
+    Without a right camera (`stereo` False) baseline_m is VIRTUAL_BASELINE_M: disparity = fx * baseline_m / depth is
+    then only a unit of inverse depth.
     """
 
     width: int
@@ -95,19 +95,17 @@ class RectifiedCamera:
 
 
 class Rectifier:
-    """Maps raw images onto the ideal camera. Built once; a pair that is already rectified costs nothing."""
+    """Rectifies raw images. Images that are already rectified are passed through."""
 
     def __init__(self, rig: CameraRig) -> None:
         left = rig.left
         self._size = (left.width, left.height)
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
-        self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and matrix behind its maps
+        self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and camera matrix for its maps
         self._depth_map: NDArray[np.int16] | None = None
         self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self.blank = np.zeros((left.height, left.width), np.uint8)
-        self.right_grid: NDArray[np.float32] | None = (
-            None  # see _grid; None where the right image needs no rectification
-        )
+        self.right_grid: NDArray[np.float32] | None = None  # see _grid; None if the right image needs no rectification
         if rig.right is None:
             if left.lens is not Lens.NONE:
                 self._maps[0] = _undistortion_maps(left, np.eye(3), left.matrix())
@@ -134,7 +132,7 @@ class Rectifier:
         self._maps[0] = _undistortion_maps(left, r_left, new)
         self._right = (rig.right, r_right, new)
         self.right_grid = _grid(rig.right, r_right, new)
-        # A point of the raw left camera is turned by r_left into the rectified one.
+        # r_left rotates points of the raw left camera into the rectified one.
         t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
         self.camera = RectifiedCamera(
             left.width,
@@ -149,41 +147,47 @@ class Rectifier:
         )
 
     @property
-    def bends(self) -> bool:
-        """Whether images have to be remapped at all."""
+    def remaps(self) -> bool:
+        """True if images must be remapped."""
         return self._maps[0] is not None
 
-    def rectify(self, eye: int, image: U8) -> U8:
-        """Rectify the image of an eye (0 left, 1 right). Raises CalibrationError as `left` does."""
-        return self._apply(eye, image)
-
-    def half(self, eye: int, image: U8) -> U8:
-        """Level 1 of the rectified image's pyramid ((h+1)//2, (w+1)//2), from level 1 of the raw one's."""
+    def rectify(self, side: int, image: U8) -> U8:
+        """Rectify an image (h, w) of a side (0 left, 1 right). Raises CalibrationError for a wrong size."""
         self.check_size(image)
-        return self.halved(eye, np.asarray(cv2.pyrDown(image), np.uint8))
+        if side == 1:
+            self._maps[1] = self._full_maps(1)
+        maps = self._maps[side]
+        if maps is None:
+            return image
+        return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR), np.uint8)
 
-    def halved(self, eye: int, small: U8) -> U8:
-        """The same from level 1 ((h+1)//2, (w+1)//2) of a raw image's pyramid."""
-        halves = self._halves[eye]
+    def half(self, side: int, image: U8) -> U8:
+        """Rectify level 1 of the pyramid, ((h+1)//2, (w+1)//2), from the full raw image."""
+        self.check_size(image)
+        return self.halved(side, np.asarray(cv2.pyrDown(image), np.uint8))
+
+    def halved(self, side: int, small: U8) -> U8:
+        """Rectify level 1 of a raw image's pyramid, ((h+1)//2, (w+1)//2)."""
+        halves = self._halves[side]
         if halves is None:
-            maps = self._whole(eye)
+            maps = self._full_maps(side)
             if maps is None:
                 return small
             x, y = cv2.convertMaps(maps[0][::2, ::2], maps[1][::2, ::2], cv2.CV_32FC1)
             fixed = cv2.convertMaps(0.5 * x, 0.5 * y, cv2.CV_16SC2)
-            halves = self._halves[eye] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
+            halves = self._halves[side] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
         return np.asarray(cv2.remap(small, halves[0], halves[1], cv2.INTER_LINEAR), np.uint8)
 
     def left(self, image: U8) -> U8:
-        """Rectify a left image (h, w) uint8. Raises CalibrationError when its size is not the calibrated one."""
-        return self._apply(0, image)
+        """Rectify a left image (h, w) uint8. Raises CalibrationError for a wrong size."""
+        return self.rectify(0, image)
 
     def right(self, image: U8) -> U8:
-        """Rectify a right image (h, w) uint8. Raises CalibrationError when its size is not the calibrated one."""
-        return self._apply(1, image)
+        """Rectify a right image (h, w) uint8. Raises CalibrationError for a wrong size."""
+        return self.rectify(1, image)
 
     def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Bring depth (h, w) onto the rectified left pixels, without blending across edges."""
+        """Rectify depth (h, w) to the left camera, by nearest neighbour, so that edges are not blended."""
         if depth_m.shape != (self._size[1], self._size[0]):
             raise CalibrationError(
                 f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
@@ -192,33 +196,24 @@ class Rectifier:
             maps = self._maps[0]
             if maps is None:
                 return depth_m
-            # Fixed-point maps hold whole pixels rounded down, and the rest in 1/32 px (5 bits for x, 5 for y).
+            # Fixed-point maps hold the integer pixel, and the fraction in 1/32 px (5 bits for x, 5 for y).
             whole, rest = maps[0].astype(np.int32), maps[1].astype(np.int32)
             rest_xy = np.stack([rest & 31, (rest >> 5) & 31], axis=-1)
             self._depth_map = (whole + (rest_xy >= 16)).astype(np.int16)
         return np.asarray(cv2.remap(depth_m, self._depth_map, np.empty(0), cv2.INTER_NEAREST), np.float32)
 
     def check_size(self, image: U8) -> None:
-        """Raises CalibrationError when an image has not the calibrated size."""
+        """Raise CalibrationError if an image does not have the calibrated size."""
         if image.shape != (self._size[1], self._size[0]):
             raise CalibrationError(
                 f"image is {image.shape[1]}x{image.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
             )
 
-    def _apply(self, eye: int, image: U8) -> U8:
-        self.check_size(image)
-        if eye == 1:
-            self._maps[1] = self._whole(1)
-        maps = self._maps[eye]
-        if maps is None:
-            return image
-        return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR), np.uint8)
-
-    def _whole(self, eye: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
-        """The maps of an eye. Those of the right one are kept only once a whole right image was asked for."""
-        if self._maps[eye] is None and eye == 1 and self._right is not None:
+    def _full_maps(self, side: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
+        """Maps of a full image. Those of the right image are kept only once `rectify` needs them."""
+        if self._maps[side] is None and side == 1 and self._right is not None:
             return _undistortion_maps(*self._right)
-        return self._maps[eye]
+        return self._maps[side]
 
 
 def _is_rectified(rig: CameraRig) -> bool:
@@ -252,23 +247,23 @@ def _grid(camera: CameraModel, rotation: F64, new: F64) -> NDArray[np.float32]:
 
 
 def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:
-    """Rotations raw -> rectified of both eyes and the camera matrix they share (A. Fusiello et al., 2000).
+    """Rotations raw -> rectified of both cameras and their common camera matrix (A. Fusiello et al., 2000).
 
-    Each eye turns by half of their relative rotation, then both turn x onto the baseline. The shared focal length is
-    chosen so that the middle of each image side stays in view: what is cropped is only the far corners of the lens.
+    Each camera is rotated by half of their relative rotation, then x is aligned with the baseline. The focal length
+    keeps the middle of each image side in view; only corners are cropped.
     """
     assert rig.right is not None and rig.T_c_r is not None
-    half = se3.so3_exp(0.5 * se3.so3_log(rig.T_c_r[:3, :3]))  # maps the middle orientation into the left camera
+    half = se3.so3_exp(0.5 * se3.so3_log(rig.T_c_r[:3, :3]))  # from the mean orientation to the left camera
     baseline = half.T @ rig.T_c_r[:3, 3]
     if abs(baseline[0]) < abs(baseline[1]) or baseline[0] < 0:
         raise CalibrationError("the right camera must lie to the right of the left one (x of T_c_r positive)")
     x = baseline / np.linalg.norm(baseline)
     y = np.cross(np.array([0.0, 0.0, 1.0]), x)
     y /= np.linalg.norm(y)
-    turn = np.stack([x, y, np.cross(x, y)])
-    r_left = turn @ half.T
-    r_right = turn @ half.T @ rig.T_c_r[:3, :3]
-    if min(r_left[2, 2], r_right[2, 2]) < LEAST_COSINE:
+    align = np.stack([x, y, np.cross(x, y)])
+    r_left = align @ half.T
+    r_right = align @ half.T @ rig.T_c_r[:3, :3]
+    if min(r_left[2, 2], r_right[2, 2]) < _MIN_COSINE:
         raise CalibrationError("the two cameras hardly look the same way: expected the extrinsics of a stereo pair")
     sides = [_side_rays(rig.left, r_left), _side_rays(rig.right, r_right)]
     left, right = max(s[0] for s in sides), min(s[1] for s in sides)
@@ -290,7 +285,7 @@ def _side_rays(camera: CameraModel, rotation: F64) -> tuple[float, float, float,
     else:
         rays = cv2.undistortPoints(pixels, camera.matrix(), d, R=rotation)
     x, y = rays.reshape(4, 2).T
-    # Beyond 180 degrees a lens has no such point, and far below that the ideal image is mostly stretched corners.
-    left, top = (v if -WIDEST < v < 0 else -WIDEST for v in (float(x[0]), float(y[2])))
-    right, bottom = (v if 0 < v < WIDEST else WIDEST for v in (float(x[1]), float(y[3])))
+    # Beyond 180 degrees there is no such point; well below it the rectified image is mostly stretched corners.
+    left, top = (v if -_MAX_SLOPE < v < 0 else -_MAX_SLOPE for v in (float(x[0]), float(y[2])))
+    right, bottom = (v if 0 < v < _MAX_SLOPE else _MAX_SLOPE for v in (float(x[1]), float(y[3])))
     return left, right, top, bottom

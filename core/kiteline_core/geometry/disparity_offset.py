@@ -1,8 +1,7 @@
-"""What the disparities of a pair are too large by, over the image.
+"""Disparity offset over the image, from small errors of the right camera's rotation, focal length and centre.
 
-What a right camera makes that is turned by a little, or of a little other focal length or centre, than its calibration
-says: the first terms of a homography, c0 + c1 x + c2 y + c3 x^2 + c4 x y in normalised image coordinates (R. Hartley,
-"Theory and practice of projective rectification").
+The first terms of a homography, c0 + c1 x + c2 y + c3 x^2 + c4 x y in normalised image coordinates (R. Hartley, "Theory
+and practice of projective rectification").
 """
 
 from __future__ import annotations
@@ -22,5 +21,5 @@ def terms(xy: F64) -> F64:
 
 
 def none() -> F64:
-    """The offset (5,) of a pair that is as its calibration says."""
+    """Zero offset (5,)."""
     return np.zeros(TERMS)

@@ -14,7 +14,7 @@ F64 = NDArray[np.float64]
 _SMALL_RAD = 1e-7  # below this angle the series is exact to double precision
 
 _EYE = np.eye(3)
-_NEARLY = 1e-7  # from orthonormal; its square is below what numbers hold
+_NEARLY = 1e-7  # deviation from orthonormal whose square is below double precision
 
 
 def skew(v: F64) -> F64:
@@ -80,10 +80,10 @@ def transform(t: F64, points: F64) -> F64:
 
 
 def orthonormalise(t: F64) -> F64:
-    """The rigid motion nearest to T: products of many rotations drift off the manifold."""
+    """The rigid motion nearest to T, since products of rotations lose orthonormality."""
     r = t[:3, :3]
     error = r.T @ r - _EYE
-    if np.abs(error).max() < _NEARLY:  # one step of Newton's polar iteration: what is left is the error's square
+    if np.abs(error).max() < _NEARLY:  # one step of Newton's polar iteration leaves the square of the error
         return from_rt(r - 0.5 * (r @ error), t[:3, 3])
     u, _, vt = np.linalg.svd(r)
     r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

@@ -1,7 +1,7 @@
-"""Similarities as 4x4 float64 arrays: `S_a_b` maps points of frame b into a, whose unit of length may be another.
+"""Similarities as 4x4 float64 arrays: `S_a_b` maps points of frame b into a, which may have another unit of length.
 
-The upper left part is a scale times a rotation: lengths of b, times the scale, are lengths of a. A rigid motion is a
-similarity of scale 1, and is treated to the last bit as `se3` treats it.
+The upper left part is a scale times a rotation; the scale converts lengths of b to lengths of a. A rigid motion is a
+similarity of scale 1, with results bit-identical to `se3`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 
-_ONE = 1e-9  # a scale nearer to 1 is 1: rotations are orthonormal to no more
+_ONE = 1e-9  # a scale closer to 1 is 1, given the accuracy of orthonormal rotations
 
 
 def scale_of(S: F64) -> float:
-    """How many units of a one unit of b is."""
+    """Scale of S_a_b: units of a per unit of b."""
     scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
     return 1.0 if abs(scale - 1.0) < _ONE else scale
 
@@ -45,19 +45,19 @@ def inverse(S: F64) -> F64:
 
 
 def normalise(S: F64) -> F64:
-    """The similarity nearest to S: products of many drift off the manifold."""
+    """The similarity nearest to S, since products of many lose orthonormality."""
     scale = scale_of(S)
     return se3.orthonormalise(S) if scale == 1.0 else of(scale, rigid(S))
 
 
-def grown(S_a_b: F64, factor: float, T_b_k: F64) -> F64:
-    """The similarity (4,4) with so many times the scale, by which a body at T_b_k (4,4) stands where it stood."""
-    there = of(scale_of(S_a_b) * factor, rigid(place(S_a_b, T_b_k)))
-    return normalise(there @ se3.inverse(T_b_k))
+def scaled_about(S_a_b: F64, factor: float, T_b_k: F64) -> F64:
+    """Multiply the scale by `factor`, keeping the pose in a of a body at T_b_k (4,4)."""
+    kept = of(scale_of(S_a_b) * factor, rigid(place(S_a_b, T_b_k)))
+    return normalise(kept @ se3.inverse(T_b_k))
 
 
 def place(S_a_b: F64, T_b_k: F64) -> F64:
-    """Where bodies that stand at rigid motions T_b_k (4,4) or (n,4,4) stand in a: rigid motions again."""
+    """Poses in a, as rigid motions, of bodies at T_b_k (4,4) or (n,4,4)."""
     scale = scale_of(S_a_b)
     out = np.asarray(S_a_b @ T_b_k)
     if scale != 1.0:
@@ -65,6 +65,6 @@ def place(S_a_b: F64, T_b_k: F64) -> F64:
     return out
 
 
-def stretched(T: F64, factor: float) -> F64:
+def with_scaled_translation(T: F64, factor: float) -> F64:
     """A rigid motion (4,4) with its translation multiplied by `factor`."""
     return se3.from_rt(T[:3, :3], T[:3, 3] * factor)

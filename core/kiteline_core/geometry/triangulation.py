@@ -1,4 +1,4 @@
-"""Points from rays of known cameras."""
+"""Triangulation of points from rays of cameras with known poses."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ def rays(pixels: F64, camera: F64, T_m_k: F64) -> tuple[F64, F64]:
 
 
 def nearest_point(origins: F64, directions: F64) -> tuple[F64, Bool]:
-    """The point nearest to k lines in the mean square, for n points at once. origins, unit directions: (n,k,3).
+    """Least-squares intersection of k rays, for n points. origins, unit directions: (n,k,3).
 
-    Returns points (n,3) and whether each is well defined. Source: "Monocular EKF-SLAM with delayed landmark
+    Returns points (n,3) and whether each is well defined (n,). Source: "Monocular EKF-SLAM with delayed landmark
     initialisation", the analytical initialisation by linear least squares; one 3x3 system a point.
     """
     eye = np.eye(3)
-    across = (
-        eye - directions[..., :, None] * directions[..., None, :]
-    )  # (n,k,3,3): projects onto the plane across a ray
+    across = eye - directions[..., :, None] * directions[..., None, :]  # (n,k,3,3): projection perpendicular to a ray
     a = across.sum(axis=1)
     b = np.einsum("nkij,nkj->ni", across, origins)
     good = np.abs(np.linalg.det(a)) > 1e-9
@@ -36,14 +34,14 @@ def nearest_point(origins: F64, directions: F64) -> tuple[F64, Bool]:
 
 
 def parallax(origins_a: F64, origins_b: F64, points: F64) -> F64:
-    """Cosine (n,) of the angle under which points (n,3) see the two origins (n,3)."""
+    """Cosine (n,) of the parallax angle of points (n,3) between two origins (n,3)."""
     a, b = points - origins_a, points - origins_b
     norm = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.asarray(np.einsum("ni,ni->n", a, b) / np.maximum(norm, 1e-12))
 
 
 def project(points: F64, camera: F64, T_m_k: F64) -> tuple[F64, F64]:
-    """Pixels (n,2) and depths (n,) of points (n,3) in cameras (n,4) at T_m_k (n,4,4); no pixel means a thing behind."""
+    """Pixels (n,2) and depths (n,) of points (n,3) in cameras (n,4) at T_m_k (n,4,4)."""
     local = np.einsum("nji,nj->ni", T_m_k[:, :3, :3], points - T_m_k[:, :3, 3])
     z = np.where(local[:, 2] > 1e-6, local[:, 2], 1.0)
     pixels = np.stack([camera[:, 0] * local[:, 0] / z + camera[:, 2], camera[:, 1] * local[:, 1] / z + camera[:, 3]], 1)

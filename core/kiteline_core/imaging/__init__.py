@@ -1,1 +1,1 @@
-"""TODO."""
+"""Descriptors of two views enter; matches leave."""

@@ -1,4 +1,4 @@
-"""Which descriptor of one view shows the same thing as which of another."""
+"""Matching of binary descriptors between two views: brute force, or guided by predicted pixels."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ U64 = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True)
 class MatchConfig:
-    """What counts as the same descriptor."""
+    """Thresholds of descriptor matching."""
 
-    max_hamming: int = 64  # bits of 256: unrelated descriptors differ in 128 +- 8, re-seen ones in 20 to 60
-    ratio: float = 0.85  # of the best distance to the second best: above it, the texture repeats
-    turn_bins: int = 16  # bins of the histogram of turns between the two views; 22.5 degrees each
-    turn_kept: int = 3  # bins that stay: neighbours share a turn that falls between them
+    max_hamming: int = 64  # bits of 256: unrelated descriptors differ in 128 +- 8, true matches in 20 to 60
+    ratio: float = 0.85  # of the best to the second-best distance: above it, the match is ambiguous
+    turn_bins: int = 16  # bins of the histogram of rotations between the two views; 22.5 degrees each
+    turn_kept: int = 3  # bins that are kept: neighbours share a rotation between them
     cell_px: float = 32.0  # cells of the guided search
 
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """a, b: (n,) int32 indices that belong together. distance: (n,) int32 bits."""
+    """a, b: (n,) int32 indices of the pairs. distance: (n,) int32 bits."""
 
     a: I32
     b: I32
@@ -36,15 +36,15 @@ class Matches:
 
 
 def words(descriptors: U8) -> U64:
-    """Descriptors (n,32) uint8 as (n,4) uint64, which is what the kernels compare."""
+    """Descriptors (n,32) uint8 as (n,4) uint64 for the kernels."""
     return np.ascontiguousarray(descriptors).view(np.uint64).reshape(len(descriptors), 4)
 
 
 def match(a: U8, angle_a: U8, b: U8, angle_b: U8, config: MatchConfig) -> Matches:
-    """Brute force: descriptors (n,32) and (m,32) with their angles in 1/256 turns. One match each at most."""
+    """Match descriptors (n,32) and (m,32) by brute force, one to one. Angles in 1/256 turns."""
     best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
     kernels.match_all(words(a), words(b), config.max_hamming, config.ratio, best, distance)
-    kernels.agree_in_turn(best, angle_a, angle_b, config.turn_bins, config.turn_kept)
+    kernels.keep_common_rotation(best, angle_a, angle_b, config.turn_bins, config.turn_kept)
     return _pairs(best, distance)
 
 
@@ -52,9 +52,9 @@ def match_near(
     uv: F64, radius_px: F64, octave: F64, a: U8, uv2: F64, octave2: U8, b: U8, size: tuple[int, int],
     octave_gap: float, config: MatchConfig,
 ) -> Matches:  # fmt: skip
-    """Guided: each foreseen pixel uv (n,2) looks within radius_px (n,) among measured uv2 (m,2).
+    """Match each predicted pixel uv (n,2) with measured ones uv2 (m,2) within radius_px (n,).
 
-    octave: (n,) foreseen pyramid level; octave2: (m,) measured. size: width, height px of the image.
+    octave: (n,) predicted pyramid level; octave2: (m,) measured. size: width, height px of the image.
     """
     columns = -(-size[0] // int(config.cell_px))
     rows = -(-size[1] // int(config.cell_px))

@@ -22,7 +22,7 @@ _FAR = 1 << 20  # more bits than any two descriptors differ in
 
 @njit
 def hamming(a: U64, i: int, b: U64, j: int) -> int:
-    """Bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
+    """Number of bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
     total = 0
     for k in range(4):
         x = a[i, k] ^ b[j, k]
@@ -35,7 +35,7 @@ def hamming(a: U64, i: int, b: U64, j: int) -> int:
 
 @njit
 def take(i: int, j: int, distance: int, owner: I32, owner_distance: I32, best: I32) -> bool:
-    """Let i have j, unless j's owner is as near; an owner that is not loses it. Whether i has it."""
+    """Assign j to i if i is nearer than j's current match, which is then undone. Returns whether i got j."""
     if distance >= owner_distance[j]:
         return False
     if owner[j] >= 0:
@@ -46,9 +46,9 @@ def take(i: int, j: int, distance: int, owner: I32, owner_distance: I32, best: I
 
 @njit
 def match_all(a: U64, b: U64, max_hamming: int, ratio: float, best: I32, distance: I32) -> int:
-    """For each of a (n,4) the nearest of b (m,4), where it is near, distinct, and prefers nobody else.
+    """Match each of a (n,4) with the nearest of b (m,4), if near, distinctive and one to one.
 
-    best: (n,) index in b or -1, out. distance: (n,) bits, out. Returns how many matched.
+    best: (n,) index in b or -1, out. distance: (n,) bits, out. Returns the number of matches.
     """
     n, m = a.shape[0], b.shape[0]
     owner = np.full(m, -1, np.int32)
@@ -74,7 +74,7 @@ def match_all(a: U64, b: U64, max_hamming: int, ratio: float, best: I32, distanc
 def fill_cells(uv: F64, cell_px: float, start: I32, item: I32) -> None:
     """Sort pixels (m,2) into square cells. start: (rows, columns + 1) out; item: (m,) indices in order of cell, out.
 
-    Those of cell (r, c) are item[start[r, c]:start[r, c + 1]]. Pixels outside count for the nearest cell.
+    Cell (r, c) holds item[start[r, c]:start[r, c + 1]]. Pixels outside belong to the nearest cell.
     """
     rows, columns = start.shape[0], start.shape[1] - 1
     m = uv.shape[0]
@@ -101,9 +101,9 @@ def match_cells(
     uv2: F64, octave2: U8, b: U64, cell_px: float, start: I32, item: I32,
     octave_gap: float, max_hamming: int, ratio: float, best: I32, distance: I32,
 ) -> int:  # fmt: skip
-    """Like match_all, but each of a looks only within radius_px (n,) of its foreseen pixel uv (n,2), by cells.
+    """Like match_all, but only within radius_px (n,) of the predicted pixel uv (n,2), by cells.
 
-    octave: (n,) foreseen pyramid level, octave2: (m,) measured. start, item: of uv2 (m,2) by fill_cells.
+    octave: (n,) predicted pyramid level, octave2: (m,) measured. start, item: of uv2 (m,2) by fill_cells.
     """
     n, m = uv.shape[0], uv2.shape[0]
     rows, columns = start.shape[0], start.shape[1] - 1
@@ -137,32 +137,32 @@ def match_cells(
 
 
 @njit
-def agree_in_turn(best: I32, angle: U8, angle2: U8, bins: int, kept: int) -> int:
-    """Drop matches whose turn of the image is not one of the most frequent (ORB-SLAM's orientation histogram).
+def keep_common_rotation(best: I32, angle: U8, angle2: U8, bins: int, kept: int) -> int:
+    """Remove matches whose image rotation is not among the most frequent (ORB-SLAM's orientation histogram).
 
-    best: (n,) in and out. angle (n,), angle2 (m,): 1/256 turns. kept: how many of `bins` bins, with their two
-    neighbours counted in, stay. Returns how many matches are left.
+    best: (n,) in and out. angle (n,), angle2 (m,): 1/256 turns. kept: number of `bins` bins that are kept, ranked with
+    their two neighbours counted in. Returns the number of matches left.
     """
     count = np.zeros(bins, np.int64)
     for i in range(best.shape[0]):
         if best[i] >= 0:
-            turn = (int(angle2[best[i]]) - int(angle[i])) & 255
-            count[turn * bins >> 8] += 1
-    stays = np.zeros(bins, np.bool_)
+            rotation = (int(angle2[best[i]]) - int(angle[i])) & 255
+            count[rotation * bins >> 8] += 1
+    is_kept = np.zeros(bins, np.bool_)
     for _ in range(kept):
         top, most = -1, 0
         for k in range(bins):
-            if stays[k]:
+            if is_kept[k]:
                 continue
             around = count[k] * 2 + count[(k + 1) % bins] + count[(k + bins - 1) % bins]
             if around > most:
                 top, most = k, around
         if top >= 0:
-            stays[top] = True
+            is_kept[top] = True
     for i in range(best.shape[0]):
         if best[i] >= 0:
-            turn = (int(angle2[best[i]]) - int(angle[i])) & 255
-            if not stays[turn * bins >> 8]:
+            rotation = (int(angle2[best[i]]) - int(angle[i])) & 255
+            if not is_kept[rotation * bins >> 8]:
                 best[i] = -1
     return _count(best)
 

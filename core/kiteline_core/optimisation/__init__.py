@@ -1,1 +1,1 @@
-"""TODO."""
+"""Poses, points and observations enter; the bundle-adjusted ones leave."""

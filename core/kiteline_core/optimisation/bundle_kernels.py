@@ -3,7 +3,7 @@
 Arrays throughout: cameras (k,12) = rotation row by row and translation of T_c_m; lens (k,5) = fx fy cx cy bf; points
 (n,3) in m; observations sorted by point, inside a point by camera: starts (n + 1,), camera (m,), measured (m,3) = u, v,
 disparity (negative: none) in px, weight (m,2) = 1/sigma^2 of pixel and disparity, active (m,) uint8. free (k,):
-the number of each camera among the free ones, increasing, -1 for a fixed camera. It moves by T_c_m <- Exp(d) T_c_m with
+index of each camera among the free ones, increasing, -1 for a fixed camera. A camera step is T_c_m <- Exp(d) T_c_m with
 d = [translation, rotation].
 """
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from kiteline_core.jit import njit
 
-NEAR_M = 0.02  # a point nearer than this to the camera plane has no image
-BEHIND = 1.0e12  # squared residual charged for such an observation: no step may lead there
+NEAR_M = 0.02  # least depth of a point with an image
+BEHIND = 1.0e12  # squared residual of an observation without an image, so that no step leads there
 
 
 @njit
 def _residual(cameras, c, lens, points, i, measured, weight, o):  # type: ignore[no-untyped-def]
-    """Observation o of point i by camera c: squared norm, residuals, place in the camera (x, y, depth), is seen."""
+    """Observation o of point i by camera c: squared norm, residuals, point in the camera, has an image."""
     p0, p1, p2 = points[i, 0], points[i, 1], points[i, 2]
     x = cameras[c, 0] * p0 + cameras[c, 1] * p1 + cameras[c, 2] * p2 + cameras[c, 9]
     y = cameras[c, 3] * p0 + cameras[c, 4] * p1 + cameras[c, 5] * p2 + cameras[c, 10]
@@ -39,7 +39,7 @@ def _residual(cameras, c, lens, points, i, measured, weight, o):  # type: ignore
 
 @njit
 def squared_residuals(cameras, lens, points, starts, camera, measured, weight, out):  # type: ignore[no-untyped-def]
-    """Squared normalised residual (m,) of every observation, active or not; BEHIND where there is no image."""
+    """Squared normalised residual (m,) of every observation, active or not; BEHIND without an image."""
     for i in range(points.shape[0]):
         for o in range(starts[i], starts[i + 1]):
             out[o] = _residual(cameras, camera[o], lens, points, i, measured, weight, o)[0]
@@ -140,7 +140,7 @@ def linearise(  # type: ignore[no-untyped-def]
 
 @njit
 def reduce(starts, camera, active, free, damping, hcc, bc, hpp, bp, hcp, inv, s, rhs):  # type: ignore[no-untyped-def]
-    """The camera system left when the points are eliminated: upper triangle of s (6f,6f) and rhs (6f,).
+    """Eliminate the points from the normal equations: upper triangle of s (6f,6f) and rhs (6f,).
 
     Diagonals are damped by the factor 1 + damping (Marquardt). inv (n,6): the inverted point blocks. Returns the number
     of pairs of observations that were combined.
@@ -242,7 +242,7 @@ def solve(s, x):  # type: ignore[no-untyped-def]
 def step(  # type: ignore[no-untyped-def]
     cameras, points, starts, camera, active, free, inv, bp, hcp, dx, new_cameras, new_points
 ):
-    """Apply a camera step dx (6f,), and the point steps that follow from it. Returns the largest motion of a camera."""
+    """Apply a camera step dx (6f,) and the resulting point steps. Returns the largest motion of a camera."""
     largest = 0.0
     r = np.empty((3, 3))
     for c in range(cameras.shape[0]):
@@ -293,57 +293,3 @@ def _rotation(x, y, z, r):  # type: ignore[no-untyped-def]
     r[0, 0], r[0, 1], r[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
     r[1, 0], r[1, 1], r[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
     r[2, 0], r[2, 1], r[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
-
-
-@njit
-def _copy(a, out):  # type: ignore[no-untyped-def]
-    """out = a for matrices of one shape."""
-    for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            out[i, k] = a[i, k]
-
-
-@njit
-def minimise(  # type: ignore[no-untyped-def]
-    cameras, lens, points, starts, camera, measured, weight, active, bound, free, trials, stop, hcc, bc, hpp, bp, hcp,
-    inv, s, rhs, new_cameras, new_points, counts,
-):  # fmt: skip
-    """Levenberg-Marquardt in place of cameras and points. counts (3,): trials, linearisations, pairs. Returns the cost.
-
-    Damping after H. Nielsen, "Damping parameter in Marquardt's method", 1999. Ends after `trials` trials, or when a
-    step lowers the cost by less than the fraction `stop`.
-    """
-    damping, growth = 1e-4, 2.0
-    fresh = True
-    cost = 0.0
-    for _ in range(trials):
-        counts[0] += 1
-        if fresh:
-            cost = linearise(
-                cameras, lens, points, starts, camera, measured, weight, active, bound, free, hcc, bc, hpp, bp, hcp
-            )  # fmt: skip
-            counts[1] += 1
-            fresh = False
-        counts[2] += reduce(starts, camera, active, free, damping, hcc, bc, hpp, bp, hcp, inv, s, rhs)
-        if not solve(s, rhs):
-            damping *= growth
-            growth *= 2.0
-            continue
-        step(cameras, points, starts, camera, active, free, inv, bp, hcp, rhs, new_cameras, new_points)
-        new = robust_cost(new_cameras, lens, new_points, starts, camera, measured, weight, active, bound)
-        if new < cost:
-            gain = (cost - new) / cost
-            _copy(new_cameras, cameras)
-            _copy(new_points, points)
-            cost = new
-            fresh = True
-            damping = max(damping * 0.2, 1e-9)
-            growth = 2.0
-            if gain < stop:
-                break
-        else:
-            damping *= growth
-            growth *= 2.0
-            if damping > 1e8:
-                break
-    return cost

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Descriptors of places enter; similar places leave."""

@@ -1,7 +1,7 @@
-"""Places recognised by their descriptors: a tree of binary words, and an inverted index of which place has which.
+"""Place recognition: a visual vocabulary (tree of binary words) and an inverted index from words to places.
 
-(D. Galvez-Lopez, J. Tardos, "Bags of binary words for fast place recognition in image sequences", 2012.) The tree is
-trained once and handed in; places come and go. Whether successive candidates agree is the caller's business.
+Source: D. Galvez-Lopez, J. Tardos, "Bags of binary words for fast place recognition in image sequences", 2012. The
+vocabulary is trained once; consistency of successive candidates is left to the caller.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ U64 = NDArray[np.uint64]
 
 _MAGIC = b"KLW1"
 _HEADER = struct.Struct("<4sBB")
-_IDF_STEP = 1.0 / 24.0  # of the packed logarithm: 255 steps reach words that 1 of 40,000 images has
+_IDF_STEP = 1.0 / 24.0  # of the packed logarithm: 255 steps cover words in 1 of 40,000 images
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +45,19 @@ class Vocabulary:
 
 
 def nodes(branching: int, levels: int) -> int:
-    """How many centres a tree has; the root needs none."""
+    """Number of centres of a tree; the root has none."""
     return sum(branching**level for level in range(1, levels + 1))
 
 
 def pack(vocabulary: Vocabulary) -> bytes:
-    """A vocabulary as the bytes that `unpack` reads; weights are rounded to 1/24."""
+    """Pack a vocabulary into bytes; weights are rounded to 1/24."""
     weight = np.clip(np.rint(vocabulary.weight / _IDF_STEP), 0, 255).astype(np.uint8)
     head: bytes = _HEADER.pack(_MAGIC, vocabulary.branching, vocabulary.levels)
     return b"".join((head, vocabulary.centres.astype("<u8").tobytes(), weight.tobytes()))
 
 
 def unpack(data: bytes) -> Vocabulary:
-    """A vocabulary from its bytes. Raises ValueError when they are none."""
+    """Unpack a vocabulary. Raises ValueError for invalid bytes."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise ValueError(f"no packed words: expected {_MAGIC!r} first, found {data[:4]!r}")
     _, branching, levels = _HEADER.unpack_from(data)
@@ -74,23 +74,23 @@ def unpack(data: bytes) -> Vocabulary:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """keys: (n,) int64 of places, the most alike first. score: (n,) likeness in [0, 1]."""
+    """keys: (n,) int64 of places, most similar first. score: (n,) similarity in [0, 1]."""
 
     keys: I64
     score: F64
 
 
 class PlaceIndex:
-    """Which places look like this one? Keys are the caller's (keyframe ids). Grows as it is filled."""
+    """Index of places by visual words. Keys are the caller's (keyframe ids)."""
 
     def __init__(self, vocabulary: Vocabulary) -> None:
         self._vocabulary = vocabulary
         n = len(vocabulary.weight)
         self._scratch = np.zeros(n)
-        # A word's postings (which place has it, and how much) are a run: start, size, and room to grow.
-        self._start, self._size, self._room = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+        # The postings of a word (place and value) are a run: start, size, and capacity.
+        self._start, self._size, self._capacity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
         self._top = np.zeros(1, np.int32)
-        self._owner, self._worth = np.empty(0, np.int32), np.empty(0, np.float32)
+        self._owner, self._value = np.empty(0, np.int32), np.empty(0, np.float32)
         self._row: dict[int, int] = {}
         self._key = np.empty(0, np.int64)  # of each row; -1 unused
         self._entries: list[tuple[I32, F64]] = []
@@ -104,11 +104,11 @@ class PlaceIndex:
 
     @property
     def keys(self) -> list[int]:
-        """Keys of all places, in the order in which they came."""
+        """Keys of all places, in order of insertion."""
         return list(self._row)
 
     def add(self, key: int, descriptors: U8) -> None:
-        """Remember a place by its descriptors (n,32); what it had before is replaced."""
+        """Add or replace a place with its descriptors (n,32)."""
         self.remove(key)
         word, value = self._vector(descriptors)
         row = self._unused.pop() if self._unused else len(self._entries)
@@ -121,26 +121,27 @@ class PlaceIndex:
         done = 0
         while True:
             done = kernels.insert(
-                word, value, done, row, self._top, self._start, self._size, self._room, self._owner, self._worth
+                word, value, done, row, self._top, self._start, self._size, self._capacity, self._owner, self._value
             )
             if done == len(word):
                 return
             self._grow()
 
     def remove(self, key: int) -> None:
-        """Forget a place; unknown keys are no error."""
+        """Remove a place; unknown keys are ignored."""
         row = self._row.pop(key, None)
         if row is None:
             return
         word, _ = self._entries[row]
-        kernels.remove(word, row, self._start, self._size, self._owner, self._worth)
+        kernels.remove(word, row, self._start, self._size, self._owner, self._value)
         self._entries[row] = (np.empty(0, np.int32), np.empty(0))
         self._key[row] = -1
         self._unused.append(row)
 
     def query(self, descriptors: U8, exclude: Collection[int] = (), limit: int = 10) -> Places:
-        """The `limit` places most alike to descriptors (n,32), without those excluded. Places that share no word
-        never come; of equally alike ones the smaller key comes first.
+        """The `limit` places most similar to descriptors (n,32), without excluded ones.
+
+        Places without a common word are left out; ties are ordered by key.
         """
         total = self._scores(self._vector(descriptors))
         for key in exclude:
@@ -152,14 +153,14 @@ class PlaceIndex:
         rows = rows[np.lexsort((self._key[rows], -total[rows]))[:limit]]
         return Places(self._key[rows], total[rows])
 
-    def likeness(self, key: int, others: Collection[int]) -> F64:
-        """Likeness (n,) of a known place to others, 0 for unknown ones: what a true candidate has to beat."""
+    def similarity(self, key: int, others: Collection[int]) -> F64:
+        """Similarity (n,) of a known place to others, 0 for unknown ones."""
         total = self._scores(self._entries[self._row[key]])
         return np.array([total[self._row[k]] if k in self._row else 0.0 for k in others])
 
     def _scores(self, vector: tuple[I32, F64]) -> F64:
         total = np.zeros(len(self._entries))
-        kernels.score(vector[0], vector[1], self._start, self._size, self._owner, self._worth, total)
+        kernels.score(vector[0], vector[1], self._start, self._size, self._owner, self._value, total)
         return total
 
     def _vector(self, descriptors: U8) -> tuple[I32, F64]:
@@ -170,11 +171,11 @@ class PlaceIndex:
 
     def _grow(self) -> None:
         wanted = np.where(self._size > 0, np.maximum(4, self._size + self._size // 2), 0)
-        self._room = np.minimum(self._room, wanted).astype(np.int32)
-        held, widest = int(self._room.sum()), int(self._room.max())
-        capacity = held + max(held // 2, 2 * widest) + 4096  # any run finds room at the top now
+        self._capacity = np.minimum(self._capacity, wanted).astype(np.int32)
+        held, widest = int(self._capacity.sum()), int(self._capacity.max())
+        capacity = held + max(held // 2, 2 * widest) + 4096  # any run fits at the top now
         owner, worth = np.empty(capacity, np.int32), np.empty(capacity, np.float32)
         kernels.move_runs(
-            self._top, self._start, self._size, self._room, self._owner, self._worth, owner, worth
+            self._top, self._start, self._size, self._capacity, self._owner, self._value, owner, worth
         )  # fmt: skip
-        self._owner, self._worth = owner, worth
+        self._owner, self._value = owner, worth

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Matches between points and pixels enter; camera poses leave."""

@@ -1,4 +1,4 @@
-"""Kernels of absolute pose: P3P in a RANSAC whose draws are seeded by the caller."""
+"""Kernels of P3P in a RANSAC seeded by the caller."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _polish(length: F64, a12: float, a13: float, a23: float, b12: float, b13: fl
 
 @njit
 def _frame(p: F64, q: F64, r: F64, out: F64) -> bool:
-    """Right-handed axes (columns of out (3,3)) that hang on a triangle. False when it has no area."""
+    """Right-handed axes of a triangle as columns of out (3,3). False if it has no area."""
     x0, x1, x2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     y0, y1, y2 = r[0] - p[0], r[1] - p[1], r[2] - p[2]
     n0, n1, n2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
@@ -83,10 +83,10 @@ def _frame(p: F64, q: F64, r: F64, out: F64) -> bool:
 
 @njit
 def p3p(ray: F64, point: F64, T: F64) -> int:
-    """Poses that put three points on three rays (M. Persson, K. Nordberg, "Lambda Twist", 2018).
+    """Poses that project three points onto three rays (M. Persson, K. Nordberg, "Lambda Twist", 2018).
 
     ray: (3,3) unit vectors in the camera, one a row. point: (3,3) m in the map. T: (4,4,4) out: T_c_m of each
-    solution. Returns how many there are, 0 to 4.
+    solution. Returns their number, 0 to 4.
     """
     b12 = -2.0 * (ray[0, 0] * ray[1, 0] + ray[0, 1] * ray[1, 1] + ray[0, 2] * ray[1, 2])
     b13 = -2.0 * (ray[0, 0] * ray[2, 0] + ray[0, 1] * ray[2, 1] + ray[0, 2] * ray[2, 2])
@@ -99,20 +99,20 @@ def p3p(ray: F64, point: F64, T: F64) -> int:
     axes_m = np.empty((3, 3))
     if not _frame(point[0], point[1], point[2], axes_m):
         return 0
-    # One conic of the pencil spanned by the two distance ratios degenerates: its parameter g is a root of a cubic.
+    # The degenerate conic of the pencil spanned by the two distance ratios: its parameter g is a root of a cubic.
     c12, c31, c23 = -0.5 * b12, -0.5 * b13, -0.5 * b23
-    blob = c12 * c23 * c31 - 1.0
+    cross_term = c12 * c23 * c31 - 1.0
     s12, s31, s23 = 1.0 - c12 * c12, 1.0 - c31 * c31, 1.0 - c23 * c23
     p3 = a13 * (a23 * s31 - a13 * s23)
-    p2 = 2.0 * blob * a23 * a13 + a13 * (2.0 * a12 + a13) * s23 + a23 * (a23 - a12) * s31
-    p1 = a23 * (a13 - a23) * s12 - a12 * a12 * s23 - 2.0 * a12 * (blob * a23 + a13 * s23)
+    p2 = 2.0 * cross_term * a23 * a13 + a13 * (2.0 * a12 + a13) * s23 + a23 * (a23 - a12) * s31
+    p1 = a23 * (a13 - a23) * s12 - a12 * a12 * s23 - 2.0 * a12 * (cross_term * a23 + a13 * s23)
     p0 = a12 * (a12 * s23 - a23 * s12)
     if p3 == 0.0:
         return 0
     g = _real_cubic_root(p2 / p3, p1 / p3, p0 / p3)
     x00, x01, x02 = a23 * (1.0 - g), a23 * b12 * 0.5, -a23 * b13 * g * 0.5
     x11, x12, x22 = a23 - a12 + a13 * g, b23 * (a13 * g - a12) * 0.5, g * (a13 - a23) - a12
-    # Its two eigenvalues that are not 0 give the two lines.
+    # Its two nonzero eigenvalues give the two lines.
     b = -x00 - x11 - x22
     c = -x01 * x01 - x02 * x02 - x12 * x12 + x00 * (x11 + x22) + x11 * x22
     root = b * b - 4.0 * c
@@ -200,10 +200,10 @@ def p3p_ransac(
     point: F64, uv: F64, limit_px: F64, camera: F64, most_draws: int, confidence: float, state: U64, T_c_m: F64,
     inlier: Bools,
 ) -> int:  # fmt: skip
-    """The pose of most support over random triples. point: (n,3) m, n >= 3. uv: (n,2) px. limit_px: (n,) of an inlier.
+    """The pose of least cost over random triples. point: (n,3) m, n >= 3. uv: (n,2) px. limit_px: (n,) of an inlier.
 
-    camera: fx, fy, cx, cy. state: (1,) uint64 seed, in and out. T_c_m: (4,4) out. inlier: (n,) out. Returns how many
-    inliers; 0 when no triple has a pose.
+    camera: fx, fy, cx, cy. state: (1,) uint64 seed, in and out. T_c_m: (4,4) out. inlier: (n,) out. Returns the
+    number of inliers.
     """
     n = point.shape[0]
     pick = np.empty(3, np.int64)

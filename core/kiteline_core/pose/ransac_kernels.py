@@ -1,4 +1,4 @@
-"""What every RANSAC here needs: seeded draws, how many, and what a pose costs."""
+"""Kernels shared by all RANSACs: seeded draws, their number, and the cost of a pose."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw(state: U64, n: int) -> int:
 
 @njit
 def draws_needed(share: float, confidence: float, most: int) -> int:
-    """Draws of three after which one without outliers has come with the given confidence."""
+    """Number of draws of three until one has no outlier with the given confidence. share: of inliers."""
     bad = 1.0 - share * share * share
     if bad <= 0.0:
         return 1
@@ -36,6 +36,7 @@ def draws_needed(share: float, confidence: float, most: int) -> int:
 
 @njit
 def three(state: U64, n: int, pick: I64) -> None:
+    """Draw three different numbers in [0, n) into pick (3,)."""
     pick[0] = draw(state, n)
     pick[1] = draw(state, n - 1)
     if pick[1] >= pick[0]:

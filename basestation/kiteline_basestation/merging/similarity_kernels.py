@@ -1,4 +1,4 @@
-"""Kernels of the motion, with or without scale, between two sets of points, in a RANSAC seeded by the caller."""
+"""Kernels of point-set alignment, with or without scale, in a RANSAC seeded by the caller."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ U64 = NDArray[np.uint64]
 def align_points(a: F64, b: F64, chosen: Bools, with_scale: bool, S_a_b: F64) -> bool:
     """Least-squares similarity a = S_a_b b over the chosen rows (B. Horn, 1987; scale symmetric in a and b).
 
-    a, b: (n,3). S_a_b: (4,4) out, its upper left part scale times rotation. False when the points leave it open.
+    a, b: (n,3). S_a_b: (4,4) out, its upper left part scale times rotation. False if degenerate.
     """
     n = 0
     mean_a, mean_b = np.zeros(3), np.zeros(3)
@@ -72,7 +72,7 @@ def align_points(a: F64, b: F64, chosen: Bools, with_scale: bool, S_a_b: F64) ->
 
 @njit
 def _largest_eigenvector(h: F64, q: F64) -> bool:
-    """Unit eigenvector of the largest eigenvalue of a symmetric (4,4), by Jacobi rotations. False when two tie."""
+    """Unit eigenvector of the largest eigenvalue of a symmetric (4,4), by Jacobi rotations. False if two are equal."""
     v = np.eye(4)
     scale = 0.0
     for i in range(4):
@@ -129,12 +129,13 @@ def _invert(S: F64, out: F64) -> None:
 
 
 @njit
-def _take_over(S: F64, mine: Bools, S_a_b: F64, inlier: Bools) -> None:
+def _store(S: F64, marked: Bools, S_a_b: F64, inlier: Bools) -> None:
+    """Copy a similarity and its inliers to the outputs."""
     for i in range(4):
         for j in range(4):
             S_a_b[i, j] = S[i, j]
-    for i in range(mine.shape[0]):
-        inlier[i] = mine[i]
+    for i in range(marked.shape[0]):
+        inlier[i] = marked[i]
 
 
 @njit
@@ -142,17 +143,17 @@ def align_ransac(
     a: F64, uv_a: F64, limit_a_px: F64, camera_a: F64, b: F64, uv_b: F64, limit_b_px: F64, camera_b: F64,
     with_scale: bool, most_draws: int, confidence: float, state: U64, S_a_b: F64, inlier: Bools,
 ) -> int:  # fmt: skip
-    """The similarity between two views' points that most pairs support, in both images.
+    """The similarity between the points of two views with the most inliers in both images.
 
-    a, b: (n,3) m in either camera, n >= 3. uv_*: (n,2) px at which each is seen there. limit_*_px: (n,). camera_*: fx,
+    a, b: (n,3) m in either camera, n >= 3. uv_*: (n,2) px of each. limit_*_px: (n,). camera_*: fx,
     fy, cx, cy. state: (1,) uint64 seed, in and out. S_a_b: (4,4) out. inlier: (n,) out: the pair reprojects within the
-    limits both ways. Returns how many inliers, 0 for none.
+    limits both ways. Returns the number of inliers.
     """
     n = a.shape[0]
     pick = np.empty(3, np.int64)
     three_a, three_b, all3 = np.empty((3, 3)), np.empty((3, 3)), np.ones(3, np.bool_)
     S, back = np.empty((4, 4)), np.empty((4, 4))
-    mine = np.empty(n, np.bool_)
+    marked = np.empty(n, np.bool_)
     count, needed, k = 0, most_draws, 0
     while k < needed:
         k += 1
@@ -163,19 +164,19 @@ def align_ransac(
         if not align_points(three_a, three_b, all3, with_scale, S):
             continue
         _invert(S, back)
-        support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, mine)
+        support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, marked)
         if support <= count:
             continue
-        # Every new best is fitted to its support, as long as that grows it.
+        # Refit each new best similarity to its inliers while their number grows.
         while support > count:
             count = support
-            _take_over(S, mine, S_a_b, inlier)
+            _store(S, marked, S_a_b, inlier)
             if not align_points(a, b, inlier, with_scale, S):
                 break
             _invert(S, back)
-            support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, mine)
+            support = _mark_pairs(S, back, a, uv_a, limit_a_px, camera_a, b, uv_b, limit_b_px, camera_b, marked)
         if support == count:
-            _take_over(S, mine, S_a_b, inlier)
+            _store(S, marked, S_a_b, inlier)
         needed = draws_needed(count / n, confidence, most_draws)
     if count == 0:
         for i in range(n):

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 from kiteline_core.geometry.se3 import from_rt, so3_exp
-from kiteline_core.imaging import stereo_kernels
 
 RADIUS = stereo_kernels.RADIUS
 RECTIFIED = np.zeros((0, 0, 2), np.float32)

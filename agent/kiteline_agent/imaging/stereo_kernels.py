@@ -1,23 +1,23 @@
-"""Stereo along the row of a rectified pair: coarse search, then sub-pixel alignment in one dimension."""
+"""Kernels of row-wise stereo matching: coarse search, then sub-pixel alignment in one dimension."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from kiteline_core.geometry.cameras import GRID_STEP
 from kiteline_core.jit import njit
 
 RADIUS = 4
 SIDE = 2 * RADIUS + 1
-FINE_STEP_PX = 2.0  # px of the finer level: what the coarser one, or a sure prediction, leaves
-GRID_STEP = 4  # px; between grid points a lens bends by less than 0.01 px
+FINE_STEP_PX = 2.0  # px of the finer level: error left by the coarser one, or by a good prediction
 
 
 @njit
 def _row_costs(patch, image, y, first, mean, total, cost):  # type: ignore[no-untyped-def]
-    """Zero-mean SAD of a patch (SIDE, SIDE) int16 with those whose left columns are `first` and the next (n,) of a row.
+    """Zero-mean SAD of a patch (SIDE, SIDE) int16 with n candidates of a row, the first at left column `first`.
 
-    mean: of the patch. total, cost: (n,) int32, out: sums of the other patches, and their costs. All candidates are
-    done side by side, so that the loops become vectors; unsigned indices spare them the check for negative ones.
+    mean: of the patch. total, cost: (n,) int32, out: sums of the candidates, and their costs. The loops run over the
+    candidates, with unsigned indices (no check for negative ones), so that they are vectorised.
     """
     n = cost.shape[0]
     for k in range(n):
@@ -49,7 +49,7 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
     """Coarse disparity of pixels by zero-mean SAD over whole rows, at pyramid level max(octave, 1).
 
     left, right: tuples of uint8 pyramids. uv: (n,2) level-0 px. uniqueness: the second-best cost must exceed this
-    factor of the best. disparity: (n,) float64 out, level-0 px, -1 where there is no sure match.
+    factor of the best. disparity: (n,) float64 out, level-0 px, -1 without a unique match.
     """
     levels = len(left)
     patch = np.empty((SIDE, SIDE), np.int16)
@@ -137,7 +137,7 @@ def _cut(image, x, y, patch, gradient):  # type: ignore[no-untyped-def]
 
 @njit
 def _strip_of(image, first, columns, y, strip):  # type: ignore[no-untyped-def]
-    """Fill strip (SIDE, >= columns) with rows around y of a level, from column `first` on."""
+    """Fill strip (SIDE, >= columns) with the rows around y of a level, from column `first` on."""
     y0 = int(y)
     fy = y - y0
     for r in range(SIDE):
@@ -148,7 +148,7 @@ def _strip_of(image, first, columns, y, strip):  # type: ignore[no-untyped-def]
 
 @njit
 def _raw_at(grid, x, y):  # type: ignore[no-untyped-def]
-    """Where pixel (x, y) of the rectified image lies in the raw one. grid: (gh,gw,2) float32, every GRID_STEP px."""
+    """Raw pixel of the rectified pixel (x, y). grid: (gh,gw,2) float32, every GRID_STEP px."""
     gx = min(max(x * (1.0 / GRID_STEP), 0.0), grid.shape[1] - 1.001)
     gy = min(max(y * (1.0 / GRID_STEP), 0.0), grid.shape[0] - 1.001)
     x0 = int(gx)
@@ -166,8 +166,9 @@ def _raw_at(grid, x, y):  # type: ignore[no-untyped-def]
 
 @njit
 def _raw_strip_of(image, grid, scale, first, columns, y, strip):  # type: ignore[no-untyped-def]
-    """The same strip of the rectified image, from the raw one. Along a row the lens is a parabola through three
-    pixels: over the 140 px of the coarsest level that is exact to 0.02 px of it. False where the raw image ends.
+    """Fill the strip by rectifying the raw image; False outside of it.
+
+    Distortion along a row is a parabola through three pixels: accurate to 0.02 px over the coarsest level.
     """
     h, w = image.shape
     last = columns - 1.0
@@ -199,7 +200,7 @@ def _raw_strip_of(image, grid, scale, first, columns, y, strip):  # type: ignore
 
 @njit
 def _slide(strip, first, patch, gradient, tt, hess, begin, width, iterations, max_step_px):  # type: ignore[no-untyped-def]
-    """Slide along a strip until it looks like the patch. Returns where (px of the level), and the correlation."""
+    """Align the patch along a strip. Returns the column (px of the level) and the correlation, -1 on failure."""
     xr = begin
     ncc = 0.0
     converged = False
@@ -237,11 +238,11 @@ def _slide(strip, first, patch, gradient, tt, hess, begin, width, iterations, ma
 def refine_rows(left, right, grid, uv, octave, sure, iterations, max_step_px, min_ncc, disparity, found):  # type: ignore[no-untyped-def]
     """Sub-pixel disparity by 1-D Lucas-Kanade, invariant to gain and offset, at level `octave` (and one coarser first).
 
-    grid: (0,0,2) where `right` is rectified; else `right` is the raw image's pyramid, and grid (gh,gw,2) float32 says
-    where every GRID_STEP-th rectified pixel lies in it: only what is looked at is rectified.
-    sure: (n,) bool, the prediction is good to a pixel of its octave: the coarser level is left out.
+    grid: (0,0,2) if `right` is rectified; else `right` is the raw image's pyramid, and grid (gh,gw,2) float32 the raw
+    pixel of every GRID_STEP-th rectified one, so that only the strips are rectified.
+    sure: (n,) bool, the prediction is good to a pixel of its octave: the coarser level is skipped.
     disparity: (n,) float64 px at level 0: prediction in (negative: skip), result out. found: (n,) bool out.
-    max_step_px: how far the match may lie from the prediction, in px of the level.
+    max_step_px: largest distance of the match from the prediction, in px of the level.
     """
     levels = len(left)
     patch = np.empty((SIDE, SIDE))
