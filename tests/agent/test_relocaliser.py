@@ -245,7 +245,7 @@ def copy_map(agent: Agent, shift_m: np.ndarray) -> None:
     m = agent.map
     for slot in np.flatnonzero(m.keyframe != NO_KEYFRAME).tolist():
         n = int(m.counts[slot])
-        rows = slice(slot * m.births, slot * m.births + n)
+        rows = slice(slot * m.slot_size, slot * m.slot_size + n)
         T_m_k = m.T_m_k[slot].copy()
         T_m_k[:3, 3] += shift_m
         copy = KeyframeId(int(m.keyframe[slot]) + 1000)

@@ -121,13 +121,13 @@ class PoseCovariance:
         m = self._map
         sensitivity(
             track.T_c_m, m.intrinsics, 0.5 * m.camera.width, track.rows, track.inlier, track.xyz, track.ray,
-            track.observed, track.sigma_px, m.births, m.T_m_k, m.uv.reshape(-1, 2), m.rho.reshape(-1), self._shift_k,
+            track.observed, track.sigma_px, m.slot_size, m.T_m_k, m.uv.reshape(-1, 2), m.rho.reshape(-1), self._shift_k,
             self._h, self._g,
         )  # fmt: skip
         inverse = np.linalg.inv(self._h + 1e-6 * np.eye(6))
         a = adjoint(se3.inverse(track.T_c_m))
         noise = max(track.rms, self._config.least_rms) ** 2 * self._config.inflation * inverse
-        seen = np.bincount(track.rows[track.inlier] // m.births)
+        seen = np.bincount(track.rows[track.inlier] // m.slot_size)
         slots = np.flatnonzero(seen)
         share = seen[slots] / max(int(seen.sum()), 1)
         self._noise = a @ (noise + self._imu_offset_cov) @ a.T + np.tensordot(share, self._noise_k[slots], 1)

@@ -1,8 +1,9 @@
-"""What the base says: corrections of the local map, copies, where submaps lie in the world, tiles of the grid."""
+"""Records of the base: corrections of the local map, cached keyframes, submap placements, grid tiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ F64 = NDArray[np.float64]
 
 
 class Corrections:
-    """Takes records to where they belong, and knows the world as far as the base told of it."""
+    """Applies the base's records, one handler for each kind, and holds where submaps lie in the world."""
 
     def __init__(self, local_map: LocalMap, cache: MapCache, smoothing: SmoothingConfig) -> None:
         self._map = local_map
@@ -42,60 +43,79 @@ class Corrections:
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self.tiles: dict[tuple[int, int], GridTile] = {}
+        # A handler returns whether the local map moved.
+        self._handlers: Mapping[type[Record], Callable[[Any], bool]] = {
+            KeyframePose: local_map.set_pose,
+            RefinedLandmarks: local_map.refine,
+            FusedLandmarks: local_map.fuse,
+            RemovedObservations: local_map.remove,
+            CulledLandmarks: local_map.remove,
+            SubmapPlacement: self._place,
+            CachedKeyframe: cache.store,
+            CachedLandmarks: cache.store,
+            DisparityCalibration: self._calibrate,
+            GridTile: self._add_tile,
+        }
+        self._events: list[str] = []  # of the records that are being applied
 
     def take(self, records: Sequence[Record], removed: Sequence[Key]) -> tuple[bool, list[str]]:
         """Apply records, and drop what the base removed. Returns whether the local map moved, and events."""
-        touched, events = False, list[str]()
+        self._events = []
+        moved = False
         for record in records:
-            if isinstance(
-                record, KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
-            ):
-                touched |= self._map.apply(record)
-            elif isinstance(record, SubmapPlacement):
-                self._S_w_m[record.submap] = record.S_w_m
-                if record.recognised:
-                    self._recognised.add(record.submap)
-                else:
-                    self._recognised.discard(record.submap)
-            elif isinstance(record, CachedKeyframe | CachedLandmarks):
-                self._cache.store(record)
-            elif isinstance(record, DisparityCalibration) and self._map.camera.stereo:
-                self._map.set_disparity_offset(record.disparity_px)
-                events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
-            elif isinstance(record, GridTile):
-                self.tiles[record.column, record.row] = record
+            handler = self._handlers.get(type(record))
+            if handler is not None:
+                moved |= handler(record)
         self._cache.remove(removed)
         for key in removed:
-            if key.kind == SubmapPlacement.KIND:  # the map was taken out of a larger one, and has no place any more
+            if key.kind == SubmapPlacement.KIND:  # its merge was undone, and its place is not known yet
                 self._S_w_m.pop(SubmapId(key.id), None)
                 self._recognised.discard(SubmapId(key.id))
-        if touched:
+        if moved:
             self._map.compose_unplaced()
-        return touched, events
+        return moved, self._events
+
+    def _place(self, record: SubmapPlacement) -> bool:
+        self._S_w_m[record.submap] = record.S_w_m
+        if record.recognised:
+            self._recognised.add(record.submap)
+        else:
+            self._recognised.discard(record.submap)
+        return False
+
+    def _calibrate(self, record: DisparityCalibration) -> bool:
+        if self._map.camera.stereo:
+            self._map.set_disparity_offset(record.disparity_px)
+            self._events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
+        return False
+
+    def _add_tile(self, record: GridTile) -> bool:
+        self.tiles[record.column, record.row] = record
+        return False
 
     def is_recognised(self, submap: SubmapId) -> bool:
         """True if the base merged a submap with another one: its pose there rests on more than odometry."""
         return submap in self._recognised
 
-    def set_upright(self, level: GravityAlignment) -> None:
-        """Where a submap lies until the base says so, who sets it upright too; over a thin link that takes seconds."""
-        self._S_w_m.setdefault(level.submap, level.T_l_m)
+    def set_upright(self, alignment: GravityAlignment) -> None:
+        """Place a gravity-aligned submap until the base does, which takes seconds over a thin link."""
+        self._S_w_m.setdefault(alignment.submap, alignment.T_l_m)
 
     def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int) -> F64 | None:
-        """T_w_b (4,4) as it is told: corrections arrive at once, or slowly. None where the submap has no place yet.
+        """T_w_b (4,4), with corrections smoothed; None if the submap is not placed.
 
-        Odometry has the unit of length of the submap; where one eye's is not the world's, its place says the scale.
+        m and o share a unit of length; if w has another one, as with a monocular camera, the placement has a scale.
         """
         S_w_m = self._S_w_m.get(submap)
         if S_w_m is None:
             return None
         if not self._smoothing.on:
-            return self._in_unit(S_w_m, T_m_b)
+            return self._body_in_world(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b
-        return self._in_unit(self._smoothing.follow(S_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns), T_o_b)
+        return self._body_in_world(self._smoothing.follow(S_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns), T_o_b)
 
-    def _in_unit(self, S_w_x: F64, T_x_b: F64) -> F64:
-        """T_w_b (4,4) of a body; the arm from eye to body is in metres, whatever the unit in which the eye measures."""
+    def _body_in_world(self, S_w_x: F64, T_x_b: F64) -> F64:
+        """T_w_b (4,4). S_w_x scales the camera's position, but not the lever arm to the body, which is in metres."""
         if sim3.scale_of(S_w_x) == 1.0:
             return S_w_x @ T_x_b
         T_b_c = self._map.camera.T_b_c

@@ -1,4 +1,4 @@
-"""The channel of an agent that flies without a base: nothing is sent, nothing comes."""
+"""The channel of an agent without a base: nothing is sent or received."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from kiteline_codec.schema import Key, LivePose, Record, messages
 
 
 class NoBaseChannel:
-    """A RecordChannel with nobody at the other end."""
+    """A RecordChannel without another end; can collect what was put for a log."""
 
     profile = EXACT
 
     def __init__(self) -> None:
-        self.noting = False  # whether `take_noted` will be asked
+        self.noting = False  # collect records for `take_noted`
         self._noted: dict[Key, Record] = {}
 
     def keyframe_gap_ns(self) -> int:
-        """None: there is no link."""
+        """0: there is no link."""
         return 0
 
     def arrived(self, key: Key) -> bool:
-        """Nobody waits for it."""
+        """True: nothing waits for an acknowledgement."""
         return True
 
     def put(self, record: Record) -> Record:
-        """The record as it is: no code has rounded it."""
+        """The record itself, not quantised."""
         if self.noting and not isinstance(record, LivePose):
             self._noted[messages.key(record)] = record
         return record
 
     def take_noted(self) -> dict[Key, bytes]:
-        """The codes of what was put since the last call, live poses left out: for a log, while `noting`."""
+        """Codes of the records put since the last call but for live poses, while `noting`."""
         noted, self._noted = self._noted, {}
         return {key: messages.encode(record) for key, record in noted.items()}
 
     def remove(self, key: Key) -> None:
-        """Nothing was shared, so nothing is taken back."""
+        """Do nothing: nothing was shared."""
 
     def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
         """Nothing."""

@@ -1,4 +1,4 @@
-"""How a correction reaches the live pose: at once, or as a slow motion of the odometry frame in the world."""
+"""Smooths corrections of the live pose: the odometry frame moves in the world at a limited speed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ F64 = NDArray[np.float64]
 
 
 class Smoothing:
-    """Where the odometry frame lies in the world, as it is told: it follows where it truly lies."""
+    """The reported pose of the odometry frame in the world, which follows the corrected one."""
 
     def __init__(self, config: SmoothingConfig) -> None:
         self._config = config
@@ -21,13 +21,14 @@ class Smoothing:
 
     @property
     def on(self) -> bool:
-        """Whether corrections are told slowly."""
+        """True if corrections are smoothed."""
         return self._config.max_m_s > 0.0 or self._config.max_rad_s > 0.0
 
     def follow(self, T_w_o: F64, here_o: F64, t_ns: int) -> F64:
-        """T_w_o (4,4) to be told at a time, where it should be this one. here_o: (3,) m, where the vehicle is in o:
-        about it the frame turns, and there its motion is measured. With a scale where w has another unit of length
-        than o; that is told at once, about where the vehicle is.
+        """The pose (4,4) to report for the corrected T_w_o (4,4). here_o: (3,) m, vehicle in o.
+
+        The frame rotates about the vehicle, and its speed is measured there. A scale, if w has another unit of length
+        than o, is applied at once.
         """
         dt_s, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
         limits = self._config
@@ -36,20 +37,20 @@ class Smoothing:
             return T_w_o
         held = self._T_w_o
         moved = se3.transform(T_w_o, here_o[None])[0] - se3.transform(held, here_o[None])[0]
-        turned = se3.so3_log(sim3.rigid(T_w_o)[:3, :3] @ sim3.rigid(held)[:3, :3].T)
-        way, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(turned))
-        if way > limits.snap_m:
+        rotation = se3.so3_log(sim3.rigid(T_w_o)[:3, :3] @ sim3.rigid(held)[:3, :3].T)
+        distance, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(rotation))
+        if distance > limits.snap_m:
             self._T_w_o = T_w_o
             return T_w_o
-        share = 1.0  # of the correction, that may be told within this time: motion and turn end together
-        if limits.max_m_s > 0.0 and way > 0.0:
-            share = min(share, limits.max_m_s * dt_s / way)
+        share = 1.0  # of the correction, applied in this time: translation and rotation end together
+        if limits.max_m_s > 0.0 and distance > 0.0:
+            share = min(share, limits.max_m_s * dt_s / distance)
         if limits.max_rad_s > 0.0 and angle > 0.0:
             share = min(share, limits.max_rad_s * dt_s / angle)
         if share >= 1.0:
             self._T_w_o = T_w_o
             return T_w_o
-        R = se3.so3_exp(share * turned) @ sim3.rigid(held)[:3, :3]
+        R = se3.so3_exp(share * rotation) @ sim3.rigid(held)[:3, :3]
         at = se3.transform(held, here_o[None])[0] + share * moved
         scale = sim3.scale_of(T_w_o)
         self._T_w_o = sim3.normalise(sim3.of(scale, se3.from_rt(R, at - scale * R @ here_o)))

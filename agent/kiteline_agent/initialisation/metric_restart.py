@@ -46,7 +46,7 @@ def metric_points(ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: 
     inside = (uv >= margin).all(axis=1) & (uv < np.array([camera.width, camera.height]) - margin).all(axis=1)
     keep = np.flatnonzero(track.inlier & inside)
     relative = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]  # deviation of depth over depth
-    keep = keep[np.argsort(relative, kind="stable")[: local_map.births]]
+    keep = keep[np.argsort(relative, kind="stable")[: local_map.slot_size]]
     keep = keep[np.lexsort((uv[keep, 0], uv[keep, 1] // ctx.config.detector.cell_px))]
     rho = 1.0 / (unit_m * track.depth_m[keep])
     relative = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]

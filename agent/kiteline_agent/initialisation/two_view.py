@@ -1,9 +1,8 @@
-"""The motion between two views of one camera, and the points they share, from matched pixels alone.
+"""Relative pose of two views and the points in both, from matched pixels; the distance between the views is 1.
 
-A homography and a fundamental matrix are fitted side by side; the ratio of their scores says whether the scene is flat
-or the motion a mere turn (R. Mur-Artal, J. Montiel, J. Tardos, "ORB-SLAM", 2015, section IV). The motion that a matrix
-allows and that puts most points in front of both views is refined by a bundle of the two. The scale is free: the
-distance between the views is 1.
+A homography and a fundamental matrix are fitted; the ratio of their scores tells a flat scene or a pure rotation
+(R. Mur-Artal, J. Montiel, J. Tardos, "ORB-SLAM", 2015, section IV). The motion that puts most points in front of both
+views is refined by bundle adjustment.
 """
 
 from __future__ import annotations
@@ -25,23 +24,23 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class TwoViewConfig:
-    """What two views must show before a map is built on them."""
+    """What two views must show to begin a map."""
 
     draws: int = 200  # RANSAC draws of each model: 8 good points of 60 % come up with 97 %
     sigma_px: float = 1.0  # one standard deviation of a matched pixel
     flat_ratio: float = 0.45  # R_H above which the homography is the model
-    min_points: int = 100  # points with depth; fewer carry no map
-    min_share: float = 0.7  # of the model's inliers: a motion that explains fewer is not the one
-    rival_share: float = 0.75  # a second motion that explains this share of the best one's points makes both unsure
-    min_parallax_rad: float = 0.0175  # 1 degree, median over the points: below it depth is noise
-    min_point_parallax_rad: float = 0.005  # a point below it has no depth of its own
-    reprojection_px: float = 2.0  # px that a point may lie from where it was matched
+    min_points: int = 100  # points with depth that a map needs
+    min_share: float = 0.7  # of the model's inliers that the motion must explain
+    rival_share: float = 0.75  # share of the best motion's points with which a second motion makes both ambiguous
+    min_parallax_rad: float = 0.0175  # rad: 1 degree, median over the points; below it depth is noise
+    min_point_parallax_rad: float = 0.005  # rad: with less a point has no depth
+    reprojection_px: float = 2.0  # px: largest reprojection error of a point
     bundle: BundleConfig = field(default_factory=BundleConfig)
 
 
 @dataclass(frozen=True, slots=True)
 class TwoView:
-    """What two views say. T_b_a: (4,4), its translation has length 1. points: (n,3) in a. good: (n,) whether a point
+    """Result. T_b_a: (4,4), its translation has length 1. points: (n,3) in a. good: (n,) True if a point
     has a depth. flat: the homography was chosen. ratio: R_H. parallax_rad: median over the good points.
     """
 
@@ -54,7 +53,7 @@ class TwoView:
 
 
 def two_view(uv_a: F64, uv_b: F64, camera: F64, config: TwoViewConfig, seed: int) -> TwoView | None:
-    """Motion and points from pixels (n,2) that two views share; None where they do not tell. camera: fx fy cx cy."""
+    """Motion and points from pixels (n,2) that two views share; None if they are ambiguous. camera: fx fy cx cy."""
     if len(uv_a) < max(config.min_points, 8):
         return None
     flat, ratio, model, fitted = _choose_model(uv_a, uv_b, config, seed)
@@ -72,7 +71,7 @@ def two_view(uv_a: F64, uv_b: F64, camera: F64, config: TwoViewConfig, seed: int
 
 
 def _choose_model(uv_a: F64, uv_b: F64, config: TwoViewConfig, seed: int) -> tuple[bool, float, F64, Bool]:
-    """Whether the homography fits better, R_H, the chosen matrix, and its inliers (n,)."""
+    """True if the homography fits better, R_H, the chosen matrix, and its inliers (n,)."""
     h, h_score, h_in = two_view_models.homography(uv_a, uv_b, config.draws, config.sigma_px, seed)
     f, f_score, f_in = two_view_models.fundamental(uv_a, uv_b, config.draws, config.sigma_px, seed)
     ratio = h_score / max(h_score + f_score, 1e-9)
@@ -103,7 +102,7 @@ def _homography_motions(h: F64, matrix: F64) -> list[F64]:
 
 
 def _depths(T_b_a: F64, uv_a: F64, uv_b: F64, fitted: Bool, camera: F64, config: TwoViewConfig) -> tuple[F64, Bool]:
-    """Points (n,3) in a where the rays meet, and which of them lie before both views and where they were matched."""
+    """Triangulated points (n,3) in a, and which lie in front of both views with a small reprojection error."""
     n = len(uv_a)
     lens, T_a_b = np.tile(camera, (n, 1)), se3.inverse(T_b_a)
     places = np.tile(np.eye(4), (n, 1, 1)), np.tile(T_a_b, (n, 1, 1))
@@ -122,7 +121,7 @@ def _refined(
     T_b_a: F64, points: F64, front: Bool, uv_a: F64, uv_b: F64, camera: F64, flat: bool, ratio: float,
     config: TwoViewConfig,
 ) -> TwoView | None:  # fmt: skip
-    """The bundle of the two views, brought back to a distance of 1, and the verdict on it."""
+    """Bundle adjustment of the two views, rescaled to a distance of 1; None if parallax or points are too few."""
     rows = np.flatnonzero(front)
     m = 2 * len(rows)
     measured = np.full((m, 3), -1.0)

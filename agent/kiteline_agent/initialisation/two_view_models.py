@@ -1,7 +1,7 @@
 """Homography and fundamental matrix of matched pixels, by seeded RANSAC on normalised points.
 
 All draws are fitted and scored at once, as stacks of small matrices. Scores are those of ORB-SLAM (2015, section IV):
-each match that a model explains adds what it lies below the bound for outliers, so scores of both models compare.
+each inlier adds its distance to the outlier bound, so that scores of both models compare.
 """
 
 from __future__ import annotations
@@ -14,37 +14,37 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-_CHI2_POINT = 5.991  # 95 % of a chi-square with 2 degrees of freedom: a point from a point
-_CHI2_LINE = 3.841  # 95 % with 1 degree of freedom: a point from a line
+_CHI2_POINT = 5.991  # 95 % of a chi-square with 2 degrees of freedom: point to point
+_CHI2_LINE = 3.841  # 95 % with 1 degree of freedom: point to line
 
 
 def homography(a: F64, b: F64, draws: int, sigma_px: float, seed: int) -> tuple[F64, float, Bool]:
-    """H (3,3) with b = H a for pixels a, b (n,2), n >= 8; its score, and which matches it explains (n,)."""
-    return _ransac(a, b, 4, draws, sigma_px, seed, _fit_homographies, _judge_homographies)
+    """H (3,3) with b = H a for pixels a, b (n,2), n >= 8; its score, and its inliers (n,)."""
+    return _ransac(a, b, 4, draws, sigma_px, seed, _fit_homographies, _score_homographies)
 
 
 def fundamental(a: F64, b: F64, draws: int, sigma_px: float, seed: int) -> tuple[F64, float, Bool]:
-    """F (3,3) with b' F a = 0 for pixels a, b (n,2), n >= 8; its score, and which matches it explains (n,)."""
-    return _ransac(a, b, 8, draws, sigma_px, seed, _fit_fundamentals, _judge_fundamentals)
+    """F (3,3) with b' F a = 0 for pixels a, b (n,2), n >= 8; its score, and its inliers (n,)."""
+    return _ransac(a, b, 8, draws, sigma_px, seed, _fit_fundamentals, _score_fundamentals)
 
 
 def _ransac(
     a: F64, b: F64, size: int, draws: int, sigma_px: float, seed: int,
-    fit: Callable[[F64, F64], F64], judge: Callable[[F64, F64, F64, float], tuple[F64, Bool]],
+    fit: Callable[[F64, F64], F64], score_models: Callable[[F64, F64, F64, float], tuple[F64, Bool]],
 ) -> tuple[F64, float, Bool]:  # fmt: skip
     scale_a, scale_b = _normalisation(a), _normalisation(b)
     na, nb = _apply(scale_a, a), _apply(scale_b, b)
     turn = scale_b.T if fit is _fit_fundamentals else np.linalg.inv(scale_b)
     chosen = np.argpartition(np.random.default_rng(seed).random((draws, len(a))), size, axis=1)[:, :size]
     models = turn @ fit(na[chosen], nb[chosen]) @ scale_a
-    scores, inside = judge(models, a, b, sigma_px)
+    scores, inside = score_models(models, a, b, sigma_px)
     best = int(np.argmax(scores))
     model, score, inlier = models[best], float(scores[best]), inside[best]
-    for _ in range(2):  # least squares over all that it explains, while that explains more
+    for _ in range(2):  # least squares over the inliers, while the score grows
         if np.count_nonzero(inlier) < 8:
             break
         wider = turn @ fit(na[None, inlier], nb[None, inlier]) @ scale_a
-        scores, inside = judge(wider, a, b, sigma_px)
+        scores, inside = score_models(wider, a, b, sigma_px)
         if scores[0] <= score:
             break
         model, score, inlier = wider[0], float(scores[0]), inside[0]
@@ -90,13 +90,13 @@ def _fit_fundamentals(a: F64, b: F64) -> F64:
     return np.asarray((left * s[:, None, :]) @ right)
 
 
-def _judge_homographies(models: F64, a: F64, b: F64, sigma_px: float) -> tuple[F64, Bool]:
+def _score_homographies(models: F64, a: F64, b: F64, sigma_px: float) -> tuple[F64, Bool]:
     """Scores (s,) of H (s,3,3), and which matches each explains (s,n)."""
     regular = np.abs(np.linalg.det(models)) > 1e-15
     models = np.where(regular[:, None, None], models, np.eye(3))
     inverses: F64 = np.asarray(np.linalg.inv(models), np.float64)
     forth, back = _squared_transfer(models, a, b), _squared_transfer(inverses, b, a)
-    scores, inside = _score(forth / sigma_px**2, back / sigma_px**2, _CHI2_POINT)
+    scores, inside = _score_errors(forth / sigma_px**2, back / sigma_px**2, _CHI2_POINT)
     return np.where(regular, scores, 0.0), inside
 
 
@@ -107,10 +107,10 @@ def _squared_transfer(models: F64, a: F64, b: F64) -> F64:
     return np.asarray(((mapped[..., :2] / w[..., None] - b) ** 2).sum(axis=-1))
 
 
-def _judge_fundamentals(models: F64, a: F64, b: F64, sigma_px: float) -> tuple[F64, Bool]:
+def _score_fundamentals(models: F64, a: F64, b: F64, sigma_px: float) -> tuple[F64, Bool]:
     """Scores (s,) of F (s,3,3), and which matches each explains (s,n)."""
     forth, back = _squared_line(models, a, b), _squared_line(np.swapaxes(models, 1, 2), b, a)
-    return _score(forth / sigma_px**2, back / sigma_px**2, _CHI2_LINE)
+    return _score_errors(forth / sigma_px**2, back / sigma_px**2, _CHI2_LINE)
 
 
 def _squared_line(models: F64, a: F64, b: F64) -> F64:
@@ -120,7 +120,7 @@ def _squared_line(models: F64, a: F64, b: F64) -> F64:
     return np.asarray(off**2 / np.maximum(line[..., 0] ** 2 + line[..., 1] ** 2, 1e-15))
 
 
-def _score(forth: F64, back: F64, bound: float) -> tuple[F64, Bool]:
+def _score_errors(forth: F64, back: F64, bound: float) -> tuple[F64, Bool]:
     inside = (forth < bound) & (back < bound)
     gain = np.where(forth < bound, _CHI2_POINT - forth, 0.0) + np.where(back < bound, _CHI2_POINT - back, 0.0)
     return gain.sum(axis=1), inside

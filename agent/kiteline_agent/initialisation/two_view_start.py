@@ -47,7 +47,7 @@ class TwoViewMap:
         """Write the deviations of the triangulated depths into the local map. sigma_px: of a pixel at octave 0."""
         slot = local_map.slot_of(keyframe)
         n = int(local_map.counts[slot])
-        octave = local_map.octave[slot * local_map.births : slot * local_map.births + n]
+        octave = local_map.octave[slot * local_map.slot_size : slot * local_map.slot_size + n]
         local_map.sigma_rho[slot, :n] = triangulated_sigma(
             local_map.bearing[slot, :n], local_map.rho[slot, :n], se3.inverse(self.T_a_b),
             local_map.camera.fx, sigma_px * np.exp2(octave.astype(np.float64)),

@@ -86,7 +86,7 @@ class DepthFromMotion:
 
     def _rays(self, T_c_m: F64, rows: I64, bearing: F64) -> tuple[F64, F64]:
         """Directions (n,3) of the seeds, and centres (n,3) of their keyframes, in the camera."""
-        T_c_k = T_c_m @ self._map.T_m_k[rows // self._map.births]
+        T_c_k = T_c_m @ self._map.T_m_k[rows // self._map.slot_size]
         ray = np.column_stack([bearing, np.ones(len(rows))])
         return np.einsum("nij,nj->ni", T_c_k[:, :3, :3], ray), T_c_k[:, :3, 3]
 

@@ -78,7 +78,7 @@ class KeyframeMaker:
     def _inliers(self, track: Track) -> tuple[NDArray[np.int64], F64]:
         """Rows (n,) and observations (n,3) of the inliers, by landmark id."""
         keep = np.flatnonzero(track.inlier)
-        keep = keep[np.argsort(self._map.point_ids(track.rows[keep]), kind="stable")]
+        keep = keep[np.argsort(self._map.landmark_ids(track.rows[keep]), kind="stable")]
         return track.rows[keep], track.observed[keep]
 
     def _count(self, ctx: FrameContext, landmarks: int, observations: int) -> None:
@@ -113,7 +113,7 @@ class KeyframeMaker:
             seen[:, :2].astype(np.float32),
             self._measured_rho(seen[:, 2], seen[:, :2]),
             self._map.octave[rows],
-            self._map.point_ids(rows),
+            self._map.landmark_ids(rows),
         )
 
     def _measured_rho(self, disparity: F64, uv: F64) -> NDArray[np.float32]:

@@ -1,8 +1,8 @@
-"""What the agent remembers: a bounded number of keyframes, and the points born in them with their templates.
+"""The agent's local map: a bounded number of keyframes, and their landmarks with templates.
 
-Structure of arrays with fixed capacity: slot k holds a keyframe, row k * births + i the point born at its keypoint i.
-A point is a bearing in its keyframe and an inverse depth, so a corrected keyframe carries its points along. Keyframes
-of several submaps are remembered side by side; only those of the active one are tracked.
+Structure of arrays of fixed capacity: slot k holds a keyframe, row k * slot_size + i the new landmark at its keypoint i.
+A landmark is a bearing in its keyframe and an inverse depth, so that a corrected keyframe moves its landmarks. Keyframes
+of several submaps are stored; only those of the active one are tracked.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, Keyfram
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_SEED_DEPTH_M = 1e4  # stands in for infinity where a birth has no depth
+_SEED_DEPTH_M = 1e4  # stands for infinity in landmarks without depth
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Points that should be in view. rows: (n,) slot*births+index. uv: (n,2) px. warp: (n,2,2). xyz: (n,3) m.
-    ray: (n,3) m, one deviation of depth. depth: (n,) m in the camera.
+    """Landmarks that should be in view. rows: (n,) slot*slot_size+index. uv: (n,2) px. warp: (n,2,2). xyz: (n,3) m.
+    ray: (n,3) m, one standard deviation of depth. depth: (n,) m in the camera.
     """
 
     rows: I64
@@ -48,7 +48,7 @@ class Candidates:
 
 
 class LocalMap:
-    """Keyframes and points near the vehicle, bounded in number."""
+    """Keyframes and landmarks near the vehicle."""
 
     def __init__(self, camera: RectifiedCamera, config: LocalMapConfig, filtering: DepthFilterConfig) -> None:
         k, b = config.keyframes, config.landmarks
@@ -62,14 +62,14 @@ class LocalMap:
         self.parent = np.full(k, NO_KEYFRAME, np.int64)
         self.T_m_k = np.tile(np.eye(4), (k, 1, 1))
         self.T_p_k = np.tile(np.eye(4), (k, 1, 1))
-        self.from_base = np.zeros(k, np.bool_)  # the pose is the base's
-        self.last_seen = np.zeros(k, np.int64)  # number of the frame that last tracked a point of the slot
+        self.from_base = np.zeros(k, np.bool_)  # the pose was set by the base
+        self.last_seen = np.zeros(k, np.int64)  # number of the frame that last tracked a landmark of the slot
         self.counts = np.zeros(k, np.int64)
-        self.shared = np.zeros(k, np.int64)  # of each slot's births: the first so many are known to the base
+        self.shared = np.zeros(k, np.int64)  # number of landmarks in each slot that the base knows: the first ones
         self.usable = np.zeros((k, b), np.bool_)
-        self.seed = np.zeros((k, b), np.bool_)  # a bearing that waits for a depth from motion
-        self.measured = np.zeros((k, b), np.bool_)  # the depth is the pair's own, not the base's nor motion's
-        self.disparity_offset = disparity_offset.none()  # of the pair's disparities, as far as the base knows
+        self.seed = np.zeros((k, b), np.bool_)  # a landmark that still has no depth
+        self.measured = np.zeros((k, b), np.bool_)  # the depth is that of stereo, not of the base or of motion
+        self.disparity_offset = disparity_offset.none()  # of the stereo disparities, as the base estimates it
         self.bearing = np.zeros((k, b, 2))
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
@@ -80,9 +80,9 @@ class LocalMap:
         self.templates = np.zeros((k * b, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
         self.tried = np.zeros(k * b, np.int32)
         self.hits = np.zeros(k * b, np.int32)
-        self.misses = np.zeros(k * b, np.int32)  # of a bearing: how often it was looked for in vain
-        self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the point
-        self.active = SubmapId(0)  # the submap whose points are tracked
+        self.misses = np.zeros(k * b, np.int32)  # of a seed: searches without a match
+        self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
+        self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
         self._uv = np.zeros((capacity, 2))
@@ -92,35 +92,35 @@ class LocalMap:
         self._depth = np.zeros(capacity)
 
     @property
-    def births(self) -> int:
-        """Rows a slot."""
+    def slot_size(self) -> int:
+        """Number of rows of a slot."""
         return self._config.landmarks
 
     def activate(self, submap: SubmapId) -> None:
-        """Track the points of this submap from now on; those of the others stay remembered while there is room."""
+        """Track this submap from now on; keyframes of the others stay while there is room."""
         self.active = submap
 
     def slot_of(self, keyframe: int) -> int:
-        """The slot of a keyframe, -1 when it is not remembered."""
+        """The slot of a keyframe, -1 if it is not stored."""
         slot = int((self.keyframe == keyframe).argmax())
         return slot if self.keyframe[slot] == keyframe else -1
 
-    def point_ids(self, rows: I64) -> I64:
-        """Point ids (n,) of rows (n,)."""
-        return np.asarray((self.keyframe[rows // self.births] << KEYPOINT_BITS) | (rows % self.births))
+    def landmark_ids(self, rows: I64) -> I64:
+        """Landmark ids (n,) of rows (n,)."""
+        return np.asarray((self.keyframe[rows // self.slot_size] << KEYPOINT_BITS) | (rows % self.slot_size))
 
     def add(
         self, head: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
         angle: NDArray[np.uint8], descriptor: NDArray[np.uint8], templates: NDArray[np.uint8], frame_number: int,
     ) -> int:  # fmt: skip
-        """Remember a keyframe with its births; the slot that it got. The slot seen least recently makes room.
+        """Store a keyframe with its new landmarks, and return its slot. The slot seen least recently is evicted.
 
-        uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: depth unknown, the point waits for motion or the base.
+        uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: without depth, a seed.
         angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21).
         """
         slot = self._free_slot(head.parent)
-        n = min(len(uv), self.births)
-        rows = slice(slot * self.births, slot * self.births + n)
+        n = min(len(uv), self.slot_size)
+        rows = slice(slot * self.slot_size, slot * self.slot_size + n)
         self.keyframe[slot], self.parent[slot] = head.keyframe, head.parent
         self.T_m_k[slot], self.T_p_k[slot] = T_m_k, head.T_p_k
         self.from_base[slot] = False
@@ -131,7 +131,7 @@ class LocalMap:
         self.uv[slot, :n] = uv[:n]
         self.bearing[slot, :n] = self._bearings(uv[:n])
         self.rho[slot, :n] = np.where(rho[:n] > 0.0, rho[:n], 1.0 / _SEED_DEPTH_M)
-        self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, sigma_rho[:n], 0.0)  # 0: not planted
+        self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, sigma_rho[:n], 0.0)  # 0: not initialised
         self.measured[slot] = False
         self.measured[slot, :n] = rho[:n] > 0.0
         self.seed[slot] = False
@@ -154,18 +154,18 @@ class LocalMap:
         age = np.where(self.keyframe == parent, np.iinfo(np.int64).max, self.last_seen)
         return int(np.argmin(age))
 
-    def share(self, keyframe: KeyframeId, births: int) -> None:
-        """The first so many births of a keyframe are shared with the base; the others stay here."""
-        self.shared[self.slot_of(keyframe)] = births
+    def share(self, keyframe: KeyframeId, landmarks: int) -> None:
+        """Note how many of a keyframe's landmarks, the first ones, are shared with the base."""
+        self.shared[self.slot_of(keyframe)] = landmarks
 
     def is_shared(self, rows: I64) -> NDArray[np.bool_]:
-        """Which points of rows (n,) the base knows."""
-        return np.asarray(rows % self.births < self.shared[rows // self.births])
+        """Which landmarks of rows (n,) the base knows."""
+        return np.asarray(rows % self.slot_size < self.shared[rows // self.slot_size])
 
     def candidates(
         self, T_c_m: F64, margin_px: float, max_scale: float, *, seeds: bool = False, submap: SubmapId | None = None
     ) -> Candidates:
-        """The usable points (or bearings) that should be in view of a camera at T_c_m (4,4).
+        """The usable landmarks (or seeds) that should be in view of a camera at T_c_m (4,4).
 
         submap: None for the active one. Views into buffers: use them at once.
         """
@@ -179,7 +179,7 @@ class LocalMap:
         return Candidates(self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n])
 
     def _searched(self, slots: I64) -> I64:
-        """Of some slots those seen last, as many as are searched."""
+        """Of some slots those seen last, as many as the governor allows."""
         if len(slots) <= self.searched:
             return slots
         order = np.argsort(-self.last_seen[slots], kind="stable")[: self.searched]
@@ -188,32 +188,32 @@ class LocalMap:
     def update_depths(
         self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float
     ) -> None:
-        """Mend the inverse depths of rows by where they were seen from T_c_m."""
+        """Update the inverse depths of rows (n,) by observations (n,3) from T_c_m (4,4)."""
         floor = self._filtering.floor_px / self.camera.bf
-        kernels.sharpen(
+        kernels.update_depths(
             T_c_m, self.intrinsics, rows, inlier, observed, sigma_px, inflate, floor,
             self.T_m_k, self.bearing, self.rho, self.sigma_rho,
         )  # fmt: skip
 
     def note_tracking(self, rows: I64, inlier: NDArray[np.bool_], frame_number: int) -> None:
-        """Keep count of tries and hits; points that keep failing leave."""
+        """Count tries and hits; landmarks that keep failing are no longer searched."""
         self.tried[rows] += 1
         good = rows[inlier]
         self.hits[good] += 1
         self.last_hit[good] = frame_number
-        self.last_seen[np.unique(good // self.births)] = frame_number
+        self.last_seen[np.unique(good // self.slot_size)] = frame_number
         hopeless = rows[(self.tried[rows] >= 12) & (self.hits[rows] * 5 < self.tried[rows])]
         self.usable.reshape(-1)[hopeless] = False
 
-    # bearings without depth
+    # landmarks without depth (seeds)
 
     def initialise_seeds(self, rho: float, sigma_rho: float) -> None:
-        """Give bearings that are new a rough inverse depth in 1/m, to look around."""
+        """Give new seeds an inverse depth and its deviation in 1/m, which bound the search."""
         new = self.seed & (self.sigma_rho == 0.0)
         self.rho[new], self.sigma_rho[new] = rho, sigma_rho
 
     def promote(self, rows: I64) -> None:
-        """Bearings (n,) that have a depth now become points."""
+        """Make landmarks of seeds, rows (n,), whose depth is known now."""
         self.seed.reshape(-1)[rows] = False
         self.usable.reshape(-1)[rows] = True
         self.tried[rows], self.hits[rows] = 0, 0
@@ -224,60 +224,68 @@ class LocalMap:
         self.keyframe[slots] = NO_KEYFRAME
         self.counts[slots] = 0
 
-    # what the base made of it
+    # records of the base
 
-    def apply(
-        self, record: KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
-    ) -> bool:
-        """Take over one value of the base; False when its keyframe is not remembered here."""
+    def set_pose(self, record: KeyframePose) -> bool:
+        """Take over a keyframe's pose. False if the keyframe is not stored; likewise in the other records."""
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
-        if isinstance(record, KeyframePose):
-            self.T_m_k[slot] = record.T_m_k
-            self.from_base[slot] = True
-        elif isinstance(record, RefinedLandmarks):
-            self._apply_depths(slot, record)
-        elif isinstance(record, FusedLandmarks):
-            self._apply_found(slot, record)
-        else:  # removed births and culled points are no longer looked for
-            index = record.index.astype(np.int64)
-            self.usable[slot, index[index < self.shared[slot]]] = False
-            self.seed[slot, index[index < self.shared[slot]]] = False
+        self.T_m_k[slot] = record.T_m_k
+        self.from_base[slot] = True
         return True
 
-    def _apply_depths(self, slot: int, record: RefinedLandmarks) -> None:
+    def remove(self, record: RemovedObservations | CulledLandmarks) -> bool:
+        """Stop searching for landmarks that the base removed."""
+        slot = self.slot_of(record.keyframe)
+        if slot < 0:
+            return False
+        index = record.index.astype(np.int64)
+        self.usable[slot, index[index < self.shared[slot]]] = False
+        self.seed[slot, index[index < self.shared[slot]]] = False
+        return True
+
+    def refine(self, record: RefinedLandmarks) -> bool:
+        """Take over landmarks that the base optimised or triangulated."""
+        slot = self.slot_of(record.keyframe)
+        if slot < 0:
+            return False
         keep = (record.index < self.shared[slot]) & (record.inv_depth > 0.0)
         index = record.index[keep].astype(np.int64)
-        never = ~self.usable[slot, index] & (self.tried[slot * self.births + index] == 0)
+        never = ~self.usable[slot, index] & (self.tried[slot * self.slot_size + index] == 0)
         fresh = never | self.seed[slot, index]
         self.rho[slot, index] = record.inv_depth[keep]
         self.measured[slot, index] = False
         self.sigma_rho[slot, index] = self._filtering.refined_sigma_px / self.camera.bf
         self.bearing[slot, index] = self._bearings(self.uv[slot, index] + record.offset[keep])
-        self.promote(slot * self.births + index[fresh])  # points that only the base could place
+        self.promote(slot * self.slot_size + index[fresh])  # landmarks that only the base could triangulate
+        return True
 
     def offset_px(self, uv: F64) -> F64:
-        """What the pair's disparities at pixels (n,2) are too large by (n,)."""
+        """Error (n,) of stereo disparities at pixels (n,2)."""
         return np.asarray(disparity_offset.terms(self._bearings(uv)) @ self.disparity_offset)
 
     def set_disparity_offset(self, offset: F64) -> None:
-        """The pair's disparities are too large by an offset (5,) px (`disparity_offset`): depths it measured follow."""
+        """Set the error of stereo disparities (5,) px (`disparity_offset`), and correct the depths measured by stereo."""
         at = disparity_offset.terms(self.bearing[self.measured])
         change = at @ (offset - self.disparity_offset) / self.camera.bf
         self.disparity_offset = np.array(offset)
         least = self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
         self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, least)
 
-    def _apply_found(self, slot: int, record: FusedLandmarks) -> None:
-        """A birth that shows an older point leaves, where the older one is remembered."""
+    def fuse(self, record: FusedLandmarks) -> bool:
+        """Stop searching for landmarks whose root landmark is stored here, too."""
+        slot = self.slot_of(record.keyframe)
+        if slot < 0:
+            return False
         for index, point in zip(record.index.tolist(), record.point.tolist()):
             if index < self.shared[slot] and self.slot_of(point >> KEYPOINT_BITS) >= 0:
                 self.usable[slot, index] = point == point_id(KeyframeId(int(self.keyframe[slot])), index)
                 self.seed[slot, index] &= self.usable[slot, index]
+        return True
 
     def compose_unplaced(self) -> None:
-        """Compose keyframes that the base has not placed from their parents, oldest first."""
+        """Compose the poses of keyframes that the base has not set from those of their parents, oldest first."""
         for slot in np.argsort(self.keyframe, kind="stable"):
             if self.keyframe[slot] == NO_KEYFRAME or self.from_base[slot] or self.parent[slot] == NO_KEYFRAME:
                 continue

@@ -1,4 +1,4 @@
-"""Which points of the local map should be in view, where, and how their templates look from here."""
+"""Projection of landmarks into a camera, choice of those to search, and depth updates from observations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def project(  # type: ignore[no-untyped-def]
     out_ray,
     out_depth,
 ):
-    """Project the usable points of keyframe slots into a camera.
+    """Project the usable landmarks of keyframe slots into a camera.
 
     T_c_m: (4,4). camera: fx, fy, cx, cy, bf. size: width, height px. slots: (s,) int64. T_m_k: (K,4,4). counts: (K,).
     usable: (K,B) bool. bearing: (K,B,2) x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth, its deviation,
@@ -36,7 +36,7 @@ def project(  # type: ignore[no-untyped-def]
     m in the submap frame, out_ray m (one deviation of depth as a vector), out_depth m. Returns how many were written.
     """
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    births = usable.shape[1]
+    slot_size = usable.shape[1]
     n = 0
     step = 4.0
     for s in range(slots.shape[0]):
@@ -77,7 +77,7 @@ def project(  # type: ignore[no-untyped-def]
             det = a00 * a11 - a01 * a10
             if det < 1.0 / (max_scale * max_scale) or det > max_scale * max_scale:
                 continue
-            out_row[n] = k * births + i
+            out_row[n] = k * slot_size + i
             out_uv[n, 0] = u
             out_uv[n, 1] = v
             out_warp[n, 0, 0] = a00
@@ -117,20 +117,20 @@ def select(order, uv, cell_px, limit, per_cell, cells, chosen):  # type: ignore[
 
 
 @njit
-def sharpen(T_c_m, camera, rows, inlier, observed, sigma_px, inflate, floor_rho, T_m_k, bearing, rho, sigma_rho):  # type: ignore[no-untyped-def]
-    """Scalar Kalman update of inverse depths from where points were seen, the pose held fixed.
+def update_depths(T_c_m, camera, rows, inlier, observed, sigma_px, inflate, floor_rho, T_m_k, bearing, rho, sigma_rho):  # type: ignore[no-untyped-def]
+    """Scalar Kalman update of inverse depths by observations, with the pose held fixed.
 
     rows: (n,) slot*B+index. observed: (n,3) u, v, disparity px (< 0: none). sigma_px: (n,). inflate: factor on the
-    variance of a sighting, for the pose's own error and for errors that successive sightings share. rho, sigma_rho: in,
-    out.
+    variance of an observation, for the pose's error and errors that successive observations share. rho, sigma_rho:
+    in, out.
     """
     fx, fy, cx, cy, bf = camera[0], camera[1], camera[2], camera[3], camera[4]
-    births = rho.shape[1]
+    slot_size = rho.shape[1]
     for j in range(rows.shape[0]):
         if not inlier[j]:
             continue
-        k = rows[j] // births
-        i = rows[j] % births
+        k = rows[j] // slot_size
+        i = rows[j] % slot_size
         if sigma_rho[k, i] <= floor_rho:
             continue
         p = rho[k, i]

@@ -98,17 +98,18 @@ class MapCache:
     def __len__(self) -> int:
         return int(np.count_nonzero(self.keyframe != NO_KEYFRAME))
 
-    def store(self, record: CachedKeyframe | CachedLandmarks) -> None:
-        """Take over the pose of a cached keyframe, or some of its landmarks."""
+    def store(self, record: CachedKeyframe | CachedLandmarks) -> bool:
+        """Take over the pose of a cached keyframe, or some of its landmarks. False: the local map does not move."""
         slot = self._slot(record.keyframe)
         self._clock += 1
         self._touched[slot] = self._clock
         if isinstance(record, CachedKeyframe):
             self._submap[slot] = record.submap
             self._T_m_k[slot] = record.T_m_k
-            return
-        self._parts[slot][record.part] = record
-        self._fill(slot)
+        else:
+            self._parts[slot][record.part] = record
+            self._fill(slot)
+        return False
 
     def remove(self, keys: Sequence[Key]) -> None:
         """Drop the cached keyframes that the base removed."""

@@ -82,7 +82,7 @@ class Relocaliser:
             if self._map.slot_of(key) < 0:
                 self._index.remove(key)
         slot = self._map.slot_of(keyframe)
-        first = slot * self._map.births
+        first = slot * self._map.slot_size
         own = np.arange(first, first + int(self._map.counts[slot]))
         in_view = self._map.candidates(
             se3.inverse(self._map.T_m_k[slot]), 0.0, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
@@ -186,7 +186,7 @@ class Relocaliser:
         if self._index is None:
             return False
         limits = self._config.relocalisation
-        near = self._map.keyframe[np.unique(found.track.rows[found.track.inlier] // self._map.births)].tolist()
+        near = self._map.keyframe[np.unique(found.track.rows[found.track.inlier] // self._map.slot_size)].tolist()
         out = [k for k in self._index.keys if k in near or submap_of_keyframe(KeyframeId(k)) != found.submap]
         for key in self._index.query(seen.descriptor, out, limits.ambiguous_candidates).keys.tolist():
             fit = self._pose_from(KeyframeId(key), seen, seed)
