@@ -1,4 +1,4 @@
-"""A disk in memory that can be full or forget, for tests of what waits on disk."""
+"""A spill in memory that can be full or lose data."""
 
 from __future__ import annotations
 

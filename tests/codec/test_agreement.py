@@ -49,7 +49,7 @@ class TwoEnds(RuleBasedStateMachine):
         self.held: list[dict[Key, bytes]] = [{}, {}]
         self.history: list[dict[bytes, int]] = [{}, {}]
         self.known: list[dict[Key, int]] = [{}, {}]  # place in the other end's history of what end i holds
-        self.shown: list[dict[Key, bytes]] = [{}, {}]  # what the updates told
+        self.shown: list[dict[Key, bytes]] = [{}, {}]  # what the updates said
         self.wire: list[tuple[int, bytes]] = []
         self.spent: list[list[tuple[int, int]]] = [[], []]
         self.writes = 0

@@ -79,7 +79,7 @@ def test_plain_records_pass_as_they_are() -> None:
     assert b.receive([], 0) == []
 
 
-def test_a_thin_link_carries_corrections_first_then_copies_then_tiles() -> None:
+def test_a_thin_link_carries_corrections_then_cached_keyframes_then_tiles() -> None:
     config = SyncConfig(packet_bytes=220, overhead_bytes=7, budget_bytes=500)
     a, b = CodedChannel(config, 1), CodedChannel(config, 1)
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The window of a link of which nobody said what it carries."""
+"""The congestion window of a link without a budget."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_it_shrinks_once_a_round_trip_while_packets_queue() -> None:
     assert window.packets == 3
 
 
-def test_a_way_that_became_longer_is_believed_in_the_end() -> None:
+def test_a_path_that_became_longer_is_accepted_in_the_end() -> None:
     window = CongestionWindow(64)
     window.measured(50 * MS, 1, 10, 0)
     for i in range(300):

@@ -239,7 +239,7 @@ def test_removals_are_forgotten_once_they_have_arrived_and_old_packets_do_not_un
     assert pair.b.stats.duplicates > 0
 
 
-def test_what_was_never_sent_is_removed_without_a_word() -> None:
+def test_a_value_that_was_never_sent_is_removed_silently() -> None:
     pair = Pair()
     pair.a.put(Key(KeyframePose.KIND, 1), b"x")
     pair.a.remove(Key(KeyframePose.KIND, 1))
@@ -294,7 +294,7 @@ def test_packets_of_dead_sessions_change_nothing() -> None:
     assert pair.b.peer_values() == {}
 
 
-def test_a_session_number_that_went_back_is_told() -> None:
+def test_a_session_number_that_went_back_is_reported() -> None:
     pair = Pair()
     pair.restart(0)
     pair.settle()

@@ -1,4 +1,4 @@
-"""What the base says of keyframes, over hours: beyond a bound it waits beside memory, and nothing of it is lost."""
+"""The base's values of keyframes over hours: beyond a limit they are archived, and none is lost."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_memory_is_bounded_and_the_two_sides_agree() -> None:
     assert line.b._in.resident_bytes <= LIMIT + pages
 
 
-def test_a_new_base_is_told_what_the_old_one_said() -> None:
+def test_values_of_the_last_base_stay_readable() -> None:
     line = Line(Memory())
     for keyframe in range(100):
         line.say(keyframe)

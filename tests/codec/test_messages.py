@@ -169,10 +169,10 @@ def test_errors_say_what_was_expected() -> None:
         messages.encode(RemovedObservations(KeyframeId(1), np.array([2, 2], np.uint16)))
     with pytest.raises(ValueError, match="rigid motion"):
         messages.encode(SubmapPlacement(SubmapId(1), np.zeros((4, 4))))
-    births = some_records(0, 3)[5]
-    assert isinstance(births, NewLandmarks)
+    landmarks = some_records(0, 3)[5]
+    assert isinstance(landmarks, NewLandmarks)
     with pytest.raises(ValueError, match="descriptors"):
-        messages.encode(replace(births, descriptor=births.descriptor[:2]))
+        messages.encode(replace(landmarks, descriptor=landmarks.descriptor[:2]))
     tile = next(r for r in some_records(0, 1) if isinstance(r, GridTile))
     code = messages.encode(tile)
     with pytest.raises(WireError, match="tile"):
@@ -180,8 +180,8 @@ def test_errors_say_what_was_expected() -> None:
 
 
 def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:
-    """300 sightings of points from 12 keyframes and 180 births, in an image of 752x480 px. Indices as an agent gives
-    them: sightings by point id, then births by image row.
+    """300 observations of landmarks of 12 keyframes and 180 new landmarks, in an image of 752x480 px. Indices as an agent
+    assigns them: observations by landmark id, then new landmarks by image row.
     """
     rng = np.random.default_rng(5)
     submap = submap_id(2, 17, 1)
@@ -196,50 +196,54 @@ def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:
         }
 
     point = np.sort((keyframe - rng.integers(1, 13, 300)) << 11 | rng.integers(0, 480, 300))
-    sightings = Observations(keyframe, 0, np.arange(300, dtype=np.uint16), point=point, **keypoints(300))
-    births = NewLandmarks(
+    observations = Observations(keyframe, 0, np.arange(300, dtype=np.uint16), point=point, **keypoints(300))
+    landmarks = NewLandmarks(
         keyframe, 0, np.arange(300, 480, dtype=np.uint16), angle=rng.integers(0, 256, 180).astype(np.uint8),
         descriptor=rng.integers(0, 256, (180, 32)).astype(np.uint8), **keypoints(180),
     )  # fmt: skip
     T_p_k = se3.exp(np.array([0.2, 0.01, 0.1, 0.02, 0.1, 0.01]))
-    return KeyframeHeader(keyframe, 1_700_000_000_123_456_789, KeyframeId(keyframe - 1), T_p_k, 480), births, sightings
+    return (
+        KeyframeHeader(keyframe, 1_700_000_000_123_456_789, KeyframeId(keyframe - 1), T_p_k, 480),
+        landmarks,
+        observations,
+    )
 
 
 def test_a_keyframe_is_short_and_its_sections_fit_packets() -> None:
-    head, births, sightings = a_keyframe()
+    head, landmarks, observations = a_keyframe()
     value = np.random.default_rng(6).uniform(size=480)
-    parts = sections.split(births, value[:180]) + sections.split(sightings, value[180:])
+    parts = sections.split(landmarks, value[:180]) + sections.split(observations, value[180:])
     sizes = [len(messages.encode(record)) for record in (head, *parts)]
     assert max(sizes) <= sections.SECTION_BYTES
     assert sum(sizes) <= 9500
-    assert len(messages.encode(births)) + len(messages.encode(sightings)) <= 9100
+    assert len(messages.encode(landmarks)) + len(messages.encode(observations)) <= 9100
     assert np.mean(sizes[1:]) > 700  # sections are no crumbs
 
 
 @given(st.integers(0, 1000), st.integers(0, 200), st.integers(150, 3000))
 def test_sections_hold_each_row_once_best_first(seed: int, n: int, section_bytes: int) -> None:
-    births = some_records(seed, n)[5]
-    assert isinstance(births, NewLandmarks)
+    landmarks = some_records(seed, n)[5]
+    assert isinstance(landmarks, NewLandmarks)
     value = np.random.default_rng(seed).integers(0, 50, n).astype(np.float64)
-    parts = sections.split(births, value, section_bytes)
+    parts = sections.split(landmarks, value, section_bytes)
     assert [p.part for p in parts] == list(range(len(parts)))
-    index = np.concatenate([p.index for p in parts] or [births.index])
-    assert np.array_equal(np.sort(index), births.index)
-    order = {int(i): float(v) for i, v in zip(births.index, value, strict=True)}
+    index = np.concatenate([p.index for p in parts] or [landmarks.index])
+    assert np.array_equal(np.sort(index), landmarks.index)
+    order = {int(i): float(v) for i, v in zip(landmarks.index, value, strict=True)}
     for a, b in pairwise(parts):
         assert min(order[int(i)] for i in a.index) >= max(order[int(i)] for i in b.index)
     for p in parts:
         assert len(messages.encode(p)) <= section_bytes
-        rows = np.searchsorted(births.index, p.index)
-        assert np.array_equal(births.descriptor[rows], p.descriptor)
+        rows = np.searchsorted(landmarks.index, p.index)
+        assert np.array_equal(landmarks.descriptor[rows], p.descriptor)
 
 
 def test_a_keyframe_is_coded_quickly() -> None:
-    head, births, sightings = a_keyframe()
+    head, landmarks, observations = a_keyframe()
     best = 1e9
     for _ in range(5):
         start = time.process_time()
-        for record in (head, births, sightings):
+        for record in (head, landmarks, observations):
             messages.decode(messages.key(record), messages.encode(record))
         best = min(best, time.process_time() - start)
     assert best < 0.005  # typically 0.4 ms

@@ -1,4 +1,4 @@
-"""A link that is down for long: memory stays bounded, and what was kept elsewhere arrives when the link is back."""
+"""A long outage of the link: memory stays bounded, and archived values arrive when the link is back."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_on_a_thin_link_old_values_do_not_starve() -> None:
     assert line.b.peer_values() == line.a.own_values()
 
 
-def test_without_a_place_for_them_old_values_are_given_up_by_worth() -> None:
+def test_without_a_spill_old_values_are_dropped_by_priority() -> None:
     line = Line(None)
     line.run(80, up=True)
     line.run(400, up=False)

@@ -22,41 +22,41 @@ KEYFRAME = keyframe_id(submap_id(1, 2, 3), 40)
 SECOND = 1_000_000_000
 
 
-def a_keyframe(births: int, sightings: int, seed: int = 0) -> tuple[NewLandmarks, np.ndarray, Observations]:
+def a_keyframe(landmarks: int, observations: int, seed: int = 0) -> tuple[NewLandmarks, np.ndarray, Observations]:
     rng = np.random.default_rng(seed)
-    born = NewLandmarks(
-        KEYFRAME, 0, np.arange(births, dtype=np.uint16), rng.uniform(0, 700, (births, 2)).astype(np.float32),
-        rng.uniform(0, 1, births).astype(np.float32), rng.integers(0, 3, births).astype(np.uint8),
-        rng.integers(0, 256, births).astype(np.uint8), rng.integers(0, 256, (births, 32)).astype(np.uint8),
+    new = NewLandmarks(
+        KEYFRAME, 0, np.arange(landmarks, dtype=np.uint16), rng.uniform(0, 700, (landmarks, 2)).astype(np.float32),
+        rng.uniform(0, 1, landmarks).astype(np.float32), rng.integers(0, 3, landmarks).astype(np.uint8),
+        rng.integers(0, 256, landmarks).astype(np.uint8), rng.integers(0, 256, (landmarks, 32)).astype(np.uint8),
     )  # fmt: skip
-    point = np.sort(rng.permutation(4000)[:sightings]).astype(np.int64)
+    point = np.sort(rng.permutation(4000)[:observations]).astype(np.int64)
     seen = Observations(
-        KEYFRAME, 0, np.arange(births, births + sightings, dtype=np.uint16),
-        rng.uniform(0, 700, (sightings, 2)).astype(np.float32), rng.uniform(-1, 1, sightings).astype(np.float32),
-        rng.integers(0, 3, sightings).astype(np.uint8), point,
+        KEYFRAME, 0, np.arange(landmarks, landmarks + observations, dtype=np.uint16),
+        rng.uniform(0, 700, (observations, 2)).astype(np.float32), rng.uniform(-1, 1, observations).astype(np.float32),
+        rng.integers(0, 3, observations).astype(np.uint8), point,
     )  # fmt: skip
-    return born, rng.uniform(size=births), seen
+    return new, rng.uniform(size=landmarks), seen
 
 
 @given(st.sampled_from([WIFI, RADIO, EXACT]), st.integers(0, 200), st.integers(0, 250))
-def test_what_is_shared(profile: Profile, births: int, sightings: int) -> None:
-    born, strength, seen = a_keyframe(births, sightings)
-    n = min(births, profile.landmarks)
-    seen = replace(seen, index=np.arange(n, n + sightings, dtype=np.uint16))
-    parts, sections = profile.choose(born, strength, seen)
+def test_what_is_shared(profile: Profile, landmarks: int, observations: int) -> None:
+    new, strength, seen = a_keyframe(landmarks, observations)
+    n = min(landmarks, profile.landmarks)
+    seen = replace(seen, index=np.arange(n, n + observations, dtype=np.uint16))
+    parts, sections = profile.choose(new, strength, seen)
     assert [p.part for p in parts] == list(range(len(parts)))
     index = np.sort(np.concatenate([p.index for p in parts])) if parts else np.zeros(0)
     assert np.array_equal(index, np.arange(n))
     rows = np.concatenate([s.index for s in sections]) if sections else np.zeros(0)
-    assert np.array_equal(rows, np.arange(n, n + min(sightings, profile.observations)))
+    assert np.array_equal(rows, np.arange(n, n + min(observations, profile.observations)))
     named = sum(int(p.descriptor.any(axis=1).sum()) for p in parts)
     assert named == min(n, profile.described)
     for part in parts:
         assert len(messages.encode(part)) <= profile.landmarks_bytes
-        assert np.abs(part.uv - born.uv[part.index]).max() == 0
-        known = born.inv_depth[part.index] > 0
+        assert np.abs(part.uv - new.uv[part.index]).max() == 0
+        known = new.inv_depth[part.index] > 0
         assert np.array_equal(part.inv_depth > 0, known)
-        assert np.abs(part.inv_depth - born.inv_depth[part.index]).max() < 0.01
+        assert np.abs(part.inv_depth - new.inv_depth[part.index]).max() < 0.01
         if profile.narrow:
             assert descriptors.is_narrow(part.descriptor).all()
     for section in sections:
@@ -67,11 +67,11 @@ def test_what_is_shared(profile: Profile, births: int, sightings: int) -> None:
 
 @pytest.mark.parametrize("profile", [WIFI, RADIO, EXACT], ids=lambda p: p.name)
 def test_coarser_depths_leave_the_scale(profile: Profile) -> None:
-    born, strength, seen = a_keyframe(1000, 1000)
-    born = replace(born, inv_depth=np.linspace(0.05, 1.0, 1000).astype(np.float32))
-    seen = replace(seen, inv_depth=born.inv_depth.copy())
-    parts, sections = replace(profile, landmarks=1000, observations=1000).choose(born, strength, seen)
-    ours = np.concatenate([np.log(p.inv_depth / born.inv_depth[p.index]) for p in parts])
+    new, strength, seen = a_keyframe(1000, 1000)
+    new = replace(new, inv_depth=np.linspace(0.05, 1.0, 1000).astype(np.float32))
+    seen = replace(seen, inv_depth=new.inv_depth.copy())
+    parts, sections = replace(profile, landmarks=1000, observations=1000).choose(new, strength, seen)
+    ours = np.concatenate([np.log(p.inv_depth / new.inv_depth[p.index]) for p in parts])
     theirs = np.concatenate([np.log(s.inv_depth / seen.inv_depth[s.index - 1000]) for s in sections])
     assert len(ours) == len(theirs) == 1000
     assert abs(ours.mean()) < 5e-5 and abs(theirs.mean()) < 5e-5
@@ -96,10 +96,10 @@ def test_narrow_descriptors_are_compared_like_wide_ones() -> None:
     assert distance(blank, np.concatenate([blank, narrow])).min() > 80
 
 
-def test_radio_keeps_its_promise_of_bytes() -> None:
-    born, strength, seen = a_keyframe(200, 200)
-    parts, sections = RADIO.choose(born, strength, replace(seen, index=seen.index - 200 + 96))
-    assert sum(len(messages.encode(s)) for s in (*parts, *sections)) < 3000  # plain; tight forms take a third off
+def test_a_radio_keyframe_takes_few_bytes() -> None:
+    new, strength, seen = a_keyframe(200, 200)
+    parts, sections = RADIO.choose(new, strength, replace(seen, index=seen.index - 200 + 96))
+    assert sum(len(messages.encode(s)) for s in (*parts, *sections)) < 3000  # plain; residual codes take a third less
 
 
 def test_a_budget_chooses_the_profile() -> None:
@@ -145,7 +145,7 @@ def test_the_pause_between_keyframes_follows_the_link() -> None:
     assert Pacer(RADIO, 300).keyframe_gap_ns(1 << 30, None) == 5 * SECOND
 
 
-def test_births_follow_the_pace_of_keyframes() -> None:
+def test_landmarks_follow_the_rate_of_keyframes() -> None:
     pacer = Pacer(RADIO, 1000)
     for i in range(30):
         pacer.keyframe(i * 400_000_000)

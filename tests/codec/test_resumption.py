@@ -1,4 +1,4 @@
-"""After a restart what the other side still knows goes as a checksum, not as a code."""
+"""After a restart, codes that the other side still holds are sent as checksums."""
 
 from __future__ import annotations
 
@@ -89,28 +89,28 @@ def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> Non
     assert again.digest_equal
 
 
-def test_another_boot_is_told_nothing() -> None:
+def test_another_boot_gets_no_summary() -> None:
     old = values(boot=4)
     assert resumption.summaries(old, 5) and not resumption.summaries(old, 6)
 
 
 @given(st.dictionaries(keys, st.binary(min_size=16, max_size=40), max_size=150))
-def test_what_is_told_is_heard(known: dict[Key, bytes]) -> None:
-    told = resumption.summaries(known, 1)
-    heard: dict[Key, int] = {}
-    for code in told.values():
-        heard.update(resumption.read_summary(code))
-    assert heard.keys() == known.keys()
+def test_summaries_are_read_as_written(known: dict[Key, bytes]) -> None:
+    summaries = resumption.summaries(known, 1)
+    read: dict[Key, int] = {}
+    for code in summaries.values():
+        read.update(resumption.read_summary(code))
+    assert read.keys() == known.keys()
     for key, code in known.items():
-        form = resumption.reference_to(key, code, heard)
+        form = resumption.reference_to(key, code, read)
         assert form is not None
         assert resumption.resolve(form, code) == code
-        assert resumption.reference_to(key, code + b"!", heard) is None
+        assert resumption.reference_to(key, code + b"!", read) is None
         with pytest.raises(WireError):
             resumption.resolve(form, code + b"!")
 
 
 @given(st.binary(max_size=60))
-def test_any_bytes_are_heard_or_refused(noise: bytes) -> None:
+def test_any_bytes_are_a_summary_or_an_error(noise: bytes) -> None:
     with contextlib.suppress(WireError):
         resumption.read_summary(noise)

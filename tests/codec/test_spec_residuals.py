@@ -1,4 +1,4 @@
-"""A second reader of tight forms, written from codec/SPEC.md in plain Python, reads what the codec writes."""
+"""A second reader of residual codes, written from codec/SPEC.md in plain Python, reads what the codec writes."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def load(name: str) -> ModuleType:
     return module
 
 
-SPEC, TIGHT = load("test_spec"), load("test_residual_coding")
+SPEC, RESIDUALS = load("test_spec"), load("test_residual_coding")
 Rows = list[list[int]]
 
 
-def tight(s: Any, c: int, n: int) -> Rows:
+def residual_columns(s: Any, c: int, n: int) -> Rows:
     if not n:
         return [[] for _ in range(c)]
     heads = []
@@ -91,8 +91,8 @@ def inverse(a: Any) -> Any:
     return [[a[0][i], a[1][i], a[2][i], -(a[0][i] * a[0][3] + a[1][i] * a[1][3] + a[2][i] * a[2][3])] for i in range(3)]
 
 
-def foresee(birth: list[int], T: Any, camera: Any) -> list[int] | None:
-    u, v, code = birth[:3]
+def predict(landmark: list[int], T: Any, camera: Any) -> list[int] | None:
+    u, v, code = landmark[:3]
     if not code:
         return None
     e, m = divmod(code, 1024)
@@ -111,7 +111,7 @@ def foresee(birth: list[int], T: Any, camera: Any) -> list[int] | None:
     return [a, b, min(max(1024 * e + floor((w - 1) * 1024 + 0.5), 1), 13311)]
 
 
-def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[int]], list[int], Any]:
+def read_observations(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[int]], list[int], Any]:
     """Columns, versions used, and the source before its checksum."""
     s = SPEC.Source(form)
     n, step = s.varint(), s.varint()
@@ -125,9 +125,9 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
     for _ in range(s.varint()):
         last -= s.varint()
         table.insert(0, last)
-    counts, masks = tight(s, 2, len(table))
-    gaps = tight(s, 1, n)[0]
-    points, births, used, octave = [], [], [], []
+    counts, masks = residual_columns(s, 2, len(table))
+    gaps = residual_columns(s, 1, n)[0]
+    points, landmarks, used, octave = [], [], [], []
     for a, count, mask in zip(table, counts, masks, strict=True):
         known: dict[int, list[int]] = {}
         for part in range(mask.bit_length()):
@@ -139,7 +139,7 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
                 used.append(version)
         for keypoint in ungap(gaps[len(points) : len(points) + count]):
             points.append(a << 11 | keypoint)
-            births.append((a, known.get(keypoint)))
+            landmarks.append((a, known.get(keypoint)))
     ways: dict[int, Any] = {}
     on_way: dict[int, int] = {}
     for a in [a for a, mask in zip(table, masks, strict=True) if mask]:
@@ -161,12 +161,12 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
         used += [on_way[k] for k in sorted(on_way)]
         used.append(next(v for k, (v, _) in values.items() if k.kind == CameraIntrinsics.KIND))
     camera = next(r.camera for r in records.values() if isinstance(r, CameraIntrinsics))
-    seen = [foresee(b, ways[a], camera) if b else None for a, b in births]
+    seen = [predict(b, ways[a], camera) if b else None for a, b in landmarks]
     steps = s.u8()
     su, sd = steps >> 4, steps & 15
-    index, octave = tight(s, 2, n)
-    near = tight(s, 3, sum(x is not None for x in seen))
-    far = tight(s, 3, sum(x is None for x in seen))
+    index, octave = residual_columns(s, 2, n)
+    near = residual_columns(s, 3, sum(x is not None for x in seen))
+    far = residual_columns(s, 3, sum(x is None for x in seen))
     rows = []
     i = j = 0
     for x in seen:
@@ -181,14 +181,14 @@ def read_sightings(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[i
     columns = {
         "index": [k + v for k, v in enumerate(index)],
         "u": [r[0] for r in rows], "v": [r[1] for r in rows], "depth": [r[2] for r in rows],
-        "octave": [o + (b[3] if b else 0) for o, (_, b) in zip(octave, births, strict=True)], "point": points,
+        "octave": [o + (b[3] if b else 0) for o, (_, b) in zip(octave, landmarks, strict=True)], "point": points,
     }  # fmt: skip
     return columns, used, s
 
 
 @pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != KeyframeHeader.KIND or key.id % 64 < 5])
-def test_sightings(held: Callable[[Key], bool]) -> None:
-    values = TIGHT.coded(TIGHT.flight(7, keyframes=6, births=40))
+def test_observations(held: Callable[[Key], bool]) -> None:
+    values = RESIDUALS.coded(RESIDUALS.flight(7, keyframes=6, landmarks=40))
     compared = 0
     for key, (_, code) in values.items():
         if key.kind != Observations.KIND:
@@ -197,7 +197,7 @@ def test_sightings(held: Callable[[Key], bool]) -> None:
         form = ResidualCoder().compress(key, code, known.get, values.get)
         if form is None:
             continue
-        columns, used, s = read_sightings(key, form, known)
+        columns, used, s = read_observations(key, form, known)
         record = messages.decode(key, code)
         assert isinstance(record, Observations)
         n = SPEC.Source(code).varint()
@@ -211,8 +211,8 @@ def test_sightings(held: Callable[[Key], bool]) -> None:
     assert compared > 200
 
 
-def test_births() -> None:
-    values = TIGHT.coded(TIGHT.flight(7, keyframes=1, births=40))
+def test_new_landmarks() -> None:
+    values = RESIDUALS.coded(RESIDUALS.flight(7, keyframes=1, landmarks=40))
     for key, (_, code) in values.items():
         if key.kind != NewLandmarks.KIND:
             continue
@@ -221,7 +221,7 @@ def test_births() -> None:
         s = SPEC.Source(form)
         head = s.varint()
         n, size = head // 4, (0, 16, 32)[head % 4]
-        columns = tight(s, 6, n)
+        columns = residual_columns(s, 6, n)
         plain = SPEC.Source(code)
         assert plain.varint() == n
         assert [ungap(columns[0]), *columns[1:]] == plain.columns(6, n)

@@ -23,7 +23,7 @@ class CongestionWindow:
         self._shortest_ns: int | None = None  # minimum round trip of this period
         self._before_ns: int | None = None  # of the period before
         self._since_ns = 0
-        self._shrunk_ns = 0  # when the window shrank last
+        self._shrunk_ns: int | None = None  # when the window shrank last
 
     def measured(self, rtt_ns: int, acked: int, in_flight: int, now_ns: int) -> None:
         """Take in the round trip of the oldest of `acked` packets, out of `in_flight` before."""
@@ -34,6 +34,6 @@ class CongestionWindow:
         if rtt_ns <= floor_ns + _QUEUE_NS:
             if in_flight >= self.packets * _USED:  # an unused window proves nothing about the link
                 self.packets = min(self.packets + acked, self._most)
-        elif now_ns - self._shrunk_ns >= rtt_ns:
+        elif self._shrunk_ns is None or now_ns - self._shrunk_ns >= rtt_ns:
             self.packets = max(_LEAST_PACKETS, self.packets * (floor_ns + _QUEUE_NS) // rtt_ns)
             self._shrunk_ns = now_ns

@@ -224,8 +224,11 @@ class Endpoint:
             return items
         if self._coder is None:
             raise WireError("a residual code, which this side does not read")
-        held = lambda key: self._in.held(key) or self._out.held(key)  # noqa: E731
-        return resumption.expand_items(items, self._coder, held, self._earlier)
+        return resumption.expand_items(items, self._coder, self._held, self._earlier)
+
+    def _held(self, key: Key) -> tuple[int, bytes] | None:
+        """Version and code of a value of either side."""
+        return self._in.held(key) or self._out.held(key)
 
     def _take_summary(self, code: bytes) -> None:
         """Take in what the peer holds of earlier sessions of this side; a summary that cannot be read is ignored."""
