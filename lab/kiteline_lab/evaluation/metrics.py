@@ -114,11 +114,11 @@ def associate(est_ns: I64, truth_ns: I64, max_difference_ns: int = MAX_DIFFERENC
 
 
 def truth_at(est_ns: I64, truth: Trajectory, max_difference_ns: int = MAX_DIFFERENCE_NS) -> tuple[I64, F64]:
-    """The truth at the times of an estimate: indices (k,) of the estimated poses that have one, and poses (k,4,4).
+    """Ground truth at the times of an estimate: indices (k,) of the estimated poses that have one, poses (k,4,4).
 
-    Between two true poses at most MAX_BRIDGE_NS apart it is interpolated (straight line, steady turn): taking the
-    nearest instead would charge the estimate with the path flown in half a period, 10 mm at 1 m/s and 50 Hz. Sparser
-    truth is associated with the nearest pose within max_difference_ns, each used once.
+    Between true poses at most MAX_BRIDGE_NS apart it is interpolated (constant velocity and rotation rate); the nearest
+    pose would add the path of half a period to the error, 10 mm at 1 m/s and 50 Hz. Sparser truth is matched with the
+    nearest pose within max_difference_ns, each used once.
     """
     n = len(truth.t_ns)
     if n == 0 or len(est_ns) == 0:
