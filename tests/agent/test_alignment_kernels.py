@@ -136,7 +136,7 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     inside = np.zeros((kernels.PATCH, kernels.STRIDE), np.bool_)
     inside[:, : kernels.PATCH] = True
     patches[4] = inside.ravel()
-    kernels.spread_out(reference, patches)
+    kernels.template_gradients(reference, patches)
     grey = reference[:, : kernels.PATCH + 2].astype(np.int64)
     for row, wanted in (
         (1, grey[1:-1, 1:-1]),
@@ -149,7 +149,7 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
 
     raw, across = np.zeros(kernels.LANES + kernels.STRIDE, np.uint8), np.zeros(kernels.LANES + kernels.STRIDE, np.int16)
     for x, y in ((100.0, 90.0), (47.31, 60.78), (4.0, 4.99), (314.9, 234.9)):
-        kernels.look(image, x, y, raw, across, patches[0])
+        kernels.sample_patch(image, x, y, raw, across, patches[0])
         dx, dy = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0))
         seen = patches[0].reshape(inside.shape)[:, : kernels.PATCH] / kernels.GREY
         np.testing.assert_allclose(seen, bilinear(image, x + dx, y + dy), atol=0.04 + 40.0 / 256)

@@ -1,4 +1,4 @@
-"""How errors that a whole flight shares, those of the calibration, move a pose that is measured against a map."""
+"""Kernels that propagate calibration errors, shared by a whole flight, to a pose measured against a map."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-CALIBRATION = 10  # ways in which a calibration errs, see bias_error: those of the disparity, then those of both eyes
+CALIBRATION = 10  # error terms of a calibration, see bias_error: those of the disparity, then those of both cameras
 DISPARITY_SHAPES = 5
-SHAPES = CALIBRATION + 1  # what a whole flight shares: the last is how an IMU pulls poses off the images
+SHAPES = CALIBRATION + 1  # with the mean offset by the IMU as the last one
 
 
 @njit
 def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
-    """out (3,11): by how much u, v and disparity are off for one pixel of each error, told at the image's edge.
+    """out (3,11): error of u, v and disparity for one pixel of each error term at the image's edge.
 
-    Disparity (the eyes differ): constant, along x and y, with the square of the distance from the centre, distortion.
-    Both eyes alike: focal length along x and y, principal point along x and y, distortion.
+    Disparity (difference of the cameras): constant, along x and y, with the squared distance from the centre,
+    distortion. Both cameras: focal length along x and y, principal point along x and y, distortion.
     """
     x, y = (u - camera[2]) / half_px, (v - camera[3]) / half_px
     r2 = x * x + y * y
@@ -38,13 +38,13 @@ def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float
 @njit
 def sensitivity(
     T_c_m: F64, camera: F64, half_px: float, rows: I64, inlier: Bools, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
-    births: int, T_m_k: F64, born_at: F64, rho: F64, of_keyframes: F64, h: F64, g: F64,
+    per_keyframe: int, T_m_k: F64, anchor_px: F64, rho: F64, of_keyframes: F64, h: F64, g: F64,
 ) -> None:  # fmt: skip
-    """Normal equations of a pose (left perturbation of T_c_m, [translation, rotation]) by the calibration's errors.
+    """Normal equations of a pose (left perturbation of T_c_m, [translation, rotation]) by the calibration errors.
 
-    T_c_m: (4,4). camera: fx, fy, cx, cy, bf. half_px: half the image's width. rows: (n,) slot * births + index.
-    inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. born_at:
-    (K*births,2) px. rho: (K*births,) 1/m. of_keyframes: (K,6,11) what the errors did to the keyframes, as a left
+    T_c_m: (4,4). camera: fx, fy, cx, cy, bf. half_px: half the image's width. rows: (n,) slot * per_keyframe + index.
+    inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. anchor_px:
+    (K*per_keyframe,2) px. rho: (K*per_keyframe,) 1/m. of_keyframes: (K,6,11) effect of the errors on the keyframes, as a left
     perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a pixel of each error.
     """
     fx, fy, bf = camera[0], camera[1], camera[4]
@@ -74,11 +74,11 @@ def sensitivity(
             a, b, c = pj[k, 0], pj[k, 1], pj[k, 2]
             jac[k, 0], jac[k, 1], jac[k, 2] = a, b, c
             jac[k, 3], jac[k, 4], jac[k, 5] = c * y - b * z, a * z - c * x, b * x - a * y
-        # how far the point in the map is off, and what that and the image's own error make of the residual
+        # error of the point in the map, and the resulting error of the residual with that of the image
         row = rows[i]
-        slot = row // births
+        slot = row // per_keyframe
         depth = 1.0 / rho[row]
-        u0, v0 = born_at[row, 0], born_at[row, 1]
+        u0, v0 = anchor_px[row, 0], anchor_px[row, 1]
         bias_error(u0, v0, bf * rho[row], camera, half_px, there)
         bias_error(observed[i, 0], observed[i, 1], observed[i, 2], camera, half_px, here)
         bx, by = (u0 - camera[2]) / fx, (v0 - camera[3]) / fy
@@ -97,7 +97,7 @@ def sensitivity(
                 dk[k] = T_c_m[k, 0] * dm[0] + T_c_m[k, 1] * dm[1] + T_c_m[k, 2] * dm[2]
             for k in range(measured):
                 e[k, s] = pj[k, 0] * dk[0] + pj[k, 1] * dk[1] + pj[k, 2] * dk[2] - here[k, s]
-        # the point's own uncertain depth is taken out, as when the pose was measured
+        # the point's depth is marginalised, as in the pose optimisation
         s2 = sigma_px[i] * sigma_px[i]
         vv = s2
         for k in range(3):
@@ -184,13 +184,13 @@ def body_into(T: F64, j: F64) -> None:
 
 @njit
 def pose_covariance(
-    noise: F64, shift: F64, calibration: F64, carried: F64, blind: F64, extrinsic: F64, T_a_m: F64, T_m_b: F64,
+    noise: F64, shift: F64, calibration: F64, carried: F64, reckoned: F64, extrinsic: F64, T_a_m: F64, T_m_b: F64,
     T_a_b0: F64, left: F64, out: F64,
 ) -> None:  # fmt: skip
-    """Covariance of a body pose in a frame a (o or m itself), all parts together; see certainty.
+    """Covariance of a body pose in a frame a (o or m itself), the sum of all parts of pose_covariance.py.
 
     noise (6,6), shift (6,11): of the camera in m, on the left. calibration: (11,) variances. carried: (6,6) of m in a.
-    blind: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6) of the camera in the body. T_a_b0:
+    reckoned: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6) of the camera in the body. T_a_b0:
     where the frame began. Out: left (6,6) the first three parts on the left of T_a_b; out (6,6) all of it, [translation
     in a, rotation about the body's axes].
     """
@@ -215,12 +215,12 @@ def pose_covariance(
             T[i, k] = s
     body_into(T, j)
     _sandwich(j, left, out)
-    # blind: translations turn from m to a
+    # dead reckoning: translations rotate from m to a
     turn = np.eye(6)
     for i in range(3):
         for k in range(3):
             turn[i, k] = T_a_m[i, k]
-    _sandwich(turn, blind, m)
+    _sandwich(turn, reckoned, m)
     # extrinsic: on the left of T_a_b it is Ad(T_a_b0) - Ad(T_a_b)
     adjoint_into(T_a_b0, a)
     adjoint_into(T, e)

@@ -1,4 +1,4 @@
-"""The virtual CPU's prices: what a step costs, from operations counted while it ran. Pure and reproducible."""
+"""Cost model of the virtual CPU: the time of a step from the operations counted in it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(slots=True)
 class Work:
-    """Operations of one step, counted where they are done; see PRICES_NS for what each stands for."""
+    """Operations counted in one step; PRICES_NS explains each."""
 
     steps: int = 0
     frames: int = 0
@@ -27,32 +27,32 @@ class Work:
     searches: int = 0
 
     def clear(self) -> None:
-        """Begin a new step."""
+        """Reset all counts for a new step."""
         for field in fields(self):
             setattr(self, field.name, 0)
 
 
-# ns each on the modelled core: an x86 laptop's, fitted to measured steps at every level of effort, and rounded.
+# ns each on the modelled core, an x86 laptop's: fitted to measured steps at every effort, and rounded.
 PRICES_NS: dict[str, float] = {
     "steps": 40_000,  # endpoint and log
-    "frames": 375_000,  # what does not grow with anything: arrays, motion model, estimate
-    "rectified_px": 2.1,  # a pixel that was remapped
-    "pyramid_px": 0.35,  # a pixel of an image on which a pyramid was built
-    "projected": 60,  # a point of the local map that is in view
+    "frames": 375_000,  # fixed cost: arrays, motion model, estimate
+    "rectified_px": 2.1,  # a remapped pixel
+    "pyramid_px": 0.35,  # a pixel of an image whose pyramid was built
+    "projected": 60,  # a landmark of the local map in view
     "alignments": 800,  # a template aligned at one level
-    "stereo_points": 1_750,  # a row looked along
-    "posed_points": 1_300,  # a point in the motion-only optimisation
+    "stereo_points": 1_750,  # a searched row
+    "posed_points": 1_300,  # a landmark in the motion-only optimisation
     "inertial_samples": 1_000,  # preintegration
     "fused": 340_000,  # a frame in the smoother
     "keyframes": 1_200_000,  # coding and bookkeeping
-    "detected_px": 2.1,  # a pixel of the image searched for corners
+    "detected_px": 2.1,  # a pixel searched for corners
     "births": 11_000,  # row search, descriptor, template, code
     "sightings": 1_600,  # code
-    "bearings": 7_500,  # a segment searched for a point without depth
-    "searches": 5_000_000,  # a look for a lost place
+    "bearings": 7_500,  # an epipolar segment searched for a landmark without depth
+    "searches": 5_000_000,  # a relocalisation attempt
 }
 
 
 def cost_ns(work: Work) -> int:
-    """CPU time in ns that the modelled core takes for a step."""
+    """CPU time in ns of a step on the modelled core."""
     return round(sum(price * int(getattr(work, name)) for name, price in PRICES_NS.items()))

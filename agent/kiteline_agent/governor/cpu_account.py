@@ -1,4 +1,4 @@
-"""What an agent's frames cost in CPU time, decoding taken off. Pure: the clock is handed in."""
+"""CPU time of each frame of an agent, without image decoding."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from kiteline_agent.runtime.frame_reader import FrameReader
 
 
 class CpuAccount:
-    """CPU time a frame.
+    """Measures the CPU time of each frame.
 
-    clock: process CPU time in ns. whole: the agent is alone in its process, so that all CPU time between two frames is
-    its own; otherwise only the time inside its steps is. ms: a frame each. last_ns: what the last one took.
+    clock: process CPU time in ns. whole: the agent is alone in its process, so that all CPU time between two frames
+    counts; otherwise only that inside its steps. ms: of each frame. last_ns: of the last one.
     """
 
     def __init__(self, clock: Callable[[], int], camera: FrameReader, whole: bool) -> None:
@@ -25,12 +25,12 @@ class CpuAccount:
         self.last_ns = 0
 
     def begin(self) -> None:
-        """A step begins."""
+        """Start of a step."""
         if not self._whole:
             self._mark_ns = self._clock()
 
     def end(self, with_frame: bool) -> None:
-        """It ended."""
+        """End of a step; with_frame: a frame was processed."""
         end_ns = self._clock()
         self._spent_ns += end_ns - self._mark_ns
         if self._whole:

@@ -1,10 +1,10 @@
-"""The CPU governor: holds the agent's CPU time under a share of one core, at the least loss of accuracy.
+"""CPU governor: keeps the agent's CPU time below a share of one core, with the least loss of accuracy.
 
-A closed loop on the CPU time that is handed in with each frame. What is steered is an effort, one row of a ladder: how
-many points, how much stereo, how fine the images, how many keyframes, and every which frame is tracked. The rows stand
-in the order of what they cost in accuracy (docs/decisions/governor-ladder.md). Effort follows the expected load, with
-hysteresis; on the last row frames are let through evenly, as many as the budget bears; and over all stands a sum over
-the last second that is overdrawn only where nothing was tracked for a second.
+A closed loop on the CPU time of each frame. It controls the effort, one row of a ladder: number of points, share of
+stereo, image resolution, keyframe rate, and how many frames are skipped. The rows are ordered by their loss of accuracy
+(docs/decisions/governor-ladder.md). The effort follows the expected load with hysteresis; on the last row, frames are
+skipped evenly to fit the budget. The sum over the last second exceeds the budget only if no frame was tracked for a
+second.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from kiteline_agent.config import AgentConfig, GovernorConfig
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much work a frame may be. Factors on the configuration's own numbers, except levels and every."""
+    """Work allowed for a frame: factors on the configured numbers, except for levels and `every`."""
 
-    points: float  # of the fine and the coarse pass, and of the inliers that are wanted
-    corners: float  # a keyframe's births
-    stereo: float  # points whose disparity is measured
-    fine_from: int  # template level at which the fine pass begins
-    first: int  # finest pyramid level that is made
+    points: float  # of the fine and the coarse pass, and of the required inliers
+    corners: float  # new landmarks of a keyframe
+    stereo: float  # landmarks whose disparity is measured
+    fine_from: int  # template level at which the fine pass starts
+    first: int  # finest pyramid level that is built
     keyframes: float  # motion until the next keyframe
-    slots: float  # keyframes whose points are looked for
-    every: int  # which frame is tracked: 1 all, 2 every other one
-    frame_cost: float  # of a tracked frame relative to the first row: a start, until it was measured
-    keyframe_cost: float  # the same of what a keyframe adds
+    slots: float  # keyframes whose landmarks are searched
+    every: int  # 1: every frame is tracked, 2: every other one
+    frame_cost: float  # of a tracked frame relative to the first row: initial value of the estimate
+    keyframe_cost: float  # the same of the extra cost of a keyframe
 
 
 FULL = Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 1, 1.00, 1.00)
@@ -43,7 +43,7 @@ CARRIED = (
     Effort(0.50, 0.50, 0.5, 1, 0, 1.4, 0.5, 8, 0.75, 0.90),
     Effort(0.65, 0.65, 0.5, 1, 1, 1.4, 0.5, 8, 0.60, 0.75),
     Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 9, 0.52, 0.70),
-)  # an IMU carries the pose over skipped frames: they cost next to nothing
+)  # with an IMU, which bridges skipped frames: skipping costs little accuracy
 ALONE = (
     FULL,
     Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
@@ -53,30 +53,28 @@ ALONE = (
     Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.58, 0.75),
     Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.58, 0.75),
     Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.52, 0.70),
-)  # images alone: a turn between two frames has to be followed, so pixels go before more frames
+)  # images alone: rotation between frames must stay small, so resolution is reduced before frames are skipped
 
 
 class Extra(Enum):
-    """What makes a frame dear."""
+    """Extra work that makes a frame expensive."""
 
     KEYFRAME = "keyframe"
-    SEARCH = "search"  # for a lost place
-    SUBMAP = "submap"  # a first keyframe
+    SEARCH = "search"  # relocalisation
+    SUBMAP = "submap"  # the first keyframe of a submap
 
 
-_LONGER = 1.03  # growth of the expected period a frame, should the camera be slower than thought
-_FIRST_LONGER = 2.5  # the same between the first two frames; more, and the core was busy with the first
-_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0}  # usual frames that it costs, before it was seen
-_OUTLIER = 1.5  # a frame dearer than so many usual ones is no usual frame
-_SPREAD = 2.0  # mean deviations within which nine of ten frames lie
-_LEAST = 0.1  # of the budget is for frames, whatever keyframes cost
+_LONGER = 1.03  # growth of the expected period per frame, if the camera is slower than assumed
+_FIRST_LONGER = 2.5  # the same between the first two frames; a longer gap is due to the first frame's processing
+_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0}  # initial estimate, in frames
+_OUTLIER = 1.5  # cost of a frame, in usual frames, above which it is clipped
+_SPREAD = 2.0  # mean deviations that cover nine of ten frames
+_LEAST = 0.1  # least share of the budget for frames
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What to do with a frame. track: whether it is tracked at all. effort: at which. events: what was decided, in
-    words for the log.
-    """
+    """Decision about a frame. track: False to skip it. effort: of the frame. events: for the log."""
 
     track: bool
     effort: Effort
@@ -84,7 +82,7 @@ class Decision:
 
 
 def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
-    """The configuration at an effort. Fewer points lie in larger cells, and fewer inliers are enough."""
+    """The configuration at an effort: with fewer points, cells are larger and fewer inliers are required."""
     align, keyframe = config.align, config.keyframe
     points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
     return replace(
@@ -113,47 +111,47 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
 
 
 class Governor:
-    """Asked once before each frame, and told of each keyframe. Without a budget it never says no."""
+    """Decides about each frame and each expensive extra. Without a budget it permits everything."""
 
     def __init__(self, config: GovernorConfig, *, inertial: bool = False) -> None:
-        """inertial: there is an IMU, which will soon carry the pose."""
+        """inertial: there is an IMU, which will soon bridge skipped frames."""
         self._config = config
         self.level = 0
         self._ladder: tuple[Effort, ...] = CARRIED if inertial else ALONE
-        self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # a window
+        self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # per window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
-        self._turn = 1.0  # grows by the share of frames that are tracked; at 1 it is a frame's turn
-        self._frame_ns = 0.0  # what a tracked frame without a keyframe costs at this level
-        self._scatter = 0.0  # how much, of their cost, frames differ from what was expected, on average
-        self._idle_ns = 0.0  # what a frame costs that is not tracked
-        self._extra_ns = dict.fromkeys(Extra, 0.0)  # what each adds to a frame
-        self._keyframes_s = config.first_keyframes  # that are asked for in a second
+        self._due = 1.0  # accumulates the share of tracked frames; at 1 a frame is due
+        self._frame_ns = 0.0  # expected cost of a tracked frame without extras at this level
+        self._scatter = 0.0  # mean relative deviation of frames from their expected cost
+        self._idle_ns = 0.0  # cost of a skipped frame
+        self._extra_ns = dict.fromkeys(Extra, 0.0)  # expected extra cost of each
+        self._keyframes_s = config.first_keyframes  # requested per second
         self._keyframe_t_ns = 0  # of the last one
-        self._asked_t_ns: int | None = None  # when the next one was first asked for
+        self._asked_t_ns: int | None = None  # of the first pending request
         self._period_ns = config.first_period_s * 1e9  # between frames
         self._first_t_ns = 0
         self._last_t_ns: int | None = None
-        self._tracked_t_ns = 0  # of the last frame that was tracked
+        self._tracked_t_ns = 0  # of the last tracked frame
         self._last_tracked = False
         self._last_extra: Extra | None = None  # of the last frame
-        self._waiting: Extra | None = None  # what there was no room for in the last frame that was tracked
-        self._waited: Extra | None = None  # the same of the one before
+        self._waiting: Extra | None = None  # extra that did not fit in the last tracked frame
+        self._waited: Extra | None = None  # the same of the tracked frame before
         self._calm_since_ns = 0
         self._level_since_ns = 0
-        self._gap_s = config.max_gap_s  # most that may lie between two tracked frames
-        self._measured = False  # until then frames are expected to cost what they do elsewhere
-        if self.on:  # a map begins with dear frames: not at an effort that cannot be borne
+        self._gap_s = config.max_gap_s  # longest time between two tracked frames
+        self._measured = False  # False: the expected cost is the configured one
+        if self.on:  # a map starts with expensive frames: choose an effort that fits
             self._frame_ns = config.first_frame_ms * 1e6
-            self._climb_to(self._ladder, self._bearable(0))
-            if self._row.every > 3:  # too few frames for the IMU to start from
-                self._climb_to(ALONE, 0)
-                self._climb_to(ALONE, self._bearable(0))
+            self._change_row(self._ladder, self._best_affordable(0))
+            if self._row.every > 3:  # too few frames for the IMU initialisation
+                self._change_row(ALONE, 0)
+                self._change_row(ALONE, self._best_affordable(0))
         self._first_ladder = self._ladder
 
     @property
     def on(self) -> bool:
-        """Whether there is a budget."""
+        """True if there is a budget."""
         return self._budget_ns > 0.0
 
     @property
@@ -161,9 +159,9 @@ class Governor:
         return self._ladder[self.level]
 
     def frame(self, t_ns: int, last_cpu_ns: int, *, lost: bool = False, carried: bool = False) -> Decision:
-        """Decide about the frame at t_ns. last_cpu_ns: what the frame before cost, whether it was tracked or not.
+        """Decide about the frame at t_ns. last_cpu_ns: cost of the frame before, tracked or skipped.
 
-        lost: there is no track that a skipped frame could endanger. carried: an IMU bridges skipped frames.
+        lost: tracking is lost already. carried: an IMU bridges skipped frames.
         """
         if not self.on:
             return Decision(True, FULL, ())
@@ -172,17 +170,17 @@ class Governor:
         before, load = self.level, self._load(self.level)
         events: list[str] = []
         self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
-        self._steer(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
-        track = (self._its_turn(lost) or self._early(t_ns)) and self._affordable(t_ns, lost)
-        if not track and not lost and self._blind_for(t_ns, self._gap_s):  # frames before tracking
-            track = self._window_ns + (1.0 + 0.5 * self._doubt) * self._frame_ns <= self._budget_ns
-            if not track and self._blind_for(t_ns, self._config.blind_s):
+        self._choose_row(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
+        track = (self._is_due(lost) or self._early(t_ns)) and self._affordable(t_ns, lost)
+        if not track and not lost and self._gap_exceeds(t_ns, self._gap_s):  # the last reserve, before tracking is lost
+            track = self._window_ns + (1.0 + 0.5 * self._safety) * self._frame_ns <= self._budget_ns
+            if not track and self._gap_exceeds(t_ns, self._config.blind_s):
                 track = True
                 events.append("governor: over budget, or the track would be lost")
         if self.level != before:
             events.insert(0, f"governor: effort {before} -> {self.level}, the load was {100.0 * load:.0f} % of it")
         if track:
-            self._turn = max(self._turn - 1.0, 0.0)
+            self._due = max(self._due - 1.0, 0.0)
             self._tracked_t_ns = t_ns
             self._waited, self._waiting = self._waiting, None
         else:
@@ -191,27 +189,27 @@ class Governor:
         return Decision(track, self._row, tuple(events))
 
     def may(self, extra: Extra, *, urgent: bool = False) -> bool:
-        """Whether there is CPU time for something dear in this frame. Then it is done: the frame is booked under it.
+        """True if there is CPU time for an extra in this frame, which is then booked for the frame.
 
-        urgent: without it the track may be lost; then half of the doubt is enough.
+        urgent: without it tracking may be lost; half of the safety margin is enough.
         """
         if self.on:
             if extra is Extra.KEYFRAME and self._asked_t_ns is None:
                 self._asked_t_ns = self._last_t_ns
-            if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the room is for the new map
+            if self._waited is Extra.SUBMAP and extra is Extra.SEARCH:  # the time is reserved for the new submap
                 return False
-            if not self._room_for(extra, 1.0 + (0.5 if urgent else 1.0) * self._doubt):
+            if not self._room_for(extra, 1.0 + (0.5 if urgent else 1.0) * self._safety):
                 self._waiting = extra
                 return False
         self.note(extra)
         return True
 
     def note(self, extra: Extra) -> None:
-        """Something dear is done in this frame, whether there is CPU time for it or not."""
+        """Book an extra that is done in this frame whether or not there is CPU time."""
         self._last_extra = extra
 
     def _learn(self, cpu_ns: int) -> None:
-        """Book what the last frame cost, and sharpen what frames and keyframes are expected to cost."""
+        """Book the cost of the last frame, and update the expected costs."""
         if self._last_t_ns is None:
             return
         if not self._early(self._last_t_ns):
@@ -221,7 +219,7 @@ class Governor:
         if not self._last_tracked:
             self._idle_ns += (cpu_ns - self._idle_ns) * (gain if self._idle_ns else 1.0)
             return
-        self._scatter += (self._surprise(cpu_ns) - self._scatter) * gain
+        self._scatter += (self._relative_error(cpu_ns) - self._scatter) * gain
         if self._last_extra is not None:
             known_ns = self._extra_ns[self._last_extra]
             more_ns = max(cpu_ns - self._frame_ns, 0.0)
@@ -229,34 +227,34 @@ class Governor:
             if self._last_extra is not Extra.SEARCH:
                 self._count_keyframe(self._last_t_ns)
         elif self._measured:
-            cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # a frame that was lost and found says little
-            # Quicker to believe that frames are dear than that they are cheap.
+            cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # outliers: a frame that lost and regained tracking
+            # Increases are followed faster than decreases.
             up = 2.0 * gain if cpu_ns > self._frame_ns else gain
             self._frame_ns += (cpu_ns - self._frame_ns) * min(up, 1.0)
         else:
             self._frame_ns, self._measured = float(cpu_ns), True
 
     def _advance(self, t_ns: int) -> None:
-        """Move the window to a new time."""
+        """Advance the window to t_ns."""
         window_ns = round(self._config.window_s * 1e9)
         while self._spent and self._spent[0][0] <= t_ns - window_ns:
             self._window_ns -= self._spent.popleft()[1]
         if self._last_t_ns is None:
             self._first_t_ns = self._level_since_ns = self._calm_since_ns = self._tracked_t_ns = t_ns
             return
-        # Frames that a busy core passed over were not asked about: the shortest period is the camera's.
+        # A busy core drops frames without a decision: the shortest period is the camera's.
         passed_ns = float(t_ns - self._last_t_ns)
         longer = _LONGER if self._last_t_ns > self._first_t_ns else _FIRST_LONGER
         if passed_ns <= longer * self._period_ns:
             self._period_ns = passed_ns
         elif self._last_t_ns > self._first_t_ns:
             self._period_ns *= longer
-        if self._asked_t_ns is None:  # none was needed for so long
+        if self._asked_t_ns is None:  # no request for a while
             self._keyframes_s = min(self._keyframes_s, 1e9 / max(t_ns - self._keyframe_t_ns, 1))
-        self._turn += self._share() * passed_ns / self._period_ns
+        self._due += self._share() * passed_ns / self._period_ns
 
-    def _surprise(self, cpu_ns: int) -> float:
-        """By how much the last frame was off, of what it was expected to cost, as far as that was known."""
+    def _relative_error(self, cpu_ns: int) -> float:
+        """Relative deviation of the last frame from its expected cost."""
         known_ns = 0.0 if self._last_extra is None else self._extra_ns[self._last_extra]
         if not self._measured or (self._last_extra is not None and not known_ns):
             return self._scatter
@@ -264,12 +262,12 @@ class Governor:
         return min(abs(cpu_ns - expected_ns) / max(expected_ns, 1.0), _OUTLIER - 1.0)
 
     @property
-    def _doubt(self) -> float:
-        """How much dearer than expected a frame may be."""
+    def _safety(self) -> float:
+        """Safety margin: relative excess over the expected cost."""
         return max(self._config.doubt, _SPREAD * self._scatter)
 
     def _count_keyframe(self, t_ns: int) -> None:
-        """A keyframe was made: how many are asked for, whether there was room for them at once or not."""
+        """Update the rate of keyframe requests after a keyframe."""
         asked_t_ns = t_ns if self._asked_t_ns is None else self._asked_t_ns
         apart_ns = max(asked_t_ns - self._keyframe_t_ns, self._period_ns)
         if self._keyframe_t_ns:
@@ -277,64 +275,65 @@ class Governor:
         self._keyframe_t_ns, self._asked_t_ns = t_ns, None
 
     def _affordable(self, t_ns: int, lost: bool) -> bool:
-        """Whether the last second leaves room for the frame; of a lost one, for the search as well."""
+        """True if the budget of the last second allows the frame, and if lost, also a relocalisation attempt."""
         if lost:
-            return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._doubt)
-        if self._waiting is Extra.KEYFRAME and not self._blind_for(t_ns, self._gap_s):
-            return self._room_for(Extra.KEYFRAME, 1.0 + self._doubt)  # it goes before more frames
-        cost_ns = self._frame_ns * (1.0 + self._doubt)
+            return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._safety)
+        if self._waiting is Extra.KEYFRAME and not self._gap_exceeds(t_ns, self._gap_s):
+            return self._room_for(Extra.KEYFRAME, 1.0 + self._safety)  # the keyframe has priority over more frames
+        cost_ns = self._frame_ns * (1.0 + self._safety)
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 
-    def _blind_for(self, t_ns: int, gap_s: float) -> bool:
-        """Whether the last tracked frame will be longer ago than gap_s if this one is not tracked."""
+    def _gap_exceeds(self, t_ns: int, gap_s: float) -> bool:
+        """True if skipping this frame makes the time since the last tracked one exceed gap_s."""
         return t_ns + self._period_ns - self._tracked_t_ns > gap_s * 1e9
 
-    def _room_for(self, extra: Extra, dearer: float) -> bool:
-        """Whether a frame with something dear fits, were it dearer than expected; what never fits is done when little
-        else was.
+    def _room_for(self, extra: Extra, factor: float) -> bool:
+        """True if a frame with an extra fits, at `factor` times the expected cost.
+
+        An extra that never fits is allowed when the window is nearly empty.
         """
         need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS[extra] * self._frame_ns)
-        if self._last_extra is not None and self._last_extra is not extra:  # done in this very frame
+        if self._last_extra is not None and self._last_extra is not extra:  # also done in this frame
             need_ns += self._extra_ns[self._last_extra] or _GUESS[self._last_extra] * self._frame_ns
-        if self._window_ns + dearer * need_ns <= self._budget_ns:
+        if self._window_ns + factor * need_ns <= self._budget_ns:
             return True
         if self._last_extra not in (None, extra):
-            return False  # it comes next, alone
+            return False  # it is done in the next frame, alone
         idle_ns = self._idle_ns * self._config.window_s * 1e9 / self._period_ns
         little = self._window_ns <= idle_ns + _LEAST * self._budget_ns
-        return little and idle_ns + dearer * need_ns > self._budget_ns
+        return little and idle_ns + factor * need_ns > self._budget_ns
 
     def _early(self, t_ns: int) -> bool:
-        """Whether the map has just begun: nothing is booked, and an IMU needs frames to start from."""
+        """True at the start of a map: nothing is booked, and the IMU initialisation needs frames."""
         return t_ns < self._first_t_ns + self._config.grace_s * 1e9
 
-    def _its_turn(self, lost: bool) -> bool:
-        """Whether the frame is one of those, evenly spread, that are tracked. A turn that cannot be paid for waits."""
-        self._turn = min(self._turn, 2.0)
-        return lost or self._turn >= 1.0 - 1e-6
+    def _is_due(self, lost: bool) -> bool:
+        """True if the frame is due, with tracked frames spread evenly."""
+        self._due = min(self._due, 2.0)
+        return lost or self._due >= 1.0 - 1e-6
 
     def _share(self) -> float:
-        """Of the frames that are tracked: what the budget bears, but no more than on the next better row."""
+        """Share of frames to track: as the budget allows, but no more than on the next better row."""
         most = 1.0 / self._every(max(self.level - 1, 0))
         all_frames = self._frames(self.level) * self._every(self.level)
         if all_frames <= 0.0:
             return most
-        bearable = self._config.fill - self._load(self.level) + self._frames(self.level)
-        return min(most, max(bearable, _LEAST) / all_frames)
+        affordable = self._config.fill - self._load(self.level) + self._frames(self.level)
+        return min(most, max(affordable, _LEAST) / all_frames)
 
     def _every(self, level: int) -> float:
-        """Which frame a row tracks; never so few that the track would be lost."""
+        """`every` of a row, limited so that tracking is not lost."""
         most = self._gap_s * 1e9 // self._period_ns
         return max(min(self._ladder[level].every, most), 1.0)
 
     def _frames(self, level: int) -> float:
-        """Share of the budget that the tracked frames of a row take, without keyframes."""
+        """Share of the budget for the tracked frames of a row, without keyframes."""
         row, now = self._ladder[level], self._row
         frame_ns = self._frame_ns * row.frame_cost / now.frame_cost
         return frame_ns / self._every(level) * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
 
     def _load(self, level: int) -> float:
-        """Share of the budget that a row is expected to take: frames, keyframes (one may always come), the rest."""
+        """Expected load of a row, as a share of the budget: frames, keyframes (at least one), skipped frames."""
         if not self._frame_ns:
             return 0.0
         row, now = self._ladder[level], self._row
@@ -343,18 +342,18 @@ class Governor:
         idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * self._config.window_s * 1e9 / self._period_ns
         return self._frames(level) + (keyframes * keyframe_ns + idle_ns) / self._budget_ns
 
-    def _steer(self, t_ns: int, ladder: tuple[Effort, ...]) -> None:
-        """Hysteresis on the load: down at once, up only after a calm while and one row a time."""
+    def _choose_row(self, t_ns: int, ladder: tuple[Effort, ...]) -> None:
+        """Choose the row with hysteresis: lower effort at once, higher after a calm period and one row at a time."""
         config = self._config
         if ladder is not self._ladder:
-            self._climb_to(ladder, 0)
-            self._set_level(t_ns, self._bearable(0))
+            self._change_row(ladder, 0)
+            self._set_level(t_ns, self._best_affordable(0))
             return
-        if t_ns - self._first_t_ns < config.settling_s * 1e9:  # nothing to hold on to yet
-            self._set_level(t_ns, self._bearable(0))
+        if t_ns - self._first_t_ns < config.settling_s * 1e9:  # no stable load yet
+            self._set_level(t_ns, self._best_affordable(0))
             return
         if self._load(self.level) > config.tight and t_ns - self._level_since_ns >= config.down_s * 1e9:
-            level = self._bearable(self.level)
+            level = self._best_affordable(self.level)
             if level != self.level:
                 self._set_level(t_ns, level)
                 return
@@ -363,17 +362,17 @@ class Governor:
         elif t_ns - self._calm_since_ns >= config.up_s * 1e9:
             self._set_level(t_ns, self.level - 1)
 
-    def _bearable(self, best: int) -> int:
-        """The best row from `best` on that the budget bears, else the last one."""
+    def _best_affordable(self, best: int) -> int:
+        """The best row from `best` on that fits the budget, else the last one."""
         rows = range(best, len(self._ladder))
         return next((row for row in rows if self._load(row) <= self._config.tight), rows[-1])
 
     def _set_level(self, t_ns: int, level: int) -> None:
-        self._climb_to(self._ladder, level)
+        self._change_row(self._ladder, level)
         self._level_since_ns = self._calm_since_ns = t_ns
 
-    def _climb_to(self, ladder: tuple[Effort, ...], level: int) -> None:
-        """Another row: what was learned is scaled."""
+    def _change_row(self, ladder: tuple[Effort, ...], level: int) -> None:
+        """Change the row and scale the expected costs."""
         before = self._row
         self._ladder, self.level = ladder, level
         self._frame_ns *= self._row.frame_cost / before.frame_cost

@@ -1,11 +1,11 @@
-"""Patch alignment: where in a new image does a template lie, to a fraction of a pixel.
+"""Kernels of sub-pixel template alignment.
 
 Inverse-compositional Lucas-Kanade over position, invariant to gain and offset of brightness (S. Baker, I. Matthews,
 "Lucas-Kanade 20 years on", 2004): the template's gradients are made orthogonal to the template and to a constant, so
-both drop out of the normal equations. Templates are warped by the affine map that the predicted pose gives.
+both drop out of the normal equations. Templates are warped by the affine map of the predicted pose.
 
-All sums over patches are sums of integers (values to 1/16 of a grey level, positions to 1/128 px): they come out the
-same in any order, so that the compiler may make vectors of them.
+All sums over patches are integer sums (values in 1/16 grey level, positions in 1/128 px), which are exact in any order,
+so that the compiler can vectorise them.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from kiteline_core.jit import njit
 
 PATCH_RADIUS = 4  # a patch is 9x9 px of the level at which it is compared
 PATCH = 2 * PATCH_RADIUS + 1
-TEMPLATE_RADIUS = 10  # a template is 21x21 px: room for a 9x9 patch turned by 45 degrees and scaled by 1.5
+TEMPLATE_RADIUS = 10  # a template is 21x21 px: fits a 9x9 patch rotated by 45 degrees and scaled by 1.5
 TEMPLATE = 2 * TEMPLATE_RADIUS + 1
-STRIDE = 16  # of a patch's rows, 9 pixels and as many others as fill whole vectors
+STRIDE = 16  # of a patch's rows: 9 pixels, padded to full vectors
 LANES = PATCH * STRIDE
-GREY = 16  # steps a grey level: patches are integers, whose sums are exact in any order and so become vectors
+GREY = 16  # steps per grey level of integer patches
 TEMPLATE_LEVELS = 3  # octave of the corner, and two coarser ones for convergence
 
 
 @njit
 def sample(image, x, y):  # type: ignore[no-untyped-def]
-    """Bilinear value of `image` at (x, y); the caller keeps 0 <= x < w-1, 0 <= y < h-1."""
+    """Bilinear value of `image` at (x, y), with 0 <= x < w-1 and 0 <= y < h-1."""
     x0 = int(x)
     y0 = int(y)
     fx = x - x0
@@ -42,7 +42,7 @@ def sample(image, x, y):  # type: ignore[no-untyped-def]
 
 @njit
 def _cut_inside(image, left, top, template):  # type: ignore[no-untyped-def]
-    """Cut a template (21,21) uint8 whose first pixel is at (left, top), all of it inside: one weight for all pixels."""
+    """Cut a template (21,21) uint8 that is fully inside the image, with its first pixel at (left, top)."""
     u1 = np.uint64(1)
     x0 = int(left)
     y0 = int(top)
@@ -65,7 +65,7 @@ def _cut_inside(image, left, top, template):  # type: ignore[no-untyped-def]
 def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-def]
     """Cut templates around pixels. uv: (n,2) level-0 px. octave: (n,). templates: (n,3,21,21) uint8, out.
 
-    Pixels outside of the image repeat its border.
+    Pixels outside the image repeat its border.
     """
     levels = len(pyramid)
     for i in range(uv.shape[0]):
@@ -88,7 +88,7 @@ def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-de
 
 @njit
 def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-untyped-def]
-    """Sample the warped template. Returns False where the warp leaves it.
+    """Sample the warped template. Returns False if the warp exceeds it.
 
     template: (21,21) uint8. reference: (11,STRIDE) int16 in 1/GREY grey levels, out. In 1/128 px.
     """
@@ -119,8 +119,8 @@ def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-u
 
 
 @njit
-def spread_out(reference, patches):  # type: ignore[no-untyped-def]
-    """The template (row 1 of patches) and its gradients along x (2) and y (3), twice in the same unit."""
+def template_gradients(reference, patches):  # type: ignore[no-untyped-def]
+    """Write the template (row 1 of patches) and twice its gradients along x (2) and y (3)."""
     grey = reference.reshape(-1)
     for k in range(LANES - 2):
         j = np.uint64(k)
@@ -141,11 +141,11 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit
-def look(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
-    """The patch around (x, y) of an image, in 1/GREY grey levels, in 1/128 px.
+def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
+    """Sample the patch around (x, y) in 1/GREY grey levels, with (x, y) rounded to 1/128 px.
 
     raw: (PATCH + 1, STRIDE) uint8. across: as many int16, for the rows interpolated along x. seen: (LANES,) int16, out.
-    Beside a patch's 9 columns stands anything.
+    Padding columns are undefined.
     """
     x0 = int(x)
     y0 = int(y)
@@ -166,10 +166,10 @@ def look(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _settle(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
-    """Move (x, y) until the patch there looks like the template. Returns (x, y, ncc, whether it stayed inside).
+def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
+    """Gauss-Newton on (x, y) until the patch matches the template. Returns (x, y, ncc, inside).
 
-    patches: (5, LANES) int16: the patch as seen (filled here), the template, its gradients, see spread_out, and ones.
+    patches: (5, LANES) int16: the patch as seen (filled here), the template, its gradients, see template_gradients, and ones.
     The gradients that count are those made orthogonal to the template and to a constant: their sums follow from the
     sums over the plain ones, which are exact.
     """
@@ -196,7 +196,7 @@ def _settle(image, patches, raw, across, x, y, iterations, max_step):  # type: i
     for k in range(iterations + 1):
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             return x, y, 0.0, False
-        look(image, x, y, raw, across, seen)
+        sample_patch(image, x, y, raw, across, seen)
         total = float(dot(seen, ones))
         st = dot(seen, t) - mean * total
         gain = st / tt
@@ -213,7 +213,7 @@ def _settle(image, patches, raw, across, x, y, iterations, max_step):  # type: i
         dx = -2.0 * (h11 * sx - h01 * sy) / (det * gain)
         dy = -2.0 * (h00 * sy - h01 * sx) / (det * gain)
         norm = np.sqrt(dx * dx + dy * dy)
-        if norm > 2.0:  # beyond the patch's linear range: go only part of the way
+        if norm > 2.0:  # beyond the patch's linear range: shorten the step
             dx *= 2.0 / norm
             dy *= 2.0 / norm
         x += dx
@@ -268,9 +268,11 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
             )
             if not inside:
                 continue
-            spread_out(reference, patches)
+            template_gradients(reference, patches)
             s = float(1 << level)
-            px, py, score, ok = _settle(pyramid[level], patches, raw, across, x / s, y / s, iterations, max_step_px)
+            px, py, score, ok = _align_level(
+                pyramid[level], patches, raw, across, x / s, y / s, iterations, max_step_px
+            )
             if ok and (score >= min_ncc or j > last):
                 if score > 0.5:
                     x = px * s

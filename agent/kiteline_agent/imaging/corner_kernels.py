@@ -14,7 +14,7 @@ from kiteline_core.jit import njit
 
 @njit
 def ring_scores(r0, r1, r2, r3, r4, r5, r6, score):  # type: ignore[no-untyped-def]
-    """By how much the weakest pixel of the best arc of nine differs from the centre: the FAST score.
+    """FAST score: difference from the centre of the weakest pixel of the best arc of nine.
 
     r0 to r6: rows y-3 to y+3, (n+6,) uint8. score: (n,) uint8 out, of the pixels 3 to n+2 of r3.
     """
@@ -26,7 +26,7 @@ def ring_scores(r0, r1, r2, r3, r4, r5, r6, score):  # type: ignore[no-untyped-d
         p4, p5, p6, p7 = r3[j + u6], r4[j + u6], r5[j + u5], r6[j + u4]
         p8, p9, p10, p11 = r6[j + u3], r6[j + u2], r5[j + u1], r4[j]
         p12, p13, p14, p15 = r3[j], r2[j], r1[j + u1], r0[j + u2]
-        # Darkest pixel of two, of four, then of eight neighbours, and the better of two ways to a ninth.
+        # Darkest pixel of two, of four, then of eight neighbours, and the better of two ninth ones.
         a1, a3, a5, a7 = min(p1, p2), min(p3, p4), min(p5, p6), min(p7, p8)
         a9, a11, a13, a15 = min(p9, p10), min(p11, p12), min(p13, p14), min(p15, p0)
         b1, b3, b5, b7 = min(a1, a3), min(a3, a5), min(a5, a7), min(a7, a9)
@@ -56,7 +56,7 @@ def ring_scores(r0, r1, r2, r3, r4, r5, r6, score):  # type: ignore[no-untyped-d
 
 @njit
 def peaks(above, at, below, threshold, peak):  # type: ignore[no-untyped-def]
-    """Where a score is over a threshold and greater than its eight neighbours.
+    """Mark scores above a threshold that exceed their eight neighbours.
 
     above, at, below: rows of scores (n+2,) uint8. peak: (n,) uint8 out, 1 or 0, of the scores 1 to n of `at`.
     """
@@ -71,7 +71,7 @@ def peaks(above, at, below, threshold, peak):  # type: ignore[no-untyped-def]
 
 @njit
 def fast_corners(image, threshold, margin, scale, cell_px, occupied, xy):  # type: ignore[no-untyped-def]
-    """Corners at least `margin` (> 3) px inside an image that lie in free cells, row by row. Returns how many.
+    """Detect corners in free cells, at least `margin` (> 3) px inside the image. Returns their number.
 
     scale: level-0 px a pixel of this image. cell_px: side of a cell at level 0. occupied: (rows, columns) bool.
     xy: (m,2) int32 out; corners beyond m are left out, which a quarter of the pixels always is enough for.

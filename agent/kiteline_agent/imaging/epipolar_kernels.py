@@ -1,4 +1,4 @@
-"""Where on a line segment of an image does a template lie: the search for points whose depth is not known yet."""
+"""Kernel of the epipolar search for landmarks without depth: template correlation along a line segment."""
 
 from __future__ import annotations
 

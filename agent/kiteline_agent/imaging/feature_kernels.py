@@ -1,4 +1,4 @@
-"""Corners, their orientation and their binary descriptors."""
+"""Kernels of corner scores, orientations and binary descriptors."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from kiteline_core.jit import njit
 
-DESCRIPTOR_RADIUS = 15  # px around a corner that orientation and descriptor look at
-BORDER = 18  # px a corner stays away from the image border, at its own level
+DESCRIPTOR_RADIUS = 15  # px around a corner used by orientation and descriptor
+BORDER = 18  # least distance of a corner from the image border, px of its level
 
 
 @njit
@@ -88,14 +88,14 @@ def orientations(image, xy, angle):  # type: ignore[no-untyped-def]
 def _blur(image, x, y, across, patch):  # type: ignore[no-untyped-def]
     """Smooth the patch (31, 32) around (x, y) as cv2.GaussianBlur(image, (7, 7), 2.0) does, to the last bit.
 
-    across: (37, 32) uint16 for the rows smoothed along x. The weights are 1/256 each; unsigned indices need no check
-    for negative ones, so that these loops become vectors.
+    across: (37, 32) uint16 buffer of the rows smoothed along x. Weights are in 1/256. Unsigned indices (no check for
+    negative ones) allow vectorisation.
     """
     u1, u2, u3, u4, u5, u6 = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5), np.uint64(6)
     side = 2 * DESCRIPTOR_RADIUS + 1
     for r in range(side + 6):
         line = image[y - BORDER + r, x - BORDER : x + BORDER + 1]
-        for half in range(2):  # two times 16 columns, of which one is in both: whole vectors
+        for half in range(2):  # twice 16 columns, one of them in both: full vectors
             for c in range(16):
                 j = np.uint64(15 * half + c)
                 across[r, j] = np.uint16(

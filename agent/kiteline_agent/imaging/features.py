@@ -1,4 +1,4 @@
-"""Image pyramids, corners spread over the image, and binary descriptors."""
+"""Image pyramids, corner detection spread over the image, and binary descriptors."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from kiteline_agent.imaging.corner_kernels import fast_corners
 U8 = NDArray[np.uint8]
 Pyramid = tuple[U8, ...]
 
-# 256 tests drawn once from a Gaussian of 1/5 of the 31 px patch (M. Calonder et al., "BRIEF", 2010, layout G II), then
-# frozen: both halves of every future version must draw the same ones.
+# 256 tests from a Gaussian of 1/5 of the 31 px patch (M. Calonder et al., "BRIEF", 2010, layout G II). They must never
+# change: descriptors of all versions are compared.
 PATTERN_SEED = 20_260_101
-PATTERN_REACH_PX = 10.0  # per axis, so that a turned test stays within 15 px
+PATTERN_REACH_PX = 10.0  # per axis, so that a rotated test stays within 15 px
 
 
 def _pattern() -> NDArray[np.float64]:
-    # Park-Miller's generator by hand: numpy does not promise the same stream for ever.
+    # Park-Miller's generator, since numpy does not guarantee the same stream for ever.
     state, draws = PATTERN_SEED, np.empty(256 * 4 * 12)
     for i in range(draws.size):
         state = state * 48271 % 2147483647
@@ -35,19 +35,19 @@ PATTERN = _pattern()
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    """Where new corners come from."""
+    """Options of the corner detector."""
 
     levels: int = 3  # pyramid levels searched; each halves the size
     first: int = 0  # finest of them
-    cell_px: int = 32  # one new corner a cell keeps features spread; 32 px gives about 350 cells at 752x480
-    fast_threshold: int = 12  # grey levels; low, since the cell keeps only its best corner
-    min_score: float = 12.0  # (grey levels / px)^2; below it, sensor noise is as strong as the corner
-    faint_below: int = 100  # corners, taken ones among them: with fewer, the cells left are searched for faint ones
-    faint_threshold: int = 6  # grey levels of those
-    faint_score: float = 2.0  # of those at least, and
-    faint_noise: float = 1.5  # times the square of the noise: corners of pure noise reach 0.9
-    margin_px: int = 20  # level-0 px: the lens's blind rim after rectification
-    max_corners: int = 200  # a keyframe's births; what a link of 12 kB a keyframe carries
+    cell_px: int = 32  # at most one new corner per cell; 32 px gives about 350 cells at 752x480
+    fast_threshold: int = 12  # grey levels; low, since only the best corner of a cell is kept
+    min_score: float = 12.0  # (grey levels / px)^2; weaker corners are sensor noise
+    faint_below: int = 100  # corners, existing ones included: with fewer, empty cells are searched for faint corners
+    faint_threshold: int = 6  # grey levels, for faint corners
+    faint_score: float = 2.0  # least score of faint corners, and
+    faint_noise: float = 1.5  # least score in squared noise: corners of pure noise reach 0.9
+    margin_px: int = 20  # level-0 px: border without image after rectification
+    max_corners: int = 200  # new landmarks of a keyframe: what fits in 12 kB
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Corners:
 
 
 def build_pyramid(image: U8, levels: int) -> Pyramid:
-    """Gaussian pyramid; pixel x of level k lies at x * 2^k of level 0."""
+    """Build a Gaussian pyramid; pixel x of level k is at x * 2^k of level 0."""
     out = [np.ascontiguousarray(image)]
     for _ in range(levels - 1):
         out.append(np.asarray(cv2.pyrDown(out[-1]), np.uint8))
@@ -68,7 +68,7 @@ def build_pyramid(image: U8, levels: int) -> Pyramid:
 
 
 def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig) -> Corners:
-    """Best corners of the cells in which none of `taken` (n,2) level-0 px lies."""
+    """Detect the best corners of the cells without any of `taken` (n,2) level-0 px."""
     h, w = pyramid[0].shape
     rows, columns = -(-h // config.cell_px), -(-w // config.cell_px)
     occupied = np.zeros((rows, columns), np.bool_)
@@ -101,16 +101,17 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
 
 
 def noise_of(image: U8) -> float:
-    """Deviation of an image's noise in grey levels, by what second differences along both axes leave of its content
-    (J. Immerkaer, "Fast noise variance estimation", 1996), median of every eighth row.
+    """Standard deviation of the image noise in grey levels, from second differences of every eighth row.
+
+    Source: J. Immerkaer, "Fast noise variance estimation", 1996.
     """
     at = np.arange(1, image.shape[0] - 1, 8)
-    bent = image[at - 1].astype(np.int32) - 2 * image[at].astype(np.int32) + image[at + 1]
-    return float(np.median(np.abs(bent[:, :-2] - 2 * bent[:, 1:-1] + bent[:, 2:]))) * 1.4826 / 6.0
+    second = image[at - 1].astype(np.int32) - 2 * image[at].astype(np.int32) + image[at + 1]
+    return float(np.median(np.abs(second[:, :-2] - 2 * second[:, 1:-1] + second[:, 2:]))) * 1.4826 / 6.0
 
 
 def describe(pyramid: Pyramid, uv: NDArray[np.float64], octave: U8) -> tuple[U8, U8]:
-    """Angles (n,) in 1/256 turns and descriptors (n,32) of corners at uv (n,2) level-0 px, at least BORDER inside."""
+    """Angles (n,) in 1/256 turns and descriptors (n,32) of corners uv (n,2) level-0 px, at least BORDER inside."""
     n = len(uv)
     angle_code, descriptor = np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8)
     for level in range(len(pyramid)):

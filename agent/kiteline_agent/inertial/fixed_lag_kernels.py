@@ -1,4 +1,4 @@
-"""A short chain of inertial states: normal equations, elimination, and the marginalisation of the oldest state.
+"""Kernels of a short chain of inertial states: normal equations, elimination, marginalisation of the oldest state.
 
 States and residuals are those of inertial_kernels. The matrix is block tridiagonal with a border of width 2 (gravity),
 so elimination goes along the chain.
@@ -73,7 +73,7 @@ def _add_imu(
 
 @njit
 def _from_linearised(r: F64, p: F64, h: F64, b: F64, at_r: F64, at_p: F64, out: F64) -> None:
-    """Right side out (6,) at a pose of a term h (6,6), b (6,) that was linearised at another pose."""
+    """Right-hand side out (6,) at a pose, of a term h (6,6), b (6,) linearised at another pose."""
     rel, d = np.empty((3, 3)), np.empty(6)
     mul33_tn(at_r, r, rel)
     so3_log(rel, d[:3])
@@ -90,7 +90,7 @@ def _from_linearised(r: F64, p: F64, h: F64, b: F64, at_r: F64, at_p: F64, out: 
 def _prior_side(
     r: F64, s: F64, tilt: F64, prior_h: F64, prior_b: F64, prior_r: F64, prior_s: F64, prior_tilt: F64, out: F64
 ) -> None:
-    """Right side out (17,) of the prior on [state, tilt] at the present values."""
+    """Right-hand side out (17,) of the prior on [state, tilt] at the current values."""
     rel, d = np.empty((3, 3)), np.empty(_B)
     mul33_tn(prior_r, r, rel)
     so3_log(rel, d[:3])
@@ -155,7 +155,7 @@ def smooth(
             for i in range(_W):
                 for k in range(_W + 1):
                     blocks[f, i, k] = 0.0
-        # gravity's part of the system rides in rows and columns 30, 31 of every block and is passed on
+        # gravity's part of the system is in rows and columns 30, 31 of every block and is passed to the next
         _prior_side(rot[0], state[0], tilt, prior_h, prior_b, prior_r, prior_s, prior_tilt, out17)
         for i in range(_B):
             ii = i if i < _D else 15 + i
@@ -268,7 +268,7 @@ def marginalise(
     walk: F64, vis_h: F64, vis_b: F64, vis_r: F64, vis_p: F64, vel: F64, vel_info: F64, tilt_walk: float,
     prior_h: F64, prior_b: F64, prior_r: F64, prior_s: F64, prior_tilt: F64,
 ) -> bool:  # fmt: skip
-    """Turn the prior on state 0 (of the first two, rot (2,3,3), state (2,12)) into the prior on state 1, in place.
+    """Transform the prior on state 0 (of the first two, rot (2,3,3), state (2,12)) into the prior on state 1, in place.
 
     tilt_walk: variance in rad^2 by which gravity's direction in the map may have moved meanwhile.
     """
@@ -301,9 +301,9 @@ def marginalise(
         for k in range(i, _B):
             prior_h[i, k] = a[_D + i, _D + k]
             prior_h[k, i] = prior_h[i, k]
-    # gravity walks: eliminate its old value from the prior joined with (new - old)^2 / tilt_walk
+    # random walk of gravity: eliminate its old value from the prior plus (new - old)^2 / tilt_walk
     if tilt_walk > 0.0:
-        _let_tilt_walk(1.0 / tilt_walk, prior_h, prior_b)
+        _add_tilt_walk(1.0 / tilt_walk, prior_h, prior_b)
     copy33(rot[1], prior_r)
     for i in range(12):
         prior_s[i] = state[1, i]
@@ -313,7 +313,7 @@ def marginalise(
 
 
 @njit
-def _let_tilt_walk(q: float, h: F64, b: F64) -> None:
+def _add_tilt_walk(q: float, h: F64, b: F64) -> None:
     s00, s01, s11 = h[15, 15] + q, h[15, 16], h[16, 16] + q
     det = s00 * s11 - s01 * s01
     i00, i01, i11 = s11 / det, -s01 / det, s00 / det

@@ -1,4 +1,4 @@
-"""Rotations in small loops, and the preintegration of inertial samples between two instants.
+"""Kernels of 3x3 rotations and of the preintegration of IMU samples between two instants.
 
 Source: C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preintegration for real-time visual-inertial
 odometry", 2017; rotations are perturbed on the right, R = R_hat Exp(phi). Midpoint rule instead of Euler's.

@@ -1,4 +1,4 @@
-"""Residuals of images and of preintegrated motions with their Jacobians, for inertial states.
+"""Kernels of image and IMU residuals with their Jacobians, for inertial states.
 
 A state is a rotation R_m_b and 12 numbers: position, velocity (m), gyro bias, accel bias. Its 15 degrees of freedom
 are [rotation (on the right), position, velocity, gyro bias, accel bias]. All states share the direction of gravity,
@@ -50,7 +50,7 @@ def visual_terms(
     r: F64, p: F64, r_cb: F64, t_cb: F64, camera: F64, n: int, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
     use: Bools, chi2: float, scale: float, h: F64, b: F64,
 ) -> float:  # fmt: skip
-    """Information h (6,6) and right side b (6,) of [rotation, position] of one body pose from its points.
+    """Information h (6,6) and right-hand side b (6,) of [rotation, position] of a body pose from its points.
 
     r (3,3), p (3,): body in m. r_cb, t_cb: body in the camera. camera: fx, fy, cx, cy, bf. xyz, ray, observed,
     sigma_px: as in pose_kernels.optimise_pose. use: (n,). chi2: squared error of 2 measurements from which on Huber's
@@ -155,7 +155,7 @@ def visual_terms(
 
 @njit
 def velocity_terms(r: F64, v: F64, measured: F64, info: F64, h: F64, b: F64, first: int) -> float:
-    """Add to the system h (w,w), b (w,) what a velocity in the body's axes says of a state whose 15 degrees of freedom
+    """Add a velocity measured in the body's axes to the system h (w,w), b (w,) of a state whose 15 degrees of freedom
     begin at row `first`. r (3,3): R_m_b. v: (3,) m/s in m. measured: (3,) m/s in b. info: (3,3). Returns the cost.
     """
     u, res, j = np.empty(3), np.empty(3), np.zeros((3, 6))  # by the rotation, by the velocity
