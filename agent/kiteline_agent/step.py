@@ -15,7 +15,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who this agent is. boot: counts starts, never reused."""
+    """Number of an agent. boot: number of its start, never reused."""
 
     agent: AgentId
     boot: int
@@ -23,8 +23,9 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class StepInput:
-    """All that enters a step. imu, odometry: samples since the last frame. cpu_ns: process CPU time that the last frame
-    took, as measured or modelled outside.
+    """All that enters a step.
+
+    imu, odometry: samples since the last frame. cpu_ns: CPU time of the last frame, measured or modelled outside.
     """
 
     frame: Frame | None = None
@@ -36,18 +37,18 @@ class StepInput:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What is known of the vehicle at one frame.
+    """Pose of the vehicle at one frame, with covariance and quality.
 
-    tracked: T_m_b is measured from at least 15 image inliers, or (bridged) carried by the IMU for a short while.
+    tracked: T_m_b is measured from at least 15 image inliers, or (bridged) dead reckoning for at most 1 s.
     T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
-    keyframe, T_k_c: the same pose relative to a keyframe's camera. T_w_b: (4,4) in the world, once the base has placed
-    the submap; before that in the submap set upright, where it began askew.
-    quality: how likely, in percent, the pose is good (CertaintyConfig) against where the flight began, at least 1; -1:
-    nothing measures the motion. A later submap lies there as odometry says, until it is found how it truly lies.
-    cov_m: (6,6) of T_m_b against where its submap began, [translation in m, rotation about the body's axes], m and rad.
-    cov_o: (6,6) of T_o_b against where the flight began, [translation in o, rotation about the body's axes].
-    R_l_o: (3,3) sets the odometry frame upright, the same for good once it is known; None before, where a flight begins
-    in motion.
+    keyframe, T_k_c: camera relative to a keyframe. T_w_b: (4,4) in the world once the base has placed the submap;
+    before that in the gravity-aligned submap, if it is tilted.
+    quality: probability in percent, at least 1, that the pose is good (CovarianceConfig) relative to the start of the
+    flight; -1: nothing measures the motion. A later submap counts as placed by odometry until it is recognised.
+    cov_m: (6,6) of T_m_b relative to the start of its submap, [translation in m, rotation about the body's axes], m, rad.
+    cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes].
+    R_l_o: (3,3) odometry frame to gravity-aligned frame, constant once it is known; None before, if a flight begins in
+    motion.
     """
 
     t_ns: int
@@ -67,7 +68,7 @@ class Estimate:
 
     @property
     def T_l_b(self) -> F64 | None:
-        """(4,4) body in the odometry frame set upright: what a flight controller gets. None until that is known."""
+        """(4,4) body in the gravity-aligned odometry frame, for a flight controller; None until that is known."""
         if self.R_l_o is None:
             return None
         T = self.T_o_b.copy()
@@ -76,15 +77,15 @@ class Estimate:
 
     @property
     def cov_l(self) -> F64:
-        """cov_o with translations in the upright frame."""
-        turn = np.eye(6)
-        turn[:3, :3] = np.eye(3) if self.R_l_o is None else self.R_l_o
-        return np.asarray(turn @ self.cov_o @ turn.T)
+        """cov_o with translations in the gravity-aligned frame."""
+        rotation = np.eye(6)
+        rotation[:3, :3] = np.eye(3) if self.R_l_o is None else self.R_l_o
+        return np.asarray(rotation @ self.cov_o @ rotation.T)
 
 
 @dataclass(frozen=True, slots=True)
 class StepOutput:
-    """All that leaves a step. events: short words for the log, in order."""
+    """All that leaves a step. events: short texts for the log, in order."""
 
     estimate: Estimate | None
     packets: tuple[bytes, ...]

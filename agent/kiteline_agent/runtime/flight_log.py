@@ -1,7 +1,6 @@
-"""How the steps of an agent stand in its log: first what went in, then what came out. Pure: the log is handed in.
+"""Writes the steps of an agent to its log: inputs, then outputs. Pure: the log is handed in.
 
-Each step begins with a /step record (what follows is counted there), so that a reader can group what belongs together.
-Numbers pass through JSON unchanged to the last bit.
+Each step begins with a /step message that counts the messages after it. Numbers pass through JSON bit for bit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a flight leaves: its log and its trajectories. Pure: what is written to is handed in."""
+"""Log and trajectories of a flight. Pure: the files are handed in."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from kiteline_codec.schema import record_log
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 
-_LINK_NS = 1_000_000_000  # ns between two words of the link in the log
+_LINK_NS = 1_000_000_000  # ns between two link reports in the log
 
 
 class FlightRecord:
-    """Writes down each step, what was shared in it, and where the vehicle was."""
+    """Writes each step, the records that it shared, and the poses."""
 
     def __init__(self, log: StepLog, live: TextIO, odometry: TextIO, agent: int, channel: RecordChannel) -> None:
         """live, odometry: files of TUM lines."""
@@ -35,7 +35,7 @@ class FlightRecord:
             channel.noting = True
 
     def step(self, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int) -> None:
-        """Note a step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+        """Write a step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
         write_step(self._log, step_input, output, now_ns, log_ns)
         self._shared(log_ns)
         if isinstance(self._channel, CodedChannel) and now_ns >= self._link_due_ns:
@@ -43,21 +43,21 @@ class FlightRecord:
             self._log.json("/link", log_ns, self._channel.report())
 
     def _shared(self, log_ns: int) -> None:
-        """What was shared, for a base that reads the log after landing: no link may have carried it."""
+        """Write the shared records, for a base that imports the log after the flight."""
         if isinstance(self._channel, CodedChannel | NoBaseChannel):
             for key, code in self._channel.take_noted().items():
                 self._log.blob(record_log.TOPIC, log_ns, record_log.write_record(self._agent, key, code))
 
     def pose(self, estimate: Estimate) -> None:
-        """Note where the vehicle was."""
+        """Write the poses of a frame."""
         self._live.write(live_line(estimate))
         self._odometry.write(odometry_line(estimate))
 
 
 def metadata(spec: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
-    """What a log says of its flight at its head. source: its name."""
+    """Metadata at the head of a log. source: its name."""
     plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
-    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
+    plain["link"] = spec.link.partition(":")[0]  # the kind of link decides how packets are made, its address does not
     return {
         "role": "agent",
         "channel": type(channel).__name__,

@@ -1,4 +1,4 @@
-"""What a flight amounts to, counted frame by frame; no clock and no file."""
+"""Counts of a flight, frame by frame, and its trajectory lines. No clock, no file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ F64 = NDArray[float64]
 
 @dataclass(slots=True)
 class FrameCounts:
-    """frames = tracked + lost + dropped. bridged: those of the tracked that the IMU carried."""
+    """frames = tracked + lost + dropped. bridged: tracked frames placed by dead reckoning."""
 
     tracked: int = 0
     bridged: int = 0
@@ -29,11 +29,11 @@ class FrameCounts:
 
     @property
     def frames(self) -> int:
-        """How many frames the source gave."""
+        """Number of frames that the source gave."""
         return self.tracked + self.lost + self.dropped
 
     def count(self, estimate: Estimate | None) -> None:
-        """Count one frame that was given to the agent; None when it was passed over to save CPU time."""
+        """Count one frame that was given to the agent. estimate: None if the governor skipped it."""
         if estimate is None:
             self.dropped += 1
         elif live_pose(estimate) is None:
@@ -63,14 +63,14 @@ class FrameCounts:
 
 
 def live_pose(estimate: Estimate) -> F64 | None:
-    """The body in w where the base has placed the submap, else in m; None for a frame that was not tracked."""
+    """The body in w if the base has placed the submap, else in m; None if the frame was not tracked."""
     if not estimate.tracked:
         return None
     return estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
 
 
 def live_line(estimate: Estimate) -> str:
-    """The frame's line in live.tum; empty where it has no pose."""
+    """The frame's line in live.tum; empty if it has no pose."""
     pose = live_pose(estimate)
     return "" if pose is None else tum.line(estimate.t_ns, pose)
 

@@ -1,4 +1,4 @@
-"""A source read one frame ahead: when the next frame comes, what it brings, and what decoding it cost."""
+"""Reads a source one frame ahead, and measures what decoding costs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
 
 class FrameReader:
-    """Frames of a source, each with the inertial samples, and what an odometer measured, since the one taken before it.
+    """Frames of a source, each with the IMU samples and odometry since the last one that was taken.
 
-    until_ns: frames with a later stamp are left out; None: all. cpu_clock: process CPU time in ns, handed in.
+    until_ns: frames with a later stamp are left out; None: all. cpu_clock: process CPU time in ns.
     """
 
     def __init__(
@@ -36,15 +36,15 @@ class FrameReader:
         return None if self._frame is None else self._frame.t_ns
 
     def take(self) -> tuple[Frame, ImuBatch | None, OdometryBatch | None]:
-        """The next frame, and the inertial samples and velocities since the one that was taken before it."""
+        """The next frame, and IMU samples and odometry since the last one that was taken."""
         assert self._frame is not None, "no frame is left"
-        frame, imu, driven = self._frame, joined(self._imu), odometry.joined(self._odometry)
+        frame, imu, odometry_batch = self._frame, joined(self._imu), odometry.joined(self._odometry)
         self._imu, self._odometry = [], []
         self._advance()
-        return frame, imu, driven
+        return frame, imu, odometry_batch
 
     def drop(self) -> None:
-        """Pass over the next frame; its samples go with the one after."""
+        """Drop the next frame; its samples come with the one after."""
         self._advance()
 
     def _advance(self) -> None:
@@ -68,7 +68,7 @@ class FrameReader:
 
 
 def joined(batches: Sequence[ImuBatch]) -> ImuBatch | None:
-    """Batches one after the other as one; None where there is none."""
+    """Batches concatenated; None if there are none."""
     if len(batches) < 2:
         return batches[0] if batches else None
     return ImuBatch(

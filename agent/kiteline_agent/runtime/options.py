@@ -1,4 +1,4 @@
-"""What one agent's flight is told, on the command line or by `fly`; and its configuration and channel."""
+"""Options of one agent process, from the command line or from `fly`; its configuration and channel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kiteline_core import config as configuration
 
 @dataclass(frozen=True, slots=True)
 class AgentOptions:
-    """All that one agent's flight is told. Plain values, so that it travels as JSON."""
+    """Options of one agent process. Plain values, so that it can be sent as JSON."""
 
     source: str
     folder: str  # for the log and the trajectories
@@ -35,20 +35,20 @@ class AgentOptions:
     profile: str = ""  # what to share of a keyframe: wifi or radio; "": as the link allows
     delay_s: float = 0.0  # s that a packet is under way
     loss: float = 0.0  # probability that a packet is lost
-    disorder: float = 0.0  # probability that it is doubled, and that it is late
+    disorder: float = 0.0  # probability that a packet is duplicated, and that it is delayed
     seed: int = 0
     cpu_percent: float = 0.0  # of one core; 0: all of it
     mavlink: str = ""  # URL of a flight controller
     axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
-    odometry: str = ""  # what to take from the flight controller: controller, wheels, wheels:TRACK_M; "": nothing
-    imu_of: str = ""  # whose inertial samples are used: controller; "": the source's, where it has any
+    odometry: str = ""  # from the flight controller: controller, wheels, wheels:TRACK_M; "": none
+    imu_of: str = ""  # whose IMU is used: controller; "": the source's, if it has one
     kill_at_s: float | None = None  # end like a crash at this flight time
     await_base_at_s: float | None = None  # look for a base again at this flight time
-    await_bases: bool = False  # wait for a new base whenever one ends, as often as that is
+    await_bases: bool = False  # wait for a new base whenever one ends
 
 
 def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
-    """What the command line says. folder: for the log. boot: number of this start."""
+    """Options from the command line. folder: for the log. boot: number of this start."""
     return AgentOptions(
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
@@ -71,7 +71,7 @@ def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
 
 
 def channel_for(spec: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
-    """The agent's end of the codec, or nothing where no base is meant to be. A session is the boot, counted from 1.
+    """The agent's end of the codec, or a channel to nowhere without a base. A session is the boot, counted from 1.
 
     spill: keeps what would take too much memory while the link is down.
     """
