@@ -160,33 +160,33 @@ class RelocalisationConfig:
 
 @dataclass(frozen=True, slots=True)
 class CovarianceConfig:
-    """What is not known of the sensors, and when a pose counts as good."""
+    """Errors of sensors and calibration, and when a pose counts as good."""
 
-    calibration_px: float = 0.05  # px at the image's edge that a good calibration of one camera is off by
-    extrinsic_rad: float = 3e-4  # of the camera in the body: a hundredth of a degree or two
-    extrinsic_m: float = 1e-3  # likewise
-    least_rms: float = 0.3  # whitened residual of a frame below which its noise is not believed to be smaller
-    inflation: float = 1.0  # of the variance of a measured pose
-    dispute_frames: float = 10.0  # frames over which what an IMU pulls poses off the images is averaged
-    pull_share: float = 1.0  # of its mean, one deviation, that is wrong
-    refined_share: float = 0.25  # of a keyframe's variance that is left when the base has optimised it
-    blind_accel_m_s2: float = 2.0  # that an unseen vehicle may have: a multicopter that leans by twelve degrees
-    blind_turn_rad_s2: float = 2.0  # likewise
-    blind_velocity_m_s: float = 0.03  # error of the velocity between two frames
-    blind_rate_rad_s: float = 0.02  # likewise
-    blind_speed_m_s: float = 5.0  # error of the velocity of a vehicle that was not seen to move: it just began
-    blind_speed_rad_s: float = 1.0  # likewise
-    good_m: float = 0.2  # a pose counts as good within so much
-    good_rad: float = 0.1745  # and so much: 10 degrees
-    few_inliers: int = 10  # from which on points speak for a pose: so many agree by chance
-    many_inliers: int = 30  # with which nothing speaks against it
-    flagged_below: int = 50  # quality below which a pose is not to be relied on: it is as likely wrong as good
-    surprise: float = 7.0  # deviations by which a place found again may differ from where the IMU says the vehicle is
-    surprise_blind: float = 10.0  # the same where nothing measured the way: two g, all the time
-    strange: float = 4.0  # the same, from which on a place is doubted at first: nearly one g
-    doubt_frames: int = 20  # for which it is: one second, in which a place that only resembles falls apart
-    surprise_m: float = 0.1  # deviation of that beside the covariances: maps are corrected meanwhile
-    surprise_rad: float = 0.05  # likewise
+    calibration_px: float = 0.05  # px at the image's edge: error of a good calibration of one camera
+    extrinsic_rad: float = 3e-4  # rad: error of the camera's rotation in the body, a hundredth of a degree or two
+    extrinsic_m: float = 1e-3  # m: error of the camera's position in the body
+    least_rms: float = 0.3  # whitened residual of a frame: its noise is never assumed to be smaller
+    inflation: float = 1.0  # factor on the variance of a measured pose
+    dispute_frames: float = 10.0  # frames over which the difference between fused and image poses is averaged
+    pull_share: float = 1.0  # of the mean difference: standard deviation of its systematic part
+    refined_share: float = 0.25  # of a keyframe's variance that remains when the base has optimised it
+    blind_accel_m_s2: float = 2.0  # m/s^2 of an unobserved vehicle: a multicopter tilted by twelve degrees
+    blind_turn_rad_s2: float = 2.0  # rad/s^2: the same for the rotation
+    blind_velocity_m_s: float = 0.03  # m/s: error of the velocity between two frames
+    blind_rate_rad_s: float = 0.02  # rad/s: the same for the rotation
+    blind_speed_m_s: float = 5.0  # m/s: error of the velocity of a vehicle whose motion was not observed yet
+    blind_speed_rad_s: float = 1.0  # rad/s: the same for the rotation
+    good_m: float = 0.2  # m: error up to which a pose counts as good
+    good_rad: float = 0.1745  # rad: the same for the rotation, 10 degrees
+    few_inliers: int = 10  # inliers with which quality begins to rise: so many agree by chance
+    many_inliers: int = 30  # inliers with which quality is not reduced
+    flagged_below: int = 50  # percent: quality below which a pose must not be relied on, as likely wrong as good
+    surprise: float = 7.0  # standard deviations between a relocalised pose and the IMU's prediction, at most
+    surprise_blind: float = 10.0  # the same if nothing measured the motion: 2 g all the time
+    strange: float = 4.0  # the same beyond which a relocalised pose is doubted at first: nearly 1 g
+    doubt_frames: int = 20  # frames for which it is doubted: one second, in which a wrong place fails to track
+    surprise_m: float = 0.1  # m: standard deviation added to that comparison, since maps are corrected meanwhile
+    surprise_rad: float = 0.05  # rad: the same for the rotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,26 +218,26 @@ class SmoothingConfig:
 
 @dataclass(frozen=True, slots=True)
 class GovernorConfig:
-    """How CPU time is held under a budget."""
+    """How CPU time is kept within a budget."""
 
-    cpu_percent: float = 0.0  # of one core, over any window; 0: no budget
-    window_s: float = 1.0  # s in which the budget has to hold
-    margin: float = 0.97  # share of the budget that is planned with: the rest is for what was not foreseen
+    cpu_percent: float = 0.0  # percent of one core, over any window; 0: no budget
+    window_s: float = 1.0  # s: window in which the budget has to hold
+    margin: float = 0.97  # share of the budget that is planned; the rest is for what was not expected
     tight: float = 1.0  # share of the budget above which effort falls
-    fill: float = 1.05  # share up to which frames are let through between two rows: keyframes are not always due
-    comfort: float = 0.86  # share below which the next better effort would have to stay, so that effort rises
-    grace_s: float = 2.0  # s at the start that are not booked: a map has to be begun
-    down_s: float = 0.25  # s between two falls: the expectations need time to show the first one
-    up_s: float = 1.5  # s of comfort before a rise
-    max_gap_s: float = 0.35  # s between tracked frames; after more, a track is hard to find again
-    carried_gap_s: float = 0.8  # the same with an IMU, whose prediction counts as tracking for 1 s
+    fill: float = 1.05  # share up to which frames are tracked between two rows: keyframes are not always due
+    comfort: float = 0.86  # share below which the load at the next better effort must stay before effort rises
+    grace_s: float = 2.0  # s at the start that do not count: a map has to be begun
+    down_s: float = 0.25  # s between two falls: the expected costs need time to follow the first one
+    up_s: float = 1.5  # s of low load before a rise
+    max_gap_s: float = 0.35  # s between tracked frames; after more, tracking often fails
+    carried_gap_s: float = 0.8  # s: the same with an IMU, whose prediction counts as tracking for 1 s
     blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
-    doubt: float = 0.1  # how much dearer than expected a frame may be, at least
-    learning: float = 0.15  # gain of the expectations of frames
-    keyframe_learning: float = 0.4  # gain of how often keyframes are asked for
-    first_keyframes: float = 2.0  # in a second, before it was seen
-    first_frame_ms: float = 3.5  # of a tracked frame at full effort, before it was seen: 752x480 on a laptop
-    first_period_s: float = 0.05  # between frames, before it was seen
+    doubt: float = 0.1  # relative error of the expected cost of a frame, at least
+    learning: float = 0.15  # gain of the expected cost of frames
+    keyframe_learning: float = 0.4  # gain of the expected rate of keyframes
+    first_keyframes: float = 2.0  # 1/s: expected rate of keyframes at the start
+    first_frame_ms: float = 3.5  # ms: expected cost of a tracked frame at full effort at the start: 752x480 on a laptop
+    first_period_s: float = 0.05  # s: expected time between frames at the start
     settling_s: float = 1.0  # s at the start in which effort follows the load without hysteresis
 
 
