@@ -59,13 +59,11 @@ def test_only_changed_parts_are_written() -> None:
     assert writer.changes(state) == {}
     copied = replace(state.merger, merges=tuple(replace(m) for m in state.merger.merges))
     assert writer.changes(replace(state, merger=copied)) == {}
-    copied.merges[0].fused = np.array([[5, 6]])
-    less = replace(copied, edges=copied.edges[:1])
-    assert set(writer.changes(replace(state, merger=less))) == {
-        "mapper.merger.merges/000000",
-        "mapper.merger.edges/000001",
-    }
-    assert writer.changes(replace(state, merger=less)) == {}
+    more = replace(state.merger.merges[0], fused=np.array([[5, 6]]))
+    changed = replace(copied, edges=copied.edges[:1], merges=(more, *copied.merges[1:]))
+    expected = {"mapper.merger.merges/000000", "mapper.merger.edges/000001"}
+    assert set(writer.changes(replace(state, merger=changed))) == expected
+    assert writer.changes(replace(state, merger=changed)) == {}
 
 
 @pytest.mark.parametrize(
