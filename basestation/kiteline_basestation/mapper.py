@@ -262,7 +262,7 @@ class Mapper:
                 self._publisher.send(agent, DisparityCalibration(agent, offset))
 
     def _delete(self, submaps: Collection[SubmapId]) -> None:
-        """Cull all of some submaps; their agents are told, and later records of them are ignored."""
+        """Cull submaps, publish it, and ignore later records of them."""
         self.deleted.update(submaps)
         for submap in submaps:
             keyframes: Sequence[KeyframeId] = self.map.submaps.get(submap, [])

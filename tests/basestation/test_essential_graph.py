@@ -1,4 +1,4 @@
-"""The essential graph: loops spread drift over the way, wrong loops hardly count, and 1000 keyframes take no time."""
+"""Pose graph optimisation: drift is spread over the path, wrong loops have little effect."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def rms(a: F64, b: F64) -> float:
     return float(np.sqrt(np.mean(np.sum((a[:, :3, 3] - b[:, :3, 3]) ** 2, axis=1))))
 
 
-def test_loops_take_drift_back_and_what_is_held_stays() -> None:
+def test_loops_reduce_drift_and_held_keyframes_stay() -> None:
     true, inputs = ring(200, 60, 12)
     result = optimise(inputs)
     assert rms(result.T_w_k, true) < 0.5 * rms(inputs.T_w_k, true)
@@ -66,7 +66,7 @@ def test_without_loops_nothing_moves() -> None:
     assert np.allclose(optimise(inputs).T_w_k, inputs.T_w_k, atol=1e-9)
 
 
-def test_a_wrong_loop_stands_out_and_does_little_harm() -> None:
+def test_wrong_loop_has_a_large_residual_and_little_effect() -> None:
     true, inputs = ring(200, 60, 12, wrong=1)
     result = optimise(inputs)
     loops = result.residual[inputs.loop]

@@ -1,4 +1,4 @@
-"""The keeper: batches follow each other in order, a disk that refuses loses nothing, and nothing waits for it."""
+"""The keeper writes batches in order, repeats failed writes and does not block the loop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def kept_heads(folder: Path) -> int:
     return sum(key.kind == KeyframeHeader.KIND for codes in read(folder).agents.values() for key in codes.received)
 
 
-def test_a_disk_that_refuses_for_a_while_loses_nothing(
+def test_failed_writes_are_repeated(
     make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(keeper_module, "_RETRY_S", 0.02)
@@ -64,7 +64,7 @@ def test_a_disk_that_refuses_for_a_while_loses_nothing(
     assert capsys.readouterr().err.count("the disk is full") == 1
 
 
-def test_a_slow_disk_makes_fewer_batches_and_holds_nobody_up(
+def test_slow_disk_does_not_block_the_loop(
     make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flown, write, go = FlightSummary(make_flight(keyframes=12, turns=0.2), tmp_path), Store.write, threading.Event()

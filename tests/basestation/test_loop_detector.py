@@ -1,4 +1,4 @@
-"""Loops: drift over a long way is taken back when the place is seen again, and corridors that repeat fool nobody."""
+"""Loop closures reduce drift, and repetitive corridors close none."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def around(make_flight: MakeFlight, ring: Any, words: Any) -> Any:
 
 
 @pytest.mark.parametrize("late", [0, 6])
-def test_a_ring_is_closed_while_new_keyframes_come(around: Any, late: int) -> None:
+def test_loop_is_closed_while_keyframes_arrive(around: Any, late: int) -> None:
     flight, mapper, published, jobs = around(late)
     blind = around(-1)[1]
     assert mapper.summary()["loops"] >= 1
@@ -80,7 +80,7 @@ def test_a_ring_is_closed_while_new_keyframes_come(around: Any, late: int) -> No
         assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
 
 
-def test_the_same_flight_gives_the_same_map(around: Any, words: Any) -> None:
+def test_same_flight_gives_same_map(around: Any, words: Any) -> None:
     flight, mapper, _, _ = around(0)
     again = Mapper(BaseConfig(), words)
     feed(again, [flight])
@@ -88,7 +88,7 @@ def test_the_same_flight_gives_the_same_map(around: Any, words: Any) -> None:
         assert np.array_equal(mapper.map.pose(keyframe), again.map.pose(keyframe))
 
 
-def test_a_loop_without_drift_counts_too(make_flight: MakeFlight, words: Any) -> None:
+def test_loop_without_drift_is_counted(make_flight: MakeFlight, words: Any) -> None:
     flight = make_flight(keyframes=60, turns=1.5, drift_m=0.001)
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [flight])
@@ -98,7 +98,7 @@ def test_a_loop_without_drift_counts_too(make_flight: MakeFlight, words: Any) ->
     assert short.summary()["loops"] == 0
 
 
-def test_windows_that_repeat_along_a_corridor_close_no_loop(
+def test_repetitive_corridor_closes_no_loop(
     make_flight: MakeFlight, corridor: Any, words: Any
 ) -> None:  # fmt: skip
     flight = make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4)
@@ -110,7 +110,7 @@ def test_windows_that_repeat_along_a_corridor_close_no_loop(
     assert np.max(errors_m(mapper, flight)) < 0.3
 
 
-def test_who_shares_with_whom() -> None:
+def test_sharing_policy() -> None:
     a, b, c = AgentId(0), AgentId(1), AgentId(2)
     assert SharingPolicy("all").allows(a, c)
     assert not SharingPolicy("none").allows(a, c) and SharingPolicy("none").allows(a, a)
@@ -120,7 +120,7 @@ def test_who_shares_with_whom() -> None:
         SharingPolicy("0-1")
 
 
-def test_a_config_without_loops_has_none(make_flight: MakeFlight, words: Any) -> None:
+def test_loops_can_be_disabled(make_flight: MakeFlight, words: Any) -> None:
     config = replace(
         BaseConfig(), landmark_matching=LandmarkMatchingConfig(), loops=replace(BaseConfig().loops, enabled=False)
     )

@@ -1,4 +1,4 @@
-"""Maps of one eye with different units of length are not taken for one place."""
+"""Monocular maps with different units of length are not matched."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
     ("unit", "known", "one"),
     [(1.0, 40, True), (1.08, 40, True), (1.4, 40, False), (0.6, 40, False), (0.6, 5, True)],
 )
-def test_depths_in_both_maps_tell_the_unit(unit: float, known: int, one: bool) -> None:
+def test_same_unit_compares_depths_of_both_maps(unit: float, known: int, one: bool) -> None:
     random = np.random.default_rng(0)
     keyframe = keyframe_id(submap_id(0, 0, 0), 0)
     T_w_k = se3.exp(random.normal(0.0, 1.0, 6))

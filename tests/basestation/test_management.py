@@ -1,4 +1,4 @@
-"""Maps in the hands of people: every verb does what it says, and says why where it cannot."""
+"""Commands of users on maps: list, get, name, merge, split, delete."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def pair(make_flight: MakeFlight, words: Any) -> Base:
     return base
 
 
-def test_list_and_get_tell_what_there_is(pair: Base) -> None:
+def test_list_and_get_describe_all_maps(pair: Base) -> None:
     (told,) = pair.ask("list")["maps"]
     assert told["id"] == "0.1.0"
     assert told["agents"] == [0, 1]
@@ -95,7 +95,7 @@ def test_list_and_get_tell_what_there_is(pair: Base) -> None:
     assert np.array_equal(np.reshape(pose["T_m_k"], (4, 4)), held)
 
 
-def test_a_name_serves_as_an_id(pair: Base) -> None:
+def test_map_can_be_addressed_by_name(pair: Base) -> None:
     assert pair.ask("name", map="1.1.0", name="hangar")["name"] == "hangar"
     assert pair.ask("get", map="hangar")["id"] == "0.1.0"
     assert "characters" in pair.ask("name", map="hangar", name="x" * 65)["error"]
@@ -104,7 +104,7 @@ def test_a_name_serves_as_an_id(pair: Base) -> None:
     assert "no map 'hangar'" in pair.ask("get", map="hangar")["error"]
 
 
-def test_a_split_is_for_good_until_a_person_merges_again(pair: Base, make_flight: MakeFlight) -> None:
+def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) -> None:
     assert ids(pair.ask("split", map="1.1.0")) == ["0.1.0", "1.1.0"]
     assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
     more = make_flight(keyframes=45, turns=0.9, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
@@ -115,7 +115,7 @@ def test_a_split_is_for_good_until_a_person_merges_again(pair: Base, make_flight
     assert "nothing to be undone" in pair.ask("split", map="1.1.0")["error"]
 
 
-def test_maps_are_merged_where_a_person_says(make_flight: MakeFlight, words: Any) -> None:
+def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=20, turns=0.3)
     b = make_flight(keyframes=20, turns=0.3, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
@@ -132,7 +132,7 @@ def test_maps_are_merged_where_a_person_says(make_flight: MakeFlight, words: Any
     assert "one map already" in base.ask("merge", map="1.1.0", into="0.1.0")["error"]
 
 
-def test_maps_that_a_person_says_to_overlap_are_looked_at_again(make_flight: MakeFlight, words: Any) -> None:
+def test_user_requests_a_search_for_overlap(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=24, turns=0.5)
     b = make_flight(keyframes=24, turns=0.5, start=0.42, variant=1, agent=1, T_w_m=ELSEWHERE)
@@ -145,7 +145,7 @@ def test_maps_that_a_person_says_to_overlap_are_looked_at_again(make_flight: Mak
     assert ids(base.ask("list")) == ["0.1.0"]
 
 
-def test_a_deleted_map_is_gone_for_agents_and_for_good(make_flight: MakeFlight, words: Any) -> None:
+def test_deleted_map_is_culled_and_later_records_ignored(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=12, turns=0.2)
     b = make_flight(keyframes=12, turns=0.2, seed=4, agent=1)
@@ -183,7 +183,7 @@ def test_a_deleted_map_is_gone_for_agents_and_for_good(make_flight: MakeFlight, 
         ("merge", '{"map": "0.1.0", "into": "0.1.0"}', "gtsam"),
     ],
 )
-def test_what_cannot_be_done_is_explained(make_flight: MakeFlight, verb: str, text: str, told: str) -> None:
+def test_refused_commands_give_a_reason(make_flight: MakeFlight, verb: str, text: str, told: str) -> None:
     base = Base(None)
     base.fly([make_flight(keyframes=3, turns=0.05)])
     (answer,) = base.step(commands=[Command(1, verb, text)])
@@ -191,6 +191,6 @@ def test_what_cannot_be_done_is_explained(make_flight: MakeFlight, verb: str, te
     assert told in json.loads(answer.text)["error"]
 
 
-def test_ids_are_read_as_they_are_written() -> None:
+def test_submap_names_and_verbs() -> None:
     assert submap_name(SubmapId(submap_id(3, 17, 4))) == "3.17.4"
     assert set(VERBS) == {"list", "get", "name", "merge", "split", "delete"}

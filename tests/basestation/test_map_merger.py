@@ -1,4 +1,4 @@
-"""Maps of several agents become one where they overlap, and never where they only look alike."""
+"""Maps are merged where they overlap, and not where they only look alike."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def joint_error_m(mapper: Mapper, flights: Sequence[Any]) -> F64:
     return np.array(out)
 
 
-def test_two_agents_in_one_room_get_one_map(make_flight: MakeFlight, words: Any) -> None:
+def test_maps_of_two_agents_in_one_room_are_merged(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=40, turns=0.8)
     b = make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
     mapper = Mapper(BaseConfig(), words)
@@ -69,14 +69,12 @@ def test_two_agents_in_one_room_get_one_map(make_flight: MakeFlight, words: Any)
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
     placed = [r for r in published if isinstance(r, SubmapPlacement)]
     assert {r.submap for r in placed if r.recognised} == {submap_of_keyframe(b.keyframes[0])}
-    last = [r for r in published if isinstance(r, SubmapPlacement) and r.submap == submap_of_keyframe(b.keyframes[0])][
-        -1
-    ]
+    last = [r for r in placed if r.submap == submap_of_keyframe(b.keyframes[0])][-1]
     assert np.allclose(last.S_w_m, ELSEWHERE, atol=0.03)
 
 
 @pytest.mark.parametrize("rooms", ["papered", "half_papered"])
-def test_two_rooms_with_one_wallpaper_stay_two(
+def test_similar_rooms_are_not_merged(
     make_flight: MakeFlight, request: pytest.FixtureRequest, words: Any, rooms: str
 ) -> None:
     one, other = request.getfixturevalue(rooms)
@@ -90,7 +88,7 @@ def test_two_rooms_with_one_wallpaper_stay_two(
     assert mapper.summary()["maps"] == 2
 
 
-def test_agents_in_a_corridor_that_repeats_stay_apart(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
+def test_repetitive_corridor_is_not_merged(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
     a = make_flight(keyframes=40, turns=0.6, scene=corridor)
     b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1)
     mapper = Mapper(BaseConfig(), words)
@@ -99,14 +97,12 @@ def test_agents_in_a_corridor_that_repeats_stay_apart(make_flight: MakeFlight, c
 
 
 @pytest.mark.parametrize(("predecessors", "merges"), [(0, 0), (4, 1)])
-def test_where_one_keyframe_finds_another_map_those_before_it_are_asked(
+def test_predecessors_of_a_matched_keyframe_are_verified(
     make_flight: MakeFlight, words: Any, predecessors: int, merges: int
 ) -> None:
     first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
     second = make_flight(keyframes=24, turns=0.45, T_w_m=ELSEWHERE)
-    loops = replace(
-        BaseConfig().loops, predecessors=predecessors, min_likeness=0.34
-    )  # words alone tell of one keyframe
+    loops = replace(BaseConfig().loops, predecessors=predecessors, min_likeness=0.34)  # the index finds one keyframe
     mapper = Mapper(replace(BaseConfig(), loops=loops), words)
     feed(mapper, [first, second], [0, 24])
     assert mapper.summary()["merges"] == merges
@@ -114,7 +110,7 @@ def test_where_one_keyframe_finds_another_map_those_before_it_are_asked(
         assert np.sqrt(np.mean(joint_error_m(mapper, [first, second]) ** 2)) < 0.03
 
 
-def test_three_agents_in_a_chain_and_one_that_keeps_to_itself(make_flight: MakeFlight, words: Any) -> None:
+def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) -> None:
     flights = [
         make_flight(keyframes=24, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))
         for n in range(3)
@@ -128,7 +124,7 @@ def test_three_agents_in_a_chain_and_one_that_keeps_to_itself(make_flight: MakeF
             assert np.sqrt(np.mean(joint_error_m(mapper, flights) ** 2)) < 0.02
 
 
-def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flight: MakeFlight, words: Any) -> None:
+def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=30, turns=0.6)
     b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, submap=1, T_w_m=ELSEWHERE)
     mapper = Mapper(BaseConfig(), words)
@@ -148,7 +144,7 @@ def test_a_submap_after_a_loss_is_merged_and_a_merge_can_be_taken_back(make_flig
     assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
 
 
-def test_an_agent_hears_that_its_map_has_no_place_any_more(make_flight: MakeFlight, words: Any) -> None:
+def test_placement_of_a_split_map_is_withdrawn(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=30, turns=0.6)
     b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     ours, theirs = {}, {}

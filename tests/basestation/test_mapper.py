@@ -1,4 +1,4 @@
-"""The mapper on synthetic flights: it refines, recognises, removes, and is the same every time."""
+"""The mapper on synthetic flights: refinement, landmark matching, culling, determinism."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def drift_m(flight: Any) -> F64:
     return np.array([np.linalg.norm(a[:3, 3] - t[:3, 3]) for a, t in zip(flight.agent_T_m_k, flight.true_T_m_k)])
 
 
-def test_two_rounds_of_a_room_drift_less_than_what_the_agent_believed(make_flight: MakeFlight) -> None:
+def test_mapper_reduces_drift_over_two_rounds(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=2.0, memory=3)
     mapper = Mapper()
     feed(mapper, flight, flight.records)
@@ -68,7 +68,7 @@ def test_two_rounds_of_a_room_drift_less_than_what_the_agent_believed(make_fligh
     assert np.sqrt(np.mean(errors_m(mapper, flight) ** 2)) < 0.5 * np.sqrt(np.mean(drift_m(flight) ** 2))
 
 
-def test_refind_fuses_doubles_and_nothing_else(make_flight: MakeFlight) -> None:
+def test_landmark_matching_fuses_only_true_duplicates(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=2.0, memory=3)
     mapper = Mapper()
     feed(mapper, flight, flight.records)
@@ -81,7 +81,7 @@ def test_refind_fuses_doubles_and_nothing_else(make_flight: MakeFlight) -> None:
     assert all(r < a for a, r in zip(aliases, roots))
 
 
-def test_without_refind_the_second_round_does_not_join_the_first(make_flight: MakeFlight) -> None:
+def test_rounds_stay_unconnected_without_landmark_matching(make_flight: MakeFlight) -> None:
     apart, together = [], []
     for seed in (0, 1):
         flight = make_flight(keyframes=60, turns=2.0, memory=3, seed=seed)
@@ -95,7 +95,7 @@ def test_without_refind_the_second_round_does_not_join_the_first(make_flight: Ma
     assert np.mean(together) < 0.7 * np.mean(apart)
 
 
-def test_wild_observations_are_removed_and_good_ones_kept(make_flight: MakeFlight) -> None:
+def test_outlier_observations_are_removed(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=20, outliers=0.05, turns=0.5)
     mapper = Mapper()
     published = feed(mapper, flight, flight.records)
@@ -110,7 +110,7 @@ def test_wild_observations_are_removed_and_good_ones_kept(make_flight: MakeFligh
     assert len(removed & (sightings - wild)) < 0.08 * len(sightings)  # a wild birth spoils its point
 
 
-def test_points_that_are_not_seen_again_are_culled(make_flight: MakeFlight) -> None:
+def test_landmarks_without_later_observations_are_culled(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=16, turns=0.15)
     ghosts: set[tuple[KeyframeId, int]] = set()
     rng = np.random.default_rng(3)
@@ -135,7 +135,7 @@ def test_points_that_are_not_seen_again_are_culled(make_flight: MakeFlight) -> N
 
 
 @pytest.mark.parametrize("stereo", [True, False])
-def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight, stereo: bool) -> None:
+def test_landmarks_without_depth_are_triangulated(make_flight: MakeFlight, stereo: bool) -> None:
     flight = make_flight(keyframes=14, turns=0.4, no_depth=0.4 if stereo else 0.0, stereo=True, drift_m=0.0005)
     if not stereo:  # all births and sightings without depth: the poses alone place the points
         flight = make_flight(keyframes=14, turns=0.4, no_depth=1.0, drift_m=0.0005)
@@ -154,14 +154,14 @@ def test_points_without_depth_get_one_from_several_views(make_flight: MakeFlight
     assert any(isinstance(r, RefinedLandmarks) for r in published)
 
 
-def test_strict_new_point_rules_refuse_two_views_that_are_one(make_flight: MakeFlight) -> None:
+def test_no_triangulation_from_one_viewpoint(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=8, turns=0.2, no_depth=1.0)
     mapper = Mapper(replace(BaseConfig(), triangulation=TriangulationConfig(max_cosine=-1.0)))
     feed(mapper, flight, flight.records)
     assert mapper.counts.triangulated == 0
 
 
-def test_order_and_grouping_of_records_do_not_change_what_is_taken_in(make_flight: MakeFlight) -> None:
+def test_intake_does_not_depend_on_order_of_records(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=12, turns=0.4)
     rng = np.random.default_rng(9)
     maps = []
@@ -186,7 +186,7 @@ def test_two_runs_publish_the_same_bytes(make_flight: MakeFlight) -> None:
     assert runs[0] == runs[1]
 
 
-def test_late_sections_are_waited_for_then_done_without_and_taken_up_when_they_come(make_flight: MakeFlight) -> None:
+def test_incomplete_keyframe_is_used_after_the_patience(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=8, turns=0.2)
     late = flight.records[5].pop()
     mapper = Mapper()
@@ -205,7 +205,7 @@ def test_late_sections_are_waited_for_then_done_without_and_taken_up_when_they_c
     assert len(mapper.map.observations_of(flight.keyframes[5])) > before
 
 
-def test_what_is_published_replaces_older_values_and_matches_the_map(make_flight: MakeFlight) -> None:
+def test_published_values_match_the_map(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=20, turns=1.0)
     mapper = Mapper()
     published = feed(mapper, flight, flight.records)
@@ -247,7 +247,7 @@ def test_a_superseded_or_unknown_job_changes_nothing(make_flight: MakeFlight) ->
     assert not mapper.step(MapperInput((), (done,)), 12 * STEP_NS).publish  # a second answer to the same job
 
 
-def test_a_base_without_its_store_begins_at_the_oldest_keyframe_it_gets(make_flight: MakeFlight) -> None:
+def test_submap_without_first_keyframe_begins_at_its_oldest(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=12, turns=0.3)
     mapper = Mapper()
     camera: tuple[Record, ...] = (CameraIntrinsics(flight.agent, flight.camera),)
@@ -264,7 +264,7 @@ def test_a_base_without_its_store_begins_at_the_oldest_keyframe_it_gets(make_fli
     assert np.allclose(se3.inverse(a) @ b, true, atol=0.05)
 
 
-def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
+def test_summary_describes_each_agent(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=5, turns=0.1, agent=3)
     mapper = Mapper()
     live = LivePose(flight.agent, 77, flight.keyframes[-1], np.eye(4), 80)
@@ -284,7 +284,7 @@ def test_summary_tells_of_each_agent(make_flight: MakeFlight) -> None:
     assert not (table.flags[mapper.map.find_landmarks(view.landmark_ids)] & CULLED).any()
 
 
-def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFlight) -> None:
+def test_mapper_continues_from_restored_state(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=24, turns=1.2, memory=3)
     first = Mapper()
     published = feed(first, flight, flight.records[:20])
@@ -314,7 +314,7 @@ def test_a_new_base_goes_on_from_what_an_earlier_one_kept(make_flight: MakeFligh
     assert len(second.map) == 24
 
 
-def test_a_backlog_is_worked_off_from_the_oldest_on(make_flight: MakeFlight) -> None:
+def test_backlog_is_bundled_from_the_oldest_on(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=24, turns=1.2, memory=3)
     mapper = Mapper()
     feed(mapper, flight, [[r for part in flight.records for r in part]])
@@ -324,7 +324,7 @@ def test_a_backlog_is_worked_off_from_the_oldest_on(make_flight: MakeFlight) -> 
     assert refined == flight.keyframes[1:]
 
 
-def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) -> None:
+def test_later_submap_is_placed_by_odometry(make_flight: MakeFlight) -> None:
     flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
     mapper = Mapper()
     seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, KeyframeHeader)) - 10**9
@@ -338,7 +338,7 @@ def test_a_later_submap_begins_where_the_last_was_left(make_flight: MakeFlight) 
     assert not placement.recognised
 
 
-def test_a_submap_that_begins_long_after_the_last_was_left_has_no_place(make_flight: MakeFlight) -> None:
+def test_submap_after_a_long_gap_is_not_placed(make_flight: MakeFlight) -> None:
     flight, later = make_flight(keyframes=4, turns=0.1), make_flight(keyframes=4, turns=0.1, submap=1)
     mapper = Mapper()
     seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, KeyframeHeader)) - 5 * 10**9

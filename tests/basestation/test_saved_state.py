@@ -1,4 +1,4 @@
-"""A map at rest becomes the same map again; what contradicts itself is found, told and taken out."""
+"""A saved map is restored bit for bit; inconsistent values are reported and left out."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def joined(make_flight: MakeFlight, words: Any) -> tuple[Agents, Station]:
     return agents, station
 
 
-def test_a_restored_map_is_the_map_to_the_last_bit(joined: tuple[Agents, Station], words: Any) -> None:
+def test_restored_map_is_equal_to_the_last_bit(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     assert contradictions(first.mapper) == []
     kept = snapshot(first, SavedMap())
@@ -130,7 +130,7 @@ def test_a_restored_map_is_the_map_to_the_last_bit(joined: tuple[Agents, Station
         assert channel.endpoint.own_values() == before.endpoint.own_values()
 
 
-def test_each_base_goes_on_from_what_the_last_one_kept(make_flight: MakeFlight, words: Any, tmp_path: Path) -> None:
+def test_map_survives_six_restarts(make_flight: MakeFlight, words: Any, tmp_path: Path) -> None:
     flight = make_flight(keyframes=40, turns=1.0)
     agents, at = Agents([flight]), 0
     for session, until in enumerate((3, 9, 14, 22, 27, 35, 80), 1):
@@ -168,7 +168,7 @@ def spoilt(
     )
 
 
-def test_every_kind_of_contradiction_is_told_and_mended(joined: tuple[Agents, Station], words: Any) -> None:
+def test_every_kind_of_inconsistency_is_reported_and_left_out(joined: tuple[Agents, Station], words: Any) -> None:
     agents, first = joined
     kept = snapshot(first, SavedMap())
     keyframe = agents.flights[0].keyframes[10]
@@ -201,7 +201,7 @@ def _coded(record: Any) -> dict[Key, bytes]:
     return {messages.key(record): messages.encode(record)}
 
 
-def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station], words: Any) -> None:
+def test_missing_parent_is_awaited(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     kept = snapshot(first, SavedMap())
     alone = sorted(k for k in kept.agents[AgentId(2)].received if k.kind == KeyframeHeader.KIND)[3]
@@ -213,7 +213,7 @@ def test_a_parent_that_has_not_come_yet_is_awaited(joined: tuple[Agents, Station
     assert restored.keyframes == 7
 
 
-def test_a_joined_map_whose_other_half_is_gone_stands_alone(joined: tuple[Agents, Station], words: Any) -> None:
+def test_submap_whose_root_is_missing_becomes_a_map(joined: tuple[Agents, Station], words: Any) -> None:
     _, first = joined
     kept = snapshot(first, SavedMap())
     (root,) = set(state_of(kept.texts).map.root_submaps.values())
@@ -239,7 +239,7 @@ def test_an_unreadable_state_is_refused(joined: tuple[Agents, Station], words: A
             restore(new_station(words, session=2), SavedMap(kept.agents, {**kept.texts, name: text}), 0)
 
 
-def test_contradictions_in_the_tables_are_seen(make_flight: MakeFlight, words: Any) -> None:
+def test_contradictions_in_the_tables_are_found(make_flight: MakeFlight, words: Any) -> None:
     agents, station = Agents([make_flight(keyframes=6, turns=0.1)]), new_station(words)
     agents.fly(station, 0, 10)
     sparse_map = station.mapper.map
@@ -254,7 +254,7 @@ def test_contradictions_in_the_tables_are_seen(make_flight: MakeFlight, words: A
     assert any("no rigid pose" in text for text in contradictions(station.mapper))
 
 
-def test_yesterdays_map_is_found_again_in_todays(make_flight: MakeFlight, words: Any) -> None:
+def test_new_flight_is_merged_with_a_restored_map(make_flight: MakeFlight, words: Any) -> None:
     yesterday = Agents([make_flight(keyframes=30, turns=0.6, agent=0)])
     old = new_station(words)
     yesterday.fly(old, 0, 40)
@@ -266,7 +266,7 @@ def test_yesterdays_map_is_found_again_in_todays(make_flight: MakeFlight, words:
     assert next(iter(station.mapper.placements)) == submap_of_keyframe(yesterday.flights[0].keyframes[0])
 
 
-def test_two_finished_maps_are_joined_by_their_places(make_flight: MakeFlight, words: Any) -> None:
+def test_combined_maps_are_merged_by_loop_closure(make_flight: MakeFlight, words: Any) -> None:
     kept = []
     for agent, start in ((0, 0.0), (1, 0.3)):
         agents = Agents([make_flight(keyframes=30, turns=0.6, start=start, variant=agent, agent=agent)])
@@ -295,7 +295,7 @@ def test_maps_of_two_agents_with_one_number_are_refused(make_flight: MakeFlight,
         combine(*kept)
 
 
-def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFlight, words: Any) -> None:
+def test_values_lost_on_the_link_are_imported_later(make_flight: MakeFlight, words: Any) -> None:
     flight = make_flight(keyframes=20, turns=0.4)
     codes = [(messages.key(r), messages.encode(r)) for r in flight.all_records()]
     agents, station = Agents([flight]), new_station(words)
@@ -316,7 +316,7 @@ def test_what_the_link_did_not_carry_is_added_after_landing(make_flight: MakeFli
     assert heads == set(flight.keyframes[5:12])  # the others were here
 
 
-def test_heads_are_what_they_were(joined: tuple[Agents, Station]) -> None:
+def test_saved_keyframe_headers_are_complete(joined: tuple[Agents, Station]) -> None:
     agents, first = joined
     kept = snapshot(first, SavedMap())
     for flight in agents.flights:

@@ -1,4 +1,4 @@
-"""The essential graph over similarities: loops take back what the unit of length drifts, and metres stay metres."""
+"""Pose graph optimisation over similarities: loops correct scale drift."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def rms(a: F64, b: F64) -> float:
     return float(np.sqrt(np.mean(np.sum((a[:, :3, 3] - b[:, :3, 3]) ** 2, axis=1))))
 
 
-def test_loops_take_back_the_drift_of_the_unit() -> None:
+def test_loops_correct_scale_drift() -> None:
     true, unit, inputs = drifting_ring(200, 60, 12)
     result = optimise(inputs)
     rigid = optimise(replace(inputs, scaled=None))
@@ -69,7 +69,7 @@ def test_loops_take_back_the_drift_of_the_unit() -> None:
     assert np.array_equal(result.T_w_k, optimise(inputs).T_w_k)
 
 
-def test_what_is_in_metres_keeps_them() -> None:
+def test_metric_submaps_keep_their_scale() -> None:
     _, _, inputs = drifting_ring(200, 60, 12)
     assert inputs.scaled is not None
     free = np.arange(200) >= 100
@@ -85,7 +85,7 @@ def test_without_drift_it_is_the_rigid_graph() -> None:
     assert rms(optimise(held).T_w_k, optimise(replace(inputs, scaled=None)).T_w_k) < 1e-3
 
 
-def test_the_minimum_is_one() -> None:
+def test_result_is_a_local_minimum() -> None:
     """Numerically: whatever moves or stretches a keyframe makes the sum of squares larger."""
     _, _, inputs = drifting_ring(40, 30, 3, growth=0.001)
     inputs = replace(inputs, config=replace(inputs.config, huber=1e6, stop=1e-12))

@@ -1,4 +1,4 @@
-"""The station over real channels: both sides end with the same numbers."""
+"""The station over real channels: both sides end with the same values."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_agent_holds_what_the_base_computes_with(make_flight: Callable[..., 
     assert station.mapper.idle
 
 
-def test_plain_channels_serve_as_well_and_agents_are_served_in_order(make_flight: Callable[..., Any]) -> None:
+def test_plain_channels_and_order_of_agents(make_flight: Callable[..., Any]) -> None:
     ends = {agent: plain_pair() for agent in (AgentId(0), AgentId(2))}
     station = Station(BaseConfig(), lambda agent: ends[agent][0])
     flights = [make_flight(keyframes=5, turns=0.1, agent=int(a), seed=int(a)) for a in (2, 0)]

@@ -1,4 +1,4 @@
-"""The store: what is put in comes out, in whole batches, whatever kills the writer."""
+"""The store returns what was written, in whole batches, also after the writer was killed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def without_nothing(kept: SavedMap) -> SavedMap:
 
 
 @given(maps)
-def test_packing_gives_back_what_it_was_given(kept: SavedMap) -> None:
+def test_packing_round_trip(kept: SavedMap) -> None:
     assert unpack(pack(kept)) == kept
 
 
@@ -50,9 +50,7 @@ def test_a_flipped_bit_is_found() -> None:
 
 @settings(max_examples=25)
 @given(maps, maps)
-def test_a_batch_leads_from_one_map_to_the_other(
-    tmp_path_factory: pytest.TempPathFactory, a: SavedMap, b: SavedMap
-) -> None:
+def test_batch_turns_one_map_into_another(tmp_path_factory: pytest.TempPathFactory, a: SavedMap, b: SavedMap) -> None:
     folder = tmp_path_factory.mktemp("store")
     store = Store(folder)
     store.write(batch_of(a, store.load()))
@@ -63,7 +61,7 @@ def test_a_batch_leads_from_one_map_to_the_other(
     assert read(folder / FILE) == without_nothing(b)
 
 
-def test_nothing_is_left_of_a_deleted_submap(tmp_path: Path) -> None:
+def test_values_of_a_deleted_submap_are_removed(tmp_path: Path) -> None:
     doomed, other = submap_id(3, 1, 0), submap_id(3, 1, 1)
     received = {Key(KeyframeHeader.KIND, s << SEQUENCE_BITS | 5): b"head" for s in (doomed, other)}
     received |= {Key(GravityAlignment.KIND, s): b"level" for s in (doomed, other)}
@@ -90,7 +88,7 @@ def test_a_store_serves_one_base_and_any_number_of_readers(tmp_path: Path) -> No
     Store(tmp_path).close()
 
 
-def test_what_is_no_store_is_named(tmp_path: Path) -> None:
+def test_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such file"):
         read(tmp_path)
     (tmp_path / FILE).write_bytes(b"hello, I am no database at all")
@@ -104,7 +102,7 @@ def test_what_is_no_store_is_named(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_another_version_is_told(tmp_path: Path) -> None:
+def test_other_version_is_refused(tmp_path: Path) -> None:
     Store(tmp_path).close()
     with sqlite3.connect(tmp_path / FILE) as db:
         db.execute("PRAGMA user_version = 99")
@@ -113,7 +111,7 @@ def test_another_version_is_told(tmp_path: Path) -> None:
         Store(tmp_path)
 
 
-def test_damage_is_found(tmp_path: Path) -> None:
+def test_damaged_file_is_refused(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.write(Batch(rows=[(1, 0, 3, i, 0, bytes(500)) for i in range(200)]))
     store.close()

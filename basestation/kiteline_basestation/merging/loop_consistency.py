@@ -1,4 +1,4 @@
-"""Checks that tell a true loop closure from a place that only looks alike."""
+"""Checks that distinguish loop closures from places that only look alike."""
 
 from __future__ import annotations
 

@@ -218,10 +218,11 @@ def contradictions(mapper: Mapper) -> list[str]:
     apart = sum(map_id[a] != map_id[b] for a, b in zip(submap[across].tolist(), submap[root[across]].tolist()))
     if apart:
         out.append(f"{apart} keypoints are linked to landmarks of another map")
-    for joined, eldest in sparse_map.root_submaps.items():
-        if eldest not in sparse_map.submaps or eldest in sparse_map.root_submaps or joined not in sparse_map.submaps:
-            out.append(f"submap {joined} is joined to {eldest}, which is no map")
+    for merged, root_submap in sparse_map.root_submaps.items():
+        known = root_submap in sparse_map.submaps and merged in sparse_map.submaps
+        if not known or root_submap in sparse_map.root_submaps:
+            out.append(f"submap {merged} is merged with {root_submap}, which is no map")
     for placed, T_w_m in mapper.placements.items():
         if placed not in sparse_map.submaps or not np.isfinite(T_w_m).all():
-            out.append(f"submap {placed} has a place and no keyframes")
+            out.append(f"submap {placed} has a placement and no keyframes")
     return out
