@@ -31,7 +31,7 @@ from kiteline_codec.channel import CodedChannel, RecordChannel, settled
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
-from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import FrameSource
@@ -113,7 +113,7 @@ class AgentRuntime:
 
     def first_message(self) -> Up:
         """The first message at the barrier."""
-        return Up(self._next_or_end(), False, False, ())
+        return Up(self.next_ns, False, False, ())
 
     def tick(self, down: Down) -> Up:
         """One tick of a lock-step flight: take the base's packets, and the next frame if it is due."""
@@ -128,7 +128,7 @@ class AgentRuntime:
                 frame, imu, odometry = self.reader.take()
         sent = self.step(frame, imu, down.packets, down.now_ns, odometry)
         quiet, equal = settled(self.channel)
-        return Up(self._next_or_end(), quiet, equal, tuple(sent))
+        return Up(self.next_ns, quiet, equal, tuple(sent))
 
     def begin_at(self, begin_ns: int) -> None:
         """Begin a live flight: `begin_ns` of its clock is flight time 0."""
@@ -148,10 +148,6 @@ class AgentRuntime:
         """The last frame was flown: what follows is draining, which is reported apart."""
         if self.flight_counts is None:
             self.flight_counts = self.counts.as_report()
-
-    def _next_or_end(self) -> int:
-        next_ns = self.next_ns
-        return NO_MORE_FRAMES_NS if next_ns is None else next_ns
 
     def step(
         self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int,

@@ -31,7 +31,7 @@ from kiteline_codec.channel import RecordChannel, settled
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.links.kinds import link_traits
-from kiteline_hw.lockstep.messages import NO_MORE_FRAMES_NS, Down, Phase, Up
+from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
 from kiteline_hw.system import process
@@ -127,7 +127,7 @@ class BaseRuntime:
         if self.now_ns is not None:
             packets = {agent: up.packets for agent, up in ups.items()}
             self.step(packets, self.jobs.done(self.now_ns), self.now_ns)
-        frames = [up.next_ns for up in ups.values() if up.next_ns != NO_MORE_FRAMES_NS]
+        frames = [up.next_ns for up in ups.values() if up.next_ns is not None]
         self.now_ns = min(frames) if frames else self._drain(ups, self.now_ns or 0)
         sent = self.outgoing(self.now_ns)
         return {agent: Down(self.now_ns, self.phase, sent.get(AgentId(agent), ())) for agent in sorted(ups)}

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 from kiteline_hw.ports import LinkError
 
-NO_MORE_FRAMES_NS = -1
+_NO_FRAME_NS = -1  # on the wire, after the last frame
 
 _UP = struct.Struct("<qBI")  # next frame's flight time, flags, packets
 _DOWN = struct.Struct("<qBI")  # flight time of this tick, phase, packets
@@ -26,12 +26,12 @@ class Phase(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Up:
-    """An agent's message. next_ns: flight time of its next frame, NO_MORE_FRAMES_NS after its last.
+    """An agent's message. next_ns: flight time of its next frame, None after its last.
 
     quiet, digest_equal: state of its sync endpoint.
     """
 
-    next_ns: int
+    next_ns: int | None
     quiet: bool
     digest_equal: bool
     packets: tuple[bytes, ...]
@@ -39,13 +39,14 @@ class Up:
     def encode(self) -> bytes:
         """The encoded message."""
         flags = self.quiet | self.digest_equal << 1
-        return _UP.pack(self.next_ns, flags, len(self.packets)) + _join(self.packets)
+        next_ns = _NO_FRAME_NS if self.next_ns is None else self.next_ns
+        return _UP.pack(next_ns, flags, len(self.packets)) + _join(self.packets)
 
     @classmethod
     def decode(cls, message: bytes) -> Up:
         """Decode a message. Raises LinkError on any other bytes."""
         next_ns, flags, packets = _split(_UP, message)
-        return cls(next_ns, bool(flags & 1), bool(flags & 2), packets)
+        return cls(None if next_ns == _NO_FRAME_NS else next_ns, bool(flags & 1), bool(flags & 2), packets)
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,7 +116,7 @@ def one_box(pool: TexturePool) -> World:
     boxes = np.array([[3.0, 0.2, 0.1, 0.5, 0.4, 0.3, np.cos(0.5), np.sin(0.5)]])
     faces = np.tile(np.array([200.0, 200.0, 0.0, 0.0, 1.0, 0.5, 1.0, 0.0]), (6, 1))
     ground = np.tile(np.array([200.0, 200.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0]), (4, 1))
-    return World(boxes, faces, -1, NO_GROUND, np.zeros(7), ground, pool, 50.0, 0.0)
+    return World(boxes, faces, None, NO_GROUND, np.zeros(7), ground, pool, 50.0, 0.0)
 
 
 def corners(box: np.ndarray) -> np.ndarray:

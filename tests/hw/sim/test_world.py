@@ -112,7 +112,7 @@ def test_solids_keep_their_distance_from_the_path(scene: str, seed: int) -> None
     assert len(world.solids()) > 10
     for box in world.solids():
         assert box_distances(box, path).min() > 0.45
-    if world.shell >= 0:
+    if world.shell is not None:
         shell = world.boxes[world.shell]
         assert (np.abs(path - shell[:3]) < shell[3:6] - 0.45).all()
     else:
@@ -128,7 +128,7 @@ def test_scenes_are_built_around_recorded_paths(data_dir: Path, scene: str, name
     world, path = world_and_path(scene, trajectory=str(file))
     nearest = min(float(box_distances(box, path).min()) for box in world.solids())
     assert 0.45 < nearest < 1.5
-    if world.shell >= 0:
+    if world.shell is not None:
         shell = world.boxes[world.shell]
         assert (np.abs(path - shell[:3]) < shell[3:6] - 0.45).all()
     else:

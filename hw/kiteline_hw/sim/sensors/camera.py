@@ -9,7 +9,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.sim.sensors.lens import pixel_rays, vignette
 from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
-from kiteline_hw.sim.world.raycast_kernels import TILE, render, tile_lists, visible_boxes
+from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, TILE, render, tile_lists, visible_boxes
 from kiteline_hw.sim.world.textures import DETAIL_M
 from kiteline_hw.sim.world.world import World
 
@@ -53,11 +53,12 @@ class SimCamera:
         t_w_c = T_w_b @ self.T_b_c
         o, rot = np.ascontiguousarray(t_w_c[:3, 3]), np.ascontiguousarray(t_w_c[:3, :3])
         near, items = self._near, self._items
-        count = visible_boxes(w.boxes, w.shell, o, rot @ self._axis, self._half_angle, near, items)
+        shell = NO_SHELL if w.shell is None else w.shell
+        count = visible_boxes(w.boxes, shell, o, rot @ self._axis, self._half_angle, near, items)
         count = int(np.searchsorted(near[:count], w.far_m))
         tile_lists(w.boxes, items, count, o, rot, self._rays, self._lists, self._lengths)
         render(
-            w.boxes, w.faces, w.shell, w.field, w.field_frame, w.ground, w.pool.atlas, w.pool.table, DETAIL_M,
+            w.boxes, w.faces, shell, w.field, w.field_frame, w.ground, w.pool.atlas, w.pool.table, DETAIL_M,
             o, rot, self._rays, self._pixel, w.far_m, near, items, self._lists, self._lengths,
             self._radiance, self._distance, self._hits,
         )  # fmt: skip

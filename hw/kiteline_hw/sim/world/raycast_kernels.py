@@ -27,6 +27,7 @@ U8 = NDArray[np.uint8]
 TILE = 16  # px, side of a screen tile
 SKY = -1
 GROUND = -2
+NO_SHELL = -1  # outdoors
 _WRAP = float(1 << 26)  # makes texel coordinates positive; a multiple of every texture's side
 _FACE_LIGHT = (0.86, 0.74, 0.95, 0.80, 0.70, 1.0)  # brightness by outward normal -x +x -y +y -z +z: light from above
 

@@ -41,7 +41,7 @@ def build_street(points: F64, seed: int, bits: int) -> World:
         ]
     )
     start = float(bilinear(field[0], frame, points[:1, :2])[0])
-    return World(boxes, faces, -1, field, frame, ground, pool, FAR_M, start)
+    return World(boxes, faces, None, field, frame, ground, pool, FAR_M, start)
 
 
 def ground_field(points: F64) -> tuple[F32, F64]:

@@ -24,7 +24,7 @@ class World:
     """Solids, ground and textures.
 
     boxes (n, 8): centre x y z, half-extents x y z in m, cos yaw, sin yaw. faces (6 n, 8): see raycast_kernels.
-    shell: the box whose inside is the room, or -1 outdoors.
+    shell: the box whose inside is the room, None outdoors.
     field (2, rows, columns) float32: ground height and distance to the path in m, empty indoors; its frame (7,): x0 y0
     cell in m, largest slope, then unused, road half-width, far side of the pavement. ground (4, 8): the surfaces of
     road, pavement, lawn and sky, laid out as faces. floor_m: z of the floor, outdoors at the path's start.
@@ -32,7 +32,7 @@ class World:
 
     boxes: F64
     faces: F64
-    shell: int
+    shell: int | None
     field: F32
     field_frame: F64
     ground: F64
@@ -42,7 +42,7 @@ class World:
 
     def solids(self) -> F64:
         """The boxes without the shell, (m, 8)."""
-        return np.delete(self.boxes, self.shell, axis=0) if self.shell >= 0 else self.boxes
+        return np.delete(self.boxes, self.shell, axis=0) if self.shell is not None else self.boxes
 
     def height(self, xy: F64) -> F64:
         """z of the floor or the ground under points (n, 2)."""
@@ -127,7 +127,7 @@ def occupancy(
     A cell is OCCUPIED where a solid or a wall reaches into it, FREE elsewhere inside the shell (outdoors: within the
     field), UNKNOWN behind the walls. The origin is the lower left corner of the lower left cell in w.
     """
-    if world.shell >= 0:
+    if world.shell is not None:
         extent = world.boxes[world.shell]
         lower, upper = extent[:2] - extent[3:5] - margin_m, extent[:2] + extent[3:5] + margin_m
     else:
@@ -149,7 +149,7 @@ def occupancy(
         dx, dy = lower[0] + (x + 0.5) * resolution_m - box[0], lower[1] + (y + 0.5) * resolution_m - box[1]
         return ys, xs, np.abs(box[6] * dx + box[7] * dy), np.abs(box[6] * dy - box[7] * dx)
 
-    if world.shell >= 0:
+    if world.shell is not None:
         ys, xs, x, y = cells_around(world.boxes[world.shell])
         image[:] = UNKNOWN
         sx, sy = extent[3:5]
