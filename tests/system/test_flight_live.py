@@ -1,4 +1,4 @@
-"""Agent and base as a user starts them: real clocks, watched over, told to stop, killed and started again."""
+"""Agent and base as users start them: real clocks, systemd, signals, kills and restarts."""
 
 from __future__ import annotations
 
@@ -134,14 +134,14 @@ def heads(store: Path) -> int:
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_a_base_alone_stops_when_told(tmp_path: Path, start: Start, how: signal.Signals) -> None:
+def test_a_base_without_agents_stops_on_a_signal(tmp_path: Path, start: Start, how: signal.Signals) -> None:
     base = start("base", "--link", f"zenoh:{free_endpoint()}", "--web", "127.0.0.1:0")
     assert base.stderr is not None
     assert "http://127.0.0.1" in base.stderr.readline()
     stop(base, how)
 
 
-def test_systemd_hears_from_the_tracking_loop_and_boots_are_counted(
+def test_the_tracking_loop_notifies_systemd_and_boots_are_counted(
     recording: Path, tmp_path: Path, start: Start
 ) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -190,7 +190,7 @@ def test_poses_go_to_a_flight_controller(recording: Path, start: Start) -> None:
         (("base", "--link", "none", "--web", "here"), "address"),
     ],
 )
-def test_a_mistake_ends_in_one_line(
+def test_a_user_error_ends_in_one_line(
     recording: Path, tmp_path: Path, start: Start, words: tuple[str, ...], told: str
 ) -> None:
     (tmp_path / "config.toml").write_text("[agent]\nspeed = 3\n")
@@ -248,9 +248,7 @@ def stretched(source: Path, out: Path, times: int) -> None:
             writer.frame(frame)
 
 
-def test_after_landing_a_base_adds_what_no_link_carried_and_maps_are_managed(
-    recording: Path, tmp_path: Path, start: Start
-) -> None:
+def test_a_base_imports_logs_and_manages_maps(recording: Path, tmp_path: Path, start: Start) -> None:
     agent = start("agent", recording, "--log", tmp_path / "log")  # without a link
     assert agent.wait(30.0) == 0
     log = tmp_path / "log" / "agent0" / "boot00001.mcap"

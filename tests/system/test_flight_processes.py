@@ -1,4 +1,4 @@
-"""Flights of separate processes over a real link: agreement, repetition, deaths, and nobody left behind."""
+"""Flights of separate processes over a real link: agreement, repetition, killed processes, no orphans."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def children_of(folder: Path) -> list[int]:
     return found
 
 
-def test_two_flights_over_a_lossy_link_are_alike_and_agree(recording: Path, tmp_path: Path) -> None:
+def test_two_flights_over_a_lossy_link_are_identical_and_agree(recording: Path, tmp_path: Path) -> None:
     for run in "ab":
         report, outcome = fly(Options((str(recording),), tmp_path / run, loss=0.2, seed=1), quiet=True)
         assert not outcome.failed
@@ -49,7 +49,7 @@ def test_two_flights_over_a_lossy_link_are_alike_and_agree(recording: Path, tmp_
     assert replay([str(tmp_path / "a" / "base" / "log.mcap"), "--verify"]) == 0
 
 
-def test_a_base_that_dies_is_missed_by_nobody_and_its_successor_catches_up(recording: Path, tmp_path: Path) -> None:
+def test_the_flight_survives_a_killed_base_and_the_next_one_catches_up(recording: Path, tmp_path: Path) -> None:
     o = Options((str(recording),), tmp_path, kill_base_at_s=0.5, restart_base_at_s=0.9)
     report, outcome = fly(o, quiet=True)
     agent = report["agents"][0]
@@ -68,7 +68,7 @@ def test_without_a_new_base_the_agent_flies_to_the_end(recording: Path, tmp_path
     assert check_contract(tmp_path) == []
 
 
-def test_an_agent_that_dies_leaves_its_map_to_the_base(recording: Path, tmp_path: Path) -> None:
+def test_the_base_keeps_the_map_of_a_killed_agent(recording: Path, tmp_path: Path) -> None:
     o = Options((str(recording), str(recording)), tmp_path, kill_agent_at_s=0.8)
     report, outcome = fly(o, quiet=True)
     assert report["agents"][1]["tracked"] == 30
@@ -79,7 +79,7 @@ def test_an_agent_that_dies_leaves_its_map_to_the_base(recording: Path, tmp_path
     assert not outcome.failed
 
 
-def test_a_base_that_cannot_listen_is_told_at_once(recording: Path, tmp_path: Path) -> None:
+def test_a_base_that_cannot_listen_is_reported_at_once(recording: Path, tmp_path: Path) -> None:
     endpoint = free_endpoint()
     from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
 
@@ -88,7 +88,7 @@ def test_a_base_that_cannot_listen_is_told_at_once(recording: Path, tmp_path: Pa
     assert children_of(tmp_path) == []
 
 
-def test_a_bad_source_is_told_before_anything_starts(tmp_path: Path) -> None:
+def test_a_bad_source_is_reported_before_anything_starts(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no such"):
         fly(Options((str(tmp_path / "nothing"),), tmp_path / "out"), quiet=True)
     assert not (tmp_path / "out").exists()

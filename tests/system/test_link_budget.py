@@ -1,4 +1,4 @@
-"""The budget holds on the wire itself: sealed, framed or cut into MAVLink messages, in any window of one second."""
+"""The byte budget holds on the wire (sealed, framed or cut into MAVLink messages) in any window of one second."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from kiteline_codec.schema import Key, LivePose, NewLandmarks, RefinedLandmarks
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, seal_bytes, suite_for
 from kiteline_hw.links.kinds import link_traits
-from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
+from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
 
 SECOND = 1_000_000_000
 KEY = bytes(range(32))
 
 
 def wire_bytes(link: str, packet: bytes) -> int:
-    """What a packet takes on a link, everything included."""
+    """Bytes of a packet on a link, everything included."""
     if link == "serial:x:57600":
         return len(frame(packet))
     if link.startswith("mavlink"):
@@ -60,6 +60,8 @@ def test_no_second_exceeds_the_budget(link: str, budget: int) -> None:
                 spent[i].popleft()
             most[i] = max(most[i], sum(n for _, n in spent[i]))
     assert max(most) <= budget
-    assert most[0] > 0.6 * budget or not ends[0].endpoint.backlog_bytes
+    if budget <= 1000:  # less than what is put: the link is busy
+        assert most[0] > 0.6 * budget
+    else:
+        assert ends[0].endpoint.backlog_bytes <= 29  # the newest live pose at most
     assert received > 100
-    assert BASE_END.payload_type == AGENT_END.payload_type

@@ -1,4 +1,4 @@
-"""An agent that is told nothing of its link: it finds the profile that suits it, and its poses do not queue up."""
+"""An agent without a named profile selects the one that suits its link, and its poses are not queued."""
 
 from __future__ import annotations
 

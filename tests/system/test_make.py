@@ -1,4 +1,4 @@
-"""What somebody sees whose machine lacks a piece."""
+"""Errors of `make` on a machine that lacks a tool."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_missing_venv_module_names_the_package_to_install(checkout: Path) -> N
     assert "Traceback" not in done.stderr
 
 
-def test_no_python_or_an_old_one_is_told(checkout: Path) -> None:
+def test_a_missing_or_old_python_is_reported(checkout: Path) -> None:
     assert "no nowhere-python found" in make(checkout, "demo", "nowhere-python").stderr
     old = checkout / "old-python"
     old.write_text('#!/bin/sh\n[ "$1" = --version ] && echo Python 3.9.2 && exit 0\nexit 1\n')

@@ -1,4 +1,4 @@
-"""The units hold up to systemd's own checkers; where those are missing, only that is skipped."""
+"""The units pass systemd's own checkers; a missing checker skips only its test."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_verify_prints_nothing(unit: str) -> None:
     assert done.returncode == 0
 
 
-def test_verify_would_complain_of_a_wrong_key(tmp_path: Path) -> None:
+def test_verify_rejects_a_wrong_key(tmp_path: Path) -> None:
     wrong = tmp_path / UNITS[0]
     wrong.write_text((FOLDER / UNITS[0]).read_text().replace("WatchdogSec=", "WatchdogSecs="))
     done = run(tool("systemd-analyze"), "verify", "--man=no", str(wrong))
@@ -60,7 +60,7 @@ def test_exposure_stays_low(unit: str) -> None:
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_what_flying_needs_is_set(unit: str) -> None:
+def test_settings_needed_in_flight(unit: str) -> None:
     s = settings(unit)
     assert s["Type"] == ["notify"]
     assert s["Restart"] == ["always"]
@@ -74,14 +74,14 @@ def test_what_flying_needs_is_set(unit: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["agent", "base"])
-def test_the_sample_of_settings_names_the_variable_that_the_unit_reads(name: str) -> None:
+def test_the_sample_settings_set_the_variable_of_the_unit(name: str) -> None:
     exec_start = settings(f"kiteline-{name}.service")["ExecStart"][0]
     variable = exec_start.rsplit("$", 1)[1]
     assert f"\n{variable}=" in (FOLDER / f"{name}.env").read_text()
     assert settings(f"kiteline-{name}.service")["EnvironmentFile"] == [f"/etc/kiteline/{name}.env"]
 
 
-def test_sysusers_makes_the_user_of_the_units(tmp_path: Path) -> None:
+def test_sysusers_creates_the_user_of_the_units(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
     done = run(tool("systemd-sysusers"), f"--root={tmp_path}", str(FOLDER / "kiteline.sysusers.conf"))
     assert done.returncode == 0, done.stderr
@@ -91,7 +91,7 @@ def test_sysusers_makes_the_user_of_the_units(tmp_path: Path) -> None:
     assert all(settings(unit)["User"] == ["kiteline"] for unit in UNITS)
 
 
-def test_tmpfiles_makes_the_folders(tmp_path: Path) -> None:
+def test_tmpfiles_creates_the_folders(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
     me, mine = os.getuid(), os.getgid()  # so that the test needs no root
     (tmp_path / "etc" / "passwd").write_text("".join(f"{n}:x:{me}:{mine}::/:/bin/sh\n" for n in ("root", "kiteline")))

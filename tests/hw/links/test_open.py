@@ -1,4 +1,4 @@
-"""Links by name."""
+"""Links opened by name."""
 
 from __future__ import annotations
 

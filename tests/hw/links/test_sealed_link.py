@@ -1,4 +1,4 @@
-"""Sealed links and the file of keys."""
+"""Sealed links, and the key file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The serial link on pseudo terminals: noise, full buffers, hang-ups and returns."""
+"""The serial link on pseudo terminals: noise, full buffers, hang-ups and reopening."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zenoh links: they come and go with either side, never block their caller, and never keep a process from ending."""
+"""Zenoh links: reconnect with either side, never block the caller, never keep a process from ending."""
 
 from __future__ import annotations
 

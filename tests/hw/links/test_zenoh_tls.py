@@ -1,4 +1,4 @@
-"""Zenoh with certificates on both sides and access by their names: a base, a known agent, and two others."""
+"""Zenoh with certificates on both sides and access control: a base, its agent, and two agents without access."""
 
 from __future__ import annotations
 

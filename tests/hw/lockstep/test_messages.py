@@ -1,4 +1,4 @@
-"""The barrier's messages survive the way, and nothing else passes for one."""
+"""Messages of the barrier: round trips, and errors on any other bytes."""
 
 from __future__ import annotations
 

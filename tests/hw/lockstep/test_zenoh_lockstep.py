@@ -1,4 +1,4 @@
-"""The barrier between processes: every message answered in order, and clear errors when either side ends."""
+"""The barrier between processes: every message is answered in order, and errors when either side ends."""
 
 from __future__ import annotations
 

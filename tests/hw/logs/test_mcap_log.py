@@ -1,4 +1,4 @@
-"""Logs: what goes in comes out to the last bit, equal calls give equal bytes, and a cut log keeps what came before."""
+"""Logs: exact round trips, equal bytes for equal calls, and cut logs."""
 
 import json
 import time

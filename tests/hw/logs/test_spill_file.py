@@ -1,4 +1,4 @@
-"""Bytes that wait on disk."""
+"""Temporary storage on disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The inertial unit of a flight controller, by hand: frames, signs, units, clocks, and who is listened to."""
+"""The IMU of a flight controller against values by hand: frames, signs, units, clocks, and the choice of message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a flight controller says of its velocity, by hand: frames, signs, clocks, and what must not be believed."""
+"""Velocities of a flight controller against values by hand: frames, signs, clocks, and unusable messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stream of poses: what a modelled ArduPilot and PX4 take, when, and what they make of it."""
+"""The session with a flight controller: what modelled ArduPilot and PX4 accept, when, and with which values."""
 
 from __future__ import annotations
 

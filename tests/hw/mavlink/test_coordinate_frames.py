@@ -1,4 +1,4 @@
-"""Frames against numbers worked out by hand: what a pilot sees is what the flight controller is told."""
+"""Coordinate frames against values by hand."""
 
 from __future__ import annotations
 

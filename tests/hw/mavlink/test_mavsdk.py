@@ -1,4 +1,4 @@
-"""An independent reading of our messages: MAVSDK's own server, which shares no code with ours."""
+"""Our messages read by MAVSDK's server, which shares no code with ours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses on real sockets and pseudo terminals, with the modelled controller at the other end."""
+"""Poses over real sockets and pseudo terminals, with a modelled controller at the other end."""
 
 from __future__ import annotations
 

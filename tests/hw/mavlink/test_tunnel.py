@@ -1,4 +1,4 @@
-"""Packets through a flight controller's radio: pieces, flow control, and what telemetry pays for it."""
+"""Packets through a flight controller's radio: chunks, flow control, and the delay of telemetry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairing by time and the sieve of inertial samples, against plain statements of what they promise."""
+"""Pairing by time, and the checks of inertial samples."""
 
 import numpy as np
 from hypothesis import given

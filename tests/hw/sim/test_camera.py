@@ -1,4 +1,4 @@
-"""The renderer against a plain reference, against the camera model, and against itself."""
+"""The renderer against a plain reference and the camera model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The modelled link: reproducible, and it does what its settings say and nothing else."""
+"""The link model: reproducible, with the rates that its settings state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths and inertial samples that belong together."""
+"""Paths, and inertial samples that are consistent with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modelled links between real peers: datagrams through a relay, bytes through a slow cable, turns and outages."""
+"""Link models between real peers: datagrams through a relay, bytes through a slow cable, turns and outages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulated flight as a source of frames: reproducible to the byte, and told in words."""
+"""A simulated flight as a source: reproducible to the byte, and its options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes that keep clear of their paths, textures that look like nature, occupancy that tells of the solids."""
+"""Scenes that keep their distance from the paths, statistics of textures, and true occupancy."""
 
 from __future__ import annotations
 

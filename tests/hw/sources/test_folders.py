@@ -1,4 +1,4 @@
-"""Data set folders: the real ones by their numbers, and small ones with every fault that folders have."""
+"""Data set folders: the recordings, and small ones with every fault that folders have."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Recordings of messages: ROS 2 bags in every storage form, Foxglove's schemas in both encodings, and their faults."""
+"""ROS 2 bags in every storage form, and their faults."""
 
 from collections.abc import Callable
 from itertools import pairwise

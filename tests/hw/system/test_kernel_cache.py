@@ -1,4 +1,4 @@
-"""Kernels are compiled by a process of their own, once."""
+"""Kernels are compiled once, by a process of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers and files that survive a crash, and signals that become flags."""
+"""Numbers and files that survive a crash; signals, systemd, and the pipe to the parent."""
 
 from __future__ import annotations
 
