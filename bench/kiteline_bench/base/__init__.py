@@ -1,1 +1,1 @@
-"""TODO."""
+"""Benchmarks of the base station: flights of one or several agents enter, bars leave."""

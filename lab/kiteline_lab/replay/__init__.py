@@ -1,1 +1,1 @@
-"""TODO."""
+"""Logs of agents and bases enter; the same steps are run again, and the first difference leaves."""
