@@ -11,8 +11,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from kiteline_lab.evaluation.evaluate import evaluate_files
 from kiteline_lab.evaluation.metrics import Evaluation
+from kiteline_lab.tools.evaluate import evaluate_files
 
 SCENE = "room"  # four walls, furniture, a window: similar to EuRoC's Vicon room
 SECONDS = 8.0  # long enough to see the room, short enough to wait for

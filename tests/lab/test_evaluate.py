@@ -8,8 +8,8 @@ import pytest
 
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
-from kiteline_lab.evaluation import evaluate
 from kiteline_lab.evaluation.trajectories import TrajectoryError, read
+from kiteline_lab.tools import evaluate
 
 TUM = "1403715273.262142976 0.1 0.2 0.3 0 0 0 1\n1403715273.312143104 0.2 0.2 0.3 0 0 0.6 0.8\n"
 

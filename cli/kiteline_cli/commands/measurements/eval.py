@@ -11,6 +11,6 @@ EXAMPLES = (
 
 def run(argv: list[str]) -> int | None:
     """Run the command with the arguments after `kiteline eval`; the exit status."""
-    from kiteline_lab.evaluation.evaluate import main
+    from kiteline_lab.tools.evaluate import main
 
     return main(argv)
