@@ -30,7 +30,7 @@ def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[lis
     """
     ends = {f.agent: CodedChannel(SyncConfig(), 1) for f in flights}
     station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1), words)
-    narrator, lines = TerminalReporter(station), []
+    reporter, lines = TerminalReporter(station), []
     done: tuple[JobDone, ...] = ()
     for n in range(max(len(f.records) for f in flights) + 30):
         if n == restart:
@@ -47,40 +47,40 @@ def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[lis
         for agent, out in output.packets:
             ends[agent].receive(out, n * STEP_NS)
         done = tuple(run_job(job) for job in output.jobs)
-        lines += narrator.lines(here, n * STEP_NS, 230.0, n < 60)
-    return lines, station, narrator
+        lines += reporter.lines(here, n * STEP_NS, 230.0, n < 60)
+    return lines, station, reporter
 
 
-def test_agents_merges_and_the_state_are_told_once_each(make_flight: MakeFlight, words: Any) -> None:
+def test_agents_merges_and_status_are_reported_once_each(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=40, turns=0.8)
     b = make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
-    lines, station, narrator = told([a, b], words, range(45, 55), 65)
-    words_of = [line.split("s  ", 1)[1] for line in lines]
-    assert words_of[:2] == ["agent 0 is here", "agent 1 is here"]
-    assert sorted(words_of[2:4]) == ["agent 0 begins map 0.1.0", "agent 1 begins map 1.1.0"]
-    joined = [w for w in words_of if " joined to " in w]
-    assert len(joined) == 1 and re.fullmatch(r"map 1\.1\.0 \(\d+ keyframes\) joined to map 0\.1\.0", joined[0])
-    assert "agent 1 is out of reach; its map stays" in words_of
-    assert "agent 1 is here again after 2.0 s" in words_of
-    assert [w for w in words_of if "started again" in w] == ["agent 0 has started again; what it sent before is kept"]
-    status = [w for w in words_of if " at most; " in w]
-    assert len(status) == 1 and lines[words_of.index(status[0])].startswith("    10.0 s")
+    lines, station, reporter = told([a, b], words, range(45, 55), 65)
+    texts = [line.split("s  ", 1)[1] for line in lines]
+    assert texts[:2] == ["agent 0 connected", "agent 1 connected"]
+    assert sorted(texts[2:4]) == ["agent 0 starts map 0.1.0", "agent 1 starts map 1.1.0"]
+    merged = [w for w in texts if " merged into " in w]
+    assert len(merged) == 1 and re.fullmatch(r"map 1\.1\.0 \(\d+ keyframes\) merged into map 0\.1\.0", merged[0])
+    assert "agent 1 disconnected; its map is kept" in texts
+    assert "agent 1 connected again after 2.0 s" in texts
+    assert [w for w in texts if "restarted" in w] == ["agent 0 restarted; its earlier map is kept"]
+    status = [w for w in texts if "peak memory" in w]
+    assert len(status) == 1 and lines[texts.index(status[0])].startswith("    10.0 s")
     assert re.match(
-        r"1 agent here; \d+ keyframes and \d+ points in 1 map; 0 loops, 1 merge; \d+\.\d kB/s up", status[0]
+        r"1 agent connected; \d+ keyframes and \d+ landmarks in 1 map; 0 loops, 1 merge; \d+\.\d kB/s up", status[0]
     )
-    assert status[0].endswith("230 MiB at most; all in the store")
+    assert status[0].endswith("peak memory 230 MiB; all stored")
     station.step({}, (), 10**12, [Command(1, "split", '{"map": "1.1.0"}')])
-    assert [w.split("s  ", 1)[1] for w in narrator.lines((), 0, 0.0, None)][-1] == (
-        "map 1.1.0 is taken out of the map that it was laid into"
+    assert [w.split("s  ", 1)[1] for w in reporter.lines((), 0, 0.0, None)][-1] == (
+        "map 1.1.0 separated from the map that it was merged into"
     )
-    assert narrator.lines((), 0, 0.0, None) == []
+    assert reporter.lines((), 0, 0.0, None) == []
 
 
-def test_a_loop_is_told_with_its_length_and_its_error(make_flight: MakeFlight, ring: Any, words: Any) -> None:
+def test_a_loop_is_reported_with_its_length_and_error(make_flight: MakeFlight, ring: Any, words: Any) -> None:
     flight = make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.02, seed=3, noise_px=0.7, memory=2)
     lines, _, _ = told([flight], words, range(0), -1)
-    loops = [line for line in lines if "loop closed" in line]
-    found = re.search(r"the 1st: off by (\d+\.\d\d) m after (\d+) m of way", loops[0])
+    loops = [line for line in lines if re.search(r"loop \d+ closed", line)]
+    found = re.search(r"loop 1 closed: error (\d+\.\d\d) m after (\d+) m", loops[0])
     assert found is not None
-    way_m = np.linalg.norm(np.diff(np.array(flight.true_T_w_k)[:, :3, 3], axis=0), axis=1).sum()
-    assert 0.02 < float(found[1]) < 5.0 and 0.5 * way_m < float(found[2]) < way_m
+    path_m = np.linalg.norm(np.diff(np.array(flight.true_T_w_k)[:, :3, 3], axis=0), axis=1).sum()
+    assert 0.02 < float(found[1]) < 5.0 and 0.5 * path_m < float(found[2]) < path_m

@@ -1,17 +1,15 @@
-"""The occupancy grid: which cells of the x-y plane of w (z up) are free, solid or unknown, made from sparse map points.
+"""Occupancy grid of the x-y plane of w (z up), built from landmarks and the rays that observe them.
 
     grid = Grid(GridConfig())
-    changed = grid.update(positions, points, observations)   # tuple[Tile, ...], ready to be published
-    grid.map.labels                                          # (m,) 0 unlabelled, 1 ground, 2 obstacle, one a point
+    changed = grid.adopt(build(config, positions, points, observations))   # tuple[GridTile, ...] to send
+    grid.map.labels                                          # (m,) 0 unlabelled, 1 ground, 2 obstacle
     files = to_pgm(grid.map), to_yaml(grid.map, "grid.pgm")  # bytes for base/grid.pgm and base/grid.yaml
 
-`build` is the pure function behind `update`: it makes the whole grid from scratch, so corrections of keyframes need no
-book-keeping; run it elsewhere (in a worker) and hand its result to `Grid.adopt` where a rebuild must not block.
+`build` is pure and makes the whole grid anew, so that corrections of keyframes need no book-keeping.
 
-Method: the two layers of "Segfloor" section 5.6 (points above the ground, and rays to the ground points that each
-keyframe sees, overlong rays dropped by its equation 5.3), extended by rays to obstacle points, by log-odds (A. Hornung
-et al., "OctoMap", 2013, equation 2) and by the heights of rays: a camera that looks over a box neither clears the box
-nor the floor under a high ray.
+Method: "Segfloor" section 5.6 (points above the ground, and rays to ground points, overlong rays dropped by equation
+5.3), extended by rays to obstacle points, log-odds (A. Hornung et al., "OctoMap", 2013, equation 2) and the heights of
+rays: a ray over a box clears neither the box nor the floor below.
 """
 
 from __future__ import annotations
@@ -47,8 +45,7 @@ class GridMap:
 
     tiles: (t, 2) int64 column, row of each tile, in order of row, column. cells: (t, 32, 32) int8, 0..100 percent
     occupied, -1 unknown, row 0 the lowest y. A tile's corner lies at (column, row) * 32 * cell_m in w.
-    points: (m,3) what it was built from, in w. labels: (m,) uint8 of the points. ground_m: (m,) z of the ground at each
-    point, NaN unknown.
+    points: (m,3) landmarks in w. labels: (m,) uint8 of the points. ground_m: (m,) z of the ground at each, NaN unknown.
     """
 
     cell_m: float
@@ -60,7 +57,7 @@ class GridMap:
 
 
 def empty(config: GridConfig, points: F64 | None = None) -> GridMap:
-    """A grid that knows nothing of any cell. points: (m,3)."""
+    """A grid without tiles. points: (m,3)."""
     points = np.zeros((0, 3)) if points is None else points
     return GridMap(
         config.cell_m,
@@ -73,25 +70,25 @@ def empty(config: GridConfig, points: F64 | None = None) -> GridMap:
 
 
 class Grid:
-    """The newest grid; returns the tiles that changed."""
+    """The newest grid."""
 
     def __init__(self, config: GridConfig | None = None) -> None:
         self.config = config or GridConfig()
         self.map = empty(self.config)
 
     def update(self, positions: F64, points: F64, observations: I64) -> tuple[GridTile, ...]:
-        """Rebuild from the whole map and return the tiles that changed; arguments as those of `build`."""
+        """Build the grid of the whole map and return the tiles that changed; arguments as for `build`."""
         return self.adopt(build(self.config, positions, points, observations))
 
     def adopt(self, new: GridMap) -> tuple[GridTile, ...]:
-        """Take a grid made by `build` and return the tiles that changed. A tile that vanished comes as unknown."""
+        """Replace the grid by one from `build`. Returns the changed tiles; one that vanished is returned as unknown."""
         changed = differences(self.map, new)
         self.map = new
         return changed
 
 
 def differences(old: GridMap, new: GridMap) -> tuple[GridTile, ...]:
-    """The tiles of `new` that `old` does not hold as they are, in order of row, column; vanished ones as unknown."""
+    """Tiles that differ between two grids, as in `new`, in order of row, column; vanished ones as unknown."""
     before, after = _by_place(old), _by_place(new)
     unknown = np.full((TILE, TILE), UNKNOWN, np.int8)
     out = []
@@ -107,10 +104,10 @@ def _by_place(grid: GridMap) -> dict[tuple[int, int], I8]:
 
 
 def build(config: GridConfig, positions: F64, points: F64, observations: I64) -> GridMap:
-    """Make the grid of a whole map.
+    """Build the grid of a whole map.
 
-    positions: (n,3) keyframe cameras in w, m. points: (m,3) map points in w, m. observations: (k,2) int64 pairs (row of
-    positions, row of points). Rows that are not finite are left out. Raises ValueError when a pair names no row.
+    positions: (n,3) keyframe cameras in w, m. points: (m,3) landmarks in w, m. observations: (k,2) int64 pairs (row of
+    positions, row of points). Rows that are not finite are ignored. Raises ValueError for a pair that names no row.
     """
     rows, columns = len(positions), len(points)
     pairs = observations.reshape(-1, 2)
@@ -149,7 +146,7 @@ def label(config: GridConfig, height_m: F64, distance_m: F64) -> U8:
 
 
 def _overlong(config: GridConfig, seen: I64, length: F64, labels: U8) -> Bool:
-    """Which rays to ground points are outliers among those of their keyframe (Segfloor, equations 5.3 and 5.5)."""
+    """Rays to ground points that are outliers in length among their keyframe's (Segfloor, equations 5.3 and 5.5)."""
     floor = labels[seen[:, 1]] == GROUND
     n = int(seen[:, 0].max()) + 1
     count = np.maximum(np.bincount(seen[floor, 0], minlength=n), 1)
@@ -161,7 +158,7 @@ def _overlong(config: GridConfig, seen: I64, length: F64, labels: U8) -> Bool:
 
 
 def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: U8, views: I64, seen: I64) -> GridMap:
-    """Draw obstacle points and rays into tiles, and turn counts into percent."""
+    """Add obstacle points and rays to tiles, and convert counts to percent."""
     if not len(seen):
         return replace(empty(config, points), labels=labels, ground_m=ground)
     obstacle = np.flatnonzero(labels == OBSTACLE)
@@ -203,12 +200,12 @@ def _draw(config: GridConfig, positions: F64, points: F64, ground: F64, labels: 
 
 
 def _cells(cell_m: float, points: F64) -> I64:
-    """Column and row (n,2) of the cells in which points (n, 2 or 3) lie."""
+    """Column and row (n,2) of the cells of points (n, 2 or 3)."""
     return np.asarray(np.floor(points[:, :2] / cell_m).astype(np.int64))
 
 
 def _tile_box(cell_m: float, *points: F64) -> tuple[I64, I64]:
-    """Column and row of the lowest and of the highest tile that points (n,2) lie in."""
+    """Column and row of the first and the last tile of points (n,2)."""
     cells = np.concatenate([_cells(cell_m, p) for p in points])
     return cells.min(axis=0) // TILE, cells.max(axis=0) // TILE
 
@@ -218,7 +215,7 @@ def _grow(a: NDArray[_T], more: int, fill: float) -> NDArray[_T]:
 
 
 def percent(config: GridConfig, hits: NDArray[np.uint16], free: NDArray[np.uint16], through: NDArray[np.uint16]) -> I8:
-    """Percent occupied, int8, -1 where nothing was seen, of counts of views, rays over and rays through a cell."""
+    """Percent occupied (int8, -1 unknown) from counts of views, of rays over and of rays through each cell."""
     odds = np.where(
         hits > 0, config.log_hit * hits + config.log_through * through, config.log_free * free.astype(np.float64)
     )
@@ -227,7 +224,7 @@ def percent(config: GridConfig, hits: NDArray[np.uint16], free: NDArray[np.uint1
 
 
 def dense(grid: GridMap) -> tuple[I8, F64]:
-    """One array of the whole grid: cells (rows, columns) int8, row 0 the lowest y, and its corner (2,) in w, m."""
+    """The whole grid as one array: cells (rows, columns) int8, row 0 the lowest y, and its corner (2,) in w, m."""
     if not len(grid.tiles):
         return np.full((1, 1), UNKNOWN, np.int8), np.zeros(2)
     first = grid.tiles.min(axis=0)
@@ -244,7 +241,7 @@ FREE_UP_TO = 35  # percent; one ray over a cell suffices
 
 
 def to_pgm(grid: GridMap) -> bytes:
-    """The grid as map_server's image (binary PGM, the highest y first): 254 free, 0 occupied, 205 unknown."""
+    """The grid as a map_server image (binary PGM, highest y first): 254 free, 0 occupied, 205 unknown."""
     cells, _ = dense(grid)
     grey = np.full(cells.shape, UNKNOWN_GREY, np.uint8)
     grey[(cells >= 0) & (cells <= FREE_UP_TO)] = FREE_GREY
@@ -253,7 +250,7 @@ def to_pgm(grid: GridMap) -> bytes:
 
 
 def to_yaml(grid: GridMap, image: str = "grid.pgm") -> bytes:
-    """map_server's description of `to_pgm`: origin is the lower left corner in w, m."""
+    """The map_server description of `to_pgm`; origin is the lower left corner in w, m."""
     _, corner = dense(grid)
     return (
         f"image: {image}\nmode: trinary\nresolution: {grid.cell_m:.6g}\n"

@@ -1,7 +1,7 @@
-"""Ray casting into a pool of grid tiles, and the spreading of the ground height: arrays in, caller's arrays out.
+"""Kernels that cast rays into a pool of grid tiles and propagate the ground height.
 
-The pool holds only tiles that were touched; `slots` (rows, columns) int32 maps a tile of the box to its place, -1 none.
-Cells are numbered from the lower left corner of the box; a tile has 32x32 of them.
+The pool holds the tiles in use; `slots` (rows, columns) int32 maps a tile of the box to its index, -1 none. Cells are
+numbered from the lower left corner of the box; a tile has 32x32 cells.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 TILE = 32  # cells along a side of a tile: the shape of a Tile record
-SHIFT, MASK = 5, TILE - 1  # a division by TILE and its rest: the inner loop's main cost otherwise
-COUNT_MAX = 65535  # counts are 16 bits wide and stay there
+SHIFT, MASK = 5, TILE - 1  # quotient and remainder by TILE, the main cost of the inner loop as a division
+COUNT_MAX = 65535  # counts are uint16 and saturate
 
 
 @njit
@@ -29,8 +29,8 @@ def mark_points(
 ) -> int:
     """Add obstacle points to their cells. column, row, z, weight: (n,). hits, low, high: (capacity, 32, 32).
 
-    `low` and `high` (start: +inf, -inf) take the heights between which a cell is known to be solid. The caller leaves
-    room for one new tile a point. Returns how many tiles are in use.
+    `low` and `high` (initially +inf, -inf) receive the height range of obstacles in each cell. The pool must have room
+    for one new tile per point. Returns the number of tiles in use.
     """
     for i in range(column.shape[0]):
         c, r = column[i], row[i]
@@ -51,11 +51,11 @@ def cast_rays(
     start: I64, end: I64, z: F64, ceiling: F64, short: I64, first: int, slots: I32, used: int, margin_m: float,
     free: U16, through: U16, low: F32, high: F32,
 ) -> tuple[int, int]:  # fmt: skip
-    """Walk rays cell by cell (Bresenham, integers only). start, end: (n,2) column, row. z: (n,2) heights at both ends.
+    """Count rays in cells (Bresenham, integers only). start, end: (n,2) column, row. z: (n,2) heights at both ends.
 
     A step below ceiling[i] counts in `free`. A step between a cell's `low` and `high` (widened by margin_m) counts in
-    `through`: that obstacle was looked through. The last short[i] cells are left out. Begins with ray `first` and
-    stops before a ray that the pool might not hold. Returns (next ray, tiles in use).
+    `through`. The last short[i] cells are left out. Begins with ray `first` and stops before a ray for which the pool
+    may be too small. Returns (next ray, tiles in use).
     """
     capacity = free.shape[0]
     for i in range(first, start.shape[0]):
@@ -102,11 +102,11 @@ def cast_rays(
 def spread_ground(
     histogram: F32, seed: int, seed_bin: int, reach: int, share: float, least: float, ground: I32, queue: I32
 ) -> None:
-    """Find the ground's height bin of every neighbourhood, going outwards from a known one.
+    """Find the height bin of the ground in every patch by breadth-first search from a known patch.
 
-    histogram: (rows, columns, bins) point counts by height. A neighbourhood's ground is the lowest peak within `reach`
-    bins of the ground of the neighbour it was reached from that has at least `share` of the highest count there and
-    `least` points; with none it takes its neighbour's. seed: row * columns + column. ground: (rows, columns), out.
+    histogram: (rows, columns, bins) point counts by height. The ground of a patch is the lowest peak within `reach`
+    bins of its neighbour's ground that has at least `share` of the highest count there and `least` points; without
+    one, its neighbour's ground. seed: row * columns + column. ground: (rows, columns), out.
     queue: (rows * columns,) scratch.
     """
     rows, columns, bins = histogram.shape

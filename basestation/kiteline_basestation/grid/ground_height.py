@@ -1,7 +1,7 @@
-"""The height of the ground under a sparse map, z up: neighbourhood by neighbourhood, so that it may rise and tilt.
+"""Estimates the ground height under a sparse map (z up) in patches, so that the ground may rise and tilt.
 
-First the lowest peak of the heights below the cameras, spread from the best known neighbourhood to the others; then a
-plane for each neighbourhood, fitted to the points near it in ever narrower bands (a hard-limited M-estimator).
+First the lowest peak of the height histogram below the cameras, propagated from the best patch to its neighbours; then
+a plane for each patch, fitted to the points near it in narrowing bands (a hard-limited M-estimator).
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ Bool = NDArray[np.bool_]
 
 
 def ground_heights(config: GroundConfig, points: F64, camera_z: F64) -> F64:
-    """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that sees each.
+    """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that observes it.
 
-    NaN at all points when the heights below the cameras have no peak.
+    NaN at all points if the histogram of heights below the cameras has no peak.
     """
     below = points[:, 2] < camera_z - config.camera_above_m
     patches = _Patches(config.patch_m, points)
-    level = _levels(config, patches, points[:, 2], below)
-    if level is None:
+    ground_z = _lowest_peaks(config, patches, points[:, 2], below)
+    if ground_z is None:
         return np.full(len(points), np.nan)
-    planes = np.stack([level, np.zeros_like(level), np.zeros_like(level)])
+    planes = np.stack([ground_z, np.zeros_like(ground_z), np.zeros_like(ground_z)])
     for band_m in config.bands_m:
         near = below & (np.abs(points[:, 2] - patches.heights(planes)) < band_m)
         planes = _fit(config, patches, points[:, 2], near, planes)
@@ -35,7 +35,7 @@ def ground_heights(config: GroundConfig, points: F64, camera_z: F64) -> F64:
 
 
 class _Patches:
-    """Points sorted into square neighbourhoods of the x-y plane."""
+    """Points in square patches of the x-y plane."""
 
     def __init__(self, side_m: float, points: F64) -> None:
         corner = points[:, :2].min(axis=0)
@@ -46,17 +46,17 @@ class _Patches:
         self.flat: I64 = self.at[:, 1] * self.columns + self.at[:, 0]
 
     def total(self, keep: Bool, values: F64) -> F64:
-        """Sums (rows, columns) of values (n,) over three by three neighbourhoods."""
+        """Sums (rows, columns) of values (n,) over three by three patches."""
         sums = np.bincount(self.flat[keep], values[keep], self.rows * self.columns).astype(np.float64)
         return _box3(_box3(sums.reshape(self.rows, self.columns), 0), 1)
 
     def centres(self) -> tuple[F64, F64]:
-        """x and y (rows, columns) of the middles."""
+        """x and y (rows, columns) of the centres."""
         r, c = np.indices((self.rows, self.columns)).astype(np.float64)
         return (c + 0.5) * self.side_m, (r + 0.5) * self.side_m
 
     def heights(self, planes: F64) -> F64:
-        """z (n,) at the points, blended from the four nearest planes. planes: (3, rows, columns) z, dz/dx, dz/dy."""
+        """z (n,) at the points, interpolated between the four nearest planes. planes: (3, rows, columns) z, dz/dx, dz/dy."""
         last = np.array([self.columns - 1, self.rows - 1])
         place = np.clip(self.xy / self.side_m - 0.5, 0.0, last)
         low = np.minimum(place.astype(np.int64), np.maximum(last - 1, 0))
@@ -72,8 +72,8 @@ class _Patches:
         return out
 
 
-def _levels(config: GroundConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
-    """z (rows, columns) of the lowest peak in every neighbourhood; None where there is no peak at all."""
+def _lowest_peaks(config: GroundConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
+    """z (rows, columns) of the lowest peak in every patch; None if there is no peak."""
     if not below.any():
         return None
     bins = 256  # 12.8 m of heights
@@ -86,23 +86,23 @@ def _levels(config: GroundConfig, patches: _Patches, z: F64, below: Bool) -> F64
     for axis in range(3):
         count = _box3(count, axis)
     counts = count.astype(np.float32)
-    floor_bin = _lowest_peak(counts.sum(axis=(0, 1)), config)
-    if floor_bin < 0:
+    ground_bin = _lowest_peak(counts.sum(axis=(0, 1)), config)
+    if ground_bin is None:
         return None
     reach = max(1, round(config.slope * config.patch_m / config.height_bin_m))
-    near = counts[:, :, max(0, floor_bin - reach) : floor_bin + reach + 1].sum(axis=2)
+    near = counts[:, :, max(0, ground_bin - reach) : ground_bin + reach + 1].sum(axis=2)
     seed = int(np.argmax(near))
     seed_bin = _lowest_peak(counts[seed // patches.columns, seed % patches.columns], config)
     ground = np.zeros((patches.rows, patches.columns), np.int32)
     kernels.spread_ground(
-        counts, seed, seed_bin if seed_bin >= 0 else floor_bin, reach, config.peak_share, config.min_peak_points,
+        counts, seed, ground_bin if seed_bin is None else seed_bin, reach, config.peak_share, config.min_peak_points,
         ground, np.zeros(ground.size, np.int32),
     )  # fmt: skip
     return np.asarray(base + (ground.astype(np.float64) + 0.5) * config.height_bin_m)
 
 
 def _fit(config: GroundConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
-    """Least-squares plane (3, rows, columns) of the points `near` in every neighbourhood; slopes kept small."""
+    """Least-squares planes (3, rows, columns) of the points `near` in every patch, with limited slope."""
     x, y = patches.xy.T
     n = patches.total(near, np.ones_like(x))
     enough = n >= config.min_plane_points
@@ -129,9 +129,9 @@ def _box3(values: F64, axis: int) -> F64:
     return out
 
 
-def _lowest_peak(count: NDArray[np.float32], config: GroundConfig) -> int:
-    """The lowest bin that is a peak, with enough points and a fair share of the highest count; -1 none."""
+def _lowest_peak(count: NDArray[np.float32], config: GroundConfig) -> int | None:
+    """The lowest bin that is a peak with enough points and a share of the highest count; None without a peak."""
     after = np.append(count[1:], 0.0)
     need = max(config.peak_share * float(count.max()), config.min_peak_points)
     peaks = np.flatnonzero((count >= need) & (count >= after))
-    return int(peaks[0]) if len(peaks) else -1
+    return int(peaks[0]) if len(peaks) else None

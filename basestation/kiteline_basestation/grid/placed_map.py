@@ -1,4 +1,4 @@
-"""The placed part of the map in w, as the grid and the exports take it."""
+"""The placed part of the map in w: input of the grid and of exports."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class PlacedMap:
-    """The placed part of the map as `grid.build` takes it, and what its rows mean.
+    """Keyframes and landmarks of placed submaps in w, as arguments of `grid.build`.
 
     keyframes: (n,) ids of the rows of positions. landmark_ids: (m,). observations: (k,2) rows of positions and of points.
-    metric: (n,) keyframes of maps in metres.
+    metric: (n,) True for keyframes of maps of known metric scale.
     """
 
     keyframes: I64
@@ -33,12 +33,12 @@ class PlacedMap:
 
     @property
     def rays(self) -> I64:
-        """Observations from which cells can be made: a map in a unit of its own says nothing of metres."""
+        """Observations in maps of known metric scale: rays for the grid."""
         return self.observations[self.metric[self.observations[:, 0]]]
 
 
 def placed_map(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> PlacedMap:
-    """Keyframes, live points seen at least twice, and observations of all placed submaps, in w."""
+    """Keyframes, landmarks with two observations or more, and their observations, of all placed submaps."""
     rows, positions, metric = [], [], []
     for submap in sorted(placements):
         S_w_m, metres = placements[submap], not sparse_map.is_up_to_scale(sparse_map.map_id(submap))

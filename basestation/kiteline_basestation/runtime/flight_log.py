@@ -1,7 +1,7 @@
-"""How the steps of a base stand in its log: first what went in, then what came out. Pure: the log is handed in.
+"""The base's steps in its log: inputs, then outputs. Pure: the caller passes the log.
 
-Each step begins with a /step record. A job's result is not kept, only its fingerprint: a replay works the job out again
-from the same inputs and hands it in at the same step.
+Each step begins with a /step record. Only the fingerprint of a job's result is logged: a replay runs the job again and
+passes the result at the same step.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/i
 
 
 def metadata_of(spec: BaseOptions, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
-    """What a log says of its base, so that it can be run again."""
+    """Metadata of a log that a replay needs."""
     unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
-    plain["link"] = spec.link.partition(":")[0]  # what kind it was decides how packets are made; where it led does not
+    plain["link"] = spec.link.partition(":")[0]  # the kind decides how packets are made, the address does not
     channel = "PlainChannel" if plain_channels else "CodedChannel"
     return {"role": "base", "channel": channel, "spec": json.dumps(plain), "config": configuration.describe(config)}
 
@@ -49,14 +49,14 @@ def station_of(
 
 
 class StepLog(Protocol):
-    """The part of a log that steps are written with; kiteline_hw.mcap_log.LogWriter is one."""
+    """What writes a log, such as kiteline_hw LogWriter."""
 
     def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
     def json(self, topic: str, t_ns: int, value: object) -> None: ...
 
 
 class StepMessage(Protocol):
-    """What is read back; kiteline_hw.mcap_log.LogMessage is one."""
+    """A message of a log, such as kiteline_hw LogMessage."""
 
     @property
     def topic(self) -> str: ...
@@ -65,12 +65,12 @@ class StepMessage(Protocol):
 
 
 def packets_in(agent: int) -> str:
-    """The topic of the packets that came from an agent."""
+    """Topic of the packets from an agent."""
     return f"/agent{agent}/packets/in"
 
 
 def packets_out(agent: int) -> str:
-    """The topic of the packets to an agent."""
+    """Topic of the packets to an agent."""
     return f"/agent{agent}/packets/out"
 
 
@@ -83,7 +83,7 @@ def write_step(
     log_ns: int,
     orders: Sequence[Import | Command] = (),
 ) -> None:
-    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+    """Write one step. now_ns: the step's time. log_ns: the log's time stamp."""
     log.json(
         STEP,
         log_ns,
@@ -113,7 +113,7 @@ def write_step(
 
 
 def read_orders(messages: Iterable[StepMessage]) -> tuple[Import | Command, ...]:
-    """The orders of one step, in order. Raises WireError."""
+    """Imports and commands of one step, in order. Raises WireError."""
     out: list[Import | Command] = []
     for message in messages:
         if message.topic == IMPORT:

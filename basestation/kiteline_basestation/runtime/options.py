@@ -1,4 +1,4 @@
-"""What a base's flight is told, on the command line or by `fly`, and the configuration made of it."""
+"""Options of the base process, from the command line or from `fly`; its configuration and channels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kiteline_core.ids import AgentId
 
 @dataclass(frozen=True, slots=True)
 class BaseOptions:
-    """All that the base's flight is told. Plain values, so that it travels as JSON."""
+    """Options of the base process. Plain values that JSON can hold."""
 
     folder: str  # for the log, the map and the grid
     log_name: str = "log.mcap"
@@ -25,21 +25,21 @@ class BaseOptions:
     session: int = 1  # higher than that of any base before it
     link: str = "none"  # LINK, or lockstep:ENDPOINT
     config: str = ""  # a TOML file
-    start_ns: int = 0  # the stamp that is flight time 0, so that the log stands in the time of the first source
-    down_bytes_s: int = 0  # B/s that the link to each agent takes; 0: any number
-    key: str = ""  # a file with the keys of agents; "": packets are not sealed
-    profile: str = ""  # wifi or radio: how packets are made; "": as the link allows
-    delay_s: float = 0.0  # s that a packet is under way
+    start_ns: int = 0  # time stamp of flight time 0: the log uses the time of the first source
+    down_bytes_s: int = 0  # B/s to each agent; 0: no limit
+    key: str = ""  # a file with the agents' keys; "": packets are not sealed
+    profile: str = ""  # wifi or radio; "": by the link's throughput
+    delay_s: float = 0.0  # s; modelled delay of the link
     loss: float = 0.0  # probability that a packet is lost
-    disorder: float = 0.0  # probability that it is doubled, and that it is late
+    disorder: float = 0.0  # probability that a packet is duplicated, and that it is reordered
     seed: int = 0
-    kill_at_s: float | None = None  # end like a crash at this flight time
-    kill_delay_s: float = 0.0  # s of real time after it, so that it strikes anywhere
+    kill_at_s: float | None = None  # s of flight time at which the process is killed; None: never
+    kill_delay_s: float = 0.0  # s of real time after that
     store: str = ""
     imports: tuple[str, ...] = ()
     web: str = ""
-    quiet: bool = False  # say nothing of how the flight goes
-    maps: str = ""  # a Zenoh endpoint on which maps are managed; "": the agents' link
+    quiet: bool = False  # no status messages
+    maps: str = ""  # a Zenoh endpoint for `kiteline maps`; "": the agents' link
 
 
 def base_config(path: str) -> BaseConfig:
@@ -53,28 +53,28 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     """The arguments of `kiteline base`. link_forms: of LINK, for the help text."""
     p = argparse.ArgumentParser(
         prog="kiteline base",
-        description="The base station: makes one better map of what any number of agents send, and sends it back.",
+        description="The base station: refines and merges the maps of any number of agents, and sends corrections back.",
         epilog=f"LINK is {link_forms}. The address 0.0.0.0 listens on all interfaces.",
     )
-    p.add_argument("--link", metavar="LINK", default="", help="where agents come in")
-    p.add_argument("--store", metavar="DIR", default="", help="keep what was shared here, and go on from it")
+    p.add_argument("--link", metavar="LINK", default="", help="link to the agents")
+    p.add_argument("--store", metavar="DIR", default="", help="save the map here, and resume from it")
     p.add_argument("--import", dest="imports", metavar="LOG", nargs="+", default=[], action="extend",
-                   help="add what agents' logs hold and no link carried; or maps: a store, a base's log")  # fmt: skip
+                   help="add agents' logs, for what no link carried; or maps: a store, a base's log")  # fmt: skip
     p.add_argument("--maps", metavar="ENDPOINT", default="",
                    help="answer `kiteline maps` here: tcp/HOST:PORT (default: on the link, if not sealed)")  # fmt: skip
     p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
-    p.add_argument("--key", metavar="FILE", default="", help="seal packets; hear no agent without a key in it")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; drop those of agents without a key in it")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
-    p.add_argument("--quiet", action="store_true", help="say nothing of how the flight goes")
+    p.add_argument("--quiet", action="store_true", help="print no status messages")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
 
 
 def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
-    """What `kiteline base` was told on the command line."""
+    """Options from the command line."""
     return BaseOptions(
         folder=a.log, log_name=f"session{session}.mcap" if a.log else "", session=session, link=a.link,
         config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
@@ -83,6 +83,6 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
 
 
 def coded_channels(spec: BaseOptions, link: LinkTraits) -> Callable[[AgentId], RecordChannel]:
-    """Opens our end of the codec to an agent."""
+    """A function that opens the base's end of the channel to an agent."""
     sealed = seal_bytes(suite_for(link)) if spec.key else 0
     return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link)

@@ -1,4 +1,4 @@
-"""What a person at a terminal is told of a base: what changes, and now and then how it stands. No clock."""
+"""Status messages of a base for the terminal: events, and a summary every few seconds. Pure."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from kiteline_codec.channel import CodedChannel
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
-_EVERY_NS = 10_000_000_000  # between two lines while nothing happens
+_EVERY_NS = 10_000_000_000  # between two summaries
 
 
 class TerminalReporter:
-    """Makes lines of text from a station, looked at after each step."""
+    """Compares the station after each step with its last state."""
 
     def __init__(self, station: Station) -> None:
         self._station = station
@@ -36,8 +36,9 @@ class TerminalReporter:
         self._bytes_down = self._bytes_up = 0
 
     def lines(self, here: Collection[int], flight_ns: int, rss_mib: float, stored: bool | None) -> list[str]:
-        """What is to be said after a step at a time of the flight. here: agents that are reachable. rss_mib: of this
-        process at the most. stored: whether all is on disk, None without a store.
+        """Lines to print after a step. here: reachable agents. rss_mib: peak memory of this process.
+
+        stored: True if all is on disk, None without a store.
         """
         out = [*self._agents(frozenset(map(AgentId, here)), flight_ns), *self._maps()]
         if flight_ns >= self._summary_ns:
@@ -46,15 +47,15 @@ class TerminalReporter:
         return [f"{flight_ns / 1e9:8.1f} s  {line}" for line in out]
 
     def _agents(self, here: frozenset[AgentId], flight_ns: int) -> list[str]:
-        """Who came, who went, who began anew."""
+        """Agents that connected, disconnected or restarted."""
         out = []
         for agent in sorted(here - self._here):
             gone_ns = self._gone_ns.pop(agent, None)
-            away = "" if gone_ns is None else f" again after {(flight_ns - gone_ns) / 1e9:.1f} s"
-            out.append(f"agent {agent} is here{away}")
+            after = "" if gone_ns is None else f" again after {(flight_ns - gone_ns) / 1e9:.1f} s"
+            out.append(f"agent {agent} connected{after}")
         for agent in sorted(self._here - here):
             self._gone_ns[agent] = flight_ns
-            out.append(f"agent {agent} is out of reach; its map stays")
+            out.append(f"agent {agent} disconnected; its map is kept")
         self._here = here
         for agent, channel in sorted(self._station.channels.items()):
             session = channel.endpoint.peer_session or 0 if isinstance(channel, CodedChannel) else 0
@@ -62,48 +63,48 @@ class TerminalReporter:
             if session != before:
                 self._sessions[agent] = session
                 if before:
-                    out.append(f"agent {agent} has started again; what it sent before is kept")
+                    out.append(f"agent {agent} restarted; its earlier map is kept")
         return out
 
     def _maps(self) -> list[str]:
-        """Maps that began, were joined, parted or deleted, and loops."""
+        """Maps that were started, merged, split or deleted, and loop closures."""
         mapper, out = self._station.mapper, []
         for submap in [s for s in mapper.map.submaps if s not in self._submaps]:
             self._submaps.add(submap)
-            out.append(f"agent {agent_of_submap(submap)} begins map {_name(submap, mapper.names)}")
+            out.append(f"agent {agent_of_submap(submap)} starts map {_name(submap, mapper.names)}")
         for submap in sorted(mapper.deleted - self._deleted):
             self._deleted.add(submap)
-            out.append(f"map {_name(submap, mapper.names)} is deleted")
+            out.append(f"map {_name(submap, mapper.names)} deleted")
         merger = mapper.merger
         if merger is None:
             return out
         proved, self._proofs = merger.edges[self._proofs :], len(merger.edges)
         if merger.loops > self._loops:
             self._loops = merger.loops
-            out.append(f"loop closed, the {_nth(self._loops)}: {self._loop(proved)}")
+            out.append(f"loop {self._loops} closed: {self._loop(proved)}")
         for merge in [m for m in merger.merges if not any(m is known for known in self._merges)]:
-            out.append(self._joined(merge))
+            out.append(self._merged(merge))
         if merger.undone > self._undone:
             self._undone = merger.undone
             gone = [m for m in self._merges if not any(m is kept for kept in merger.merges)]
             names = ", ".join(_name(m.map_id, mapper.names) for m in gone)
-            out.append(f"map {names} is taken out of the map that it was laid into")
+            out.append(f"map {names} separated from the map that it was merged into")
         self._merges = list(merger.merges)
         return out
 
     def _loop(self, proved: Sequence[LoopEdge]) -> str:
-        """How long a loop is, and how far its ends were apart."""
+        """The position error that a loop closure corrects, and the length of the loop."""
         sparse_map = self._station.mapper.map
         vote = max(proved, key=lambda v: v.inliers, default=None)
         old, new = (None, None) if vote is None else (sparse_map.world_pose(vote.old), sparse_map.world_pose(vote.new))
         if vote is None or old is None or new is None:
-            return "its points were where they were foreseen"
-        off_m = float(np.linalg.norm((se3.inverse(new) @ old @ vote.T_old_new)[:3, 3]))
-        way_m = self._way_m(vote.old, vote.new)
-        return f"off by {off_m:.2f} m" + ("" if way_m is None else f" after {way_m:.0f} m of way")
+            return "landmarks matched where predicted"
+        error_m = float(np.linalg.norm((se3.inverse(new) @ old @ vote.T_old_new)[:3, 3]))
+        path_m = self._path_length_m(vote.old, vote.new)
+        return f"error {error_m:.2f} m" + ("" if path_m is None else f" after {path_m:.0f} m")
 
-    def _way_m(self, old: KeyframeId, new: KeyframeId) -> float | None:
-        """Length of the way between two keyframes; None where they lie in two submaps."""
+    def _path_length_m(self, old: KeyframeId, new: KeyframeId) -> float | None:
+        """Path length between two keyframes; None if they are in different submaps."""
         sparse_map = self._station.mapper.map
         if submap_of_keyframe(old) != submap_of_keyframe(new):
             return None
@@ -111,38 +112,37 @@ class TerminalReporter:
         at = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in between], :3, 3]
         return float(np.linalg.norm(np.diff(at, axis=0), axis=1).sum())
 
-    def _joined(self, merge: MapMerge) -> str:
+    def _merged(self, merge: MapMerge) -> str:
         mapper = self._station.mapper
         keyframes = sum(len(mapper.map.submaps.get(submap, ())) for submap in merge.moved)
         newer, older = _name(merge.map_id, mapper.names), _name(merge.into, mapper.names)
-        return f"map {newer} ({keyframes} keyframes) joined to map {older}"
+        return f"map {newer} ({keyframes} keyframes) merged into map {older}"
 
     def summary(self) -> str:
-        """The map in one line."""
+        """Sizes of the map in one line."""
         s = self._station.mapper.summary()
         return (
-            f"{_count(_int(s['keyframes']), 'keyframe')} and {s['points']} points in {_count(_int(s['maps']), 'map')}; "
+            f"{_count(_int(s['keyframes']), 'keyframe')} and {s['points']} landmarks in {_count(_int(s['maps']), 'map')}; "
             f"{_count(_int(s['loops']), 'loop')}, {_count(_int(s['merges']), 'merge')}"
         )
 
     def _status(self, flight_ns: int, rss_mib: float, stored: bool | None) -> str:
-        """How all stands, in one line."""
+        """Agents, map, link, memory and store in one line."""
         ends = [c.endpoint.stats for c in self._station.channels.values() if isinstance(c, CodedChannel)]
         up, down = sum(e.bytes_received for e in ends), sum(e.bytes_sent for e in ends)
         seconds = (flight_ns - self._summary_ns + _EVERY_NS) / 1e9
         rates = (up - self._bytes_up) / 1000 / seconds, (down - self._bytes_down) / 1000 / seconds
         self._bytes_up, self._bytes_down = up, down
         waits = sum(e.dirty for e in ends)
-        words = [
-            f"{_count(len(self._here), 'agent')} here",
+        parts = [
+            f"{_count(len(self._here), 'agent')} connected",
             self.summary(),
-            f"{rates[0]:.1f} kB/s up, {rates[1]:.1f} down"
-            + (f", {_count(waits, 'value')} to be sent" if waits else ""),
-            f"{rss_mib:.0f} MiB at most",
+            f"{rates[0]:.1f} kB/s up, {rates[1]:.1f} down" + (f", {_count(waits, 'value')} to send" if waits else ""),
+            f"peak memory {rss_mib:.0f} MiB",
         ]
         if stored is not None:
-            words.append("all in the store" if stored else "the store is behind")
-        return "; ".join(words)
+            parts.append("all stored" if stored else "store not up to date")
+        return "; ".join(parts)
 
 
 def _name(submap: SubmapId, names: dict[SubmapId, str]) -> str:
@@ -151,11 +151,6 @@ def _name(submap: SubmapId, names: dict[SubmapId, str]) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def _nth(number: int) -> str:
-    ending = "th" if number // 10 % 10 == 1 else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
-    return f"{number}{ending}"
 
 
 def _int(value: object) -> int:
