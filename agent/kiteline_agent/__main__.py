@@ -25,14 +25,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = parser(f"SOURCE is {source_forms()}. LINK is {link_forms()}. URL is {MAVLINK_FORMS}.")
     a = p.parse_args(argv)
     if a.spec:
-        spec = configuration.from_json(AgentOptions, a.spec)
+        options = configuration.from_json(AgentOptions, a.spec)
         expected = (SourceError, LinkError, ValueError)
-        process.exit_now(process.run_child(spec.link, partial(fly_lockstep, spec), partial(fly_live, spec), expected))
+        process.exit_now(
+            process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
+        )
     if not a.source:
         p.error("a SOURCE is required")
     folder = (Path(a.log) if a.log else process.state_folder()) / f"agent{a.agent}"
-    spec = options_of(a, folder, process.next_number(folder / "boot"))
-    fly_live(spec, None, process.StopSignal())
+    options = options_of(a, folder, process.next_number(folder / "boot"))
+    fly_live(options, None, process.StopSignal())
     process.exit_now(0)
 
 

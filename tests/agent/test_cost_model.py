@@ -41,7 +41,7 @@ def test_every_work_has_a_price() -> None:
 def test_a_flight_costs_what_was_counted(recording: Path) -> None:
     costs, works, _ = costs_of(recording, AgentConfig())
     assert costs_of(recording, AgentConfig())[0] == costs
-    assert works[0].keyframes == 1 and works[0].births > 20 and works[0].alignments == 0
+    assert works[0].keyframes == 1 and works[0].new_landmarks > 20 and works[0].alignments == 0
     usual = [work for work in works[1:] if not work.keyframes]
     assert usual and all(work.alignments > 100 and work.stereo_points > 20 for work in usual)
     assert all(work.detected_px == 0 for work in usual)

@@ -21,8 +21,8 @@ class Work:
     fused: int = 0
     keyframes: int = 0
     detected_px: int = 0
-    births: int = 0
-    sightings: int = 0
+    new_landmarks: int = 0
+    observations: int = 0
     bearings: int = 0
     searches: int = 0
 
@@ -46,8 +46,8 @@ PRICES_NS: dict[str, float] = {
     "fused": 340_000,  # a frame in the smoother
     "keyframes": 1_200_000,  # coding and bookkeeping
     "detected_px": 2.1,  # a pixel searched for corners
-    "births": 11_000,  # row search, descriptor, template, code
-    "sightings": 1_600,  # code
+    "new_landmarks": 11_000,  # row search, descriptor, template, code
+    "observations": 1_600,  # code
     "bearings": 7_500,  # an epipolar segment searched for a landmark without depth
     "searches": 5_000_000,  # a relocalisation attempt
 }

@@ -84,8 +84,8 @@ class KeyframeMaker:
     def _count(self, ctx: FrameContext, landmarks: int, observations: int) -> None:
         self._work.keyframes += 1
         self._work.detected_px += ctx.images.left[max(ctx.images.first, ctx.config.detector.first)].size
-        self._work.births += landmarks
-        self._work.sightings += observations
+        self._work.new_landmarks += landmarks
+        self._work.observations += observations
 
     def _new_landmarks(
         self, keyframe: KeyframeId, points: NewPoints, order: NDArray[np.int64]

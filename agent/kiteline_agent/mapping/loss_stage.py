@@ -53,8 +53,9 @@ class LossStage:
             extended, events = self._keyframes.extend_map_by_dead_reckoning(ctx)
             if extended:
                 return FrameOutcome(True, True, 0, events)
-        # b. Relocalise in the remembered map.
-        track = self._relocalise(ctx, events)
+        # b. Relocalise in the stored submaps.
+        track, more = self._relocalise(ctx)
+        events += more
         placed = track is not None
         # c. Open a new submap.
         if not placed and self._submaps.may_open(ctx, self.failed_searches):
@@ -68,25 +69,22 @@ class LossStage:
             bridged = False
         return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events)
 
-    def _relocalise(self, ctx: FrameContext, events: list[str]) -> Track | None:
-        """Search the remembered map; if the frame is found, continue there, with a keyframe. Adds to `events`."""
+    def _relocalise(self, ctx: FrameContext) -> tuple[Track | None, list[str]]:
+        """Search the stored submaps; if the frame is found, continue there, with a keyframe. And events."""
         camera = self._camera
         if not camera.submaps.any:
-            return None
+            return None, []
         if not self._governor.may(Extra.SEARCH):
-            events.append("governor: search postponed")
             self.failed_searches = max(self.failed_searches, 1)
-            return None
+            return None, ["governor: search postponed"]
         found = self._relocaliser.relocalise(ctx, camera.reference.keyframe)
         if found is None:
             self.failed_searches += self._relocaliser.has_texture
-            return None
+            return None, []
         camera.return_to(found, ctx.number)
         camera.pose.reset_motion()
         self.failed_searches = 0
-        events.append("relocalised by the map cache" if found.from_cache else "relocalised")
         if found.from_cache:  # none of its landmarks is in the local map yet
             self._keyframes.add(ctx, found.track)
-        else:
-            events += self._keyframes.add_if_needed(ctx, found.track)
-        return found.track
+            return found.track, ["relocalised by the map cache"]
+        return found.track, ["relocalised", *self._keyframes.add_if_needed(ctx, found.track)]

@@ -54,10 +54,12 @@ class FlightRecord:
         self._odometry.write(odometry_line(estimate))
 
 
-def metadata(spec: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
+def metadata(options: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
     """Metadata at the head of a log. source: its name."""
-    plain = {key: value for key, value in asdict(spec).items() if key not in ("folder", "config")}
-    plain["link"] = spec.link.partition(":")[0]  # the kind of link decides how packets are made, its address does not
+    plain = {key: value for key, value in asdict(options).items() if key not in ("folder", "config")}
+    plain["link"] = options.link.partition(":")[
+        0
+    ]  # the kind of link decides how packets are made, its address does not
     return {
         "role": "agent",
         "channel": type(channel).__name__,

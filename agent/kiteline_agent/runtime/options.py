@@ -70,20 +70,20 @@ def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
 
 
-def channel_for(spec: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
+def channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
     """The agent's end of the codec, or a channel to nowhere without a base. A session is the boot, counted from 1.
 
     spill: keeps what would take too much memory while the link is down.
     """
-    if spec.link == "none":
+    if options.link == "none":
         return NoBaseChannel()
-    return coded_channel_for(spec, link, spill)
+    return coded_channel_for(options, link, spill)
 
 
-def coded_channel_for(spec: AgentOptions, link: LinkTraits, spill: Spill | None) -> CodedChannel:
+def coded_channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None) -> CodedChannel:
     """The agent's end of the codec."""
-    sealed = seal_bytes(suite_for(link)) if spec.key else 0
-    return coded_channel(spec.boot + 1, spec.up_bytes_s, spec.profile, sealed, link, spill, bounded=True)
+    sealed = seal_bytes(suite_for(link)) if options.key else 0
+    return coded_channel(options.boot + 1, options.up_bytes_s, options.profile, sealed, link, spill, bounded=True)
 
 
 def parser(forms: str = "") -> argparse.ArgumentParser:

@@ -34,21 +34,23 @@ def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> Non
     small = CameraRig(camera, camera, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
     right = np.ascontiguousarray(np.roll(image, -8, axis=1))
     centres = pixels[: 32 * nodes(4, 2)].view(np.uint64).reshape(-1, 4)
-    words = Vocabulary(4, 2, centres, np.ones(16, np.float32))
-    agent = Agent(small, ImuCalibration(), config or AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), words)
+    vocabulary = Vocabulary(4, 2, centres, np.ones(16, np.float32))
+    agent = Agent(
+        small, ImuCalibration(), config or AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), vocabulary
+    )
     for k in range(14):
-        # At last the picture jumps by a quarter of its width: lost, and found again by its descriptors.
+        # In the last frame the image shifts by a quarter of its width: tracking fails, and the frame is relocalised.
         shift = 0 if k < 13 else -80
-        eyes = [np.ascontiguousarray(np.roll(eye, shift, axis=1)) for eye in (image, right)]
-        agent.step(StepInput(Frame(k * 50_000_000, eyes[0], eyes[1]), _resting(k)), k * 50_000_000)
-    _warm_recovery(words, pixels)
-    _warm_one_eye(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
+        pair = [np.ascontiguousarray(np.roll(one, shift, axis=1)) for one in (image, right)]
+        agent.step(StepInput(Frame(k * 50_000_000, pair[0], pair[1]), _resting(k)), k * 50_000_000)
+    _warm_relocalisation(vocabulary, pixels)
+    _warm_monocular(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
 
 
-def _warm_recovery(words: Vocabulary, noise: NDArray[np.uint8]) -> None:
+def _warm_relocalisation(vocabulary: Vocabulary, noise: NDArray[np.uint8]) -> None:
     """A place looked up, descriptors matched, and a pose from points, on 40 corners of noise."""
     descriptor, angle = noise[:1280].reshape(40, 32).copy(), np.zeros(40, np.uint8)
-    places = PlaceIndex(words)
+    places = PlaceIndex(vocabulary)
     for key in (0, 1):
         places.add(key, descriptor)
     places.query(descriptor)
@@ -71,7 +73,7 @@ def _resting(k: int) -> ImuBatch:
     return ImuBatch(t_ns, np.zeros((10, 3)), np.tile([0.0, 0.0, 9.81], (10, 1)))
 
 
-def _warm_one_eye(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
+def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
     """The start from two views, on a cloud of points (3,n) drawn from 0 to 1, and the search along a segment."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
