@@ -96,7 +96,7 @@ class Matched:
 def associate(est_ns: I64, truth_ns: I64, max_difference_ns: int = MAX_DIFFERENCE_NS) -> tuple[I64, I64]:
     """Match times: for each estimate the nearest truth, each used once. Returns indices (k,), (k,).
 
-    Both inputs increase strictly. Of two estimates nearest to the same truth, the nearer is matched (the earlier on a tie).
+    Both inputs increase strictly. Of two estimates nearest to one truth, the nearer is matched (the earlier on a tie).
     """
     if len(truth_ns) == 0 or len(est_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -150,7 +150,7 @@ def _between_poses(a: F64, b: F64, part: float) -> F64:
 
 
 def umeyama(source: F64, target: F64, with_scale: bool = False) -> tuple[F64, float]:
-    """Align points: the T (4,4) and scale that minimise sum |target - (scale * R source + t)|^2 over points (n,3), n >= 1.
+    """Align points (n,3), n >= 1: the T (4,4) and scale that minimise sum |target - (scale * R source + t)|^2.
 
     Raises ValueError if `with_scale` and all source points coincide.
     """

@@ -90,8 +90,8 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline eval`."""
     p = argparse.ArgumentParser(
         prog="kiteline eval",
-        description="Compare a trajectory with ground truth. Either may be a TUM file (t x y z qx qy qz qw), KITTI poses "
-        "(12 columns) or EuRoC's data.csv; the truth may also be a recording that holds it (mcap:FILE, euroc:DIR, "
+        description="Compare a trajectory with ground truth. Either may be a TUM file (t x y z qx qy qz qw), KITTI "
+        "poses (12 columns) or EuRoC's data.csv; the truth may also be a recording that holds it (mcap:FILE, euroc:DIR, "
         "a folder). KITTI poses take their times from times.txt beside them; without it, from the other trajectory "
         "in order when both have as many poses, else they stand for 10 Hz from 0.",
     )
@@ -105,7 +105,7 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=metrics.MAX_DIFFERENCE_NS / 1e9,
         metavar="S",
-        help="ground truth below 20 Hz: largest difference in time of two poses that are compared (default %(default)s s)",
+        help="ground truth below 20 Hz: largest time between two poses that are compared (default %(default)s s)",
     )
     p.add_argument("--json", action="store_true", help="print JSON instead of the table")
     p.add_argument("--plot", metavar="F.png", help="draw both from above, and height and error over time")

@@ -13,7 +13,7 @@ def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline keys`."""
     p = argparse.ArgumentParser(
         prog="kiteline keys",
-        description="Keys of agents. With --key FILE, agent and base accept only packets that are sealed with one of them.",
+        description="Keys of agents. With --key FILE, agent and base accept only packets sealed with one of them.",
         epilog="Make keys on the base: `kiteline keys new 3`. Copy that agent's line to a file on the agent.",
     )
     p.add_argument("--file", metavar="F", type=Path, default=None, help=f"default: {default_path()}")
