@@ -28,7 +28,7 @@ def load(name: str) -> ModuleType:
     return module
 
 
-SPEC, RESIDUALS = load("test_spec"), load("test_residual_coding")
+SPEC, RESIDUALS = load("test_spec"), load("residuals/test_residual_coding")
 Rows = list[list[int]]
 
 

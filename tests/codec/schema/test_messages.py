@@ -43,7 +43,7 @@ from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
-GOLDEN = Path(__file__).parent / "golden" / "records.json"
+GOLDEN = Path(__file__).parents[1] / "golden" / "records.json"
 
 
 def some_records(seed: int, n: int) -> list[Record]:

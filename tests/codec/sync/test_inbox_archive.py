@@ -14,7 +14,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
-from tests.codec.spill_memory import Memory
+from tests.codec.sync.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 100_000

@@ -31,6 +31,7 @@ from kiteline_codec.sync.outbox import Outbox
 from kiteline_codec.sync.round_trip import RoundTrip
 from kiteline_codec.transport.packet import Item
 from kiteline_codec.transport.sequence_window import SequenceWindow
+from tests.codec.sync.spill_memory import Memory
 
 MS = 1_000_000
 CONFIG = SyncConfig(packet_bytes=160, overhead_bytes=10, budget_bytes=1500, window_packets=16, ack_packets=4)
@@ -239,20 +240,6 @@ class FarApart(TwoEnds):
         for _ in range(3):
             self.send(hours * 1_200_000)
             self.wire = []
-
-
-class Memory:
-    """A Spill."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-
-    def put(self, data: bytes) -> int | None:
-        self.data += data
-        return len(self.data) - len(data)
-
-    def get(self, where: int, n_bytes: int) -> bytes | None:
-        return bytes(self.data[where : where + n_bytes])
 
 
 class OutOfMemory(TwoEnds):

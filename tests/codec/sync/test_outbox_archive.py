@@ -10,7 +10,7 @@ from kiteline_codec.schema import Key, KeyframeHeader, LivePose, NewLandmarks, O
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.packet import parse
-from tests.codec.spill_memory import Memory
+from tests.codec.sync.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 200_000
