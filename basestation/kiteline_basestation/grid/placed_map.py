@@ -55,12 +55,12 @@ def placed_map(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Pla
     known &= number[sparse_map.keypoints.row[points]] >= 0
     points, xyz = points[known], xyz[known]
     starts, slots = sparse_map.observations(points)
-    seen = np.diff(starts)
-    which = np.repeat(np.arange(len(points)), seen)
-    keep = (seen >= 2)[which] & (number[sparse_map.keypoints.row[slots]] >= 0)
-    renumber = np.cumsum(seen >= 2) - 1
+    views = np.diff(starts)
+    which = np.repeat(np.arange(len(points)), views)
+    keep = (views >= 2)[which] & (number[sparse_map.keypoints.row[slots]] >= 0)
+    renumber = np.cumsum(views >= 2) - 1
     pairs = np.stack([number[sparse_map.keypoints.row[slots[keep]]], renumber[which[keep]]], 1).astype(np.int64)
-    points, xyz = points[seen >= 2], xyz[seen >= 2]
+    points, xyz = points[views >= 2], xyz[views >= 2]
     for submap in sorted(placements):
         inside = sparse_map.landmark_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
         T = placements[submap] @ sim3.inverse(sparse_map.submap_pose(submap))
