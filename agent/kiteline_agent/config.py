@@ -160,6 +160,7 @@ class RelocalisationConfig:
 
 @dataclass(frozen=True, slots=True)
 class CovarianceConfig:
+<<<<<<< HEAD
     """Errors of sensors and calibration, and when a pose counts as good."""
 
     calibration_px: float = 0.05  # px at the image's edge: error of a good calibration of one camera
@@ -187,6 +188,35 @@ class CovarianceConfig:
     doubt_frames: int = 20  # frames for which it is doubted: one second, in which a wrong place fails to track
     surprise_m: float = 0.1  # m: standard deviation added to that comparison, since maps are corrected meanwhile
     surprise_rad: float = 0.05  # rad: the same for the rotation
+=======
+    """Calibration and motion uncertainties, and when a pose counts as good."""
+
+    calibration_px: float = 0.05  # px at the image's edge, error of a good calibration of one camera
+    extrinsic_rad: float = 3e-4  # of the camera in the body: a hundredth of a degree or two
+    extrinsic_m: float = 1e-3  # likewise
+    least_rms: float = 0.3  # least whitened residual of a frame
+    inflation: float = 1.0  # of the variance of a measured pose
+    imu_offset_frames: float = 10.0  # frames over which the offset of fused from image poses is averaged
+    imu_offset_share: float = 1.0  # standard deviation of that offset's mean, relative to the mean
+    refined_share: float = 0.25  # of a keyframe's variance that remains after the base optimised it
+    unmeasured_accel_m_s2: float = 2.0  # acceleration without any sensor: a multicopter that leans by twelve degrees
+    unmeasured_turn_rad_s2: float = 2.0  # the same of the rotation
+    lost_velocity_m_s: float = 0.03  # error of the velocity between the last two frames before a loss
+    lost_rate_rad_s: float = 0.02  # the same of the rotation rate
+    unknown_velocity_m_s: float = 5.0  # velocity of a vehicle that was lost before it could be measured
+    unknown_rate_rad_s: float = 1.0  # the same of the rotation rate
+    good_m: float = 0.2  # a pose counts as good within so much
+    good_rad: float = 0.1745  # and so much: 10 degrees
+    few_inliers: int = 10  # inliers that occur by chance: quality 0
+    many_inliers: int = 30  # inliers of a reliable pose
+    flagged_below: int = 50  # quality below which a pose is as likely wrong as good
+    surprise: float = 7.0  # deviations from the IMU's prediction above which a relocalisation is rejected
+    surprise_unmeasured: float = 10.0  # the same without a sensor for the path: two g all the time
+    far_deviations: float = 4.0  # the same, above which a relocalisation has low quality at first: nearly one g
+    low_quality_frames: int = 20  # frames of that low quality: tracking fails within them in a wrong place
+    surprise_m: float = 0.1  # deviation added to the covariances: maps are corrected meanwhile
+    surprise_rad: float = 0.05  # the same of the rotation
+>>>>>>> 10e78ef (Options of dead reckoning, gravity alignment and covariance have plain names)
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,7 +156,7 @@ def test_two_seconds_blind() -> None:
 
 def test_blind_for_too_long_says_so() -> None:
     steps = flight(60, 4)
-    config = InertialConfig(max_coast_s=0.5)
+    config = InertialConfig(max_dead_reckoning_s=0.5)
     tracker, states = run(steps, range(40, 60), config)
     assert states[49] is not None and states[51] is None
     assert not tracker.running

@@ -193,7 +193,7 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
 
 
 def test_where_the_speed_was_not_known_blindness_is_worse() -> None:
-    config = replace(CovarianceConfig(), blind_speed_m_s=5.0, blind_speed_rad_s=1.0)
+    config = replace(CovarianceConfig(), unknown_velocity_m_s=5.0, unknown_rate_rad_s=1.0)
     sigma = []
     for moves in (True, False):
         covariance = PoseCovariance(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config,

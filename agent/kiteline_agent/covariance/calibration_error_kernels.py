@@ -44,8 +44,8 @@ def sensitivity(
 
     T_c_m: (4,4). camera: fx, fy, cx, cy, bf. half_px: half the image's width. rows: (n,) slot * per_keyframe + index.
     inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. anchor_px:
-    (K*per_keyframe,2) px. rho: (K*per_keyframe,) 1/m. of_keyframes: (K,6,11) effect of the errors on the keyframes, as a left
-    perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a pixel of each error.
+    (K*per_keyframe,2) px. rho: (K*per_keyframe,) 1/m. of_keyframes: (K,6,11) effect on the
+    keyframes, as a left perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a pixel of each error.
     """
     fx, fy, bf = camera[0], camera[1], camera[4]
     here, there = np.empty((3, SHAPES)), np.empty((3, SHAPES))
@@ -190,8 +190,8 @@ def pose_covariance(
     """Covariance of a body pose in a frame a (o or m itself), the sum of all parts of pose_covariance.py.
 
     noise (6,6), shift (6,11): of the camera in m, on the left. calibration: (11,) variances. carried: (6,6) of m in a.
-    reckoned: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6) of the camera in the body. T_a_b0:
-    where the frame began. Out: left (6,6) the first three parts on the left of T_a_b; out (6,6) all of it, [translation
+    reckoned: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6), camera in the body. T_a_b0:
+    first pose in a. Out: left (6,6) the first three parts on the left of T_a_b; out (6,6) all of it, [translation
     in a, rotation about the body's axes].
     """
     a, j, m, e = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))

@@ -54,7 +54,7 @@ class PoseCovariance:
         self._noise_k, self._shift_k = np.zeros((slots, 6, 6)), np.zeros((slots, 6, SHAPES))  # of each keyframe
         self._refined = np.zeros(slots, np.bool_)
         self._calibration = np.full(SHAPES, config.calibration_px**2)
-        self._calibration[CALIBRATION] = config.pull_share**2
+        self._calibration[CALIBRATION] = config.imu_offset_share**2
         self._calibration[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # a disparity has the errors of two cameras
         extrinsic = np.repeat([config.extrinsic_m, config.extrinsic_rad], 3) if has_body else np.zeros(6)
         a = adjoint(T_b_c)
@@ -112,7 +112,7 @@ class PoseCovariance:
         """
         X = T_c_m @ se3.inverse(seen_T_c_m)
         d = np.array([X[0, 3], X[1, 3], X[2, 3], X[2, 1], X[0, 2], X[1, 0]])
-        share = 1.0 / self._config.dispute_frames
+        share = 1.0 / self._config.imu_offset_frames
         self._imu_offset += share * (d - self._imu_offset)
         d -= self._imu_offset
         self._imu_offset_cov += share * (np.outer(d, d) - self._imu_offset_cov)
@@ -160,10 +160,10 @@ class PoseCovariance:
             self._reckoned = sensor_cov
             return
         self._unmeasured_s = before + dt_s
-        speed = (c.blind_velocity_m_s, c.blind_rate_rad_s) if moves else (c.blind_speed_m_s, c.blind_speed_rad_s)
+        speed = (c.lost_velocity_m_s, c.lost_rate_rad_s) if moves else (c.unknown_velocity_m_s, c.unknown_rate_rad_s)
         (m0, m1), (t0, t1) = (
             tuple(v * s + 0.5 * a * s * s for s in (before, self._unmeasured_s))
-            for v, a in zip(speed, (c.blind_accel_m_s2, c.blind_turn_rad_s2), strict=True)
+            for v, a in zip(speed, (c.unmeasured_accel_m_s2, c.unmeasured_turn_rad_s2), strict=True)
         )
         growth = np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3)
         self._reckoned = self._reckoned + np.diag(growth)
@@ -279,12 +279,12 @@ class PoseCovariance:
         apart = math.sqrt(float(e @ np.linalg.solve(cov, e)))
         if self._has_imu_motion:
             return apart < c.surprise
-        self._far_relocalisation = apart >= c.strange
-        return apart < c.surprise_blind
+        self._far_relocalisation = apart >= c.far_deviations
+        return apart < c.surprise_unmeasured
 
     def confirm_relocalisation(self) -> None:
         """Accept the last consistent relocalisation; if it is far from the prediction, its quality is low at first."""
-        self._doubtful_frames = self._config.doubt_frames if self._far_relocalisation else 0
+        self._doubtful_frames = self._config.low_quality_frames if self._far_relocalisation else 0
 
     def quality(self, cov: F64, inliers: int | None) -> int:
         """Probability in percent, at least 1, that a pose of covariance cov (6,6) is good, as configured.

@@ -169,9 +169,9 @@ def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def
 def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
     """Gauss-Newton on (x, y) until the patch matches the template. Returns (x, y, ncc, inside).
 
-    patches: (5, LANES) int16: the patch as seen (filled here), the template, its gradients, see template_gradients, and ones.
-    The gradients that count are those made orthogonal to the template and to a constant: their sums follow from the
-    sums over the plain ones, which are exact.
+    patches: (5, LANES) int16: the current patch (out), the template, its gradients (see template_gradients), and ones.
+    The steps use gradients made orthogonal to the template and to a constant; their sums follow from the exact sums
+    over the plain ones.
     """
     h, w = image.shape
     seen, t, gx, gy, ones = patches[0], patches[1], patches[2], patches[3], patches[4]

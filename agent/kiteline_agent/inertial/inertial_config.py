@@ -27,9 +27,9 @@ class InertialConfig:
     window_frames: int = 60  # most frames kept before the initialisation; a scale needs some seconds
     max_residual_m: float = 0.02  # of the initialisation; above it the poses do not fit the IMU
     max_gravity_error: float = 0.12  # relative, of the length that is found without imposing it
-    trusted_blind_s: float = 1.0  # dead reckoning by the IMU counts as tracking for this long
-    askew_rad: float = 0.035  # tilt above which the map is gravity-aligned: two degrees
-    max_coast_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it
+    trusted_dead_reckoning_s: float = 1.0  # dead reckoning by the IMU counts as tracking for this long
+    min_tilt_rad: float = 0.035  # tilt above which the map is gravity-aligned: two degrees
+    max_dead_reckoning_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it
     scale_inflation: float = 2.0  # of the deviation of a scale: errors of a young map are correlated over frames
     unit_sigma: float = 0.03  # relative error of the scale by an IMU or odometer that their deviations leave out
     offset_memory_s: float = 60.0  # time constant of the time offset's drift

@@ -157,7 +157,7 @@ class InertialTracker:
         if self._last is not None:
             self._image_loss_s += (t_ns - self._last[0]) * 1e-9
         state = None
-        if self._smoother.running and self._image_loss_s <= self._config.max_coast_s:
+        if self._smoother.running and self._image_loss_s <= self._config.max_dead_reckoning_s:
             state = self._advance(samples, None, velocity)
         if state is None:
             self._smoother.stop()

@@ -45,7 +45,7 @@ class CameraState:
             local_map, camera.T_b_c, config.covariance, has_body=rig.has_body, has_depth=has_depth
         )  # fmt: skip
         self.gravity = GravityAligner(
-            camera, self.motion.tracker, config.inertial.askew_rad, config.inertial.level_patience_s
+            camera, self.motion.tracker, config.inertial.min_tilt_rad, config.inertial.level_patience_s
         )
         self.reference = ReferenceKeyframe(local_map)
         self.submaps = Submaps(identity)

@@ -104,10 +104,10 @@ class MotionModel:
         state = None if self.tracker is None else self.tracker.dead_reckon(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
             cov = self.odometer.dead_reckon(predicted, t_ns)
-            trusted = self.odometer.used and self.odometer.image_loss_s <= self._config.trusted_blind_s
+            trusted = self.odometer.used and self.odometer.image_loss_s <= self._config.trusted_dead_reckoning_s
             return DeadReckoning(predicted, cov, trusted)
         self.odometer.dead_reckon(state.T_m_b @ self._T_b_c, t_ns)
-        trusted = self.tracker.image_loss_s <= self._config.trusted_blind_s
+        trusted = self.tracker.image_loss_s <= self._config.trusted_dead_reckoning_s
         return DeadReckoning(state.T_m_b @ self._T_b_c, state.pose_cov, trusted)
 
     def restart(self, t_ns: int) -> None:
