@@ -160,7 +160,6 @@ class RelocalisationConfig:
 
 @dataclass(frozen=True, slots=True)
 class CovarianceConfig:
-<<<<<<< HEAD
     """Errors of sensors and calibration, and when a pose counts as good."""
 
     calibration_px: float = 0.05  # px at the image's edge: error of a good calibration of one camera
@@ -168,55 +167,26 @@ class CovarianceConfig:
     extrinsic_m: float = 1e-3  # m: error of the camera's position in the body
     least_rms: float = 0.3  # whitened residual of a frame: its noise is never assumed to be smaller
     inflation: float = 1.0  # factor on the variance of a measured pose
-    dispute_frames: float = 10.0  # frames over which the difference between fused and image poses is averaged
-    pull_share: float = 1.0  # of the mean difference: standard deviation of its systematic part
+    imu_offset_frames: float = 10.0  # frames over which the difference between fused and image poses is averaged
+    imu_offset_share: float = 1.0  # of the mean difference: standard deviation of its systematic part
     refined_share: float = 0.25  # of a keyframe's variance that remains when the base has optimised it
-    blind_accel_m_s2: float = 2.0  # m/s^2 of an unobserved vehicle: a multicopter tilted by twelve degrees
-    blind_turn_rad_s2: float = 2.0  # rad/s^2: the same for the rotation
-    blind_velocity_m_s: float = 0.03  # m/s: error of the velocity between two frames
-    blind_rate_rad_s: float = 0.02  # rad/s: the same for the rotation
-    blind_speed_m_s: float = 5.0  # m/s: error of the velocity of a vehicle whose motion was not observed yet
-    blind_speed_rad_s: float = 1.0  # rad/s: the same for the rotation
+    unmeasured_accel_m_s2: float = 2.0  # m/s^2 of an unobserved vehicle: a multicopter tilted by twelve degrees
+    unmeasured_turn_rad_s2: float = 2.0  # rad/s^2: the same for the rotation
+    lost_velocity_m_s: float = 0.03  # m/s: error of the velocity between two frames
+    lost_rate_rad_s: float = 0.02  # rad/s: the same for the rotation
+    unknown_velocity_m_s: float = 5.0  # m/s: error of the velocity of a vehicle whose motion was not observed yet
+    unknown_rate_rad_s: float = 1.0  # rad/s: the same for the rotation
     good_m: float = 0.2  # m: error up to which a pose counts as good
     good_rad: float = 0.1745  # rad: the same for the rotation, 10 degrees
     few_inliers: int = 10  # inliers with which quality begins to rise: so many agree by chance
     many_inliers: int = 30  # inliers with which quality is not reduced
     flagged_below: int = 50  # percent: quality below which a pose must not be relied on, as likely wrong as good
     surprise: float = 7.0  # standard deviations between a relocalised pose and the IMU's prediction, at most
-    surprise_blind: float = 10.0  # the same if nothing measured the motion: 2 g all the time
-    strange: float = 4.0  # the same beyond which a relocalised pose is doubted at first: nearly 1 g
-    doubt_frames: int = 20  # frames for which it is doubted: one second, in which a wrong place fails to track
+    surprise_unmeasured: float = 10.0  # the same if nothing measured the motion: 2 g all the time
+    far_deviations: float = 4.0  # the same beyond which a relocalised pose has low quality at first: nearly 1 g
+    low_quality_frames: int = 20  # frames of that low quality: one second, in which a wrong place fails to track
     surprise_m: float = 0.1  # m: standard deviation added to that comparison, since maps are corrected meanwhile
     surprise_rad: float = 0.05  # rad: the same for the rotation
-=======
-    """Calibration and motion uncertainties, and when a pose counts as good."""
-
-    calibration_px: float = 0.05  # px at the image's edge, error of a good calibration of one camera
-    extrinsic_rad: float = 3e-4  # of the camera in the body: a hundredth of a degree or two
-    extrinsic_m: float = 1e-3  # likewise
-    least_rms: float = 0.3  # least whitened residual of a frame
-    inflation: float = 1.0  # of the variance of a measured pose
-    imu_offset_frames: float = 10.0  # frames over which the offset of fused from image poses is averaged
-    imu_offset_share: float = 1.0  # standard deviation of that offset's mean, relative to the mean
-    refined_share: float = 0.25  # of a keyframe's variance that remains after the base optimised it
-    unmeasured_accel_m_s2: float = 2.0  # acceleration without any sensor: a multicopter that leans by twelve degrees
-    unmeasured_turn_rad_s2: float = 2.0  # the same of the rotation
-    lost_velocity_m_s: float = 0.03  # error of the velocity between the last two frames before a loss
-    lost_rate_rad_s: float = 0.02  # the same of the rotation rate
-    unknown_velocity_m_s: float = 5.0  # velocity of a vehicle that was lost before it could be measured
-    unknown_rate_rad_s: float = 1.0  # the same of the rotation rate
-    good_m: float = 0.2  # a pose counts as good within so much
-    good_rad: float = 0.1745  # and so much: 10 degrees
-    few_inliers: int = 10  # inliers that occur by chance: quality 0
-    many_inliers: int = 30  # inliers of a reliable pose
-    flagged_below: int = 50  # quality below which a pose is as likely wrong as good
-    surprise: float = 7.0  # deviations from the IMU's prediction above which a relocalisation is rejected
-    surprise_unmeasured: float = 10.0  # the same without a sensor for the path: two g all the time
-    far_deviations: float = 4.0  # the same, above which a relocalisation has low quality at first: nearly one g
-    low_quality_frames: int = 20  # frames of that low quality: tracking fails within them in a wrong place
-    surprise_m: float = 0.1  # deviation added to the covariances: maps are corrected meanwhile
-    surprise_rad: float = 0.05  # the same of the rotation
->>>>>>> 10e78ef (Options of dead reckoning, gravity alignment and covariance have plain names)
 
 
 @dataclass(frozen=True, slots=True)
