@@ -92,7 +92,8 @@ def parser() -> argparse.ArgumentParser:
         prog="kiteline eval",
         description="Compare a trajectory with ground truth. Either may be a TUM file (t x y z qx qy qz qw), KITTI "
         "poses (12 columns) or EuRoC's data.csv; the truth may also be a recording that holds it (mcap:FILE, "
-        "euroc:DIR, a folder). KITTI poses take their times from times.txt beside them; without it, from the other trajectory "
+        "euroc:DIR, a folder). KITTI poses take their times from times.txt beside them; without it, from the other "
+        "trajectory "
         "in order when both have as many poses, else they stand for 10 Hz from 0.",
     )
     p.add_argument("estimate", metavar="EST", help="the estimated trajectory")
