@@ -138,10 +138,12 @@ def test_table_and_figure_of_flights(flight: Recording, tmp_path: Path) -> None:
     assert (tmp_path / "governor.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.alone
 def test_start_to_first_pose_is_measured(recording: Path) -> None:
     assert 0.05 < processes.start("first-pose", str(recording))["seconds"] < 60.0
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("options", [[], ["--link"]])
 def test_memory_is_measured_over_minutes(recording: Path, options: list[str]) -> None:
     found = processes.start("soak", str(recording), "--minutes", "0.1", *options)
@@ -153,12 +155,14 @@ def test_trial_that_fails_says_why(tmp_path: Path) -> None:
         processes.start("first-pose", str(tmp_path / "nothing"))
 
 
+@pytest.mark.alone
 @pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
 def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
     found = LimitedFlight(**processes.start("quota", str(recording), "--percent", "20", "--governor"))
     assert found.real and found.tracked + found.lost + found.dropped == found.frames and found.tracked > 0
 
 
+@pytest.mark.alone
 @pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
 def test_governor_keeps_a_real_flight_within_the_kernel_s_limit(data_dir: Path) -> None:
     source = str(data_dir / "room_flight.mcap")

@@ -45,7 +45,7 @@ def test_without_rules_a_copy_holds_the_same_messages_in_the_same_order(
 
 
 def test_names_are_mapped_and_all_else_stays(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(renamed_logs, "CONFIG", {"base": {"intake": "input", "cull.age": None}})
+    monkeypatch.setattr(renamed_logs, "CONFIG", {"base": {"intake": "input", "cull.landmark_age": None}})
     monkeypatch.setattr(renamed_logs, "SPEC", {"base": {"kill_at_s": ("end_s", lambda v: None if v < 0 else v)}})
     monkeypatch.setattr(renamed_logs, "FIELDS", {"/job": {"cost_ops": "cost"}})
     monkeypatch.setattr(renamed_logs, "TOPICS", {"/packets/in": "/received"})
@@ -62,7 +62,7 @@ def test_names_are_mapped_and_all_else_stays(log: Path, tmp_path: Path, monkeypa
     assert [m.data for m in new[1::3]] == [m.data for m in old[1::3]]
     assert new[5].json() == {"id": 1, "cost": 0.1, "result": "result 1"}
     old_config["input"] = old_config.pop("intake")
-    del old_config["cull"]["age"]
+    del old_config["cull"]["landmark_age"]
     assert new_config == old_config
 
 

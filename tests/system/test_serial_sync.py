@@ -24,7 +24,7 @@ def turn(endpoint: Endpoint, link: ByteLink) -> None:
 
 def test_endpoints_agree_over_a_noisy_serial_line() -> None:
     draw = random.Random(3)
-    config = SyncConfig(packet_bytes=200, budget_bytes=0, first_rto_ns=100_000_000)
+    config = SyncConfig(packet_bytes=200, first_rto_ns=100_000_000)
     agent, base = Endpoint(config, 1), Endpoint(config, 1)
     with SerialPair(bit_errors=0.0005, seed=2) as pair:
         up = open_link(f"serial:{pair.a}:57600", "agent", 1, framer=StreamFramer)

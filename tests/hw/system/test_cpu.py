@@ -15,6 +15,8 @@ from kiteline_hw.system.cpu import CpuQuota, QuotaError, process_cpu_ns
 
 SPIN = "import time; e = time.process_time() + {}\nwhile time.process_time() < e: pass"
 
+pytestmark = pytest.mark.alone
+
 
 def test_cpu_time_counts_other_threads_and_no_sleep() -> None:
     before_ns = process_cpu_ns()
