@@ -45,7 +45,8 @@ class Estimate:
     before that in the gravity-aligned submap, if it is tilted.
     quality: probability in percent, at least 1, that the pose is good (CovarianceConfig) relative to the start of the
     flight; -1: nothing measures the motion. A later submap counts as placed by odometry until it is recognised.
-    cov_m: (6,6) of T_m_b relative to the start of its submap, [translation in m, rotation about the body's axes], m, rad.
+    cov_m: (6,6) of T_m_b relative to the start of its submap, [translation in m, rotation about the body's axes],
+    m, rad.
     cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes].
     R_l_o: (3,3) odometry frame to gravity-aligned frame, constant once it is known; None before, if a flight begins in
     motion.

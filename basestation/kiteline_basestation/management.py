@@ -1,7 +1,7 @@
 """Commands of users and other programs on maps: list, get, name, merge, split, delete. JSON in, JSON out.
 
-A command is an input of the mapper's step, logged and replayed with it; see docs/how-to/manage-maps.md. A submap is named
-AGENT.BOOT.NUMBER; a map by any of its submaps, or by a name that a user gave it.
+A command is an input of the mapper's step, logged and replayed with it; see docs/how-to/manage-maps.md. A submap is
+named AGENT.BOOT.NUMBER; a map by any of its submaps, or by a name that a user gave it.
 """
 
 from __future__ import annotations

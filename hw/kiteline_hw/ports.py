@@ -113,8 +113,8 @@ class PoseSample:
 
     t_ns: capture time, on the clock whose times are handed to the sink. T_o_b: (4,4) body in the continuous odometry
     frame, z up. quality: -1 failed, 0 unknown, 1..100. epoch: incremented only when the odometry frame itself was reset
-    (a restart of the agent), never for a map correction. cov: (6,6) of T_o_b, [translation in o in m, rotation about the
-    body's axes in rad]; None if unknown.
+    (a restart of the agent), never for a map correction. cov: (6,6) of T_o_b, [translation in o in m, rotation about
+    the body's axes in rad]; None if unknown.
     """
 
     t_ns: int

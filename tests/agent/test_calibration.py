@@ -19,9 +19,9 @@ def held_map(disparity: list[float]) -> LocalMap:
     held = LocalMap(CAMERA, LocalMapConfig(), DepthFilterConfig())
     n = len(disparity)
     held.add(
-        KeyframeHeader(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0), np.array(disparity) / CAMERA.bf,
-        np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8),
-        np.zeros((n, 3, 21, 21), np.uint8), 0,
+        KeyframeHeader(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0),
+        np.array(disparity) / CAMERA.bf, np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
+        np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), 0,
     )  # fmt: skip
     held.share(FIRST, n)
     return held

@@ -49,8 +49,8 @@ def map_of(observed: F64, T_m_k: F64 | None = None) -> LocalMap:
     local_map = LocalMap(CAMERA, config.local_map, config.depth_filter)
     n = len(observed)
     local_map.add(
-        KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k, observed[:, :2],
-        observed[:, 2] / CAMERA.bf, np.full(n, 1e-4), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
+        KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k,
+        observed[:, :2], observed[:, 2] / CAMERA.bf, np.full(n, 1e-4), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
         np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), 0,
     )  # fmt: skip
     return local_map
@@ -158,8 +158,8 @@ def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
 
 def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
     config = CovarianceConfig(calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
-    covariance = PoseCovariance(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config, has_body=True,
-                          has_depth=True)  # fmt: skip
+    local_map = map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4)))
+    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=True, has_depth=True)
     covariance.begin_submap(np.eye(4))
     assert not covariance.of_poses(PoseState(), np.eye(4))[0].any()
     half = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi]))

@@ -45,7 +45,8 @@ def sensitivity(
     T_c_m: (4,4). camera: fx, fy, cx, cy, bf. half_px: half the image's width. rows: (n,) slot * per_keyframe + index.
     inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. anchor_px:
     (K*per_keyframe,2) px. rho: (K*per_keyframe,) 1/m. of_keyframes: (K,6,11) effect on the
-    keyframes, as a left perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a pixel of each error.
+    keyframes, as a left perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a
+    pixel of each error.
     """
     fx, fy, bf = camera[0], camera[1], camera[4]
     here, there = np.empty((3, SHAPES)), np.empty((3, SHAPES))

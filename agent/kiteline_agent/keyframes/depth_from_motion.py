@@ -98,7 +98,7 @@ class DepthFromMotion:
         return np.asarray(p[:, :2] / z[:, None] * f + c)
 
     def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
-        """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,): 1 found, 0 not."""
+        """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,) 1 or 0."""
         config, align = self._config.depth_from_motion, self._config.align
         octave = self._map.octave[rows]
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
@@ -160,7 +160,10 @@ class DepthFromMotion:
 
 
 def triangulated_sigma(bearing: F64, rho: F64, T_c_k: F64, f_px: float, sigma_px: F64) -> F64:
-    """Standard deviation (n,) of inverse depths triangulated by a second view at T_c_k (4,4). bearing: (n,2) x/z, y/z."""
+    """Standard deviation (n,) of inverse depths triangulated by a second view.
+
+    bearing: (n,2) x/z, y/z. T_c_k: (4,4) keyframe to the second view.
+    """
     p = np.column_stack([bearing, np.ones(len(rho))]) @ T_c_k[:3, :3].T + T_c_k[:3, 3] * rho[:, None]
     z = np.maximum(p[:, 2], 1e-3)
     slope = f_px * (T_c_k[:2, 3] - p[:, :2] / z[:, None] * T_c_k[2, 3]) / z[:, None]

@@ -1,4 +1,4 @@
-"""Makes a keyframe of a frame: shares its records with the base, and adds it to the local map as the base decodes it."""
+"""Makes a keyframe of a frame: shares its records with the base, adds it to the local map as the base decodes it."""
 
 from __future__ import annotations
 

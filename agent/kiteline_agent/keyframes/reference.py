@@ -54,7 +54,7 @@ class ReferenceKeyframe:
         return t_ns - self._t_ns
 
     def next_keyframe(self, submap: SubmapId, T_m_c: F64) -> tuple[KeyframeId, KeyframeId, F64]:
-        """Id, parent and T_p_k (4,4) of the next keyframe; the first of a submap has no parent, and its pose is T_m_c."""
+        """Id, parent and T_p_k (4,4) of the next keyframe; a submap's first one has no parent, its pose is T_m_c."""
         if submap not in self._last_sequence:
             return keyframe_id(submap, 0), NO_KEYFRAME, T_m_c
         return keyframe_id(submap, self._last_sequence[submap] + 1), self.keyframe, self.T_k_c

@@ -1,8 +1,8 @@
 """The agent's local map: a bounded number of keyframes, and their landmarks with templates.
 
-Structure of arrays of fixed capacity: slot k holds a keyframe, row k * slot_size + i the new landmark at its keypoint i.
-A landmark is a bearing in its keyframe and an inverse depth, so that a corrected keyframe moves its landmarks. Keyframes
-of several submaps are stored; only those of the active one are tracked.
+Structure of arrays of fixed capacity: slot k holds a keyframe, row k * slot_size + i the new landmark at its
+keypoint i. A landmark is a bearing in its keyframe and an inverse depth, so that a corrected keyframe moves its
+landmarks. Keyframes of several submaps are stored; only those of the active one are tracked.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ class LocalMap:
         return np.asarray(disparity_offset.terms(self._bearings(uv)) @ self.disparity_offset)
 
     def set_disparity_offset(self, offset: F64) -> None:
-        """Set the error of stereo disparities (5,) px (`disparity_offset`), and correct the depths measured by stereo."""
+        """Set the error of stereo disparities (5,) px (`disparity_offset`); correct the depths measured by stereo."""
         at = disparity_offset.terms(self.bearing[self.measured])
         change = at @ (offset - self.disparity_offset) / self.camera.bf
         self.disparity_offset = np.array(offset)

@@ -70,7 +70,10 @@ class KeyframeStage:
         return True, ["keyframe: by dead reckoning"]
 
     def make(self, ctx: FrameContext, track: Track | None, points: NewPoints, T_m_c: F64, kind: Extra) -> KeyframeId:
-        """Make a keyframe of a frame with the camera at T_m_c (4,4); it becomes the reference. track: see KeyframeMaker."""
+        """Make a keyframe of a frame with the camera at T_m_c (4,4); it becomes the reference.
+
+        track: see KeyframeMaker.
+        """
         reference, submap = self._camera.reference, self._camera.submaps.active
         keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
         T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k)

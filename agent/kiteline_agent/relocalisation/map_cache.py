@@ -48,7 +48,10 @@ class CacheMatches:
 
 @dataclass(frozen=True, slots=True)
 class _Projections:
-    """Cached landmarks projected into a camera. rows: (n,). uv: (n,2) px. octave: (n,), predicted. xyz, ray: (n,3) m."""
+    """Cached landmarks projected into a camera.
+
+    rows: (n,). uv: (n,2) px. octave: (n,), predicted. xyz, ray: (n,3) m.
+    """
 
     rows: I64
     uv: F64
@@ -160,8 +163,9 @@ class MapCache:
             return None
         offered, wanted = comparable(seen.descriptor, self._descriptor[projected.rows])
         found = match_near(
-            projected.uv, np.full(len(projected.rows), self._config.radius_px), projected.octave, wanted, seen.uv, seen.octave, offered,
-            (self._camera.width, self._camera.height), self._config.octave_gap, self._matching,
+            projected.uv, np.full(len(projected.rows), self._config.radius_px), projected.octave, wanted,
+            seen.uv, seen.octave, offered, (self._camera.width, self._camera.height), self._config.octave_gap,
+            self._matching,
         )  # fmt: skip
         return self._consistent(T_c_m, projected, found, seen)
 
@@ -224,8 +228,8 @@ class MapCache:
             return None
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         fit = solve_pnp(
-            projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics, frame_number,
-            self._ransac,
+            projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics,
+            frame_number, self._ransac,
         )  # fmt: skip
         return None if fit is None or fit.inliers < self._config.min_matches else fit.T_c_m
 

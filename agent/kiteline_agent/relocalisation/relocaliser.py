@@ -1,7 +1,7 @@
 """Relocalises a frame: candidate keyframes, P3P on matched descriptors, then a check by the tracker.
 
-Also joins a new submap to an older one: the older one is searched while the new one is tracked. In the frame where it is
-found, one keyframe is made in each, with the same stamp. Both are the same camera at the same instant, so that
+Also joins a new submap to an older one: the older one is searched while the new one is tracked. In the frame where it
+is found, one keyframe is made in each, with the same stamp. Both are the same camera at the same instant, so that
 T_old_new = T_old_k1 @ inverse(T_new_k2). The agent continues in the old submap; the base moves the other keyframes.
 """
 

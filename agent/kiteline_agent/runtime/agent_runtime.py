@@ -82,7 +82,8 @@ class AgentRuntime:
             shipped_vocabulary(),
         )
         disorder = LinkModelConfig(
-            loss=options.loss, duplicate=options.disorder, reorder=options.disorder, delay_ns=round(options.delay_s * 1e9)
+            loss=options.loss, duplicate=options.disorder, reorder=options.disorder,
+            delay_ns=round(options.delay_s * 1e9)
         )  # fmt: skip
         self._wire = LinkModel(disorder, options.seed)
         self._overhead_bytes = channel.endpoint.config.overhead_bytes if isinstance(channel, CodedChannel) else 0

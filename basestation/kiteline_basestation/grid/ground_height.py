@@ -56,7 +56,10 @@ class _Patches:
         return (c + 0.5) * self.side_m, (r + 0.5) * self.side_m
 
     def heights(self, planes: F64) -> F64:
-        """z (n,) at the points, interpolated between the four nearest planes. planes: (3, rows, columns) z, dz/dx, dz/dy."""
+        """z (n,) at the points, interpolated between the four nearest planes.
+
+        planes: (3, rows, columns) z, dz/dx, dz/dy.
+        """
         last = np.array([self.columns - 1, self.rows - 1])
         place = np.clip(self.xy / self.side_m - 0.5, 0.0, last)
         low = np.minimum(place.astype(np.int64), np.maximum(last - 1, 0))

@@ -20,7 +20,8 @@ I64 = NDArray[np.int64]
 class PlacedMap:
     """Keyframes and landmarks of placed submaps in w, as arguments of `grid.build`.
 
-    keyframes: (n,) ids of the rows of positions. landmark_ids: (m,). observations: (k,2) rows of positions and of points.
+    keyframes: (n,) ids of the rows of positions. landmark_ids: (m,). observations: (k,2) rows of positions
+    and of points.
     metric: (n,) True for keyframes of maps of known metric scale.
     """
 

@@ -50,7 +50,7 @@ class SubmapPlacements:
         return next(iter(self.S_w_m), None)
 
     def align_with_gravity(self) -> bool:
-        """Rotate w, and all that is placed in it, when the first submap's gravity is known. Returns True if it moved."""
+        """Rotate w, and all that is placed in it, when the first submap's gravity is known. True if it moved."""
         first = self.first
         gravity = None if first is None else self._intake.gravity.get(first)
         if first is None or gravity is None:

@@ -36,7 +36,7 @@ def link(slots, roots, root, first, next_):  # type: ignore[no-untyped-def]
 
 @njit
 def fuse(child, parent, root, first, next_, moved):  # type: ignore[no-untyped-def]
-    """Move all observations of landmark `child` to landmark `parent`. Writes their slots to `moved`; returns the number."""
+    """Move all observations of landmark `child` to `parent`. Writes their slots to `moved`; returns their number."""
     n = 0
     s = first[child]
     last = -1

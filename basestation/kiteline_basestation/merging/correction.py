@@ -69,8 +69,8 @@ def essential_graph_of(
             np.repeat([config.sigma_scale, config.loop_sigma_scale], [len(edges), len(loop_pairs)]),
         )  # fmt: skip
     return GraphInputs(
-        np.array(keyframes, np.int64), poses, held, np.concatenate([edges, loop_pairs]), np.concatenate([between, measured]),
-        np.concatenate([np.round(sigma, 4), np.round(loop_sigma, 4)]),
+        np.array(keyframes, np.int64), poses, held, np.concatenate([edges, loop_pairs]),
+        np.concatenate([between, measured]), np.concatenate([np.round(sigma, 4), np.round(loop_sigma, 4)]),
         np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(loop_pairs), np.bool_)]), config, scaled,
     )  # fmt: skip
 

@@ -75,7 +75,8 @@ def observations_of(sparse_map: SparseMap, keyframe: KeyframeId) -> KeyframeObse
 
 
 def verify_loop(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig, view: KeyframeObservations | None = None
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig,
+    view: KeyframeObservations | None = None,
 ) -> LoopMatch | None:  # fmt: skip
     """Match `new` against `old` and its covisible neighbours; None if the match cannot be verified.
 
@@ -118,14 +119,14 @@ def verify_loop(
         return None
     unit_new, unit_old = (float(sparse_map.keyframes.scale[sparse_map.rows[k]]) for k in (new, old))
     return LoopMatch(
-        new, old, sim3.with_scaled_translation(T_old_new, 1.0 / unit_old), len(which), float(np.median(depth)) / unit_old,
-        scale * unit_new / unit_old, *ids,
+        new, old, sim3.with_scaled_translation(T_old_new, 1.0 / unit_old), len(which),
+        float(np.median(depth)) / unit_old, scale * unit_new / unit_old, *ids,
     )  # fmt: skip
 
 
 def _solve_pnp(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations, theirs: KeyframeObservations, a: I32, b: I32,
-    config: LoopConfig,
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
+    theirs: KeyframeObservations, a: I32, b: I32, config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map by RANSAC PnP, and a rough scale of the old over the new map."""
     rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
@@ -141,8 +142,8 @@ def _solve_pnp(
 
 
 def _solve_similarity(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations, theirs: KeyframeObservations, a: I32, b: I32,
-    config: LoopConfig,
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
+    theirs: KeyframeObservations, a: I32, b: I32, config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map, and the scale of the old over the new map.
 
@@ -212,8 +213,8 @@ def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: Loo
 
 
 def _match_neighbours(
-    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations, observed: F64, T_c_w: F64, scale: float,
-    config: LoopConfig,
+    sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
+    observed: F64, T_c_w: F64, scale: float, config: LoopConfig,
 ) -> tuple[F64, I32, I32, float] | None:  # fmt: skip
     """Match all landmarks of the old keyframe and its neighbours, twice, the second time within half the radius.
 

@@ -103,7 +103,7 @@ def bundle_window(
 
 
 def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -> tuple[F64, F64]:
-    """Measurements (m,3) u, v, disparity in px (-1 none), and standard deviations (m,2) of pixel and disparity in px."""
+    """Measurements (m,3) u, v, disparity in px (-1 none); standard deviations (m,2) of pixel and disparity in px."""
     table = sparse_map.keypoints
     rows = table.row[slots]
     has_depth = np.zeros(len(sparse_map), bool)

@@ -23,7 +23,8 @@ def match_projected(
 ) -> None:  # fmt: skip
     """Match projected landmarks one to one with keypoints.
 
-    Landmarks: predicted uv (n,2) px, octave (n,) float, angle (n,) 1/256 turns, disparity (n,) px, descriptor (n,4) uint64.
+    Landmarks: predicted uv (n,2) px, octave (n,) float, angle (n,) 1/256 turns, disparity (n,) px, descriptor (n,4)
+    uint64.
     Keypoints: the same, measured; disparity2 (m,) negative where unknown. Writes best (n,), -1 none, and distance.
     """
     n, m = uv.shape[0], uv2.shape[0]

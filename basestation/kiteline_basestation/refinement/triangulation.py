@@ -118,7 +118,7 @@ def _set_positions(sparse_map: SparseMap, points: I32, position: F64, publisher:
 
 
 def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: TriangulationConfig) -> tuple[F64, Bool]:
-    """Positions (n,3) from the rays of keypoints a and b (n,), and whether parallax, depth and reprojection are good."""
+    """Positions (n,3) from rays of keypoints a and b (n,), and whether parallax, depth and reprojection are good."""
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     views = []
     for slots in (a, b):

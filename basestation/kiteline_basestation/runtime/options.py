@@ -53,7 +53,8 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     """The arguments of `kiteline base`. link_forms: of LINK, for the help text."""
     p = argparse.ArgumentParser(
         prog="kiteline base",
-        description="The base station: refines and merges the maps of any number of agents, and sends corrections back.",
+        description="The base station: refines and merges the maps of any number of agents, "
+        "and sends corrections back.",
         epilog=f"LINK is {link_forms}. The address 0.0.0.0 listens on all interfaces.",
     )
     p.add_argument("--link", metavar="LINK", default="", help="link to the agents")

@@ -122,7 +122,8 @@ class TerminalReporter:
         """Sizes of the map in one line."""
         s = self._station.mapper.summary()
         return (
-            f"{_count(_int(s['keyframes']), 'keyframe')} and {s['points']} landmarks in {_count(_int(s['maps']), 'map')}; "
+            f"{_count(_int(s['keyframes']), 'keyframe')} and {s['points']} landmarks "
+            f"in {_count(_int(s['maps']), 'map')}; "
             f"{_count(_int(s['loops']), 'loop')}, {_count(_int(s['merges']), 'merge')}"
         )
 

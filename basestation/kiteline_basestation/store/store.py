@@ -1,8 +1,8 @@
 """The map on disk: one SQLite file in a folder, written a batch at a time, safe against a kill at any instant.
 
 Tables: code (agent, own, kind, id, part, code), every value that an agent (own 0) or the base (own 1) wrote, as it is
-shared; state (name, text), the mapper's state (see `state_texts`). A batch is one transaction, so that what is read back
-is the base between two of its steps.
+shared; state (name, text), the mapper's state (see `state_texts`). A batch is one transaction, so that what is read
+back is the base between two of its steps.
 
 Write-ahead logging with synchronous=NORMAL: a commit is one write to the log without waiting for the disk. A process
 that dies loses nothing that was committed, for the kernel holds it; a power cut may lose the last seconds but never

@@ -139,8 +139,8 @@ def _table(inertial: bool, columns: dict[str, list[tuple[float, float, bool]]]) 
     """Markdown; a flight of which frames were lost, or that began a new map, is marked."""
     lines = [
         (
-            f"Settings at a fixed value, {'with an IMU' if inertial else 'without an IMU'}: cost and ATE relative to full "
-            f"effort, geometric means over {_STARTS} starts; *: lost in at least one of them.\n"
+            f"Settings at a fixed value, {'with an IMU' if inertial else 'without an IMU'}: cost and ATE relative to "
+            f"full effort, geometric means over {_STARTS} starts; *: lost in at least one of them.\n"
         ),
         f"| setting | cost | {' | '.join(f'ATE {name}' for name in columns)} |",
         "|---" * (2 + len(columns)) + "|",

@@ -106,7 +106,8 @@ def _thin(bench: Bench, first: str) -> list[Bar]:
     bench.say("flying with slow corrections")
     smooth = KeyframesInWorld(fly_with_base([old], slow))
     return [
-        at_most("by radio: live error in w over that without a cache", with_.live_m(1) / without.live_m(1), 1.05, "", 2),
+        at_most("by radio: live error in w over that without a cache", with_.live_m(1) / without.live_m(1),
+                1.05, "", 2),
         at_most("largest change of the live pose by corrections, applied slowly", smooth.largest_correction_m(0),
                 1.05 * _SLOW_M_S * TICK_NS * 1e-9, "m", 4),
         at_most("its live error in w", smooth.live_m(0), 0.08, "m", 4),

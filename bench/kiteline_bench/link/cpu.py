@@ -57,13 +57,15 @@ def flight(keyframes: int) -> list[list[Record]]:
         new_uv = new_uv[np.argsort(new_uv[:, 1] // 32, kind="stable")]
         new_rho = rng.uniform(0.1, 0.6, _NEW_LANDMARKS)
         landmarks = NewLandmarks(
-            keyframe, 0, np.arange(_NEW_LANDMARKS, dtype=np.uint16), new_uv.astype(np.float32), new_rho.astype(np.float32),
-            rng.integers(0, 3, _NEW_LANDMARKS).astype(np.uint8), rng.integers(0, 256, _NEW_LANDMARKS).astype(np.uint8),
+            keyframe, 0, np.arange(_NEW_LANDMARKS, dtype=np.uint16), new_uv.astype(np.float32),
+            new_rho.astype(np.float32), rng.integers(0, 3, _NEW_LANDMARKS).astype(np.uint8),
+            rng.integers(0, 256, _NEW_LANDMARKS).astype(np.uint8),
             rng.integers(0, 256, (_NEW_LANDMARKS, 32)).astype(np.uint8),
         )  # fmt: skip
         observations = Observations(
-            keyframe, 0, np.arange(_NEW_LANDMARKS, _NEW_LANDMARKS + len(point), dtype=np.uint16), (uv + noise).astype(np.float32),
-            (rho * rng.normal(1, 0.01, len(rho))).astype(np.float32), np.zeros(len(point), np.uint8), point,
+            keyframe, 0, np.arange(_NEW_LANDMARKS, _NEW_LANDMARKS + len(point), dtype=np.uint16),
+            (uv + noise).astype(np.float32), (rho * rng.normal(1, 0.01, len(rho))).astype(np.float32),
+            np.zeros(len(point), np.uint8), point,
         )  # fmt: skip
         parts = WIFI.choose(landmarks, rng.uniform(size=_NEW_LANDMARKS), observations)
         out.append([KeyframeHeader(keyframe, k, parent, T, _NEW_LANDMARKS + len(point)), *parts[0], *parts[1]])

@@ -160,7 +160,8 @@ _AGENT_PREFIX = re.compile(r"^(/agent\d+)?(.*)$")
 def copy_renamed(old: Path, new: Path) -> None:
     """Copy a log under new names. Raises SourceError when `old` is no MCAP file.
 
-    Where OLD.job_values.json lies beside `old`, its list replaces the logged fingerprints of the jobs' results, in order.
+    Where OLD.job_values.json lies beside `old`, its list replaces the logged fingerprints of the jobs' results,
+    in order.
     """
     log = McapFile(old)
     role = next((r.metadata.get("role", "") for r in log.metadata if r.name == "kiteline"), "")

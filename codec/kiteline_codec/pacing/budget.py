@@ -8,7 +8,7 @@ WINDOW_NS = 1_000_000_000
 
 
 class SlidingBudget:
-    """Bytes within the last second, both ends included, of which `burst_bytes` at once. A limit of None means unlimited.
+    """Bytes within the last second, both ends included, of which `burst_bytes` at once. Limit None means unlimited.
 
     The window alone would let a sender spend a second's bytes at once and then wait for a second; the bucket, which
     fills at the rate of the limit, spreads them, so that a new value waits no longer than a packet takes.

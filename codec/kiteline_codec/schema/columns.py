@@ -112,7 +112,7 @@ def write_landmarks(out: Writer, landmark: I64) -> None:
 
 
 def write_landmark_table(out: Writer, keyframes: Sequence[int], place: I64, keypoint: I64) -> None:
-    """Append landmarks as a table of their keyframes, increasing, and two columns (n,): place in the table, keypoint."""
+    """Append landmarks: a table of their keyframes, increasing, and two columns (n,): place in the table, keypoint."""
     if not len(place):
         return
     out.varint(len(keyframes))

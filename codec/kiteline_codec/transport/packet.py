@@ -48,7 +48,10 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A value, a fragment of one, or a removal (total is None). residual: the data stand for the code in fewer bytes."""
+    """A value, a fragment of one, or a removal (total is None).
+
+    residual: the data stand for the code in fewer bytes.
+    """
 
     key: Key
     version: int

@@ -70,6 +70,6 @@ def is_link(spec: str) -> bool:
 
 
 def link_traits(spec: str) -> LinkTraits:
-    """The traits of a LINK; the default ones for a link that is not in the table (the barrier of a lock-step flight)."""
+    """Traits of a LINK; the default ones for a link that is not in the table (the barrier of a lock-step flight)."""
     scheme = spec.partition(":")[0]
     return next((kind.traits for kind in LINKS if kind.scheme == scheme), LinkTraits())

@@ -12,8 +12,8 @@ Write::
     log.poses("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.scan(...);  log.text("/log", t_ns, "info", "…")
     log.close()                                                 # also a context manager
 
-Log times are handed in and nothing here reads a clock, so equal calls give equal bytes. Chunks are written at 64 KiB and
-after one second of flight time, so that a cut file loses little.
+Log times are handed in and nothing here reads a clock, so equal calls give equal bytes. Chunks are written at 64 KiB
+and after one second of flight time, so that a cut file loses little.
 
 Read::
 

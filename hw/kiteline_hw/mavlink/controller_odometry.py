@@ -63,7 +63,7 @@ class ControllerOdometryConfig:
 
 
 class StampClock:
-    """Converts a controller's stamps to our clock. Messages arrive late, never early: the least delay counts as none."""
+    """Converts a controller's stamps to our clock. Messages arrive late, never early: the least delay counts as 0."""
 
     def __init__(self, config: ControllerOdometryConfig | None = None) -> None:
         self._config = config or ControllerOdometryConfig()

@@ -142,7 +142,7 @@ class ControllerSession:
         return next((p for p in reversed(self._past) if t_ns - p.t_ns >= self.config.min_gap_ns), None)
 
     def _is_due(self, now_ns: int) -> bool:
-        """True if the rate allows a message now. After an early message the next one waits longer: the mean rate holds."""
+        """True if the rate allows a message now. An early message delays the next one: the mean rate holds."""
         due_ns = self._next_odometry_ns
         if due_ns is None or now_ns - due_ns >= self._period_ns:
             self._next_odometry_ns = now_ns + self._period_ns

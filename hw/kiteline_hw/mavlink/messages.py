@@ -84,7 +84,7 @@ class VehicleImu(MavlinkMessage):
     """An inertial sample of the flight controller, in its body frame (FRD), on its clock.
 
     accel: m/s^2 (specific force: -9.8 down at rest). gyro: rad/s. message: id of the message that held it (each has a
-    clock origin of its own). unit: number of the sensor. RAW_IMU is taken to be in mg and mrad/s, as ArduPilot sends it.
+    clock origin of its own). unit: number of the sensor. RAW_IMU is taken to be in mg and mrad/s, as sent by ArduPilot.
     """
 
     NAMES = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU")

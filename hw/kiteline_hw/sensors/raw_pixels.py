@@ -35,7 +35,7 @@ DEPTH_ENCODINGS = ("16uc1", "32fc1")  # ROS REP 118: millimetres; metres
 
 
 class BadImage(Exception):
-    """One image that cannot be used; the text says why. Raised only inside this package: sources count it as skipped."""
+    """An image that cannot be used; the text says why. Raised only in this package: sources count it as skipped."""
 
 
 @dataclass(frozen=True, slots=True)

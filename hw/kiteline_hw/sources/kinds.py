@@ -13,8 +13,9 @@ from dataclasses import dataclass
 class SourceKind:
     """One kind of source, written SCHEME:ARGUMENT.
 
-    module: "" if it is not supported yet. argument: what follows the colon, in capitals; DIR and FILE are paths that must exist. layout: glob patterns, one of
-    which a folder of this kind matches (with a trailing slash: a sub-folder), and `shown` names them in error messages.
+    module: "" if it is not supported yet. argument: what follows the colon, in capitals; DIR and FILE are paths
+    that must exist. layout: glob patterns, one of which a folder of this kind matches (with a trailing slash: a
+    sub-folder), and `shown` names them in error messages.
     """
 
     scheme: str

@@ -174,7 +174,8 @@ def test_refined_depths_are_predicted_from_measured_ones() -> None:
     landmarks = next(r for r in records if isinstance(r, NewLandmarks))
     rng = np.random.default_rng(1)
     depths = RefinedLandmarks(
-        landmarks.keyframe, landmarks.index, landmarks.inv_depth * rng.normal(1, 0.004, len(landmarks.index)).astype(np.float32),
+        landmarks.keyframe, landmarks.index,
+        landmarks.inv_depth * rng.normal(1, 0.004, len(landmarks.index)).astype(np.float32),
         rng.normal(0, 0.2, (len(landmarks.index), 2)).astype(np.float32),
     )  # fmt: skip
     key, code = messages.key(depths), messages.encode(depths)

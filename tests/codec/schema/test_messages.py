@@ -180,8 +180,9 @@ def test_errors_say_what_was_expected() -> None:
 
 
 def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:
-    """300 observations of landmarks of 12 keyframes and 180 new landmarks, in an image of 752x480 px. Indices as an agent
-    assigns them: observations by landmark id, then new landmarks by image row.
+    """300 observations of landmarks of 12 keyframes and 180 new landmarks, in an image of 752x480 px.
+
+    Indices as an agent assigns them: observations by landmark id, then new landmarks by image row.
     """
     rng = np.random.default_rng(5)
     submap = submap_id(2, 17, 1)

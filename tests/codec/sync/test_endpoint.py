@@ -95,8 +95,9 @@ def test_order_of_sending() -> None:
     pair.settle()
     got = [(key.kind, key.id, key.part) for key, _ in pair.updates[1]]
     assert got == [
-        (LivePose.KIND, 0, 0), (KeyframePose.KIND, 1, 0), (KeyframeHeader.KIND, 1, 0), (NewLandmarks.KIND, 2, 0), (NewLandmarks.KIND, 1, 0),
-        (NewLandmarks.KIND, 1, 1), (Observations.KIND, 2, 0), (GridTile.KIND, 9, 0),
+        (LivePose.KIND, 0, 0), (KeyframePose.KIND, 1, 0), (KeyframeHeader.KIND, 1, 0),
+        (NewLandmarks.KIND, 2, 0), (NewLandmarks.KIND, 1, 0), (NewLandmarks.KIND, 1, 1),
+        (Observations.KIND, 2, 0), (GridTile.KIND, 9, 0),
     ]  # fmt: skip
 
 

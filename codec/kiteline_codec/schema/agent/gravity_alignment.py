@@ -17,7 +17,10 @@ from kiteline_core.ids import SubmapId
 @register
 @dataclass(frozen=True, slots=True)
 class GravityAlignment(Record):
-    """Aligns a submap with gravity that began while the vehicle moved. T_l_m: (4,4) submap to its gravity-aligned frame."""
+    """Aligns with gravity a submap that began while the vehicle moved.
+
+    T_l_m: (4,4) submap to its gravity-aligned frame.
+    """
 
     KIND = 6
     ID = IdOf.SUBMAP

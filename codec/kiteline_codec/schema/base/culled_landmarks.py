@@ -17,7 +17,7 @@ from kiteline_core.ids import KeyframeId
 @register
 @dataclass(frozen=True, slots=True)
 class CulledLandmarks(Record):
-    """Landmarks of a keyframe that the base culled. keyframe_too: 1 if the keyframe's observations are culled as well."""
+    """Landmarks of a keyframe that the base culled. keyframe_too: 1 if its observations are culled as well."""
 
     KIND = 20
     ID = IdOf.KEYFRAME

@@ -71,8 +71,9 @@ def _solve_banded(band: F64, right: F64) -> F64:
 
 
 def read_trajectory(file: FilePath, camera_in_body: F64) -> Path:
-    """Fit a path to a TUM file (t x y z qx qy qz qw, body poses, z up) or a KITTI file (3x4 rows, camera poses, y down).
+    """Fit a path to a TUM or KITTI file.
 
+    TUM: t x y z qx qy qz qw, body poses, z up. KITTI: 3x4 rows, camera poses, y down.
     camera_in_body: T_b_c (4, 4), to convert KITTI's camera poses to body poses. Raises SourceError.
     """
     try:

@@ -14,8 +14,8 @@ F32 = NDArray[np.float32]
 def paint(shapes: F32, kinds: NDArray[np.int32], out: F32) -> None:
     """Paint shapes in order, later ones over earlier ones; `out` (n, n), n a power of two, wraps around.
 
-    shapes (m, 9): centre x y, half-sides a b in texels, cos and sin of the rotation, value, its gradient along a and b over
-    the shape. kinds: 0 ellipse, 1 rectangle, 2 triangle, 3 ring.
+    shapes (m, 9): centre x y, half-sides a b in texels, cos and sin of the rotation, value, its gradient along a and b
+    over the shape. kinds: 0 ellipse, 1 rectangle, 2 triangle, 3 ring.
     """
     mask = out.shape[0] - 1
     for i in range(shapes.shape[0]):

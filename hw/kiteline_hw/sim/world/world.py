@@ -85,7 +85,7 @@ class Builder:
         self._faces: list[F64] = []
 
     def face(self, name: str, contrast: float, brightness: float, upright: bool, base_m: float = 0.0) -> F64:
-        """A face (8,) with a random piece of a texture; `upright`: not rotated, its rows start base_m below the centre."""
+        """A face (8,) with a random piece of a texture; `upright`: not rotated, rows start base_m below the centre."""
         rng = self.rng
         stretch = 1.0 / (TEXEL_M * rng.uniform(0.85, 1.2))
         side = 1 << int(self.pool.table[self.pool.index(name), 0])
