@@ -166,6 +166,8 @@ def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
 @pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
 def test_governor_keeps_a_real_flight_within_the_kernel_s_limit(data_dir: Path) -> None:
     source = str(data_dir / "room_flight.mcap")
-    found = LimitedFlight(**processes.start("quota", source, "--percent", "3.5", "--governor", "--frames", "140"))
+    options = ("quota", source, "--percent", "3.5", "--frames", "140")
+    free = LimitedFlight(**processes.start(*options))  # how many frames this machine tracks in so little CPU time
+    found = LimitedFlight(**processes.start(*options, "--governor"))
     assert found.peak <= 3.5 * 1.02 and found.lost == 0 and found.submaps == 1
-    assert found.tracked > 30 and found.ate_m < 0.02
+    assert found.tracked > 0.7 * free.tracked > 0 and found.ate_m < 0.02

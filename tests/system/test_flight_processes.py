@@ -99,6 +99,7 @@ def test_a_link_that_fly_cannot_use_is_refused(recording: Path, tmp_path: Path) 
         fly(Options((str(recording),), tmp_path, link="serial:/dev/null:57600"), quiet=True)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_flight_leaves_no_process(recording: Path, tmp_path: Path, how: signal.Signals) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -106,6 +106,7 @@ def test_through_a_router(monkeypatch: pytest.MonkeyPatch) -> None:
         wait_for(lambda: link.receive() == [b"down"])
 
 
+@pytest.mark.alone
 def test_packets_stay_in_order_and_whole() -> None:
     endpoint = free_endpoint()
     packets = [bytes([i % 251]) * (1 + 37 * i) for i in range(200)]
