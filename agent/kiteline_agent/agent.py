@@ -22,7 +22,6 @@ from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
-from kiteline_agent.runtime.frame_reader import joined
 from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
@@ -32,7 +31,7 @@ from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import NO_KEYFRAME, SubmapId
 from kiteline_core.places.place_index import Vocabulary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,3 +85,14 @@ class Trajectory:
 
     t_ns: NDArray[np.int64]
     T_w_b: NDArray[np.float64]
+
+
+def joined(batches: Sequence[ImuBatch]) -> ImuBatch | None:
+    """IMU batches concatenated; None if there are none."""
+    if len(batches) < 2:
+        return batches[0] if batches else None
+    return ImuBatch(
+        np.concatenate([batch.t_ns for batch in batches]),
+        np.concatenate([batch.gyro for batch in batches]),
+        np.concatenate([batch.accel for batch in batches]),
+    )

@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_agent.governor.cpu_account import CpuAccount
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.runtime.cpu_account import CpuAccount
 from kiteline_agent.runtime.flight_log import estimate_from_json, estimate_to_json
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
-from kiteline_agent.runtime.frame_reader import FrameReader, joined
+from kiteline_agent.runtime.frame_reader import FrameReader
 from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.step import Estimate
 from kiteline_core import config as configuration
 from kiteline_core.config import ConfigError
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import Frame, ImuBatch, joined
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_agent.motion.odometer import Odometer, OdometerConfig
+from kiteline_agent.config import OdometerConfig
+from kiteline_agent.motion.odometer import Odometer
 from kiteline_core import odometry
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3

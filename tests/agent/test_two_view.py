@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from kiteline_agent.config import TwoViewConfig
 from kiteline_agent.initialisation import two_view_models
-from kiteline_agent.initialisation.two_view import TwoView, TwoViewConfig, two_view
+from kiteline_agent.initialisation.two_view import TwoView, two_view
 from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]

@@ -7,35 +7,20 @@ views is refined by bundle adjustment.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.config import TwoViewConfig
 from kiteline_agent.initialisation import two_view_models
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
-from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle
+from kiteline_core.optimisation.bundle import BundleProblem, bundle
 
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class TwoViewConfig:
-    """What two views must show to begin a map."""
-
-    draws: int = 200  # RANSAC draws of each model: 8 good points of 60 % come up with 97 %
-    sigma_px: float = 1.0  # one standard deviation of a matched pixel
-    flat_ratio: float = 0.45  # R_H above which the homography is the model
-    min_points: int = 100  # points with depth that a map needs
-    min_share: float = 0.7  # of the model's inliers that the motion must explain
-    rival_share: float = 0.75  # share of the best motion's points with which a second motion makes both ambiguous
-    min_parallax_rad: float = 0.0175  # rad: 1 degree, median over the points; below it depth is noise
-    min_point_parallax_rad: float = 0.005  # rad: with less a point has no depth
-    reprojection_px: float = 2.0  # px: largest reprojection error of a point
-    bundle: BundleConfig = field(default_factory=BundleConfig)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from numpy import float64
 from numpy.typing import NDArray
 
+from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
-from kiteline_agent.motion.odometer import Odometer, OdometerConfig
+from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch

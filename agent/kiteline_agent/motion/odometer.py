@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import BodyVelocity
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
 from kiteline_core.frame import OdometryBatch
@@ -20,45 +21,6 @@ from kiteline_core.geometry import se3
 F64 = NDArray[np.float64]
 
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
-
-
-@dataclass(frozen=True, slots=True)
-class OdometerConfig:
-    """When an odometer is used, and its error model."""
-
-    use: bool = True  # False: odometer samples are logged only
-    keep_s: float = 3.0  # s of samples in the buffer
-    max_gap_s: float = 0.25  # a longer gap makes an interval unknown: wheels are read at 10 Hz at least
-    floor_m_s: float = 0.02  # velocity error that no device states: its axes, its place, its stamps
-    floor_rad_s: float = 0.005  # the same of a rotation rate
-    correlation_s: float = 0.5  # correlation time of its errors: a patch of slippery floor, a gust
-    compare_s: float = 0.2  # window of a comparison, in which images measure a velocity to a centimetre a second
-    least_moved_m: float = 0.02  # motion in a window below which axes and scale are not observable
-    aligned: float = 0.9  # least cosine between both displacements for their lengths to be compared
-    scale_start: float = 0.1  # relative deviation of its scale at the start
-    scale_most: float = 0.25  # relative; a larger difference is a fault, not a scale
-    scale_floor: float = 0.01  # least relative deviation of the scale
-    scale_walk: float = 0.003  # relative, per sqrt(s): load and temperature change
-    scale_sigma_m_s: float = 0.05  # expected noise of a window in the scale estimate
-    start_m_s: float = 0.08  # expected noise at the start, weighted as one window
-    start_rad_s: float = 0.03  # the same of the rotation rate
-    memory_s: float = 3.0  # time constant of the noise estimate
-    unusual: float = 5.0  # times the expected squared error, above which `rise` applies
-    rise: float = 0.5  # weight of such an error: a slip is detected within 0.2 s
-    tolerance_m_s: float = 0.12  # noise above which it is not used; that of a good one is 0.05
-    tolerance_share: float = 0.10  # of the speed, likewise
-    proofs: int = 3  # consecutive moving windows that must agree before it is used
-    surprise: float = 4.0  # deviations from the prediction above which a sample is rejected: 8 m/s^2
-    settled: float = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
-    accel_m_s2: float = 2.0  # acceleration of the constant-velocity model: leaning by twelve degrees
-    turn_rad_s2: float = 4.0  # the same about the body's axes: a small multicopter that tilts
-    seen_m_s: float = 0.05  # error of the velocity between two frames placed by images
-    seen_rad_s: float = 0.02  # the same of the rotation rate
-    unit_window_s: float = 0.4  # window of a comparison while the scale of a monocular map is unknown
-    unit_windows: int = 40  # newest such windows that are kept
-    unit_least: int = 8  # least number of agreeing windows for a scale
-    unit_moved_m: float = 0.05  # least motion by the odometer in a window that counts
-    unit_share: float = 0.7  # least share of the windows that must agree
 
 
 class Odometer:

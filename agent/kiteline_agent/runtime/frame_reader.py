@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-
-import numpy as np
+from collections.abc import Callable, Iterable
 
 from kiteline_core import odometry
-from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch, joined
 
 
 class FrameReader:
@@ -65,14 +63,3 @@ class FrameReader:
         if self._frame is not None:
             self.decode_ms.append(spent_ns / 1e6)
             self.period_ns = 0 if last is None else self._frame.t_ns - last.t_ns
-
-
-def joined(batches: Sequence[ImuBatch]) -> ImuBatch | None:
-    """Batches concatenated; None if there are none."""
-    if len(batches) < 2:
-        return batches[0] if batches else None
-    return ImuBatch(
-        np.concatenate([batch.t_ns for batch in batches]),
-        np.concatenate([batch.gyro for batch in batches]),
-        np.concatenate([batch.accel for batch in batches]),
-    )

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.config import AgentConfig
+from kiteline_agent.config import AgentConfig, TwoViewConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
-from kiteline_agent.initialisation.two_view import TwoViewConfig, two_view
+from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.step import Identity, StepInput
 from kiteline_codec import warm as codec_warm
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration

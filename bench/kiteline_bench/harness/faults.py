@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.runtime.frame_reader import joined
 from kiteline_bench.harness.recording import Item, Recording
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import Frame, ImuBatch, joined
 
 U8 = NDArray[np.uint8]
 Change = Callable[[Frame], Frame]

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.runtime.frame_reader import joined
 from kiteline_core import odometry as odometer
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory, joined
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, LogWriter
 from kiteline_hw.ports import FrameSource

@@ -11,7 +11,6 @@ import numpy as np
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
-from kiteline_agent.runtime.frame_reader import joined
 from kiteline_agent.step import Identity, StepInput
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.runtime.worker import LockstepJobs
@@ -19,7 +18,7 @@ from kiteline_basestation.station import Station
 from kiteline_bench.harness.recording import Item, Recording, items_of
 from kiteline_bench.harness.result import AgentRun
 from kiteline_codec.channel import RecordChannel, coded_channel
-from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.frame import ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import AgentId
 from kiteline_hw.sources.open import open_source

@@ -18,6 +18,11 @@ _COMPILE_S = 12.0
 _ROUNDS = 5
 _CPU_RATIO = 1.02
 _TWO_AGENTS_S = 15.0
+_KNOWN_DIFFERENCES = (
+    "Flights with a merge differ by design: the placement of a recognised submap has one more byte "
+    "(docs/decisions/recognised-placements.md), and new keyframes no longer take depths from the map cache "
+    "(docs/decisions/map-cache-without-images.md, with twenty flights of each)."
+)
 
 
 def _structure(bench: Bench) -> list[Bar]:
@@ -60,6 +65,7 @@ def _replay(bench: Bench) -> list[Bar]:
         "two agents": (both, []),
     }
     bars = []
+    bench.more.append(_KNOWN_DIFFERENCES)
     for name, (sources, options) in flights.items():
         bench.say(f"flying with {REVISION[:8]}: {name}")
         out = bench.folder.resolve() / f"older {name}"
@@ -116,8 +122,8 @@ def _compile(bench: Bench) -> list[Bar]:
 
 
 PARTS = {
-    "structure": ("The house: structure", _structure),
-    "replay": ("The house: logs of an older build", _replay),
-    "cpu": ("The house: CPU beside an older build", _cpu),
-    "compile": ("The house: compilation", _compile),
+    "structure": ("Sources: structure", _structure),
+    "replay": ("Sources: logs of an older build", _replay),
+    "cpu": ("Sources: CPU beside an older build", _cpu),
+    "compile": ("Sources: compilation of kernels", _compile),
 }
