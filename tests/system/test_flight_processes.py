@@ -102,6 +102,8 @@ def test_a_link_that_fly_cannot_use_is_refused(recording: Path, tmp_path: Path) 
 @pytest.mark.alone
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_flight_leaves_no_process(recording: Path, tmp_path: Path, how: signal.Signals) -> None:
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's background job; children would inherit it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     # Real clocks and a long recording time: it is surely still flying when it is interrupted.
     command = [sys.executable, "-m", "kiteline_cli", "fly", str(recording), "--out", str(tmp_path), "--realtime"]
