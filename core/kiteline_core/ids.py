@@ -50,24 +50,9 @@ def point_id(keyframe: KeyframeId, keypoint: int) -> LandmarkId:
     return LandmarkId(keyframe << KEYPOINT_BITS | keypoint)
 
 
-def keyframe_of_point(point: LandmarkId) -> KeyframeId:
-    """The keyframe to which a landmark is anchored."""
-    return KeyframeId(point >> KEYPOINT_BITS)
-
-
-def keypoint_of_point(point: LandmarkId) -> int:
-    """The index of a landmark's keypoint in its anchor keyframe."""
-    return point & (MAX_KEYPOINTS - 1)
-
-
 def submap_of_keyframe(keyframe: KeyframeId) -> SubmapId:
     """The submap of a keyframe."""
     return SubmapId(keyframe >> SEQUENCE_BITS)
-
-
-def sequence_of_keyframe(keyframe: KeyframeId) -> int:
-    """The number of a keyframe within its submap."""
-    return keyframe & (MAX_KEYFRAMES - 1)
 
 
 def agent_of_submap(submap: SubmapId) -> AgentId:
