@@ -19,6 +19,7 @@ from kiteline_hw.ports import SourceError
 BENCHMARKS = {
     "first-flight": "kiteline_bench.system.first_flight",
     "house": "kiteline_bench.system.house",
+    "reality": "kiteline_bench.reality.reality",
     "agent": "kiteline_bench.agent.flights",
     "governor": "kiteline_bench.agent.governor_settings",
     "consistency": "kiteline_bench.agent.consistency",
