@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,19 @@ def test_the_same_command_gives_the_same_file(tmp_path: Path) -> None:
         assert main([SCENE, "--out", str(tmp_path / name / "f.mcap"), "--workers", str(1 + (name == "b"))]) == 0
     for file in ("f.mcap", "f.pgm", "f.yaml"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_a_worn_rig_is_recorded_with_its_truth_beside_it(tmp_path: Path) -> None:
+    out = tmp_path / "worn.mcap"
+    options = ["--rig", "worn", "--rig-seed", "6", "--png"]
+    assert main([SCENE.replace("0.4", "2.0"), *options, "--out", str(out)]) == 0
+    recorded, rendered = open_source(f"mcap:{out}"), open_sim(SCENE.replace("0.4", "2.0"), rig="worn", rig_seed=6)
+    frames, others = ([x for x in source if isinstance(x, Frame)] for source in (recorded, rendered))
+    assert [(f.t_ns, f.right is None) for f in frames] == [(f.t_ns, f.right is None) for f in others]
+    assert any(f.right is None for f in frames)
+    truth = json.loads((tmp_path / "worn.rig_truth.json").read_text())
+    assert truth["true"]["left"]["fx"] == rendered.worn.true.left.fx != recorded.rig.left.fx
+    assert truth["frame_stamps_late_s"] == rendered.worn.late_s
 
 
 def test_every_agent_gets_its_log(tmp_path: Path) -> None:

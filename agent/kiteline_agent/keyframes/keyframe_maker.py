@@ -31,6 +31,10 @@ class KeyframeMaker:
         self._channel = channel
         self._work = work
 
+    def lacks_right_image(self, ctx: FrameContext) -> bool:
+        """True if a frame of a stereo camera came without its right image."""
+        return self._camera.stereo and ctx.images.right is None
+
     def first_points(self, ctx: FrameContext) -> NewPoints | None:
         """New landmarks for a keyframe without a track; None if too few of them have a depth."""
         points = new_points(ctx.images, np.zeros((0, 2)), self._camera, ctx.config)

@@ -42,6 +42,8 @@ class KeyframeStage:
         urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
             return ["governor: keyframe postponed"]
+        if not urgent and self._maker.lacks_right_image(ctx):  # its new landmarks would have no depth
+            return []
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             return []
         self.add(ctx, track)

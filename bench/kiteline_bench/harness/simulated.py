@@ -83,11 +83,11 @@ class RandomFlight:
 
 
 def random_flight(
-    number: int, trajectories: Path, scratch: Path, scale: float = 1.0, seconds: float = 0.0
+    number: int, trajectories: Path, scratch: Path, scale: float = 1.0, seconds: float = 0.0, **more: Any
 ) -> RandomFlight:
     """Flight `number`: 9 to 13 s of a recorded path, or of a random smooth one, with world, lens and noise of its own.
 
-    scale: of the images. seconds: another length.
+    scale: of the images. seconds: another length. more: options of the simulator, such as rig="worn".
     """
     rng = np.random.default_rng([number, 77])
     drawn = float(rng.uniform(9.0, 13.0))
@@ -112,7 +112,7 @@ def random_flight(
         path = scratch / f"path{number}.txt"
         _write_path(path, rng, seconds, (1.6, 1.8, 0.4) if scene == "room" else (4.0, 4.0, 0.8))
         options["trajectory"] = str(path)
-    source = open_sim(scene, **options)
+    source = open_sim(scene, **options, **more)
     assert source.imu is not None and source.ground_truth is not None
     recording = Recording(source.rig, source.imu, tuple(items_of(source)))
     return RandomFlight(recording, options["rest"] == 0.0)

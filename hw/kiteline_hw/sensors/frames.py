@@ -42,15 +42,15 @@ def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANC
 
 def pair_by_time(
     items: Iterable[tuple[int, int, T]], tolerance_ns: int, names: tuple[str, str], report: SourceReport
-) -> Iterator[tuple[int, T, T]]:
-    """Pair items (t_ns, side 0 or 1, item), given in order of time; yields (t_ns of side 0, item 0, item 1).
+) -> Iterator[tuple[int, T, T | None]]:
+    """Pair items (t_ns, side 0 or 1, item), given in order of time; yields (t_ns of side 0, item 0, item 1 or None).
 
     Each item is paired with the nearest of the other side within the tolerance; one without a partner is counted as
-    "missing <name>". Buffers the items of one tolerance at most.
+    "missing <name>", and yielded alone if it is of side 0. Buffers the items of one tolerance at most.
     """
     waiting: tuple[deque[tuple[int, T]], deque[tuple[int, T]]] = (deque(), deque())
 
-    def pair_waiting(now_ns: int | None) -> Iterator[tuple[int, T, T]]:
+    def pair_waiting(now_ns: int | None) -> Iterator[tuple[int, T, T | None]]:
         # An item can be paired once no nearer one can follow: after its own time plus the tolerance.
         while waiting[0] or waiting[1]:
             side = 0 if waiting[0] and (not waiting[1] or waiting[0][0][0] <= waiting[1][0][0]) else 1
@@ -67,6 +67,8 @@ def pair_by_time(
                     return
                 mine.popleft()
                 report.skip(f"missing {names[1 - side]}", f"{names[side]} at {t} ns has no partner")
+                if side == 0:
+                    yield t, item, None
                 continue
             # The candidate is later than this item: a later item of the same side may be nearer to it.
             t_other = other[0][0]
@@ -74,6 +76,8 @@ def pair_by_time(
             if rival is not None and abs(rival - t_other) < t_other - t:
                 mine.popleft()
                 report.skip(f"missing {names[1 - side]}", f"{names[side]} at {t} ns has no partner")
+                if side == 0:
+                    yield t, item, None
                 continue
             if rival is None and now_ns is not None and now_ns <= t_other + (t_other - t):
                 return
@@ -92,17 +96,18 @@ def decode_frames(
 ) -> Iterator[Frame | ImuBatch]:
     """Decode images into Frames; each Frame comes after the ImuBatch of the samples up to its time.
 
-    Unreadable images, images of another size and stamps that do not increase are skipped and counted.
-    Raises SourceError if no frame is usable.
+    Unreadable images, images of another size and stamps that do not increase are skipped and counted; a left image is
+    delivered without its right one where that is missing. Raises SourceError if no frame, or of a stereo rig none with
+    both images, is usable.
     """
     last_ns = -(2**63)
-    delivered = 0
+    delivered = paired = 0
     for encoded in frames:
         if encoded.t_ns <= last_ns:
             report.skip("frame stamp not increasing", f"{encoded.t_ns} ns after {last_ns} ns")
             continue
         try:
-            frame = _decode(encoded, rig)
+            frame = _decode(encoded, rig, report)
         except BadImage as error:
             report.skip("unreadable image", f"at {encoded.t_ns} ns: {error}")
             continue
@@ -114,25 +119,33 @@ def decode_frames(
         if batch is not None:
             yield batch
         delivered += 1
+        paired += frame.right is not None
         yield frame
-    if delivered == 0:
+    if delivered == 0 or (rig.right is not None and paired == 0):
         why = "; ".join(report.notes) or "it holds no images"
-        raise SourceError(f"{name}: not one usable frame ({why})")
+        raise SourceError(f"{name}: not one usable {'frame' if delivered == 0 else 'pair of images'} ({why})")
 
 
 class _WrongSize(Exception):
     pass
 
 
-def _decode(encoded: EncodedFrame, rig: CameraRig) -> Frame:
+def _decode(encoded: EncodedFrame, rig: CameraRig, report: SourceReport) -> Frame:
     left, left_bytes = decode_grey(encoded.left)
     _check_size("left", left.shape, rig.left.height, rig.left.width)
     kept = [left_bytes]
     right = depth = None
     if encoded.right is not None and rig.right is not None:
-        right, right_bytes = decode_grey(encoded.right)
-        _check_size("right", right.shape, rig.right.height, rig.right.width)
-        kept.append(right_bytes)
+        try:
+            decoded, right_bytes = decode_grey(encoded.right)
+            _check_size("right", decoded.shape, rig.right.height, rig.right.width)
+        except BadImage as error:
+            report.skip("unreadable image", f"right at {encoded.t_ns} ns: {error}")
+        except _WrongSize as error:
+            report.skip("image of another size", f"at {encoded.t_ns} ns: {error}")
+        else:
+            right = decoded
+            kept.append(right_bytes)
     if encoded.depth is not None and rig.has_depth:
         depth, depth_bytes = decode_depth(encoded.depth)
         _check_size("depth", depth.shape, rig.left.height, rig.left.width)

@@ -6,8 +6,11 @@ from dataclasses import dataclass, fields
 
 from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import SourceError
+from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.world.path import REST_S
 from kiteline_hw.sim.world.scenes import SCENES
+
+RIGS = ("true", "worn")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +41,9 @@ class SimConfig:
     read_noise: float = 1.2  # grey values
     shot_noise: float = 0.02  # variance per grey value
     miscalibration: float = 0.5  # error of the stated calibration, see rig.perturb; 0: none
+    rig: str = "true"  # or worn: it differs from its calibration by more than a good one does, see sensors/wear.py
+    rig_seed: int = -1  # of a worn rig; -1: that of the scene
+    wear: tuple[str, ...] = KINDS  # kinds of wear of a worn rig
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
 
@@ -59,6 +65,10 @@ def read_config(scene: str, **options: object) -> SimConfig:
         raise SourceError(f"unknown scene {config.scene!r}: expected one of {', '.join(SCENES)}")
     if config.lens not in [kind.value for kind in Lens]:
         raise SourceError(f"unknown lens {config.lens!r}: expected radtan, equidistant or none")
+    if config.rig not in RIGS:
+        raise SourceError(f"unknown rig {config.rig!r}: expected {' or '.join(RIGS)}")
+    if unknown := [kind for kind in config.wear if kind not in KINDS]:
+        raise SourceError(f"unknown wear {', '.join(unknown)}: expected some of {', '.join(KINDS)}")
     if not 0 <= config.agent <= len(config.also):
         raise SourceError(f"agent {config.agent} has no trajectory: {1 + len(config.also)} are given")
     if config.seed < 0 or config.seconds < 0 or config.start < 0 or not 0.05 <= config.scale <= 4:

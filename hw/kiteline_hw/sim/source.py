@@ -17,7 +17,7 @@ from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.ports import FrameSource, SourceError, SourceReport
 from kiteline_hw.sim.config import SimConfig, read_config
 from kiteline_hw.sim.sensors import imu as inertial
-from kiteline_hw.sim.sensors import odometer
+from kiteline_hw.sim.sensors import odometer, wear
 from kiteline_hw.sim.sensors.camera import SimCamera
 from kiteline_hw.sim.sensors.rig import make_rig, perturb
 from kiteline_hw.sim.world.built_in_paths import built_in_path, lap_s
@@ -74,16 +74,17 @@ class SimSource:
         self.imu = ImuCalibration(rate_hz=1e9 / IMU_NS) if config.imu else None
         stereo = not (config.mono or config.depth)
         self.rig: CameraRig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale)
-        rng = np.random.default_rng([config.seed * 64 + config.agent, 41])
-        self._true_rig = perturb(self.rig, rng, config.miscalibration)
+        self.worn = _worn_rig(config, self.rig)
         self.path = self._choose_path()
         self.world = world if world is not None else build_world(config, self.rig.T_b_c)
         seconds = self.path.duration_s if not config.seconds else min(config.seconds, self.path.duration_s)
         self.frame_count = int(seconds * 1e9) // FRAME_NS + (1 if not config.seconds else 0)
         if self.frame_count < 1:
             raise SourceError(f"a flight of {seconds:.2f} s has no frame: expected at least {FRAME_NS * 1e-9} s")
-        self._stamps = START_NS + FRAME_NS * np.arange(self.frame_count, dtype=np.int64)
-        self._motion: Motion = self.path.motion(flight_s(self._stamps, START_NS))
+        self._exposed_ns = START_NS + FRAME_NS * np.arange(self.frame_count, dtype=np.int64)
+        self._stamps = self.worn.stamps(self._exposed_ns)
+        self._has_partner = self.worn.has_partner(self.frame_count)
+        self._motion: Motion = self.path.motion(flight_s(self._exposed_ns, START_NS))
         self._gains = _gains(self.frame_count, config.seed * 64 + config.agent)
         self._workers = workers
 
@@ -101,14 +102,16 @@ class SimSource:
 
     @cached_property
     def ground_truth(self) -> Trajectory:
-        """True body poses at the stamps of the frames."""
-        return to_trajectory(self.path, self._stamps, START_NS)
+        """True body poses at the exposures of the frames, with the stamps of the frames."""
+        return Trajectory(self._stamps, to_trajectory(self.path, self._exposed_ns, START_NS).T_w_b)
 
     def imu_samples(self) -> ImuBatch:
         """All inertial samples of the flight."""
         stamps = np.arange(START_NS, int(self._stamps[-1]) + 1, IMU_NS, dtype=np.int64)
         calibration = ImuCalibration(rate_hz=1e9 / IMU_NS)
-        return inertial.measure(self.path, stamps, START_NS, calibration, self.config.seed * 64 + self.config.agent)
+        seed = self.config.seed * 64 + self.config.agent
+        wear = self.worn.imu if self.config.rig == "worn" else None
+        return inertial.measure(self.path, stamps, START_NS, calibration, seed, wear=wear)
 
     def odometry(self) -> OdometryBatch | None:
         """All odometer samples of the flight, or None without an odometer."""
@@ -119,7 +122,7 @@ class SimSource:
 
     def cameras(self) -> list[SimCamera]:
         """New cameras in the world, left first. Each thread needs its own."""
-        rig = self._true_rig
+        rig = self.worn.true
         left = [SimCamera(self.world, rig.left, rig.T_b_c)]
         if rig.right is None or rig.T_c_r is None:
             return left
@@ -130,8 +133,8 @@ class SimSource:
         c = self.config
         pose, velocity, rate = self._motion.T_w_b[k], self._motion.velocity[k], self._motion.rate[k]
         noise = (c.read_noise, c.shot_noise)
-        images = []
-        for side, camera in enumerate(cameras):
+        images: list[NDArray[np.uint8]] = []
+        for side, camera in enumerate(cameras if self._has_partner[k] else cameras[:1]):
             gain = float(self._gains[k]) * (1.0, 0.97)[side]
             key = (((c.seed * 64 + c.agent) << 36) + (2 * k + side) * 0xD1342543DE82) & ((1 << 63) - 1)
             images.append(camera.take_image(pose, velocity, rate, c.exposure_s, gain, noise, key))
@@ -144,7 +147,8 @@ class SimSource:
         for frame in self._images():
             if batch is not None:
                 end = int(np.searchsorted(batch.t_ns, frame.t_ns, side="right"))
-                yield ImuBatch(batch.t_ns[done:end], batch.gyro[done:end], batch.accel[done:end])
+                if end > done:
+                    yield ImuBatch(batch.t_ns[done:end], batch.gyro[done:end], batch.accel[done:end])
                 done = end
             if velocities is not None:
                 end = int(np.searchsorted(velocities.t_ns, frame.t_ns, side="right"))
@@ -179,6 +183,15 @@ class SimSource:
 
     def close(self) -> None:
         """Nothing to release."""
+
+
+def _worn_rig(config: SimConfig, rig: CameraRig) -> wear.WornRig:
+    """The true rig for which `rig` is the calibration."""
+    seed = config.seed * 64 + config.agent
+    good = perturb(rig, np.random.default_rng([seed, 41]), config.miscalibration)
+    chosen = wear.selected(config.wear, wear.WearConfig()) if config.rig == "worn" else wear.NO_WEAR
+    own_seed = seed if config.rig_seed < 0 else config.rig_seed * 64 + config.agent
+    return wear.draw(rig, good, ImuCalibration(rate_hz=1e9 / IMU_NS), own_seed, chosen)
 
 
 def _gains(frames: int, seed: int) -> F64:

@@ -65,7 +65,7 @@ def _read_frames(images: list[Stamped], report: SourceReport) -> Iterator[Encode
     tolerance_ns = pair_tolerance_ns(np.array([t for t, _ in images[0]], np.int64))
     merged = heapq.merge(*sides, key=lambda item: item[0])
     for t, left, right in pair_by_time(merged, tolerance_ns, ("left image", "right image"), report):
-        yield EncodedFrame(t, ImageFile(left), ImageFile(right))
+        yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
 
 
 def _read_imu(path: Path, report: SourceReport) -> ImuSamples:

@@ -73,6 +73,7 @@ def _read_frames(
             yield EncodedFrame(t, ImageFile(left), ImageFile(by_stem[left.stem]))
         else:
             report.skip("missing right image", f"{left.name} has no partner")
+            yield EncodedFrame(t, ImageFile(left))
     stems = {path.stem for path in lefts}
     for path in rights:
         if path.stem not in stems:

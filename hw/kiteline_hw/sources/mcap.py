@@ -330,7 +330,8 @@ class McapSource:
         names = ("left image", "right image" if stereo else "depth image")
         for t, left, other in pair_by_time(images(), tolerance_ns, names, self.report):
             if not both:
-                yield EncodedFrame(t, left, other) if stereo else EncodedFrame(t, left, depth=other)
+                if stereo or other is not None:
+                    yield EncodedFrame(t, left, other) if stereo else EncodedFrame(t, left, depth=other)
                 continue
             while depths and depths[0][0] < t:
                 depths.popleft()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,8 @@ from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.images import encode_depth, encode_image
-from kiteline_hw.sim.config import SimConfig, read_config
+from kiteline_hw.sim.config import RIGS, SimConfig, read_config
+from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.world.world import World, occupancy, write_occupancy
 from kiteline_lab.flights.out_file import whole_file
@@ -30,7 +32,7 @@ def main(argv: list[str]) -> int:
     p = argparse.ArgumentParser(
         prog="kiteline sim",
         description="Record a simulated flight: images, inertial samples and true poses as a log that flies like any "
-        "other, and the true occupancy beside it (F.yaml, F.pgm).",
+        "other. Beside it the true occupancy (F.yaml, F.pgm) and the true rig (F.rig_truth.json).",
         epilog="The same scene, seed and trajectories give the same bytes.",
     )
     p.add_argument("scene", metavar="SCENE", help="room, hall, corridor or street, perhaps with options: room?seed=3")
@@ -42,6 +44,10 @@ def main(argv: list[str]) -> int:
     p.add_argument("--seconds", type=float, help="length of the flight (default: all of F, or 20 of the course)")
     p.add_argument("--start", type=float, help="s into the trajectory (default 0)")
     p.add_argument("--lens", choices=("radtan", "equidistant", "none"), help="default radtan")
+    p.add_argument("--rig", choices=RIGS, help="worn: cameras, IMU and stamps that differ from the told calibration as "
+                   "they do in the field (default true)")  # fmt: skip
+    p.add_argument("--rig-seed", metavar="N", type=int, help="of a worn rig (default: the seed)")
+    p.add_argument("--wear", metavar="KIND", nargs="+", help=f"only these kinds of wear: {', '.join(KINDS)}")
     p.add_argument("--mono", action="store_true", default=None, help="no right camera")
     p.add_argument("--depth", action="store_true", default=None, help="true depth in place of the right camera")
     p.add_argument("--no-imu", dest="imu", action="store_false", default=None, help="no inertial samples")
@@ -51,8 +57,10 @@ def main(argv: list[str]) -> int:
     p.add_argument("--png", action="store_true", help=f"images without loss (default JPEG {JPEG_QUALITY})")
     p.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="threads that render (default: all cores)")
     o = p.parse_args(argv)
-    names = ("trajectory", "seed", "seconds", "start", "lens", "mono", "depth", "imu", "odometry")
+    names = ("trajectory", "seed", "seconds", "start", "lens", "mono", "depth", "imu", "odometry", "rig", "rig_seed")
     options: dict[str, object] = {name: getattr(o, name) for name in names if getattr(o, name) is not None}
+    if o.wear:
+        options["wear"] = tuple(o.wear)
     if o.also:
         options["also"] = tuple("" if name == COURSE else name for name in o.also)
     config = read_config(o.scene, **options)
@@ -63,6 +71,8 @@ def main(argv: list[str]) -> int:
         out = o.out if agent == 0 else o.out.with_name(f"{o.out.stem}-{agent}{o.out.suffix}")
         with whole_file(out, True) as part:
             samples = record(source, part, o.png)
+        truth = out.with_suffix(".rig_truth.json")
+        truth.write_text(json.dumps({"rig": config.rig, **source.worn.to_json()}, indent=1) + "\n")
         print(f"{out}: {source.frame_count} frames, {samples} imu samples, {out.stat().st_size / 1e6:.1f} MB")
     assert world is not None
     grid = o.out.with_suffix(".yaml")

@@ -179,7 +179,8 @@ def test_euroc_broken_images_are_skipped_and_counted(tmp_path: Path) -> None:
     (cam1 / "data.csv").write_text("\n".join(line for line in csv if str(stamps[6]) not in line))
     source = open_source(str(root))
     frames, _ = read(source)
-    assert [f.t_ns for f in frames] == [stamps[0], stamps[7]]
+    assert [f.t_ns for f in frames] == [stamps[0], *stamps[3:]]
+    assert [f.right is None for f in frames] == [False, *4 * [True], False]
     assert source.report.skipped == {"unreadable image": 4, "image of another size": 1, "missing right image": 1}
     assert any("64x40" in note and "64x48" in note for note in source.report.notes)
 
@@ -197,7 +198,7 @@ def test_euroc_left_and_right_are_paired_by_time(tmp_path: Path) -> None:
     ]
     (root / "mav0/cam1/data.csv").write_text("\n".join(shifted))
     source = open_source(str(root))
-    with pytest.raises(SourceError, match="not one usable frame"):
+    with pytest.raises(SourceError, match="not one usable pair of images"):
         read(source)
     assert source.report.skipped == {"missing right image": 4, "missing left image": 4}
 
@@ -286,7 +287,10 @@ def test_kitti_missing_right_images_and_numbered_rows(tmp_path: Path) -> None:
     (root / "image_0/000003.png").unlink()
     (root / "times.txt").write_text("\n".join(str(0.1 * i) for i in range(5)))
     source = open_source(str(root))
-    assert [f.t_ns for f in read(source)[0]] == [0, 100_000_000, 400_000_000]
+    frames = read(source)[0]
+    assert [(f.t_ns, f.right is None) for f in frames] == [
+        (0, False), (100_000_000, False), (200_000_000, True), (400_000_000, False),
+    ]  # fmt: skip
     assert source.report.skipped == {"missing right image": 1, "missing left image": 1}
 
 

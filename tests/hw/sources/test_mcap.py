@@ -466,7 +466,8 @@ def test_faults_in_a_bag_are_skipped_and_counted(tmp_path: Path) -> None:
     bag.messages = kept
     source = open_source(str(bag.write(tmp_path / "a.mcap")))
     frames, batches = read(source)
-    assert [stamp[f.t_ns] for f in frames] == [0, 4, 5, 6, 7]
+    assert [stamp[f.t_ns] for f in frames] == [0, 2, 3, 4, 5, 6, 7]
+    assert [f.right is None for f in frames] == [False, True, True, *4 * [False]]
     assert source.report.skipped == {
         "unreadable image": 1, "image of another size": 1, "missing right image": 1, "imu sample not finite": 1,
         "imu stamp not increasing": 1,
