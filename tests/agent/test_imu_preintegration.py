@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
-from kiteline_agent.inertial.preintegration import Preintegrated, SampleBuffer, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 

@@ -162,15 +162,19 @@ def test_blind_for_too_long_says_so() -> None:
     assert not tracker.running
 
 
-def test_a_hole_in_the_samples_is_survived() -> None:
+@pytest.mark.parametrize(("frames", "goes_on"), [(2, True), (8, False)])
+def test_a_hole_in_the_samples_is_survived(frames: int, goes_on: bool) -> None:
+    """A short one is bridged by the images; after a long one the state begins anew."""
     steps = flight(90, 5)
     tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig())
-    running = []
+    running, apart = [], []
     for k, step in enumerate(steps):
-        tracker.predict(None if 40 <= k < 44 else step.imu, step.t_ns)
-        tracker.update(step.t_ns, step.visual, step.points)
+        tracker.predict(None if 40 <= k < 40 + frames else step.imu, step.t_ns)
+        state = tracker.update(step.t_ns, step.visual, step.points)
         running.append(tracker.running)
-    assert running[39] and not running[44] and running[-1]
+        apart.append(apart_m(state, step.truth) if state is not None else 0.0)
+    assert running[39] and running[40 + frames] == goes_on and running[-1]
+    assert max(apart[30:]) < 0.01
 
 
 @pytest.mark.parametrize("late_ns", [25_000_000, 12_000_000, -8_000_000])

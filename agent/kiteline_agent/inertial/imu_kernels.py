@@ -116,9 +116,9 @@ def preintegrate(
 ) -> None:
     """Motion between the first and the last sample, in the body frame of the first and without gravity.
 
-    t_s: (n,) s, increasing. gyro, accel: (n,3). bias: (6,) gyro, accel, taken off. density: (2,) noise of gyro and
-    accel per square root of Hz. Out: turn (3,3); vp (6,) change of velocity, change of position; cov (9,9) of
-    [rotation, velocity, position]; jac (9,6) of the same by the biases.
+    t_s: (n,) s, increasing. gyro, accel: (n,3). bias: (6,) gyro, accel, taken off. density: (n-1,2) noise of gyro and
+    accel per square root of Hz in each step. Out: turn (3,3); vp (6,) change of velocity, change of position; cov (9,9)
+    of [rotation, velocity, position]; jac (9,6) of the same by the biases.
     """
     n = t_s.shape[0]
     w, a0, a1, aa = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
@@ -183,7 +183,7 @@ def preintegrate(
                 for m in range(9):
                     s += f[i, m] * cov[m, j]
                 tmp[i, j] = s
-        qg, qa = density[0] * density[0] / dt, density[1] * density[1] / dt
+        qg, qa = density[k, 0] * density[k, 0] / dt, density[k, 1] * density[k, 1] / dt
         for i in range(9):
             for j in range(6):
                 jac[i, j] = tmp6[i, j]

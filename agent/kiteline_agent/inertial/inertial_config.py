@@ -14,7 +14,7 @@ class InertialConfig:
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     silent_s: float = 3.0  # time without a sample after which an event is logged
-    max_gap_s: float = 0.05  # a longer gap in the samples makes an interval unknown
+    max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked
     rest_window_s: float = 0.3  # time that the vehicle must stand still to start from rest
     rest_gyro_rad_s: float = 0.02  # standard deviation of the gyro below which the vehicle stands still
     rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.preintegration import SampleBuffer, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_agent.inertial.rotation_comparison import RotationComparison
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial.time_offset import TimeOffsetEstimator
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3

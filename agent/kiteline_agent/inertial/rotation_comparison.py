@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.inertial.preintegration import SampleBuffer, preintegrate
+from kiteline_agent.inertial.preintegration import preintegrate
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial.time_offset import TimeOffsetEstimator
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3

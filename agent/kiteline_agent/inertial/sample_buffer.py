@@ -1,0 +1,149 @@
+"""The newest IMU samples, and the noise that they show."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.preintegration import Samples
+from kiteline_core.frame import ImuBatch
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_NOISE_MEMORY_S = 0.5  # over which the noise is averaged: rotors change speed faster than biases do
+_ATTACK = 4.0  # factor of variance above which new noise is believed at once: motors start
+_EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
+_GAP = 2.5  # of the usual step: a longer one misses samples
+_GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
+_CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2 = 1.0, 10.0  # error of a sample at the end of the range
+_RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2 = 2.0, 15.0  # no IMU has a smaller range
+
+
+class SampleBuffer:
+    """The newest IMU samples in order of time.
+
+    The white part of the noise is measured by second differences, to which motion hardly contributes: vibration is
+    often far above the noise density of a data sheet. Steps across missing or clipped samples have more.
+    """
+
+    def __init__(self, keep_s: float, max_gap_s: float) -> None:
+        """keep_s: length of the buffer. max_gap_s: a longer gap makes an interval unknown."""
+        self._keep_ns = int(keep_s * 1e9)
+        self._gap_ns = int(max_gap_s * 1e9)
+        self._t: I64 = np.zeros(0, np.int64)
+        self._values = np.zeros((0, 6))
+        self._clipped: Bools = np.zeros((0, 2), np.bool_)
+        self._largest = np.array([_RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2])  # magnitudes so far
+        self._step_ns: float | None = None  # usual time between two samples
+        self._variance = np.zeros(2)  # of the noise of one sample: gyro, accel
+
+    def push(self, imu: ImuBatch | None) -> None:
+        """Append samples that are finite and newer than the newest one."""
+        if imu is None or len(imu.t_ns) == 0:
+            return
+        values = np.concatenate([imu.gyro, imu.accel], axis=1)
+        newest = int(self._t[-1]) if len(self._t) else -(1 << 62)
+        good = (imu.t_ns > newest) & np.isfinite(values).all(axis=1)
+        new = int(np.count_nonzero(good))
+        t = np.concatenate([self._t, imu.t_ns[good]])
+        if len(t) == 0:
+            return
+        first = int(np.searchsorted(t, t[-1] - self._keep_ns))
+        self._t, self._values = t[first:], np.concatenate([self._values, values[good]])[first:]
+        self._clipped = np.concatenate([self._clipped, np.zeros((new, 2), np.bool_)])[first:]
+        if new:
+            self._find_clipped(new)
+            self._measure_noise(new)
+
+    @property
+    def newest_t_ns(self) -> int | None:
+        """Time of the newest sample."""
+        return int(self._t[-1]) if len(self._t) else None
+
+    @property
+    def density(self) -> F64:
+        """Measured noise density (2,) of gyro (rad/s/sqrt(Hz)) and accelerometer (m/s^2/sqrt(Hz))."""
+        return np.asarray(np.sqrt(self._variance * (self._step_ns or 0.0) * 1e-9))
+
+    def between(self, from_ns: int, to_ns: int) -> Samples | None:
+        """Samples from one instant to another, ends interpolated (held beyond the newest); None with a gap."""
+        t = self._t
+        if len(t) < 2 or to_ns <= from_ns:
+            return None
+        lo, hi = int(np.searchsorted(t, from_ns, "right")), int(np.searchsorted(t, to_ns, "left"))
+        stamps = np.concatenate([[from_ns], t[lo:hi], [to_ns]])
+        steps = np.diff(stamps)
+        if from_ns < t[0] - self._gap_ns or to_ns > t[-1] + self._gap_ns or steps.max() > self._gap_ns:
+            return None
+        values = np.empty((hi - lo + 2, 6))
+        values[1:-1] = self._values[lo:hi]
+        values[0] = self._at(from_ns)
+        values[-1] = self._at(to_ns)
+        return Samples(
+            (stamps - from_ns) * 1e-9,
+            np.ascontiguousarray(values[:, :3]),
+            np.ascontiguousarray(values[:, 3:]),
+            self._densities(steps, lo, hi),
+        )
+
+    def mean(self, from_ns: int, to_ns: int) -> tuple[F64, F64, int]:
+        """Mean (6,) and standard deviation (6,) of the samples between two instants, and their number."""
+        chosen = self._values[(self._t >= from_ns) & (self._t <= to_ns)]
+        if len(chosen) == 0:
+            return np.zeros(6), np.zeros(6), 0
+        return chosen.mean(axis=0), chosen.std(axis=0), len(chosen)
+
+    def _at(self, t_ns: int) -> F64:
+        t = self._t
+        k = int(np.searchsorted(t, t_ns))
+        if k == 0 or k == len(t):
+            return np.asarray(self._values[min(k, len(t) - 1)])
+        share = (t_ns - int(t[k - 1])) / (int(t[k]) - int(t[k - 1]))
+        return np.asarray((1.0 - share) * self._values[k - 1] + share * self._values[k])
+
+    def _densities(self, steps: I64, lo: int, hi: int) -> F64:
+        """Noise density (n,2) of the steps (n,) in ns, between samples lo - 1 and hi."""
+        out = np.empty((len(steps), 2))
+        out[:] = self.density
+        clipped = self._clipped[max(lo - 1, 0) : hi + 1]
+        missed = steps > _GAP * self._step_ns if self._step_ns else np.zeros(len(steps), np.bool_)
+        if missed.any():
+            dt_s = steps[missed] * 1e-9
+            out[missed] = np.sqrt(out[missed] ** 2 + np.outer(dt_s, [_GAP_GYRO_RAD_S**2, _GAP_ACCEL_M_S2**2]))
+        if clipped.any():
+            extra = np.array([_CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2]) * clipped.any(axis=0)
+            out = np.sqrt(out**2 + np.outer(steps * 1e-9, extra**2))
+        return out
+
+    def _find_clipped(self, new: int) -> None:
+        """Mark new samples that repeat the largest magnitude of the flight: the end of the range."""
+        values = self._values[-new - 1 :]
+        for sensor in range(2):
+            size = np.abs(values[:, 3 * sensor : 3 * sensor + 3])
+            largest = float(size.max())
+            if largest < self._largest[sensor]:
+                continue
+            self._largest[sensor] = largest
+            at_end = (size == largest).any(axis=1)
+            if np.count_nonzero(at_end) > 1:
+                self._clipped[-len(values) :, sensor] |= at_end
+
+    def _measure_noise(self, new: int) -> None:
+        t, values = self._t[-new - 2 :], self._values[-new - 2 :]
+        steps = np.diff(t)
+        if len(steps) < 2:
+            return
+        usual = float(np.median(steps))
+        self._step_ns = usual if self._step_ns is None else self._step_ns + 0.1 * (usual - self._step_ns)
+        longest = np.maximum(steps[1:], steps[:-1])
+        even = (longest <= _EVEN * np.minimum(steps[1:], steps[:-1])) & (longest <= _GAP * self._step_ns)
+        if not even.any():
+            return
+        # white noise of variance v has second differences of variance 6 v
+        bent = (values[2:] - 2.0 * values[1:-1] + values[:-2])[even]
+        found = np.mean(bent.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 6.0
+        share = 1.0 - float(np.exp(-len(bent) * self._step_ns * 1e-9 / _NOISE_MEMORY_S))
+        averaged = self._variance + share * (found - self._variance)
+        self._variance = np.where(found > _ATTACK * self._variance, found, averaged)

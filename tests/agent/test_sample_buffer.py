@@ -1,0 +1,103 @@
+"""The noise that IMU samples show: vibration, missing samples, the end of the range."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.frame import ImuBatch, ImuCalibration
+
+F64 = NDArray[np.float64]
+STEP_NS = 5_000_000
+CALIBRATION = ImuCalibration()
+
+
+def lively(n: int, noise: float = 0.0, seed: int = 0) -> tuple[F64, F64]:
+    """Gyro and accelerometer (n,3) of a lively motion; noise: factor on the densities of the calibration."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n)[:, None] * STEP_NS * 1e-9
+    root = noise * np.sqrt(CALIBRATION.rate_hz)
+    gyro = 1.5 * np.sin(t * [3.0, 5.0, 4.0]) + root * CALIBRATION.gyro_noise * rng.normal(size=(n, 3))
+    accel = (
+        [0.0, 0.0, 9.8] + 3.0 * np.sin(t * [4.0, 6.0, 5.0]) + root * CALIBRATION.accel_noise * rng.normal(size=(n, 3))
+    )
+    return gyro, accel
+
+
+def filled(gyro: F64, accel: F64, without: slice = slice(0)) -> SampleBuffer:
+    """A buffer that was given the samples ten by ten, without some of them."""
+    buffer = SampleBuffer(10.0, 0.2)
+    stamps = np.arange(len(gyro), dtype=np.int64) * STEP_NS
+    kept = np.ones(len(gyro), np.bool_)
+    kept[without] = False
+    for k in range(0, len(gyro), 10):
+        some = np.arange(k, min(k + 10, len(gyro)))[kept[k : k + 10]]
+        buffer.push(ImuBatch(stamps[some], gyro[some], accel[some]))
+    return buffer
+
+
+def interval(buffer: SampleBuffer, begin: int, end: int) -> Samples:
+    samples = buffer.between(begin * STEP_NS, end * STEP_NS)
+    assert samples is not None
+    return samples
+
+
+@pytest.mark.parametrize("factor", [1.0, 10.0, 40.0])
+def test_noise_is_measured_in_motion(factor: float) -> None:
+    buffer = filled(*lively(600, factor))
+    np.testing.assert_allclose(
+        buffer.density, factor * np.array([CALIBRATION.gyro_noise, CALIBRATION.accel_noise]), rtol=0.25
+    )
+
+
+def test_motion_is_no_noise() -> None:
+    assert (filled(*lively(600)).density < 0.3 * np.array([CALIBRATION.gyro_noise, CALIBRATION.accel_noise])).all()
+
+
+def test_noise_that_begins_is_believed_at_once_and_forgotten_when_it_ends() -> None:
+    quiet, loud = lively(400, 1.0), lively(400, 20.0)
+    both = [np.concatenate([q[:200], v[200:220], q[220:]]) for q, v in zip(quiet, loud, strict=True)]
+    begun = filled(both[0][:220], both[1][:220]).density
+    assert (begun > 10.0 * np.array([CALIBRATION.gyro_noise, CALIBRATION.accel_noise])).all()
+    assert (filled(both[0], both[1]).density < 0.5 * begun).all()
+
+
+def test_a_noisy_interval_has_a_larger_covariance_and_a_quiet_one_that_of_the_calibration() -> None:
+    quiet, loud = (interval(filled(*lively(400, factor)), 300, 310) for factor in (1.0, 20.0))
+    told, low, high = (
+        preintegrate(s, np.zeros(6), CALIBRATION, 3.0).cov
+        for s in (Samples(quiet.t_s, quiet.gyro, quiet.accel), quiet, loud)
+    )
+    np.testing.assert_array_equal(told, low)
+    assert (np.diag(high) > 10.0 * np.diag(told)).all()
+
+
+def test_missing_samples_are_interpolated_with_a_larger_covariance() -> None:
+    gyro, accel = lively(400, 1.0)
+    whole, holed = filled(gyro, accel), filled(gyro, accel, slice(300, 310))
+    true, found = (preintegrate(interval(b, 295, 315), np.zeros(6), CALIBRATION) for b in (whole, holed))
+    error = found.vp - true.vp
+    assert (np.diag(found.cov) > 100.0 * np.diag(true.cov)).all()
+    assert (error**2 < 9.0 * np.diag(found.cov)[3:]).all()
+    elsewhere = [preintegrate(interval(b, 340, 360), np.zeros(6), CALIBRATION).cov for b in (whole, holed)]
+    np.testing.assert_allclose(elsewhere[0], elsewhere[1], rtol=0.5)
+
+
+def test_a_hole_too_long_makes_an_interval_unknown() -> None:
+    gyro, accel = lively(400, 1.0)
+    assert filled(gyro, accel, slice(300, 345)).between(295 * STEP_NS, 350 * STEP_NS) is None
+
+
+def test_clipped_samples_are_doubted() -> None:
+    gyro, accel = lively(400, 1.0)
+    accel[300:310, 2] += 15.0
+    free, clipped = filled(gyro, accel), filled(gyro, np.minimum(accel, 19.6))
+    sure, doubtful = (preintegrate(interval(b, 295, 315), np.zeros(6), CALIBRATION) for b in (free, clipped))
+    error = doubtful.vp - sure.vp
+    assert np.linalg.norm(error[:3]) > 0.1
+    assert (error**2 < 9.0 * np.diag(doubtful.cov)[3:]).all()
+    # the gyro was not at its end
+    np.testing.assert_allclose(doubtful.cov[:3, :3], sure.cov[:3, :3])
