@@ -32,6 +32,7 @@ from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
+from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import FrameSource
@@ -72,6 +73,7 @@ class AgentRuntime:
         self.reader = FrameReader(source, until_ns, time.process_time_ns)
         self._files = ExitStack()
         self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
+        self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, config.log.waiting))
         self._record = self._open_record(config) if options.log_name else None
         self.agent = Agent(
             source.rig,
@@ -98,7 +100,7 @@ class AgentRuntime:
         folder = Path(options.folder)
         folder.mkdir(parents=True, exist_ok=True)
         about = metadata(options, source.name, config, self.channel)
-        log = self._files.enter_context(LogWriter(folder / options.log_name, about))
+        log = self._files.enter_context(LogWriter(folder / options.log_name, about, encoder=self._encoder))
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
         live, odometry = (
@@ -135,6 +137,7 @@ class AgentRuntime:
         """Begin a live flight: `begin_ns` of its clock is flight time 0."""
         assert self.reader.next_ns is not None
         self._live_clock = True
+        self._encoder.stores = True
         self.options = replace(self.options, start_ns=self.reader.next_ns)
         self._log_shift_ns = self.options.start_ns - begin_ns
 
@@ -185,13 +188,15 @@ class AgentRuntime:
         self.end_of_frames()
         assert self.flight_counts is not None
         total = self.counts.as_report()
-        skipped = self.source.report.skipped
+        skipped, notes = self.source.report.skipped, list(self.source.report.notes)
+        if self._encoder.stored:
+            notes.append(f"log: {self._encoder.stored} images stored uncompressed, as encoding fell behind")
         return {
             "source": self.source.name,
             **self.flight_counts,
             "link": self.channel.report() if isinstance(self.channel, CodedChannel) else {},
             "skipped": dict(sorted(skipped.items())),
-            "notes": list(self.source.report.notes),
+            "notes": notes,
             "scale": "metric" if self.agent.metric else "own",
             "time_offset": self.agent.time_offset_report(),
             "odometer": self.agent.odometer_report(),

@@ -13,7 +13,8 @@ Write::
     log.close()                                                 # also a context manager
 
 Log times are handed in and nothing here reads a clock, so equal calls give equal bytes. Chunks are written at 64 KiB
-and after one second of flight time, so that a cut file loses little.
+and after one second of flight time, so that a cut file loses little. Raw images are encoded in a thread of its own;
+messages keep their order and wait for the images before them.
 
 Read::
 
@@ -30,21 +31,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs import mcap_schemas as schemas
+from kiteline_hw.logs.image_encoder import ENCODE_ALL, ImageEncoder
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
+from kiteline_hw.logs.mcap_write import McapWriter
 from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sensors.images import encode_depth, encode_image
 from kiteline_hw.system.closing import Closing
 
 F64 = NDArray[np.float64]
@@ -60,6 +62,8 @@ IMU, ODOMETER, RIG, GROUND_TRUTH = "/imu", "/odometer", "/rig", "/ground_truth"
 CHUNK_BYTES = 64 * 1024  # bytes; a cut loses one unfinished chunk at most
 FLUSH_NS = 1_000_000_000  # ns of flight time after which an unfinished chunk is written
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+_JSON = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+_NO_NOTES: Mapping[str, str] = {}
 
 
 class LogWriter(Closing):
@@ -67,14 +71,16 @@ class LogWriter(Closing):
 
     rotate_bytes: size at which a new file NAME_1.mcap, NAME_2.mcap… is started. cap_bytes: limit on disk; with rotation
     the oldest files are deleted, without it writing stops. dropped: messages not written, also because of a full disk.
+    encoder: of raw images; it is closed with the log.
     """
 
     def __init__(
         self, path: Path | str, metadata: Mapping[str, str], *, rotate_bytes: int | None = None,
-        cap_bytes: int | None = None,
+        cap_bytes: int | None = None, encoder: ImageEncoder | None = None,
     ) -> None:  # fmt: skip
         self.path = Path(path)
         self.dropped = 0
+        self._encoder = ImageEncoder(ENCODE_ALL) if encoder is None else encoder
         self._metadata = dict(metadata)
         self._rotate_bytes, self._cap_bytes = rotate_bytes, cap_bytes
         self._files: list[Path] = []
@@ -94,19 +100,14 @@ class LogWriter(Closing):
             self.transform("/tf_static", t_ns, "left", "right", rig.T_c_r)
 
     def frame(self, frame: Frame) -> None:
-        """The images of a frame, as encoded in the source; raw ones are encoded as PNG."""
-        t, kept = frame.t_ns, list(frame.encoded)
-        if not kept:
-            kept.append(encode_image(frame.left))
-            if frame.right is not None:
-                kept.append(encode_image(frame.right))
-            if frame.depth_m is not None:
-                kept.append(encode_depth(frame.depth_m))
-        self.image(LEFT, t, kept[0], "left")
+        """The images of a frame, as encoded in the source; raw ones are encoded as PNG, in another thread."""
+        t = frame.t_ns
+        kept: list[EncodedImage | Future[EncodedImage]] = [*frame.encoded] or self._encoder.encode(frame)
+        self._image(LEFT, t, kept[0], "left")
         if frame.right is not None:
-            self.image(RIGHT, t, kept[1], "right")
+            self._image(RIGHT, t, kept[1], "right")
         if frame.depth_m is not None:
-            self.image(DEPTH, t, kept[-1], "left")
+            self._image(DEPTH, t, kept[-1], "left")
 
     def image(self, topic: str, t_ns: int, image: EncodedImage, frame_id: str) -> None:
         """An encoded image. The scale of a depth format such as "png/5000" is stored in the channel's metadata."""
@@ -115,6 +116,12 @@ class LogWriter(Closing):
         self._stamp(message, t_ns)
         notes = {"depth_scale": scale} if scale else {}
         self._add(topic, t_ns, message, notes, schemas.bytes_field(schemas.CompressedImage, "data", image.data))
+
+    def _image(self, topic: str, t_ns: int, image: EncodedImage | Future[EncodedImage], frame_id: str) -> None:
+        if isinstance(image, EncodedImage):
+            self.image(topic, t_ns, image, frame_id)
+        else:
+            self._encoder.then(image, lambda done: self.image(topic, t_ns, done, frame_id))
 
     def imu(self, topic: str, t_ns: int, batch: ImuBatch) -> None:
         """A batch of inertial samples."""
@@ -205,29 +212,39 @@ class LogWriter(Closing):
 
     def blob(self, topic: str, t_ns: int, data: bytes) -> None:
         """Opaque bytes."""
-        self._add(topic, t_ns, schemas.Blob(data=data))
+        pieces = schemas.bytes_field(schemas.Blob, "data", data) if data else ()
+        self._write(topic, t_ns, schemas.Blob, pieces, _NO_NOTES)
 
     def json(self, topic: str, t_ns: int, value: object, schema: str = "kiteline.Json") -> None:
         """A JSON value; keys keep their order."""
-        data = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
-        self._write(topic, t_ns, "json", schema, "jsonschema", b'{"type":"object"}', data, {})
+        self._write(topic, t_ns, schema, (_JSON.encode(value).encode(),), _NO_NOTES)
 
     def flush(self) -> None:
-        """Pass all logged data to the operating system."""
+        """Pass all logged data to the operating system; waits for images that are being encoded."""
+        self._encoder.drain()
         try:
             self._writer.flush()
         except OSError:
-            self.dropped += 1
+            self._count_lost()
 
     def close(self) -> None:
         """Finish the file with its index."""
+        self._encoder.close()
+        self._finish()
+
+    def _finish(self) -> None:
         if self._stream.closed:
             return
         try:
             self._writer.finish()
             self._stream.close()
         except OSError:
-            self.dropped += 1
+            self._count_lost()
+
+    def _count_lost(self) -> None:
+        """Count what a full disk did not take."""
+        self.dropped += max(1, self._writer.lost)
+        self._writer.lost = 0
 
     def _open(self) -> None:
         number = len(self._files)
@@ -237,12 +254,10 @@ class LogWriter(Closing):
         except OSError as error:
             raise SourceError(f"{path}: cannot write the log: {error.strerror}") from error
         self._files.append(path)
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-        self._writer.start("", "kiteline")
+        self._writer = McapWriter(self._stream, CHUNK_BYTES, "kiteline")
         self._writer.add_metadata("kiteline", self._metadata)
-        self._channels: dict[str, tuple[int, str, dict[str, str]]] = {}
+        self._channels: dict[str, tuple[int, object]] = {}  # number and kind, by topic
         self._schemas: dict[str, int] = {}
-        self._sequence: dict[int, int] = {}
         self._flushed_ns: int | None = None
         self._bytes = 0
 
@@ -250,18 +265,22 @@ class LogWriter(Closing):
         message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, 1_000_000_000)
 
     def _add(
-        self, topic: str, t_ns: int, message: Any, notes: dict[str, str] | None = None, rest: tuple[bytes, ...] = ()
+        self, topic: str, t_ns: int, message: Any, notes: Mapping[str, str] = _NO_NOTES, rest: tuple[bytes, ...] = ()
     ) -> None:
-        name: str = message.DESCRIPTOR.full_name
-        schema = schemas.schema_data(type(message))
-        data = b"".join((message.SerializeToString(), *rest))
-        self._write(topic, t_ns, "protobuf", name, "protobuf", schema, data, notes or {})
+        self._write(topic, t_ns, type(message), (message.SerializeToString(), *rest), notes)
 
-    def _write(
-        self, topic: str, t_ns: int, encoding: str, name: str, kind: str, schema: bytes, data: bytes,
-        notes: dict[str, str],
-    ) -> None:  # fmt: skip
-        size = len(data) + 64
+    def _write(self, topic: str, t_ns: int, kind: object, pieces: tuple[bytes, ...], notes: Mapping[str, str]) -> None:
+        """Write a message, or keep it while images before it are being encoded. kind: as in `_register`."""
+        if self._encoder.waiting:
+            self._encoder.then(None, lambda _: self._write_now(topic, t_ns, kind, pieces, notes))
+            self._encoder.drain(wait=False)
+        else:
+            self._write_now(topic, t_ns, kind, pieces, notes)
+
+    def _write_now(
+        self, topic: str, t_ns: int, kind: object, pieces: tuple[bytes, ...], notes: Mapping[str, str]
+    ) -> None:
+        size = sum(map(len, pieces)) + 64
         if self._cap_bytes is not None and not self._rotate_bytes and self._bytes + size > self._cap_bytes:
             self.dropped += 1
             return
@@ -270,17 +289,10 @@ class LogWriter(Closing):
         try:
             known = self._channels.get(topic)
             if known is None:
-                if name not in self._schemas:
-                    self._schemas[name] = self._writer.register_schema(name, kind, schema)
-                channel = self._writer.register_channel(topic, encoding, self._schemas[name], notes)
-                self._channels[topic] = (channel, name, notes)
-            elif known[1] != name:
-                raise ValueError(f"topic {topic} holds {known[1]}, not {name}")
-            else:
-                channel = known[0]
-            sequence = self._sequence.get(channel, 0)
-            self._sequence[channel] = sequence + 1
-            self._writer.add_message(channel, t_ns, data, t_ns, sequence)
+                known = self._channels[topic] = self._register(topic, kind, notes), kind
+            elif known[1] is not kind and known[1] != kind:
+                raise ValueError(f"topic {topic} holds {_name(known[1])}, not {_name(kind)}")
+            self._writer.add_message(known[0], t_ns, pieces)
             self._bytes += size
             if self._flushed_ns is None:
                 self._flushed_ns = t_ns
@@ -288,10 +300,18 @@ class LogWriter(Closing):
                 self._flushed_ns = t_ns
                 self._writer.flush()
         except OSError:
-            self.dropped += 1
+            self._count_lost()
+
+    def _register(self, topic: str, kind: object, notes: Mapping[str, str]) -> int:
+        """The number of a new channel. kind: a protobuf message's class, or the name of a JSON schema."""
+        name, text = _name(kind), isinstance(kind, str)
+        if name not in self._schemas:
+            data = b'{"type":"object"}' if text else schemas.schema_data(kind)
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema" if text else "protobuf", data)
+        return self._writer.register_channel(topic, "json" if text else "protobuf", self._schemas[name], notes)
 
     def _rotate(self, t_ns: int) -> None:
-        self.close()
+        self._finish()
         if self._cap_bytes is not None and self._rotate_bytes is not None:
             most = max(1, self._cap_bytes // self._rotate_bytes - 1)
             for path in self._files[:-most]:
@@ -299,6 +319,11 @@ class LogWriter(Closing):
         self._open()
         if self._rig is not None:
             self.rig(t_ns, *self._rig)
+
+
+def _name(kind: Any) -> str:
+    """The name of a kind of message."""
+    return kind if isinstance(kind, str) else str(kind.DESCRIPTOR.full_name)
 
 
 def _fill_pose(position: Any, orientation: Any, pose: F64) -> None:

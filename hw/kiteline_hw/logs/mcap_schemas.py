@@ -58,6 +58,7 @@ Blob, Imu, Odometry = _own_messages()
 
 
 _schema_data: dict[str, bytes] = {}
+_tags: dict[tuple[Any, str], int] = {}  # first bytes of fields, by message and name
 
 
 def schema_data(message_class: Any) -> bytes:
@@ -73,7 +74,10 @@ def bytes_field(message_class: Any, name: str, data: bytes) -> tuple[bytes, byte
 
     The result equals setting the field, without the copies of a large image that setting and serialising would make.
     """
-    head = bytearray([message_class.DESCRIPTOR.fields_by_name[name].number << 3 | 2])
+    tag = _tags.get((message_class, name))
+    if tag is None:
+        tag = _tags[message_class, name] = message_class.DESCRIPTOR.fields_by_name[name].number << 3 | 2
+    head = bytearray((tag,))
     size = len(data)
     while size > 0x7F:
         head.append(size & 0x7F | 0x80)

@@ -6,6 +6,8 @@ stored value divided by 5000 is metres, 0 unknown.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +23,9 @@ F32 = NDArray[np.float32]
 
 DEPTH_FORMAT = "png/1000"  # millimetres: what our logs write if a source has no encoded depth
 
+_FAST_PNG = (
+    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG
+)  # fmt: skip
 _FORMATS = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg", b"BM": "bmp", b"II*\x00": "tiff", b"MM\x00*": "tiff"}
 
 
@@ -94,9 +99,24 @@ def depth_scale(image_format: str) -> float:
 
 
 def encode_image(pixels: U8) -> EncodedImage:
-    """Encode grey pixels (h, w) uint8 as PNG, at the fastest compression level."""
-    _, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    """Encode grey pixels (h, w) uint8 as PNG.
+
+    One filter and Huffman codes alone: for camera images smaller than zlib's fastest level, and three times as fast.
+    """
+    _, data = cv2.imencode(".png", pixels, _FAST_PNG)
     return EncodedImage(data.tobytes(), "png")
+
+
+def store_image(pixels: U8) -> EncodedImage:
+    """Grey pixels (h, w) uint8 as PNG without compression, a tenth of the CPU time of `encode_image`."""
+    h, w = pixels.shape
+    rows = np.zeros((h, w + 1), np.uint8)  # each row begins with the number of its filter: none
+    rows[:, 1:] = pixels
+    header = struct.pack(">IIBBBBB", w, h, 8, 0, 0, 0, 0)
+    parts = (b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 0)), (b"IEND", b"")
+    chunks = (struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+              for name, data in parts)  # fmt: skip
+    return EncodedImage(b"\x89PNG\r\n\x1a\n" + b"".join(chunks), "png")
 
 
 def encode_depth(depth_m: F32) -> EncodedImage:

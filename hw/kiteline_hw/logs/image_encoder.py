@@ -1,0 +1,102 @@
+"""Encodes the raw images of a log in a thread of its own, and keeps what is to be written after them waiting.
+
+OpenCV encodes without Python's lock, so that tracking goes on meanwhile. Nothing is dropped: where the thread lags,
+the caller waits, or stores the image uncompressed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+from kiteline_core.frame import EncodedImage, Frame
+from kiteline_hw.sensors.images import encode_depth, encode_image, store_image
+
+
+@dataclass(frozen=True, slots=True)
+class EncodingPolicy:
+    """How raw images are logged. compressed: as PNG of half their size, else as stored PNG for a tenth of the CPU time.
+
+    most_waiting: images that may wait to be encoded.
+    """
+
+    compressed: bool = True
+    most_waiting: int = 12
+
+
+ENCODE_ALL = EncodingPolicy()
+_Then = Callable[[EncodedImage], None]
+
+
+class ImageEncoder:
+    """A queue of images being encoded, and of all that follows them in the log.
+
+    stores: where too many images wait, one more is stored at once; else the caller waits, and files are reproducible.
+    stored: images that were not compressed for that reason.
+    """
+
+    def __init__(self, policy: EncodingPolicy) -> None:
+        self.stores = False
+        self.stored = 0
+        self._draining = False
+        self._policy = policy
+        self._thread: ThreadPoolExecutor | None = None
+        self._images: deque[Future[EncodedImage]] = deque()
+        self._order: deque[tuple[Future[EncodedImage] | None, Callable[..., None]]] = deque()
+
+    @property
+    def waiting(self) -> bool:
+        """True if something is to be written after an image that is being encoded; False for what `drain` writes."""
+        return bool(self._order) and not self._draining
+
+    def encode(self, frame: Frame) -> list[EncodedImage | Future[EncodedImage]]:
+        """Encode the images of a frame: left, right, depth."""
+        grey = [frame.left] if frame.right is None else [frame.left, frame.right]
+        out: list[EncodedImage | Future[EncodedImage]] = []
+        while self._images and self._images[0].done():
+            self._images.popleft()
+        full = len(self._images) + len(grey) > self._policy.most_waiting
+        if full and not self.stores:
+            self.drain()
+        for pixels in grey:
+            if not self._policy.compressed or (full and self.stores):
+                self.stored += full
+                out.append(store_image(pixels))
+            else:
+                out.append(self._submit(partial(encode_image, pixels)))
+        if frame.depth_m is not None:
+            out.append(self._submit(partial(encode_depth, frame.depth_m)))
+        return out
+
+    def _submit(self, work: Callable[[], EncodedImage]) -> Future[EncodedImage]:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "log-images")
+        self._images.append(self._thread.submit(work))
+        return self._images[-1]
+
+    def then(self, image: Future[EncodedImage] | None, write: Callable[..., None]) -> None:
+        """Call `write` with the image, or with None, after all that came before."""
+        self._order.append((image, write))
+
+    def drain(self, wait: bool = True) -> None:
+        """Write what is ready, in order. wait: for images that are being encoded, too."""
+        self._draining = True
+        try:
+            while self._order:
+                image, write = self._order[0]
+                if image is not None and not wait and not image.done():
+                    return
+                self._order.popleft()
+                write(None if image is None else image.result())
+        finally:
+            self._draining = False
+
+    def close(self) -> None:
+        """Write everything, and end the thread."""
+        self.drain()
+        if self._thread is not None:
+            self._thread.shutdown()
+            self._thread = None

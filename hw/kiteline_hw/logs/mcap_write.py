@@ -1,0 +1,175 @@
+"""Writes MCAP files in uncompressed chunks: the bytes that the mcap package writes, for a tenth of its CPU time.
+
+A message is packed once, its data are not copied, and a chunk is written as the pieces that it was made of. Everything
+that is written once a file is left to the package's records. Format: mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import BinaryIO
+from zlib import crc32
+
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+
+_MAGIC = b"\x89MCAP0\r\n"
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first and last time, size, CRC-32, no compression, size
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the rows
+_RECORD_BYTES = 9  # opcode and length
+
+
+class McapWriter:
+    """One MCAP file in a stream. Messages of a chunk whose writing fails with OSError are lost and counted.
+
+    chunk_bytes: size above which a chunk is written. lost: messages.
+    """
+
+    def __init__(self, stream: BinaryIO, chunk_bytes: int, library: str) -> None:
+        self.lost = 0
+        self._stream = stream
+        self._chunk_bytes = chunk_bytes
+        self._at = 0  # bytes written to the stream
+        self._schemas: list[records.Schema] = []
+        self._channels: list[records.Channel] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._chunks: list[records.ChunkIndex] = []
+        self._counts: dict[int, int] = {}  # messages by channel
+        self._first_ns: int | None = None  # of the first message
+        self._span_ns = (0, 0)  # of all messages
+        self._begin_chunk()
+        self._put(_MAGIC + _packed(records.Header("", library)))
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+        packed = _packed(records.Metadata(name, dict(data)))
+        self._metadata.append(records.MetadataIndex(self._at, len(packed), name))
+        self._put(packed)
+
+    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Add a schema. Returns its number."""
+        schema = records.Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
+        self._schemas.append(schema)
+        self._append(_packed(schema))
+        return schema.id
+
+    def register_channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]) -> int:
+        """Add a channel. Returns its number."""
+        channel = records.Channel(
+            id=len(self._channels) + 1, topic=topic, message_encoding=encoding, metadata=dict(metadata),
+            schema_id=schema,
+        )  # fmt: skip
+        self._channels.append(channel)
+        self._append(_packed(channel))
+        return channel.id
+
+    def add_message(self, channel: int, t_ns: int, pieces: tuple[bytes, ...]) -> None:
+        """Add a message, logged and published at a time. pieces: of its data."""
+        sequence = self._counts.get(channel, 0)
+        self._counts[channel] = sequence + 1
+        if self._first_ns is None:
+            self._first_ns, self._span_ns = t_ns, (t_ns, t_ns)
+        rows = self._rows.get(channel)
+        if rows is None:
+            rows = self._rows[channel] = []
+        rows += (t_ns, self._size)
+        self._times.append(t_ns)
+        size = _MESSAGE.size - _RECORD_BYTES
+        for piece in pieces:
+            size += len(piece)
+        self._pieces.append(_MESSAGE.pack(Opcode.MESSAGE, size, channel, sequence, t_ns, t_ns))
+        self._pieces += pieces
+        self._size += size + _RECORD_BYTES
+        if self._size > self._chunk_bytes:
+            self._end_chunk()
+
+    def flush(self) -> None:
+        """End the chunk, and pass all to the operating system."""
+        self._end_chunk()
+        self._stream.flush()
+
+    def finish(self) -> None:
+        """End the file with its index. The stream stays open."""
+        self._end_chunk()
+        self._put(_packed(records.DataEnd(0)))
+        start = self._at
+        groups = [
+            (Opcode.SCHEMA, b"".join(map(_packed, self._schemas))),
+            (Opcode.CHANNEL, b"".join(map(_packed, self._channels))),
+            (Opcode.STATISTICS, _packed(self._statistics())),
+            (Opcode.CHUNK_INDEX, b"".join(map(_packed, self._chunks))),
+            (Opcode.ATTACHMENT_INDEX, b""),
+            (Opcode.METADATA_INDEX, b"".join(map(_packed, self._metadata))),
+        ]
+        offsets, at = b"", start
+        for opcode, data in groups:
+            offsets += _packed(records.SummaryOffset(opcode, at, len(data)))
+            at += len(data)
+        summary = b"".join(data for _, data in groups) + offsets
+        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, at)
+        self._put(summary + _packed(records.Footer(start, at, crc32(head, crc32(summary)))) + _MAGIC)
+
+    def _statistics(self) -> records.Statistics:
+        return records.Statistics(
+            attachment_count=0, channel_count=len(self._channels), channel_message_counts=self._counts,
+            chunk_count=len(self._chunks), message_count=sum(self._counts.values()), metadata_count=len(self._metadata),
+            message_start_time=self._span_ns[0], message_end_time=self._span_ns[1], schema_count=len(self._schemas),
+        )  # fmt: skip
+
+    def _begin_chunk(self) -> None:
+        self._pieces: list[bytes] = []
+        self._size = 0  # of all pieces
+        self._rows: dict[int, list[int]] = {}  # time and offset of each message, by channel
+        self._times: list[int] = []
+
+    def _append(self, record: bytes) -> None:
+        """Add a schema or a channel to the chunk."""
+        self._pieces.append(record)
+        self._size += len(record)
+        if self._size > self._chunk_bytes:
+            self._end_chunk()
+
+    def _end_chunk(self) -> None:
+        """Write the chunk and its index; nothing if it holds no message."""
+        if not self._times:
+            return
+        pieces, size, rows, times = self._pieces, self._size, self._rows, self._times
+        self._begin_chunk()
+        first, last = min(times), max(times)
+        self._span_ns = min(first, self._span_ns[0]), max(last, self._span_ns[1])
+        crc = 0
+        for piece in pieces:
+            crc = crc32(piece, crc)
+        head = _CHUNK.pack(Opcode.CHUNK, _CHUNK.size - _RECORD_BYTES + size, first, last, size, crc, 0, size)
+        begin, at, offsets, indices = self._at, self._at + len(head) + size, dict[int, int](), list[bytes]()
+        for channel, numbers in rows.items():
+            offsets[channel] = at
+            index = _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(numbers), channel, 8 * len(numbers))
+            indices += (index, struct.pack(f"<{len(numbers)}Q", *numbers))
+            at += len(indices[-2]) + len(indices[-1])
+        try:
+            self._put(b"".join((head, *pieces, *indices)))
+        except OSError:
+            self.lost += len(times)
+            raise
+        self._chunks.append(
+            records.ChunkIndex(
+                chunk_length=len(head) + size, chunk_start_offset=begin, compression="", compressed_size=size,
+                message_end_time=last, message_index_length=at - begin - len(head) - size,
+                message_index_offsets=offsets, message_start_time=first, uncompressed_size=size,
+            )
+        )  # fmt: skip
+
+    def _put(self, data: bytes) -> None:
+        self._stream.write(data)
+        self._at += len(data)
+
+
+def _packed(record: records.McapRecord) -> bytes:
+    """The bytes of a record."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
