@@ -5,6 +5,8 @@ Agent._process is the algorithm of one frame; its numbered steps are those of AR
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -250,6 +252,11 @@ class Agent:
         """InertialTracker.offset_report; None without an IMU."""
         tracker = self._camera.motion.tracker
         return None if tracker is None else tracker.offset_report()
+
+    def imu_calibration_report(self) -> dict[str, Any] | None:
+        """InertialTracker.calibration_report; None without an IMU."""
+        tracker = self._camera.motion.tracker
+        return None if tracker is None else tracker.calibration_report()
 
     def odometer_report(self) -> dict[str, float | bool] | None:
         """Odometer.report; None without one."""

@@ -416,6 +416,26 @@ def test_a_moved_map_moves_everything() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(ends[1].cov)), sigma, rtol=0.02)
 
 
+def test_a_shifted_bias_goes_with_shifted_samples() -> None:
+    """Samples that are corrected by a constant from now on change nothing if the bias is shifted by it."""
+    change = np.array([0.2, -0.1, 0.3])
+    results = []
+    for shift in (np.zeros(3), change):
+        flight, rng = make_flight(3, 24), np.random.default_rng(4)
+        smoother = FixedLagSmoother(CAMERA, CALIBRATION, FixedLagConfig())
+        smoother.start(flight.pose(0), flight.velocity[0], np.zeros(6), GRAVITY, StartDeviations())
+        for k in range(1, 24):
+            samples = flight.samples(k - 1)
+            if k == 12:
+                smoother.shift_accel_bias(shift)
+            if k >= 12:
+                samples = Samples(samples.t_s, samples.gyro, samples.accel + shift)
+            smoother.add(samples, see(flight, k, rng, 0.3))
+        results.append(smoother.state)
+    np.testing.assert_allclose(results[1].T_m_b, results[0].T_m_b, atol=1e-7)
+    np.testing.assert_allclose(results[1].bias[3:], results[0].bias[3:] + change, atol=1e-6)
+
+
 def test_outliers_do_not_pull() -> None:
     rng = np.random.default_rng(2)
     flight = make_flight(2, 10)

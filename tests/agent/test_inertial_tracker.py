@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
 from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
@@ -191,14 +192,16 @@ def test_time_offset_is_found_and_applied(late_ns: int, calibration: ImuCalibrat
 
 def test_a_configured_time_offset_holds_and_changes_are_told() -> None:
     steps = flight(60, 6, late_ns=12_000_000)
-    tracker, states = run(steps, config=InertialConfig(offset_s=0.012, apply_offset=False))
+    tracker, states = run(
+        steps, config=InertialConfig(calibration=SelfCalibrationConfig(offset_s=0.012, apply_offset=False))
+    )
     assert tracker.offset_report()["applied_ms"] == 12.0
     assert tracker.offset_report()["ms"] == pytest.approx(12.0, abs=2.0)
-    assert tracker.take_offset_events() == []
+    assert tracker.take_calibration_events() == []
     assert apart_m(states[-1], steps[-1].truth) < 0.004
     tracker, _ = run(flight(160, 6, late_ns=12_000_000))
-    assert "ms are the IMU's time" in tracker.take_offset_events()[0]
-    assert tracker.take_offset_events() == []
+    assert "ms are the IMU's time" in tracker.take_calibration_events()[0]
+    assert tracker.take_calibration_events() == []
 
 
 def test_scale_of_a_map_without_one() -> None:

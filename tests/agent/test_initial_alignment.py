@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment as imu_alignment
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
-from kiteline_agent.inertial.time_offset import TimeOffsetEstimator
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
@@ -105,24 +104,3 @@ def test_scale_is_not_believed_without_acceleration() -> None:
 def test_too_few_poses_give_nothing() -> None:
     poses, _, motions = measured(1, 3, np.zeros(6))
     assert imu_alignment.align(poses, P_B_C, motions, np.zeros(6), 9.81, with_scale=False) is None
-
-
-@pytest.mark.parametrize("offset_steps", [-4, 0, 3])
-def test_time_offset_is_found(offset_steps: int) -> None:
-    """Images stamped so many IMU samples early; the estimate is within its deviation and within half a millisecond."""
-    T, _, gyro, _ = motion(11, 130)
-    bias = np.array([0.004, -0.002, 0.003])
-    rng = np.random.default_rng(1)
-    estimator = TimeOffsetEstimator(memory_s=20.0, start_sigma_s=0.02, turn_sigma_rad=6e-4)
-    assert estimator.sigma_s == pytest.approx(0.02)
-    t = np.arange(FRAME_STEPS + 1) * STEP_S
-    for k in range(1, 127):
-        first, after = k * FRAME_STEPS, (k + 1) * FRAME_STEPS
-        rates = gyro[first : after + 1] + bias
-        turn = preintegrate(Samples(t, rates, np.zeros_like(rates)), np.zeros(6), CALIBRATION).turn
-        seen = (
-            T[first + offset_steps, :3, :3].T @ T[after + offset_steps, :3, :3] @ se3.so3_exp(6e-4 * rng.normal(size=3))
-        )
-        estimator.add(se3.so3_log(turn.T @ seen), rates[-1] - turn.T @ rates[0], 0.05)
-    assert estimator.sigma_s < 5e-4
-    assert estimator.offset_s == pytest.approx(offset_steps * STEP_S, abs=5e-4)

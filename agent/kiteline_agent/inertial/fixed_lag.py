@@ -236,6 +236,12 @@ class FixedLagSmoother:
             bias = self._imu_bias[k].copy()
             self._put_interval(k, preintegrate(samples, bias, self._calibration, self._config.imu_inflation))
 
+    def shift_accel_bias(self, change: F64) -> None:
+        """Shift all biases of the accelerometer by (3,) m/s^2, after the correction of its samples changed."""
+        self._state[: self._n, 9:] += change
+        self._imu_bias[: self._n, 3:] += change
+        self._prior_s[9:] += change
+
     def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
         """Begin a new map, in which the newest body pose is T_m_b (4,4) by definition.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
 from kiteline_agent.inertial.fixed_lag import FixedLagConfig
 
 
@@ -12,6 +13,7 @@ class InertialConfig:
     """How the inertial state is initialised, and how long dead reckoning is trusted."""
 
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
+    calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     silent_s: float = 3.0  # time without a sample after which an event is logged
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked
@@ -32,12 +34,3 @@ class InertialConfig:
     max_dead_reckoning_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it
     scale_inflation: float = 2.0  # of the deviation of a scale: errors of a young map are correlated over frames
     unit_sigma: float = 0.03  # relative error of the scale by an IMU or odometer that their deviations leave out
-    offset_memory_s: float = 60.0  # time constant of the time offset's drift
-    offset_start_sigma_s: float = 0.02  # cameras without a trigger line
-    offset_window_s: float = 0.15  # over which rotations are compared
-    offset_turn_sigma_rad: float = 6e-4  # error of a rotation by the images over that window
-    offset_trusted_s: float = 3e-3  # deviation below which the estimate is applied
-    offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
-    offset_rate: float = 0.05  # s/s, how fast the applied offset follows
-    offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
-    apply_offset: bool = True  # False: only the configured offset is used

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
-from kiteline_agent.inertial.rotation_comparison import RotationComparison
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
-from kiteline_agent.inertial.time_offset import TimeOffsetEstimator
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -42,11 +42,8 @@ class InertialTracker:
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
         self._initialiser = ImuInitialiser(config, calibration, self._p_b_c, self._buffer)
-        self._offset = TimeOffsetEstimator(
-            config.offset_memory_s, config.offset_start_sigma_s, config.offset_turn_sigma_rad, config.offset_s
-        )
-        self._rotations = RotationComparison(calibration, config.offset_window_s)
-        self._applied_s = self._reported_s = config.offset_s
+        self._self_calibration = SelfCalibration(calibration, config.calibration, self._p_b_c, config.gravity_m_s2)
+        self._reported_s = config.calibration.offset_s
         self._incomplete: tuple[int, int] | None = None  # the last interval, if samples at its end were missing
         self._bias = np.zeros(6)
         self._last: tuple[int, F64] | None = None  # stamp and T_m_b of the last frame
@@ -86,21 +83,27 @@ class InertialTracker:
     @property
     def time_offset_s(self) -> tuple[float, float]:
         """Camera stamp + offset = IMU time, and its standard deviation, s."""
-        return self._offset.offset_s, self._offset.sigma_s
+        return self._self_calibration.gyro.offset_s, self._self_calibration.gyro.offset_sigma_s
 
     def offset_report(self) -> dict[str, float]:
         """The time offset in ms: the estimate, its standard deviation, and the offset that is applied."""
         offset_s, sigma_s = self.time_offset_s
-        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self._applied_s}
+        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self._self_calibration.offset_s}
         return {name: round(1e3 * value, 2) for name, value in values.items()}
 
-    def take_offset_events(self) -> list[str]:
-        """A line for the log whenever the applied offset has changed by a millisecond."""
-        if abs(self._applied_s - self._reported_s) < 1e-3:
-            return []
-        self._reported_s = self._applied_s
+    def calibration_report(self) -> dict[str, Any]:
+        """SelfCalibration.report."""
+        return self._self_calibration.report()
+
+    def take_calibration_events(self) -> list[str]:
+        """Lines for the log: the applied offset has changed by a millisecond, a correction of axes began."""
+        events = self._self_calibration.take_events()
+        if abs(self._self_calibration.offset_s - self._reported_s) < 1e-3:
+            return events
+        self._reported_s = self._self_calibration.offset_s
         offset_s, sigma_s = self.time_offset_s
-        return [f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)"]
+        offset = f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)"
+        return [*events, offset]
 
     # per frame
 
@@ -131,8 +134,7 @@ class InertialTracker:
         """
         samples = self._interval(t_ns)
         if samples is not None:
-            self._rotations.add(t_ns, T_m_b_visual[:3, :3])
-            self._update_offset(samples.duration_s)
+            self._calibrate(t_ns, T_m_b_visual, samples.duration_s)
         state = None
         if self._smoother.running:
             state = self._advance(samples, points, velocity)
@@ -153,7 +155,7 @@ class InertialTracker:
         for too long.
         """
         samples = self._interval(t_ns)
-        self._rotations.clear()
+        self._self_calibration.clear()
         self._initialiser.clear()
         if self._last is not None:
             self._image_loss_s += (t_ns - self._last[0]) * 1e-9
@@ -174,7 +176,7 @@ class InertialTracker:
         self._initialiser.transform(lambda T_m_b: T_new_old @ T_m_b)
         if self._last is not None:
             self._last = (self._last[0], T_new_old @ self._last[1])
-        self._rotations.rotate_map(T_new_old[:3, :3])
+        self._self_calibration.move_map(T_new_old)
 
     def begin_map(self, t_ns: int, T_m_b: F64) -> None:
         """Begin a new map at this frame, with the body at T_m_b (4,4) by definition.
@@ -183,7 +185,7 @@ class InertialTracker:
         """
         if self._smoother.running:
             self._smoother.begin_map(T_m_b)
-        self._rotations.clear()
+        self._self_calibration.begin_map()
         self._incomplete = None
         self._initialiser.clear()
         self._set_last(t_ns, T_m_b)
@@ -196,7 +198,7 @@ class InertialTracker:
         self._smoother.stop()
         self._initialiser.clear()
         self._last = None
-        self._rotations.clear()
+        self._self_calibration.begin_map()
         self._incomplete = None
         self._image_loss_s = 0.0
 
@@ -220,15 +222,23 @@ class InertialTracker:
     # steps
 
     def _interval(self, t_ns: int) -> Samples | None:
-        """Samples from the last frame to this one, on the IMU's clock."""
+        """Corrected samples from the last frame to this one, on the IMU's clock."""
         if self._last is None:
             return None
-        begin = self._interval_end_ns if self._interval_end_ns else self._last[0] + int(self._applied_s * 1e9)
-        return self._buffer.between(begin, t_ns + int(self._applied_s * 1e9))
+        begin = self._interval_end_ns if self._interval_end_ns else self._last[0] + self._offset_ns
+        return self._between(begin, t_ns + self._offset_ns)
+
+    def _between(self, from_ns: int, to_ns: int) -> Samples | None:
+        samples = self._buffer.between(from_ns, to_ns)
+        return None if samples is None else self._self_calibration.correct(samples)
+
+    @property
+    def _offset_ns(self) -> int:
+        return int(self._self_calibration.offset_s * 1e9)
 
     def _set_last(self, t_ns: int, T_m_b: F64) -> None:
         self._last = (t_ns, T_m_b.copy())
-        self._interval_end_ns = t_ns + int(self._applied_s * 1e9)
+        self._interval_end_ns = t_ns + self._offset_ns
 
     def _advance(
         self, samples: Samples | None, points: VisualPoints | None, velocity: BodyVelocity | None
@@ -248,17 +258,14 @@ class InertialTracker:
     def _complete_interval(self) -> None:
         """Replace the last interval if its final samples came after its frame: IMU stamps ahead of the camera's."""
         if self._incomplete is not None:
-            samples = self._buffer.between(*self._incomplete)
+            samples = self._between(*self._incomplete)
             if samples is not None:
                 self._smoother.replace_last(samples)
 
-    def _update_offset(self, dt_s: float) -> None:
-        config = self._config
-        self._rotations.compare(self._buffer, self._applied_s, self._offset)
-        if not config.apply_offset:
-            return
-        offset_s, sigma_s = self.time_offset_s
-        significant = abs(offset_s - self._applied_s) > config.offset_significance * sigma_s
-        if sigma_s < config.offset_trusted_s and significant:
-            step = offset_s - self._applied_s
-            self._applied_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
+    def _calibrate(self, t_ns: int, T_m_b_visual: F64, dt_s: float) -> None:
+        gravity = self._smoother.gravity if self._smoother.running and self.metric else None
+        self._self_calibration.add(t_ns, T_m_b_visual)
+        change = self._self_calibration.update(self._buffer, gravity, dt_s)
+        if change.any():
+            self._bias = np.concatenate([self._bias[:3], self._bias[3:] + change])
+            self._smoother.shift_accel_bias(change)

@@ -14,6 +14,7 @@ Bools = NDArray[np.bool_]
 
 _NOISE_MEMORY_S = 0.5  # over which the noise is averaged: rotors change speed faster than biases do
 _ATTACK = 4.0  # factor of variance above which new noise is believed at once: motors start
+_RECENT = 10  # samples whose mean is without vibration
 _EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
 _GAP = 2.5  # of the usual step: a longer one misses samples
 _GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
@@ -61,6 +62,11 @@ class SampleBuffer:
     def newest_t_ns(self) -> int | None:
         """Time of the newest sample."""
         return int(self._t[-1]) if len(self._t) else None
+
+    @property
+    def last_accel(self) -> F64:
+        """Mean specific force (3,) of the newest samples, m/s^2; zero without any."""
+        return np.asarray(self._values[-_RECENT:, 3:].mean(axis=0)) if len(self._t) else np.zeros(3)
 
     @property
     def density(self) -> F64:

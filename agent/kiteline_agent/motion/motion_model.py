@@ -97,7 +97,9 @@ class MotionModel:
         """Events since the last call, for the log."""
         events, self._events = self._events, []
         return (
-            events + self.odometer.take_events() + ([] if self.tracker is None else self.tracker.take_offset_events())
+            events
+            + self.odometer.take_events()
+            + ([] if self.tracker is None else self.tracker.take_calibration_events())
         )
 
     def dead_reckon(self, predicted: F64, t_ns: int) -> DeadReckoning:

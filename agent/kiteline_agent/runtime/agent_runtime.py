@@ -199,6 +199,7 @@ class AgentRuntime:
             "notes": notes,
             "scale": "metric" if self.agent.metric else "own",
             "time_offset": self.agent.time_offset_report(),
+            "imu_calibration": self.agent.imu_calibration_report(),
             "odometer": self.agent.odometer_report(),
             "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},
             "timing": {

@@ -1,0 +1,111 @@
+"""Bias, scale and axes of the accelerometer, the vertical and the scale of the images, from positions by images."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.calibration.window import Window
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+_AXES, _BIAS, _TILT, _SCALE = slice(0, 9), slice(9, 12), slice(12, 15), 15
+_BIAS_M_S2, _TILT_RAD = 0.1, 0.03  # standard deviations at the start
+_TILT_WALK_RAD = 2e-4  # per sqrt(s): the map bends while it grows
+_OUTLIER = 9.0  # squared error over its variance from which a pair of windows weighs less
+
+
+class AccelCalibration:
+    """Kalman filter over [axes (9), bias (3), tilt (3), scale]: force = (1 + axes) @ accel - bias.
+
+    Two windows one after the other give the change of the mean velocity by images, which is the integral of the
+    specific force, weighted by a hat over both, and of gravity: the velocity between them is not needed.
+    """
+
+    def __init__(self, axes_sigma: float, scale_sigma: float, walk_m_s3: float, gravity_m_s2: float) -> None:
+        """axes_sigma, scale_sigma: of the calibration. walk_m_s3: of the bias, per sqrt(s)."""
+        self._gravity_m_s2 = gravity_m_s2
+        self._x = np.zeros(16)
+        self._cov = np.diag(np.repeat([axes_sigma, _BIAS_M_S2, _TILT_RAD, scale_sigma], [9, 3, 3, 1]) ** 2)
+        self._walk = np.repeat([1e-5, walk_m_s3, _TILT_WALK_RAD, 1e-4], [9, 3, 3, 1]) ** 2
+        self._gravity: F64 | None = None
+        self.excess = 0.0
+
+    @property
+    def matrix(self) -> F64:
+        """(3,3) of force = matrix @ accel - bias."""
+        return np.asarray(np.eye(3) + self._x[_AXES].reshape(3, 3))
+
+    @property
+    def bias(self) -> F64:
+        """(3,) m/s^2."""
+        return self._x[_BIAS].copy()
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Metres per metre of the images, and its standard deviation."""
+        return 1.0 + float(self._x[_SCALE]), float(np.sqrt(self._cov[_SCALE, _SCALE]))
+
+    @property
+    def axes_cov(self) -> F64:
+        """(9,9) covariance of the elements of `matrix`."""
+        return self._cov[_AXES, _AXES]
+
+    def significance(self) -> float:
+        """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
+        axes = self._x[_AXES]
+        return float(axes @ np.linalg.solve(self.axes_cov, axes)) / max(self.excess, 1.0)
+
+    def set_vertical(self, gravity: F64 | None) -> None:
+        """Begin in a map in which gravity points along (3,); None: unknown as yet."""
+        self._gravity = None if gravity is None else self._gravity_m_s2 * gravity / np.linalg.norm(gravity)
+        self._cov[_TILT, :] = self._cov[:, _TILT] = 0.0
+        self._cov[_TILT, _TILT] = _TILT_RAD**2 * np.eye(3)
+
+    @property
+    def has_vertical(self) -> bool:
+        """True if gravity in the map is known."""
+        return self._gravity is not None
+
+    def rotate_map(self, R_new_old: F64) -> None:
+        """Rotate gravity with the map by R_new_old (3,3)."""
+        if self._gravity is not None:
+            self._gravity = R_new_old @ self._gravity
+            self._cov[_TILT, :] = R_new_old @ self._cov[_TILT, :]
+            self._cov[:, _TILT] = self._cov[:, _TILT] @ R_new_old.T
+
+    def add(self, windows: tuple[Window, Window], T_m_b: tuple[F64, F64, F64], p_b_c: F64, variance: float) -> None:
+        """Add two windows with the poses (4,4) at their ends.
+
+        p_b_c: (3,) m, camera in the body. variance: (m/s)^2 of the change of velocity, of images and IMU.
+        """
+        if self._gravity is None:
+            return
+        first, second = windows
+        r = [T[:3, :3] for T in T_m_b]
+        camera = [T[:3, 3] + T[:3, :3] @ p_b_c for T in T_m_b]
+        dt = first.duration_s, second.duration_s
+        moved = (camera[2] - camera[1]) / dt[1] - (camera[1] - camera[0]) / dt[0]
+        lever = (r[2] - r[1]) @ p_b_c / dt[1] - (r[1] - r[0]) @ p_b_c / dt[0]
+        force = r[0] @ first.by_force[1] + r[1] @ (second.by_force[0] - second.by_force[1])
+        time = r[0] @ first.time[1] + r[1] @ (second.time[0] - second.time[1])
+        fallen = 0.5 * (dt[0] + dt[1]) * self._gravity
+        x = self._x
+        error = (1.0 + x[_SCALE]) * moved - lever - fallen - force @ self.matrix.ravel() + time @ x[_BIAS]
+        j = np.empty((3, 16))  # of the negative error
+        j[:, _AXES], j[:, _BIAS], j[:, _TILT], j[:, _SCALE] = force, -time, -se3.skew(fallen), -moved
+        self._cov[np.diag_indices(16)] += self._walk * dt[1]
+        predicted = j @ self._cov @ j.T
+        s = predicted + variance * np.eye(3)
+        square = float(error @ np.linalg.solve(s, error)) / 3.0
+        self.excess += 0.05 * (min(square, 25.0) - self.excess)
+        if square > _OUTLIER:
+            s = predicted + variance * square / _OUTLIER * np.eye(3)
+        gain = np.linalg.solve(s, j @ self._cov).T
+        change = gain @ error
+        self._gravity = se3.so3_exp(change[_TILT]) @ self._gravity
+        change[_TILT] = 0.0
+        self._x = x + change
+        self._cov -= gain @ s @ gain.T
+        self._cov = 0.5 * (self._cov + self._cov.T)

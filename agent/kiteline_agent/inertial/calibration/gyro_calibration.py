@@ -1,0 +1,87 @@
+"""Time offset, bias, scale and axes of the gyro, from rotations by images over short windows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.calibration.window import Window
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+_AXES, _OFFSET, _BIAS = slice(0, 9), 9, slice(10, 13)
+_BIAS_RAD_S = 0.1  # standard deviation of an unknown bias
+_OUTLIER = 9.0  # squared error over its variance from which a window weighs less
+
+
+class GyroCalibration:
+    """Kalman filter over [axes (9), time offset s, bias (3)]: rate = (1 + axes) @ gyro - bias.
+
+    Axes are those of the body as the camera's extrinsics define them, so a rotation of the camera against the IMU is
+    the antisymmetric part of `axes`. Shifting a window by d rotates the gyro's rotation by d (rate at its end - rotated
+    rate at its start), after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems", 2014.
+    """
+
+    def __init__(self, axes_sigma: float, offset_sigma_s: float, offset_s: float, walk_rad_s2: float) -> None:
+        """axes_sigma, offset_sigma_s: of the calibration. offset_s: calibrated. walk_rad_s2: of the bias."""
+        self._x = np.zeros(13)
+        self._x[_OFFSET] = offset_s
+        self._cov = np.diag(np.repeat([axes_sigma, offset_sigma_s, _BIAS_RAD_S], [9, 1, 3]) ** 2)
+        self._walk = np.repeat([1e-5, 1e-4, walk_rad_s2], [9, 1, 3]) ** 2
+        self.excess = 0.0  # mean squared error of a rotation over what was expected
+
+    @property
+    def matrix(self) -> F64:
+        """(3,3) of rate = matrix @ gyro - bias."""
+        return np.asarray(np.eye(3) + self._x[_AXES].reshape(3, 3))
+
+    @property
+    def bias(self) -> F64:
+        """(3,) rad/s."""
+        return self._x[_BIAS].copy()
+
+    @property
+    def offset_s(self) -> float:
+        """Camera stamp + offset = IMU time."""
+        return float(self._x[_OFFSET])
+
+    @property
+    def offset_sigma_s(self) -> float:
+        """Standard deviation of the offset."""
+        return float(np.sqrt(self._cov[_OFFSET, _OFFSET]))
+
+    @property
+    def axes_cov(self) -> F64:
+        """(9,9) covariance of the elements of `matrix`."""
+        return self._cov[_AXES, _AXES]
+
+    def significance(self) -> float:
+        """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
+        axes = self._x[_AXES]
+        return float(axes @ np.linalg.solve(self.axes_cov, axes)) / max(self.excess, 1.0)
+
+    def add(self, window: Window, R_b0_b1: F64, turn_variance: float) -> float:
+        """Add a window over which the images rotated by R_b0_b1 (3,3).
+
+        window: integrated at the present offset, matrix and bias. turn_variance: rad^2 of an axis, of images and gyro.
+        Returns the variance of the predicted rotation about an axis, rad^2.
+        """
+        back = window.turn.T
+        j = np.empty((3, 13))
+        j[:, _AXES] = back @ window.by_rate
+        j[:, _OFFSET] = window.last_rate - back @ window.first_rate
+        j[:, _BIAS] = -back @ window.time[0]
+        error = se3.so3_log(back @ R_b0_b1)
+        self._cov[np.diag_indices(13)] += self._walk * window.duration_s
+        predicted = j @ self._cov @ j.T
+        s = predicted + turn_variance * np.eye(3)
+        square = float(error @ np.linalg.solve(s, error)) / 3.0
+        self.excess += 0.05 * (min(square, 25.0) - self.excess)
+        if square > _OUTLIER:
+            s = predicted + turn_variance * square / _OUTLIER * np.eye(3)
+        gain = np.linalg.solve(s, j @ self._cov).T
+        self._x += gain @ error
+        self._cov -= gain @ s @ gain.T
+        self._cov = 0.5 * (self._cov + self._cov.T)
+        return float(np.trace(predicted)) / 3.0

@@ -1,0 +1,72 @@
+"""Poses by images at the ends of windows, each with the IMU samples since the one before.
+
+The rates at the ends are means of several samples: the change of rate must exceed the gyro noise, which would bias the
+time offset towards zero. A window is complete once all its samples have arrived, since IMU stamps may be ahead of the
+camera's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+
+F64 = NDArray[np.float64]
+
+_RATE_NS = 12_000_000  # to either side of an instant, averaged for the rate there
+_LONGEST = 4.0  # times the window: longer ones have a gap
+_FRAMES = 64  # most frames that are kept
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Raw samples between two frames, and the poses (4,4) by images at both. rates: (2,3) rad/s, raw, at both."""
+
+    samples: Samples
+    T_m_b0: F64
+    T_m_b1: F64
+    rates: F64
+
+
+class PoseChain:
+    """Poses T_m_b by images over the newest frames, cut into windows of equal length."""
+
+    def __init__(self, window_s: float) -> None:
+        self._window_s = window_s
+        self._poses: list[tuple[int, F64]] = []
+
+    def add(self, t_ns: int, T_m_b: F64) -> None:
+        """Append the pose T_m_b (4,4) of a frame, by images alone."""
+        self._poses = [*self._poses, (t_ns, T_m_b.copy())][-_FRAMES:]
+
+    def clear(self) -> None:
+        """Begin again after an image loss or in a new map."""
+        self._poses = []
+
+    def move_map(self, T_new_old: F64) -> None:
+        """Move the poses with the map: p_new = T_new_old p_old."""
+        self._poses = [(t, T_new_old @ T) for t, T in self._poses]
+
+    def take(self, buffer: SampleBuffer, offset_s: float) -> Link | bool:
+        """The next window, once its samples have arrived; True: it has a gap, False: not yet. offset_s: camera stamp
+        to IMU time.
+        """
+        newest, shift = buffer.newest_t_ns, round(offset_s * 1e9)
+        if newest is None or len(self._poses) < 2:
+            return False
+        begin_ns, begin = self._poses[0]
+        ready = (k for k in range(1, len(self._poses)) if (self._poses[k][0] - begin_ns) * 1e-9 >= self._window_s)
+        last = next(ready, None)
+        if last is None or self._poses[last][0] + shift + _RATE_NS > newest:
+            return False
+        end_ns, end = self._poses[last]
+        self._poses = self._poses[last:]
+        samples = buffer.between(begin_ns + shift, end_ns + shift)
+        rates = [buffer.mean(t + shift - _RATE_NS, t + shift + _RATE_NS) for t in (begin_ns, end_ns)]
+        if samples is None or samples.duration_s > _LONGEST * self._window_s or min(n for _, _, n in rates) == 0:
+            return True
+        return Link(samples, begin, end, np.array([mean[:3] for mean, _, _ in rates]))

@@ -1,0 +1,207 @@
+"""Calibration of an IMU in flight: time offset, scale and axes of gyro and accelerometer.
+
+Filters beside the smoother, at a few updates a second: these values change slowly. A rig is taken as calibrated until
+the filters contradict that significantly; then their estimates correct the samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
+from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
+from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
+from kiteline_agent.inertial.calibration.window import Window
+from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SelfCalibrationConfig:
+    """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
+
+    turn_window_s: float = 0.15  # over which rotations are compared
+    move_window_s: float = 0.3  # of two windows over which velocities are compared
+    turn_sigma_rad: float = 3e-4  # error of a rotation by images over a window
+    position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows
+    axes_sigma: float = 0.012  # of scales and axes of gyro and accelerometer: 1 % and 0.7 degrees
+    scale_sigma: float = 0.015  # relative, of lengths by the images
+    significance: float = 40.0  # squared deviations of 9 axes from a true rig, above which they are applied
+    apply_s: float = 0.5  # time constant with which applied axes follow
+    offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
+    offset_sigma_s: float = 0.02  # cameras without a trigger line
+    offset_trusted_s: float = 3e-3  # deviation below which the offset is applied
+    offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
+    offset_rate: float = 0.05  # s/s, how fast the applied offset follows
+    apply_axes: bool = True  # False: axes are only estimated
+    apply_offset: bool = True  # False: only the configured offset is used
+
+
+class SelfCalibration:
+    """Call `add` with each pose by images, then `update`."""
+
+    def __init__(
+        self, calibration: ImuCalibration, config: SelfCalibrationConfig, p_b_c: F64, gravity_m_s2: float
+    ) -> None:
+        """p_b_c: (3,) m, camera in the body."""
+        self._calibration, self._config, self._p_b_c = calibration, config, p_b_c
+        self._gravity_m_s2 = gravity_m_s2
+        self.gyro = GyroCalibration(config.axes_sigma, config.offset_sigma_s, config.offset_s, calibration.gyro_walk)
+        self.accel = AccelCalibration(config.axes_sigma, config.scale_sigma, calibration.accel_walk, gravity_m_s2)
+        self._turns = PoseChain(config.turn_window_s)
+        self._moves = PoseChain(config.move_window_s)
+        self._before: tuple[Window, Link, float] | None = None  # the last window of moves, its density
+        self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
+        self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
+        self._corrects_gyro = self._corrects_accel = False
+        self._events: list[str] = []
+
+    def correct(self, samples: Samples) -> Samples:
+        """Samples with the applied scales and axes."""
+        gyro = samples.gyro @ self._gyro_matrix.T if self._corrects_gyro else samples.gyro
+        accel = samples.accel @ self._accel_matrix.T if self._corrects_accel else samples.accel
+        return Samples(samples.t_s, gyro, accel, samples.density)
+
+    def report(self) -> dict[str, Any]:
+        """What was found of gyro and accelerometer: measured = matrix @ true, in the body's axes by the camera.
+
+        camera_rotation_deg: (3,) rotation vector of the gyro's axes against those of the body, degrees.
+        """
+        return {
+            "gyro": _axes_report(self.gyro.matrix, self.gyro.axes_cov, self._corrects_gyro),
+            "accel": _axes_report(self.accel.matrix, self.accel.axes_cov, self._corrects_accel),
+            "camera_rotation_deg": np.degrees(_measured(self.gyro.matrix)[1]).round(3).tolist(),
+            "image_scale": [round(value, 5) for value in self.accel.scale],
+        }
+
+    def take_events(self) -> list[str]:
+        """A line for the log for each sensor whose correction began."""
+        events, self._events = self._events, []
+        return events
+
+    def add(self, t_ns: int, T_m_b: F64) -> None:
+        """Append the pose T_m_b (4,4) of a frame, by images alone."""
+        self._turns.add(t_ns, T_m_b)
+        self._moves.add(t_ns, T_m_b)
+
+    def clear(self) -> None:
+        """Begin new windows after an image loss."""
+        self._turns.clear()
+        self._moves.clear()
+        self._before = None
+
+    def begin_map(self) -> None:
+        """Begin new windows in a new map, whose vertical is unknown."""
+        self.clear()
+        self.accel.set_vertical(None)
+
+    def move_map(self, T_new_old: F64) -> None:
+        """Transform poses and gravity after the map moved: p_new = T_new_old p_old."""
+        self._turns.move_map(T_new_old)
+        self._moves.move_map(T_new_old)
+        self._before = None
+        self.accel.rotate_map(T_new_old[:3, :3])
+
+    def update(self, buffer: SampleBuffer, gravity: F64 | None, dt_s: float) -> F64:
+        """Add windows that are complete, and let the applied values follow the estimates.
+
+        gravity: (3,) in m as the smoother knows it; None: unknown. dt_s: since the last call. Returns the change (3,)
+        of the corrected accelerometer bias, m/s^2, that the change of its axes entails.
+        """
+        turn = self._turns.take(buffer, self.gyro.offset_s)
+        if isinstance(turn, Link):
+            window = self._integrate(turn)
+            variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
+            self.gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance)
+        if gravity is not None:
+            if not self.accel.has_vertical:
+                self.accel.set_vertical(gravity)
+            move = self._moves.take(buffer, self.gyro.offset_s)
+            if isinstance(move, Link):
+                self._add_move(move)
+            elif move:
+                self._before = None
+        self._follow_offset(dt_s)
+        return self._follow_axes(buffer, dt_s)
+
+    def _follow_offset(self, dt_s: float) -> None:
+        config = self._config
+        if not config.apply_offset or self.gyro.offset_sigma_s >= config.offset_trusted_s:
+            return
+        step = self.gyro.offset_s - self.offset_s
+        if abs(step) > config.offset_significance * self.gyro.offset_sigma_s:
+            self.offset_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
+
+    def _follow_axes(self, buffer: SampleBuffer, dt_s: float) -> F64:
+        config = self._config
+        change = np.zeros(3)
+        if not config.apply_axes:
+            return change
+        share = 1.0 - float(np.exp(-dt_s / config.apply_s))
+        if not self._corrects_gyro and self.gyro.significance() > config.significance:
+            self._corrects_gyro = True
+            self._events.append(_event("gyro", self.gyro.matrix))
+        if not self._corrects_accel and self.accel.significance() > config.significance:
+            self._corrects_accel = True
+            self._events.append(_event("accelerometer", self.accel.matrix))
+        if self._corrects_gyro:
+            self._gyro_matrix = self._gyro_matrix + share * (self.gyro.matrix - self._gyro_matrix)
+        if self._corrects_accel:
+            step = share * (self.accel.matrix - self._accel_matrix)
+            self._accel_matrix = self._accel_matrix + step
+            change = step @ buffer.last_accel
+        return change
+
+    def _add_move(self, link: Link) -> None:
+        window, density = self._integrate(link), float(self._density(link)[1])
+        if self._before is not None:
+            first, before, density_before = self._before
+            t0, t1 = first.duration_s, window.duration_s
+            images = self._config.position_sigma_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
+            imu = (t0 * density_before**2 + t1 * density**2) / 3.0
+            tilt = (self._gravity_m_s2 * self._config.turn_sigma_rad) ** 2 * 0.5 * (t0**2 + t1**2)
+            self.accel.add((first, window), (before.T_m_b0, link.T_m_b0, link.T_m_b1), self._p_b_c, images + imu + tilt)
+        self._before = (window, link, density)
+
+    def _integrate(self, link: Link) -> Window:
+        matrix, bias = self.gyro.matrix, self.gyro.bias
+        rates = link.rates @ matrix.T - bias
+        return Window.of(link.samples, matrix, bias, rates[0], rates[1])
+
+    def _density(self, link: Link) -> F64:
+        """(2,) noise density of gyro and accelerometer in a window."""
+        told = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
+        found = link.samples.density
+        return told if found is None else np.maximum(told, np.sqrt(np.mean(found**2, axis=0)))
+
+
+def _measured(matrix: F64) -> tuple[F64, F64]:
+    """What an IMU does, measured = matrix @ true, and its rotation vector (3,), for the correction `matrix` (3,3)."""
+    measured = np.asarray(np.linalg.inv(matrix), np.float64)
+    u, _, vt = np.linalg.svd(measured)
+    return measured, se3.so3_log(u @ vt)
+
+
+def _event(sensor: str, matrix: F64) -> str:
+    measured, rotation = _measured(matrix)
+    scale, angle = 100.0 * float(np.abs(np.diag(measured) - 1.0).max()), np.degrees(np.linalg.norm(rotation))
+    return f"{sensor}: scale off by up to {scale:.1f} %, camera rotated by {angle:.2f} degrees against it: corrected"
+
+
+def _axes_report(matrix: F64, cov: F64, applied: bool) -> dict[str, Any]:
+    measured, _ = _measured(matrix)
+    sigma = np.sqrt(np.diag(cov)).reshape(3, 3)
+    return {
+        "applied": applied,
+        "scale": np.diag(measured).round(5).tolist(),
+        "matrix": measured.round(5).tolist(),
+        "sigma": sigma.round(5).tolist(),
+    }

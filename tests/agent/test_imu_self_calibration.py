@@ -1,0 +1,188 @@
+"""Calibration of the IMU in flight, on simulated samples of worn and true IMUs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
+from kiteline_agent.inertial.calibration.window import Window
+from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_hw.sim.sensors import imu as sim_imu
+from kiteline_hw.sim.world.built_in_paths import built_in_path
+from kiteline_hw.sim.world.path import Path
+
+F64 = NDArray[np.float64]
+CALIBRATION = ImuCalibration()
+T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
+P_B_C = T_B_C[:3, 3].copy()
+FRAME_NS, STEP_NS = 50_000_000, 5_000_000
+HASTE = 0.4  # the course in so much of its time
+GYRO = np.array([[1.010, 0.006, -0.004], [-0.007, 0.991, 0.005], [0.003, 0.006, 1.008]])
+ACCEL = np.array([[0.990, -0.006, 0.005], [0.004, 1.011, 0.007], [-0.006, 0.003, 1.009]])
+
+
+@dataclass
+class Flight:
+    """Poses by images at the stamps of frames, and all samples."""
+
+    t_ns: NDArray[np.int64]
+    seen: F64
+    truth: F64
+    samples: ImuBatch
+
+
+def flight(
+    seconds: float, seed: int = 0, gyro: F64 | None = None, accel: F64 | None = None, late_ns: int = 0,
+    at_rest: bool = False,
+) -> Flight:  # fmt: skip
+    """A lively flight. gyro, accel: (3,3) with which the IMU measures. late_ns: stamps of frames after the exposure."""
+    rng = np.random.default_rng([seed, 5])
+    path = built_in_path("room", (seconds + 3.0) / HASTE, T_B_C, 0)
+    rest_s = seconds + 2.0 if at_rest else 0.0
+    path = Path(path.coefficients, path.knot_s * HASTE, path.length_s * HASTE, 0.7, rest_s)
+    exposed = np.arange(2, int(seconds * 1e9) // FRAME_NS, dtype=np.int64) * FRAME_NS
+    stamps = np.arange(0, int(seconds * 1e9), STEP_NS, dtype=np.int64)
+    measured = sim_imu.measure(path, stamps, 0, CALIBRATION, seed)
+    rate = measured.gyro if gyro is None else measured.gyro @ gyro.T
+    force = measured.accel if accel is None else measured.accel @ accel.T
+    truth = path.motion(exposed * 1e-9).T_w_b
+    errors = np.concatenate([5e-4 * rng.normal(size=(len(exposed), 3)), 2e-4 * rng.normal(size=(len(exposed), 3))], 1)
+    seen = np.array([T @ se3.exp(e) for T, e in zip(truth, errors, strict=True)])
+    return Flight(exposed + late_ns, seen, truth, ImuBatch(stamps, rate, force))
+
+
+def calibrated(
+    f: Flight, config: SelfCalibrationConfig | None = None, turn_map_at: int | None = None
+) -> SelfCalibration:
+    """A calibration after a flight, in a map that is turned at a frame."""
+    calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), P_B_C, 9.81)
+    buffer, done, moved = SampleBuffer(3.0, 0.2), 0, np.eye(4)
+    for k, (t_ns, T) in enumerate(zip(f.t_ns, f.seen, strict=True)):
+        end = int(np.searchsorted(f.samples.t_ns, t_ns, "right"))
+        buffer.push(ImuBatch(f.samples.t_ns[done:end], f.samples.gyro[done:end], f.samples.accel[done:end]))
+        done = end
+        if k == turn_map_at:
+            moved = se3.from_rt(se3.so3_exp(np.array([0.2, -0.3, 1.0])), np.array([3.0, 1.0, -2.0]))
+            calibration.move_map(moved)
+        calibration.add(int(t_ns), moved @ T)
+        calibration.update(buffer, moved[:3, :3] @ np.array([0.0, 0.0, -9.81]), 0.05)
+    return calibration
+
+
+def applied(calibration: SelfCalibration) -> tuple[F64, F64]:
+    """The matrices (3,3) with which samples are corrected."""
+    unit = Samples(np.arange(3.0), np.eye(3), np.eye(3))
+    corrected = calibration.correct(unit)
+    return corrected.gyro.T, corrected.accel.T
+
+
+def test_window_integrals_agree_with_sums_of_matrices() -> None:
+    rng = np.random.default_rng(1)
+    n = 31
+    t_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.003, 0.007, n - 1))])
+    gyro, accel, bias = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), 0.1 * rng.normal(size=3)
+    window = Window.of(Samples(t_s, gyro, accel), GYRO, bias, gyro[0], gyro[-1])
+    r, by_rate, by_force, time = np.eye(3), np.zeros((3, 9)), np.zeros((2, 3, 9)), np.zeros((2, 3, 3))
+    for k in range(n - 1):
+        dt, rate, force = t_s[k + 1] - t_s[k], 0.5 * (gyro[k] + gyro[k + 1]), 0.5 * (accel[k] + accel[k + 1])
+        after = r @ se3.so3_exp((GYRO @ rate - bias) * dt)
+        mean = 0.5 * (r + after) * dt
+        for weight, row in ((1.0, 0), (0.5 * (t_s[k] + t_s[k + 1]) / t_s[-1], 1)):
+            by_force[row] += weight * np.kron(mean, force)
+            time[row] += weight * mean
+        by_rate += np.kron(mean, rate)
+        r = after
+    np.testing.assert_allclose(window.turn, r, atol=1e-12)
+    np.testing.assert_allclose(window.by_rate, by_rate, atol=1e-12)
+    np.testing.assert_allclose(window.by_force, by_force, atol=1e-12)
+    np.testing.assert_allclose(window.time, time, atol=1e-12)
+
+
+def test_window_integrals_are_the_derivative_of_the_rotation() -> None:
+    samples = Samples(np.arange(31) * 0.005, np.random.default_rng(2).normal(size=(31, 3)), np.zeros((31, 3)))
+    window = Window.of(samples, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    for i in range(9):
+        step = np.zeros(9)
+        step[i] = 1e-5
+        turned = Samples(samples.t_s, samples.gyro @ (np.eye(3) + step.reshape(3, 3)).T, samples.accel)
+        change = se3.so3_log(window.turn.T @ preintegrate(turned, np.zeros(6), CALIBRATION).turn) / 1e-5
+        np.testing.assert_allclose(change, window.turn.T @ window.by_rate[:, i], atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_worn_imu_is_found_and_corrected(seed: int) -> None:
+    calibration = calibrated(flight(25.0, seed, GYRO, ACCEL, 4_000_000))
+    gyro, _ = applied(calibration)
+    wear = np.linalg.inv(GYRO) - np.eye(3)
+    assert np.linalg.norm(gyro - np.eye(3) - wear) < np.linalg.norm(wear) / 3.0
+    assert calibration.offset_s == pytest.approx(-4e-3, abs=1e-3)
+    # the accelerometer's errors along gravity look like its bias: as wrong as it believes to be
+    error = (calibration.accel.matrix - np.linalg.inv(ACCEL)).ravel()
+    assert error @ np.linalg.solve(calibration.accel.axes_cov, error) < 33.7  # 99.99 % of 9 degrees of freedom
+    error = (calibration.gyro.matrix - np.linalg.inv(GYRO)).ravel()
+    assert error @ np.linalg.solve(calibration.gyro.axes_cov, error) < 33.7
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_camera_that_turned_against_the_imu_is_found(seed: int) -> None:
+    """The camera defines the body's axes, so both sensors seem to have turned."""
+    turned = se3.so3_exp(np.array([4e-3, -3e-3, 2e-3]))
+    gyro, _ = applied(calibrated(flight(25.0, seed, turned, turned)))
+    assert np.linalg.norm(se3.so3_log(gyro @ turned)) < 1.8e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_true_imu_is_left_alone(seed: int) -> None:
+    calibration = calibrated(flight(25.0, seed))
+    samples = Samples(np.arange(3.0), np.eye(3), np.eye(3))
+    assert calibration.correct(samples).gyro is samples.gyro
+    assert calibration.correct(samples).accel is samples.accel
+    assert abs(calibration.offset_s) < 5e-4
+
+
+def test_without_motion_nothing_is_learned() -> None:
+    config = SelfCalibrationConfig()
+    calibration = calibrated(flight(10.0, 1, GYRO, ACCEL, at_rest=True))
+    samples = Samples(np.arange(3.0), np.eye(3), np.eye(3))
+    assert calibration.correct(samples).gyro is samples.gyro
+    assert calibration.offset_s == 0.0
+    assert np.abs(calibration.gyro.matrix - np.eye(3)).max() < 0.2 * config.axes_sigma
+    assert np.sqrt(np.diag(calibration.gyro.axes_cov)).min() > 0.9 * config.axes_sigma
+    assert calibration.gyro.offset_sigma_s > config.offset_trusted_s  # gyro noise looks like some motion
+
+
+def test_a_map_that_is_moved_changes_nothing() -> None:
+    f = flight(12.0, 3, GYRO, ACCEL)
+    still, turned = calibrated(f), calibrated(f, turn_map_at=120)
+    np.testing.assert_allclose(turned.gyro.matrix, still.gyro.matrix, atol=1e-9)
+    # a pair of windows across the move is left out
+    np.testing.assert_allclose(turned.accel.matrix, still.accel.matrix, atol=4e-3)
+
+
+def test_the_report_names_what_was_found() -> None:
+    calibration = calibrated(flight(25.0, 0, GYRO, ACCEL))
+    report = calibration.report()
+    assert report["gyro"]["applied"]
+    np.testing.assert_allclose(report["gyro"]["scale"], np.diag(GYRO), atol=4e-3)
+    np.testing.assert_allclose(report["gyro"]["matrix"], GYRO, atol=6e-3)
+    events = calibration.take_events()
+    assert len(events) == 1 and events[0].startswith("gyro: scale off by up to")
+    assert calibration.take_events() == []
+    turned = se3.so3_exp(np.array([4e-3, -3e-3, 2e-3]))
+    found = calibrated(flight(25.0, 0, turned, turned)).report()
+    np.testing.assert_allclose(found["camera_rotation_deg"], np.degrees([4e-3, -3e-3, 2e-3]), atol=0.1)
+
+
+def test_axes_can_be_held() -> None:
+    f = flight(12.0, 3, GYRO, ACCEL)
+    held = calibrated(f, replace(SelfCalibrationConfig(), apply_axes=False))
+    samples = Samples(np.arange(3.0), np.eye(3), np.eye(3))
+    assert held.correct(samples).gyro is samples.gyro
+    assert np.linalg.norm(held.gyro.matrix - np.eye(3)) > 0.01
