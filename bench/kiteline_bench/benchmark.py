@@ -63,6 +63,8 @@ def main(argv: list[str]) -> int:
     p.add_argument("names", metavar="NAME", nargs="*", help=f"out of: {', '.join(BENCHMARKS)} (default: all)")
     p.add_argument("--results", metavar="F", type=Path, default=Path("docs/results.md"), help="default: %(default)s")
     p.add_argument("--keep", metavar="DIR", type=Path, help="keep the flights in this folder")
+    p.add_argument("--starts", metavar="N", type=int, default=0,
+                   help="of the benches over several starts or seeds only N, for a quick look")  # fmt: skip
     a = p.parse_args(argv)
     chosen: list[tuple[str, str, Run]] = []
     for name in a.names or BENCHMARKS:
@@ -76,7 +78,7 @@ def main(argv: list[str]) -> int:
     all_met = True
     for name, title, run in chosen:
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:
-            bench = Bench(data, a.keep or Path(scratch), lambda text: print(text, flush=True))
+            bench = Bench(data, a.keep or Path(scratch), lambda text: print(text, flush=True), starts=a.starts)
             bars = run(bench)
         text = section(name, title, bars, bench.more)
         print("\n" + text)

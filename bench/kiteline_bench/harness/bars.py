@@ -8,12 +8,14 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from kiteline_bench.harness.result import FlownProcesses
 from kiteline_hw.ports import SourceError
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +45,22 @@ class FlightFailed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What a benchmark reads and writes. say: reports progress. more: Markdown that stands below the bars."""
+    """What a benchmark reads and writes. say: reports progress. more: Markdown that stands below the bars.
+
+    starts: most starts of a flight, or seeds, for a quick look; 0: all.
+    """
 
     data: Path
     folder: Path
     say: Callable[[str], None]
     more: list[str] = field(default_factory=list)
+    starts: int = 0
+
+    def chosen(self, starts: Sequence[T]) -> list[T]:
+        """All starts, or as many as wanted, spread evenly."""
+        n = len(starts)
+        few = min(self.starts or n, n)
+        return [starts[k * n // few] for k in range(few)]
 
     def source(self, name: str) -> str:
         """The path of a recording. Raises SourceError when it is not there."""

@@ -52,7 +52,8 @@ class AgentRun:
 
     estimates: None for a dropped frame. truth: T_w_b (4,4) or None. cpu_ns: CPU time of the step, 0 if dropped.
     placed: whether the base had placed the frame's submap by then. metric_submap: submap at the end, None while its
-    unit of length is not the metre. cached_keyframes: most that the agent's map cache held.
+    unit of length is not the metre; metric: whether it is, after each frame. cached_keyframes: most that the agent's
+    map cache held.
     """
 
     t_ns: list[int] = field(default_factory=list)
@@ -61,6 +62,7 @@ class AgentRun:
     cpu_ns: list[int] = field(default_factory=list)
     events: list[tuple[str, ...]] = field(default_factory=list)
     placed: list[bool] = field(default_factory=list)
+    metric: list[bool] = field(default_factory=list)
     bytes_up: int = 0
     bytes_down: int = 0
     cached_keyframes: int = 0

@@ -64,6 +64,7 @@ class FlyingAgent:
         run.truth.append(item.T_w_b)
         run.events.append(output.events)
         run.cached_keyframes = max(run.cached_keyframes, len(self.box.map_cache))
+        run.metric.append(self.box.metric)
         run.metric_submap = int(self.box.submap) if self.box.metric else None
         return output.packets
 
@@ -76,6 +77,7 @@ class FlyingAgent:
         self.run.truth.append(item.T_w_b)
         self.run.cpu_ns.append(0)
         self.run.events.append(())
+        self.run.metric.append(self.box.metric)
 
 
 def fly_alone(recording: Recording, config: AgentConfig | None = None, *, vocabulary: bool = True) -> AgentRun:
@@ -87,6 +89,40 @@ def fly_alone(recording: Recording, config: AgentConfig | None = None, *, vocabu
 
 
 # with a base
+
+
+@dataclass(slots=True)
+class RecordingRun:
+    """The flight of one agent along a recording, and the base at its end."""
+
+    agent: AgentRun
+    station: Station
+
+
+def fly_recording(
+    recording: Recording,
+    agent: AgentConfig | None = None,
+    base: BaseConfig | None = None,
+    bytes_s: tuple[int, int] = (0, 0),
+    profile: str = "wifi",
+) -> RecordingRun:
+    """Fly an agent with a base, in lock-step; packets arrive with the next frame. bytes_s: budget up and down."""
+    station = Station(base or BaseConfig(), lambda _: coded_channel(1, bytes_s[1], profile), shipped_vocabulary())
+    jobs, number = LockstepJobs(), AgentId(0)
+    channel = coded_channel(1, bytes_s[0], profile)
+    flying = FlyingAgent(recording.rig, recording.imu, agent, channel=channel, identity=Identity(number, 0))
+    first_ns = recording.items[0].frame.t_ns
+    down: tuple[bytes, ...] = ()
+    for item in recording.items:
+        now_ns = item.frame.t_ns - first_ns
+        up = flying.step(item, down, now_ns)
+        flying.run.placed.append(bool(flying.run.found[-1].submap in station.mapper.placements))
+        flying.run.bytes_down += sum(map(len, down))
+        flying.run.bytes_up += sum(map(len, up))
+        output = station.step({number: list(up)}, jobs.done(now_ns), now_ns)
+        jobs.add(output.jobs, now_ns)
+        down = dict(output.packets).get(number, ())
+    return RecordingRun(flying.run, station)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,178 @@
+"""One flight with a base, or without, compared with the truth; and tables and bars over several of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.runtime.frame_counts import live_pose
+from kiteline_basestation.runtime.flight_summary import keyframe_poses
+from kiteline_basestation.station import Station
+from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.harness.recording import Recording
+from kiteline_bench.harness.result import AgentRun
+from kiteline_bench.harness.run import fly_alone, fly_recording
+from kiteline_core.frame import Trajectory
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Rectifier
+from kiteline_lab.evaluation import metrics
+from kiteline_lab.evaluation.metrics import Matched, TrajectoryAlignment
+from kiteline_lab.flights.refined_path import refined_path
+
+F64 = NDArray[np.float64]
+Poses = list[tuple[int, F64]]
+
+_WINDOW_S, _STEP_S = 5.0, 1.0  # of the windows whose scale is compared with the truth
+_LEAST_PATH_M = 1.0  # in a window: from less the scale is not known
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """A flight and how long it took. refined: the base's path of the agent, T_w_b; empty without a base."""
+
+    run: AgentRun
+    refined: Poses
+    station: Station | None
+    seconds: float
+
+    @property
+    def begin_ns(self) -> int:
+        """Stamp of the first frame."""
+        return self.run.t_ns[0]
+
+    def poses(self, path: str, from_s: float = 0.0, to_s: float = float("inf")) -> Poses:
+        """Poses of the path "live", "base" or "odometry" between two times after the first frame."""
+        if path == "base":
+            found = self.refined
+        elif path == "live":
+            found = [(e.t_ns, pose) for e in self.run.found if (pose := live_pose(e)) is not None]
+        else:
+            found = [(e.t_ns, e.T_o_b) for e in self.run.tracked]
+        return [(t, T) for t, T in found if from_s <= (t - self.begin_ns) * 1e-9 < to_s]
+
+    def matched(
+        self, path: str, alignment: TrajectoryAlignment = TrajectoryAlignment.SE3, from_s: float = 0.0,
+        to_s: float = float("inf"),
+    ) -> Matched | None:  # fmt: skip
+        """A path beside the truth; None if fewer than four of its poses have a true one."""
+        poses, truth = self.poses(path, from_s, to_s), _truth(self.run)
+        if len(poses) < 4 or truth is None:
+            return None
+        estimate = Trajectory(np.array([t for t, _ in poses], np.int64), np.array([T for _, T in poses]))
+        try:
+            return metrics.match(estimate, truth, alignment)
+        except ValueError:
+            return None
+
+    def ate_m(self, path: str, from_s: float = 0.0) -> float:
+        """ATE, SE3-aligned; infinite without poses."""
+        found = self.matched(path, from_s=from_s)
+        return float("inf") if found is None else float(np.sqrt(np.mean(metrics.position_errors(found) ** 2)))
+
+    def rpe_mm(self, path: str) -> float:
+        """Relative error of one frame in mm."""
+        found = self.matched(path)
+        if found is None:
+            return float("inf")
+        n = len(found.t_ns)
+        step, _ = metrics.relative_errors(found, np.arange(n - 1), np.arange(1, n))
+        return float(1000.0 * np.sqrt(np.mean(step**2)))
+
+    def scale_error(self, path: str, from_s: float = 0.0, to_s: float = float("inf")) -> float:
+        """Share by which lengths are off; infinite without poses."""
+        found = self.matched(path, TrajectoryAlignment.SIM3, from_s, to_s)
+        return float("inf") if found is None else abs(1.0 / found.scale - 1.0)
+
+    @property
+    def metric_after_s(self) -> float:
+        """Time from the first frame until lengths are said to be metres; infinite if that is never said."""
+        said = [t for t, metric in zip(self.run.t_ns, self.run.metric, strict=True) if metric]
+        return (said[0] - self.begin_ns) * 1e-9 if said else float("inf")
+
+    @property
+    def lost_after_metric(self) -> int:
+        """Frames without a pose after lengths were first said to be metres; all of them if that is never said."""
+        after = self.begin_ns + 1e9 * self.metric_after_s
+        tracked = {e.t_ns for e in self.run.tracked}
+        return sum(t not in tracked for t in self.run.t_ns if t >= after or not np.isfinite(after))
+
+    def false_metric(self) -> float:
+        """Largest scale error of live poses in a window of 5 s that were all said to be metric; 0 if none were."""
+        worst, begin_s = 0.0, self.metric_after_s
+        metric = dict(zip(self.run.t_ns, self.run.metric, strict=True))
+        truth = _truth(self.run)
+        if truth is None:
+            return worst
+        end_s = (self.run.t_ns[-1] - self.begin_ns) * 1e-9
+        while np.isfinite(begin_s) and begin_s < end_s - 0.5 * _WINDOW_S:
+            poses = self.poses("live", begin_s, begin_s + _WINDOW_S)
+            if len(poses) > 20 and all(metric[t] for t, _ in poses):
+                true = metrics.truth_at(np.array([t for t, _ in poses], np.int64), truth)[1]
+                path_m = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
+                if path_m >= _LEAST_PATH_M:
+                    worst = max(worst, self.scale_error("live", begin_s, begin_s + _WINDOW_S))
+            begin_s += _STEP_S
+        return worst
+
+    def largest_jump_m(self) -> float:
+        """Largest change of the live pose between two frames, beside the motion in the odometry frame."""
+        found = [(e, pose) for e in self.run.found if (pose := live_pose(e)) is not None]
+        jumps = [
+            float(np.linalg.norm((pose_b @ se3.inverse(b.T_o_b) @ a.T_o_b)[:3, 3] - pose_a[:3, 3]))
+            for (a, pose_a), (b, pose_b) in pairwise(found)
+            if a.submap == b.submap
+        ]
+        return max(jumps, default=0.0)
+
+
+def flown(
+    bench: Bench, what: str, recording: Recording, *, base: bool = True, bytes_s: tuple[int, int] = (0, 0),
+    profile: str = "wifi",
+) -> Flown:  # fmt: skip
+    """Fly a recording in this process, and say what was flown and how long it took."""
+    begin_s = time.perf_counter()
+    if base:
+        flight = fly_recording(recording, bytes_s=bytes_s, profile=profile)
+        keyframes = {int(k): pose for k, pose in keyframe_poses(flight.station.mapper).items()}
+        refined = refined_path(flight.agent.found, keyframes, Rectifier(recording.rig).camera.T_b_c)
+        result = Flown(flight.agent, refined, flight.station, time.perf_counter() - begin_s)
+    else:
+        result = Flown(fly_alone(recording), [], None, time.perf_counter() - begin_s)
+    bench.say(f"{what}: {len(recording.items)} frames in {result.seconds:.0f} s")
+    return result
+
+
+def spread(
+    name: str, values: Sequence[float], limit: float, unit: str, digits: int = 3, *, worst: float | None = None
+) -> list[Bar]:
+    """Bars on the median and the worst of several flights. worst: a limit of its own."""
+    n = len(values)
+    return [
+        at_most(f"{name}: median of {n}", float(np.median(values)), limit, unit, digits),
+        at_most(f"{name}: worst", float(max(values)), limit if worst is None else worst, unit, digits),
+    ]
+
+
+def table(bench: Bench, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Show figures of single flights below the bars."""
+    lines = [f"{title}:", "", f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
+    lines += [f"| {' | '.join(_text(value) for value in row)} |" for row in rows]
+    bench.more.append("\n".join(lines))
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+    return str(value)
+
+
+def _truth(run: AgentRun) -> Trajectory | None:
+    known = [(t, T) for t, T in zip(run.t_ns, run.truth, strict=True) if T is not None]
+    if len(known) < 4:
+        return None
+    return Trajectory(np.array([t for t, _ in known], np.int64), np.array([T for _, T in known]))
