@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from kiteline_bench.reality import cpu, euroc
+from kiteline_bench.reality import base, cpu, euroc, motion, street, worn
 
 PARTS = {
     "euroc": ("Reality: one eye and a real IMU", euroc.run),
+    "room": ("Reality: a worn rig in a room", worn.room),
+    "hall": ("Reality: a worn rig in a hall", worn.hall),
+    "street": ("Reality: a street", street.run),
+    "motion": ("Reality: starts in motion", motion.run),
+    "base": ("Reality: the base beside the tracker alone", base.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
 }
