@@ -97,9 +97,11 @@ class Flown:
     @property
     def lost_after_metric(self) -> int:
         """Frames without a pose after lengths were first said to be metres; all of them if that is never said."""
+        if not np.isfinite(self.metric_after_s):
+            return len(self.run.t_ns)
         after = self.begin_ns + 1e9 * self.metric_after_s
         tracked = {e.t_ns for e in self.run.tracked}
-        return sum(t not in tracked for t in self.run.t_ns if t >= after or not np.isfinite(after))
+        return sum(t not in tracked for t in self.run.t_ns if t >= after)
 
     def false_metric(self) -> float:
         """Largest scale error of live poses in a window of 5 s that were all said to be metric; 0 if none were."""

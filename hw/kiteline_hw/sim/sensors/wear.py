@@ -24,7 +24,6 @@ Rng = np.random.Generator
 
 KINDS = ("lens", "extrinsics", "imu", "vibration", "range", "noise", "stamps", "gaps", "pairs")
 _SPREAD = (0.7, 1.3)  # factor on a nominal magnitude
-_APART_RAD = 1.05  # 60 degrees: both lenses sit on one mount, so their centres move in similar directions
 _REFERENCE_WIDTH_PX = 752  # image width for which WearConfig gives lengths in px
 
 
@@ -168,12 +167,10 @@ def draw(told: CameraRig, good: CameraRig, calibration: ImuCalibration, seed: in
     """A worn rig. told: its calibration. good: the true rig before it was worn. calibration: the IMU's, as told."""
     rngs = {kind: np.random.default_rng([seed, 61, k]) for k, kind in enumerate(KINDS)}
     left, right, T_c_r = good.left, good.right, good.T_c_r
-    heading = float(rngs["lens"].uniform(0.0, 2 * np.pi))
-    sign = _sign(rngs["lens"])
-    left = _worn_lens(left, rngs["lens"], wear, sign, heading)
-    if right is not None and T_c_r is not None:
-        turn = float(rngs["lens"].uniform(-_APART_RAD, _APART_RAD))
-        right = _worn_lens(right, rngs["lens"], wear, sign, heading + turn)
+    sign = _sign(rngs["lens"])  # one temperature: both focal lengths grow or shrink; centres move each for itself
+    left = _worn_lens(left, rngs["lens"], wear, sign)
+    if right is not None:
+        right = _worn_lens(right, rngs["lens"], wear, sign)
     rng = rngs["extrinsics"]
     T_b_c = good.T_b_c @ se3.exp(np.concatenate([np.zeros(3), _vector(rng, wear.camera_imu_rad)]))
     if T_c_r is not None:
@@ -210,8 +207,9 @@ def _vector(rng: Rng, length: float) -> F64:
     return np.asarray(length * _amount(rng) * direction / np.linalg.norm(direction))
 
 
-def _worn_lens(camera: CameraModel, rng: Rng, wear: WearConfig, sign: float, heading: float) -> CameraModel:
-    """A lens with a longer or shorter focal length, and its centre moved towards `heading`."""
+def _worn_lens(camera: CameraModel, rng: Rng, wear: WearConfig, sign: float) -> CameraModel:
+    """A lens with a longer or shorter focal length (sign 1 or -1), and its centre moved in a random direction."""
+    heading = rng.uniform(0.0, 2 * np.pi)
     focal = 1.0 + sign * wear.focal * _amount(rng)
     shift = wear.centre_px * _amount(rng) * camera.width / _REFERENCE_WIDTH_PX
     cx, cy = camera.cx + shift * np.cos(heading), camera.cy + shift * np.sin(heading)

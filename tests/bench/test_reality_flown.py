@@ -1,0 +1,75 @@
+"""The figures of the reality benches, on a flight whose errors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiteline_agent.runtime.frame_counts import live_pose
+from kiteline_bench.harness.bars import Bench
+from kiteline_bench.harness.recording import load
+from kiteline_bench.reality.flown import Flown, flown, spread
+from kiteline_core.geometry import se3
+
+
+def quiet(tmp_path: Path, data: Path = Path(), starts: int = 0) -> Bench:
+    return Bench(data, tmp_path, lambda _: None, starts=starts)
+
+
+@pytest.fixture(scope="module")
+def flight(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """Seven seconds of the room with a base."""
+    room = load(str(data_dir / "room_flight.mcap"), frames=140)
+    return flown(quiet(tmp_path_factory.mktemp("bench"), data_dir), "room", room)
+
+
+def test_a_good_flight(flight: Flown) -> None:
+    assert flight.run.lost == 0 and len(flight.refined) == 140
+    assert flight.ate_m("base") <= 1.2 * flight.ate_m("live") < 0.02
+    assert flight.metric_after_s == 0.0 and flight.lost_after_metric == 0 and flight.false_metric() < 0.02
+
+
+def scaled(flight: Flown, factor: float) -> Flown:
+    """The flight with lengths in another unit."""
+
+    def in_unit(T: np.ndarray | None) -> np.ndarray:
+        assert T is not None
+        return se3.from_rt(T[:3, :3], factor * T[:3, 3])
+
+    estimates = [replace(e, T_m_b=in_unit(e.T_m_b), T_o_b=in_unit(e.T_o_b), T_w_b=None)
+                 for e in flight.run.found]  # fmt: skip
+    return replace(flight, run=replace(flight.run, estimates=estimates))
+
+
+def test_a_wrong_unit_that_is_said_to_be_metres_is_found(flight: Flown) -> None:
+    wrong = scaled(flight, 1.1)
+    assert wrong.false_metric() == pytest.approx(0.1, abs=0.03)
+    assert wrong.scale_error("live", 2.0) == pytest.approx(0.1, abs=0.02)
+    silent = replace(wrong, run=replace(wrong.run, metric=[False] * 140))
+    assert silent.false_metric() == 0.0 and silent.metric_after_s == float("inf") and silent.lost_after_metric == 140
+    late = replace(wrong, run=replace(wrong.run, metric=[k >= 60 for k in range(140)]))
+    assert late.metric_after_s == pytest.approx(3.0, abs=0.01)
+
+
+def test_a_jump_beside_the_odometry_is_measured(flight: Flown) -> None:
+    moved = list(flight.run.found)
+    for k in range(70, 140):
+        shift = np.eye(4)
+        shift[0, 3] = 0.05
+        pose = live_pose(moved[k])
+        assert pose is not None
+        moved[k] = replace(moved[k], T_w_b=shift @ pose)
+    jumping = replace(flight, run=replace(flight.run, estimates=moved))
+    assert jumping.largest_jump_m() == pytest.approx(0.05, abs=0.012)
+    assert flight.largest_jump_m() < 0.02
+
+
+def test_bars_of_several_flights_and_the_starts_of_a_quick_look(tmp_path: Path) -> None:
+    bars = spread("x", [1.0, 3.0, 2.0], 2.5, "m", 1)
+    assert [(bar.measured, bar.met) for bar in bars] == [("2.0 m", True), ("3.0 m", False)]
+    assert spread("x", [3.0], 2.5, "", worst=3.5)[1].met
+    assert quiet(tmp_path, starts=3).chosen(range(10)) == [0, 3, 6]
+    assert quiet(tmp_path).chosen((4, 5)) == [4, 5] == quiet(tmp_path, starts=9).chosen((4, 5))
