@@ -9,21 +9,23 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 
-def _import_numba() -> ModuleType:
-    """Import numba without scipy: it takes 10 MiB for linear algebra that no kernel uses."""
+def _import_numba() -> tuple[ModuleType, dict[str, Any]]:
+    """Import numba without scipy: it takes 10 MiB for linear algebra that no kernel uses. Also the options of njit."""
     hidden = "scipy" not in sys.modules
     if hidden:
         sys.modules["scipy"] = None  # type: ignore[assignment]  # makes numba's import of it fail
     try:
         import numba
         import numba.core.event
+
+        from kiteline_core import kernel_compiler
     finally:
         if hidden:
             del sys.modules["scipy"]
-    return numba
+    return numba, kernel_compiler.install()
 
 
-_numba = _import_numba()
+_numba, _options = _import_numba()
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -56,5 +58,7 @@ def njit(function: F) -> F:
     half of the compile time of a small kernel.
     """
     helper = function.__name__.startswith("_")
-    compiled: F = _numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=helper)(function)
+    compiled: F = _numba.njit(
+        cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=helper, **_options
+    )(function)  # fmt: skip
     return compiled
