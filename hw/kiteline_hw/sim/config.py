@@ -38,6 +38,10 @@ class SimConfig:
     baseline: float = 0.11  # m
     scale: float = 1.0  # of image size and focal length
     exposure_s: float = 0.010  # indoor exposure of a small drone camera
+    readout_s: float = 0.0  # from the first row's exposure to the last row's: a rolling shutter; 0: a global one
+    exposure_step: float = 0.18  # logarithm of the factor by which the exposure steps up or down
+    exposure_every: float = 10.0  # s, mean time between two steps
+    flicker: float = 0.0  # amplitude of the lamps' brightness over its mean; exposures average most of it out
     read_noise: float = 1.2  # grey values
     shot_noise: float = 0.02  # variance per grey value
     miscalibration: float = 0.5  # error of the stated calibration, see rig.perturb; 0: none
@@ -73,6 +77,10 @@ def read_config(scene: str, **options: object) -> SimConfig:
         raise SourceError(f"agent {config.agent} has no trajectory: {1 + len(config.also)} are given")
     if config.seed < 0 or config.seconds < 0 or config.start < 0 or not 0.05 <= config.scale <= 4:
         raise SourceError("seed, seconds and start of a simulated scene cannot be negative; scale must be 0.05 to 4")
+    if not 0 <= config.readout_s < 0.05 or not 0 <= config.flicker <= 1 or config.exposure_every <= 0:
+        raise SourceError(
+            "readout_s of a simulated scene must be 0 to 0.05, flicker 0 to 1, exposure_every larger than 0"
+        )
     if not 0 <= config.odometry <= 1000 or config.odometry_noise < 0 or not 0 <= config.odometry_slip < 1:
         raise SourceError(
             "odometry of a simulated scene must be 0 to 1000 Hz, its noise not negative, its slip below 1"

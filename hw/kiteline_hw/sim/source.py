@@ -18,7 +18,7 @@ from kiteline_hw.ports import FrameSource, SourceError, SourceReport
 from kiteline_hw.sim.config import SimConfig, read_config
 from kiteline_hw.sim.sensors import imu as inertial
 from kiteline_hw.sim.sensors import odometer, wear
-from kiteline_hw.sim.sensors.camera import SimCamera
+from kiteline_hw.sim.sensors.camera import LAMP_HZ, Shutter, SimCamera
 from kiteline_hw.sim.sensors.rig import make_rig, perturb
 from kiteline_hw.sim.world.built_in_paths import built_in_path, lap_s
 from kiteline_hw.sim.world.path import Motion, Path, flight_s, to_trajectory
@@ -85,7 +85,7 @@ class SimSource:
         self._stamps = self.worn.stamps(self._exposed_ns)
         self._has_partner = self.worn.has_partner(self.frame_count)
         self._motion: Motion = self.path.motion(flight_s(self._exposed_ns, START_NS))
-        self._gains = _gains(self.frame_count, config.seed * 64 + config.agent)
+        self._gains = _gains(self.frame_count, config)
         self._workers = workers
 
     def _choose_path(self) -> Path:
@@ -133,11 +133,13 @@ class SimSource:
         c = self.config
         pose, velocity, rate = self._motion.T_w_b[k], self._motion.velocity[k], self._motion.rate[k]
         noise = (c.read_noise, c.shot_noise)
+        phase = LAMP_HZ * float(self._exposed_ns[k] - START_NS) * 1e-9 % 1.0
+        shutter = Shutter(c.exposure_s, c.readout_s, c.flicker, phase)
         images: list[NDArray[np.uint8]] = []
         for side, camera in enumerate(cameras if self._has_partner[k] else cameras[:1]):
             gain = float(self._gains[k]) * (1.0, 0.97)[side]
             key = (((c.seed * 64 + c.agent) << 36) + (2 * k + side) * 0xD1342543DE82) & ((1 << 63) - 1)
-            images.append(camera.take_image(pose, velocity, rate, c.exposure_s, gain, noise, key))
+            images.append(camera.take_image(pose, velocity, rate, shutter, gain, noise, key))
         right = images[1] if len(images) > 1 else None
         return Frame(int(self._stamps[k]), images[0], right, cameras[0].depth() if c.depth else None)
 
@@ -194,14 +196,15 @@ def _worn_rig(config: SimConfig, rig: CameraRig) -> wear.WornRig:
     return wear.draw(rig, good, ImuCalibration(rate_hz=1e9 / IMU_NS), own_seed, chosen)
 
 
-def _gains(frames: int, seed: int) -> F64:
-    """Grey values per unit of radiance: slow drift of the exposure, and a step up or down about every ten seconds."""
-    rng = np.random.default_rng([seed, 29])
+def _gains(frames: int, config: SimConfig) -> F64:
+    """Grey values per unit of radiance: slow drift of the exposure, and steps up or down."""
+    rng = np.random.default_rng([config.seed * 64 + config.agent, 29])
     phase = rng.uniform(0, 2 * np.pi, 2)
     t = np.arange(frames) * FRAME_NS * 1e-9
     drift = 0.10 * np.sin(2 * np.pi * t / 11.0 + phase[0]) + 0.05 * np.sin(2 * np.pi * t / 3.7 + phase[1])
     draws = rng.random((frames, 2))
-    steps = np.where(draws[:, 0] < FRAME_NS * 1e-9 / 10.0, np.where(draws[:, 1] < 0.5, -0.18, 0.18), 0.0)
+    size = np.where(draws[:, 1] < 0.5, -config.exposure_step, config.exposure_step)
+    steps = np.where(draws[:, 0] < FRAME_NS * 1e-9 / config.exposure_every, size, 0.0)
     level = np.zeros(frames)
     value = 0.0
     for k in range(frames):

@@ -11,7 +11,7 @@ import pytest
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.sim.sensors import lens
-from kiteline_hw.sim.sensors.camera import SimCamera
+from kiteline_hw.sim.sensors.camera import LAMP_HZ, Shutter, SimCamera
 from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
 from kiteline_hw.sim.source import SimSource, open_sim
@@ -182,16 +182,45 @@ def test_motion_blur_is_the_mean_of_the_exposure(room: SimSource) -> None:
     linear = to_camera @ (motion.velocity[0] + arm)
     _, distance, _ = eye.cast(motion.T_w_b[0])
     out = np.empty_like(sharp)
-    motion_blur(sharp, distance, lens.pixel_rays(room.rig.left), linear, angular, exposure, out)
+    motion_blur(sharp, distance, lens.pixel_rays(room.rig.left), linear, angular, exposure, 0.0, out)
     assert np.abs(sharp - many).mean() > 3 * np.abs(out - many).mean()
+
+
+def test_rows_of_a_rolling_shutter_are_those_of_their_times(room: SimSource) -> None:
+    """Rows of one warped cast against casts at the times of the rows."""
+    eye = room.cameras()[0]
+    times = np.arange(2.5, 7.5, 0.1)
+    t = float(times[np.argmax(np.linalg.norm(room.path.motion(times).rate, axis=1))])
+    readout, exposure = 0.045, 1e-5
+    motion = room.path.motion(np.array([t]))
+    mid = eye.cast(motion.T_w_b[0])[0].copy()
+    shutter = Shutter(exposure, readout)
+    rolled = eye.take_image(motion.T_w_b[0], motion.velocity[0], motion.rate[0], shutter, 100.0, (0.0, 0.0), 1)
+    still = eye.take_image(motion.T_w_b[0], motion.velocity[0], motion.rate[0], Shutter(exposure), 100.0, (0.0, 0.0), 1)
+    off = {"rolled": 0.0, "still": 0.0}
+    rows = range(2, len(mid) - 2, 6)
+    for row in rows:
+        at = t + readout * ((row + 0.5) / len(mid) - 0.5)
+        pose = room.path.motion(np.array([at]))
+        true = eye.take_image(pose.T_w_b[0], pose.velocity[0], pose.rate[0], Shutter(exposure), 100.0, (0.0, 0.0), 1)
+        for name, image in (("rolled", rolled), ("still", still)):
+            off[name] += float(np.abs(image[row].astype(int) - true[row]).mean()) / len(rows)
+    assert off["still"] > 2.0 * off["rolled"], off
+
+
+def test_lamps_flicker_in_bands_and_a_long_exposure_averages_them_out() -> None:
+    rows = Shutter(0.002, 0.03, 0.5, 0.1).lamps(480)
+    assert rows.max() - rows.min() > 0.8 and np.abs(rows.mean() - 1.0) < 0.1
+    assert np.ptp(Shutter(0.002, 0.0, 0.5, 0.1).lamps(480)) == 0.0
+    assert np.abs(Shutter(1.0 / LAMP_HZ, 0.03, 0.5, 0.1).lamps(480) - 1.0).max() < 1e-9
 
 
 def test_noise_variance() -> None:
     flat = np.full((200, 200), 100.0, np.float32)
     out = np.empty((200, 200), np.uint8)
-    expose(flat, np.ones_like(flat), 1.2, 1.5, 0.05, np.uint64(9), out)
+    expose(flat, np.ones_like(flat), np.full(200, 1.2), 1.5, 0.05, np.uint64(9), out)
     assert out.mean() == pytest.approx(120.0, abs=0.1)
     assert out.var() == pytest.approx(1.5**2 + 0.05 * 120 + 1 / 12, rel=0.05)
     again = np.empty_like(out)
-    expose(flat, np.ones_like(flat), 1.2, 1.5, 0.05, np.uint64(10), again)
+    expose(flat, np.ones_like(flat), np.full(200, 1.2), 1.5, 0.05, np.uint64(10), again)
     assert abs(np.corrcoef(out.ravel(), again.ravel())[0, 1]) < 0.03

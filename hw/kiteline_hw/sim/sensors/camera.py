@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,30 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
+
+LAMP_HZ = 119.7  # twice the mains' frequency, which is a little off: a whole number of periods a frame would hide it
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """When the rows of an image are exposed, and how lamps flicker then.
+
+    readout_s: from the first row's exposure to the last row's. flicker: amplitude of the lamps' brightness over its
+    mean; phase: of the lamps at the middle row, in turns.
+    """
+
+    exposure_s: float
+    readout_s: float = 0.0
+    flicker: float = 0.0
+    phase: float = 0.0
+
+    def lamps(self, rows: int) -> F64:
+        """Mean brightness (rows,) of the lamps over the exposure of each row; 1 without flicker."""
+        if self.flicker == 0.0:
+            return np.ones(rows)
+        row_s = self.readout_s * ((np.arange(rows) + 0.5) / rows - 0.5)
+        seen = self.flicker * np.sinc(LAMP_HZ * self.exposure_s)  # a long exposure averages it out
+        return np.asarray(1.0 + seen * np.sin(2 * np.pi * (self.phase + LAMP_HZ * row_s)))
 
 
 class SimCamera:
@@ -70,9 +96,9 @@ class SimCamera:
         return np.where(np.isfinite(z), z, 0.0).astype(np.float32)
 
     def take_image(
-        self, T_w_b: F64, velocity: F64, rate: F64, exposure_s: float, gain: float, noise: tuple[float, float], key: int
+        self, T_w_b: F64, velocity: F64, rate: F64, shutter: Shutter, gain: float, noise: tuple[float, float], key: int
     ) -> U8:
-        """The image (h, w) of an exposure centred on this pose.
+        """The image (h, w) of an exposure whose middle row is centred on this pose.
 
         velocity (3,) in w, rate (3,) in b. noise: read and shot (see `expose`), drawn from `key`.
         """
@@ -80,7 +106,10 @@ class SimCamera:
         to_camera = (T_w_b[:3, :3] @ self.T_b_c[:3, :3]).T
         angular = self.T_b_c[:3, :3].T @ rate
         linear = to_camera @ (velocity + T_w_b[:3, :3] @ (se3.skew(rate) @ self.T_b_c[:3, 3]))
-        motion_blur(radiance, distance, self._rays, linear, angular, exposure_s, self._streaked)
+        motion_blur(
+            radiance, distance, self._rays, linear, angular, shutter.exposure_s, shutter.readout_s, self._streaked
+        )
         out = np.empty(radiance.shape, np.uint8)
-        expose(self._streaked, self._vignette, gain, noise[0], noise[1], np.uint64(key), out)
+        gains = gain * shutter.lamps(len(radiance))
+        expose(self._streaked, self._vignette, gains, noise[0], noise[1], np.uint64(key), out)
         return out
