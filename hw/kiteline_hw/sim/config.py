@@ -48,6 +48,10 @@ class SimConfig:
     rig: str = "true"  # or worn: it differs from its calibration by more than a good one does, see sensors/wear.py
     rig_seed: int = -1  # of a worn rig; -1: that of the scene
     wear: tuple[str, ...] = KINDS  # kinds of wear of a worn rig
+    people: int = 0  # who walk through the view of the camera
+    cars: int = 0  # that drive ahead of the camera or towards it
+    repeated: float = 0.0  # share of the surfaces with a pattern that repeats every 0.3 m
+    glossy: float = 0.0  # share of the surfaces that reflect lights
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
 
@@ -81,6 +85,8 @@ def read_config(scene: str, **options: object) -> SimConfig:
         raise SourceError(
             "readout_s of a simulated scene must be 0 to 0.05, flicker 0 to 1, exposure_every larger than 0"
         )
+    if not 0 <= config.repeated <= 1 or not 0 <= config.glossy <= 1 or config.people < 0 or config.cars < 0:
+        raise SourceError("repeated and glossy of a simulated scene must be 0 to 1, people and cars not negative")
     if not 0 <= config.odometry <= 1000 or config.odometry_noise < 0 or not 0 <= config.odometry_slip < 1:
         raise SourceError(
             "odometry of a simulated scene must be 0 to 1000 Hz, its noise not negative, its slip below 1"

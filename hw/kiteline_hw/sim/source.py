@@ -20,11 +20,13 @@ from kiteline_hw.sim.sensors import imu as inertial
 from kiteline_hw.sim.sensors import odometer, wear
 from kiteline_hw.sim.sensors.camera import LAMP_HZ, Shutter, SimCamera
 from kiteline_hw.sim.sensors.rig import make_rig, perturb
+from kiteline_hw.sim.world.actors import make_actors
 from kiteline_hw.sim.world.built_in_paths import built_in_path, lap_s
 from kiteline_hw.sim.world.path import Motion, Path, flight_s, to_trajectory
 from kiteline_hw.sim.world.path_fit import read_trajectory
 from kiteline_hw.sim.world.scenes import build_indoor
 from kiteline_hw.sim.world.street import build_street
+from kiteline_hw.sim.world.surfaces import with_difficult_surfaces
 from kiteline_hw.sim.world.world import World
 from kiteline_hw.sources.overrides import SourceView
 
@@ -60,8 +62,10 @@ def build_world(config: SimConfig, camera_in_body: F64) -> World:
             points.append(built_in_path(config.scene, lap_s(config.scene), camera_in_body, agent).positions())
     cloud = np.concatenate(points)
     if config.scene == "street":
-        return build_street(cloud, config.seed, config.texture_bits)
-    return build_indoor(config.scene, cloud, config.seed, config.texture_bits)
+        world = build_street(cloud, config.seed, config.texture_bits)
+    else:
+        world = build_indoor(config.scene, cloud, config.seed, config.texture_bits)
+    return with_difficult_surfaces(world, config.seed, config.texture_bits, config.repeated, config.glossy)
 
 
 class SimSource:
@@ -77,6 +81,9 @@ class SimSource:
         self.worn = _worn_rig(config, self.rig)
         self.path = self._choose_path()
         self.world = world if world is not None else build_world(config, self.rig.T_b_c)
+        self._actors = make_actors(
+            self.world, self.path, self.rig.T_b_c, config.people, config.cars, config.seed * 64 + config.agent
+        )
         seconds = self.path.duration_s if not config.seconds else min(config.seconds, self.path.duration_s)
         self.frame_count = int(seconds * 1e9) // FRAME_NS + (1 if not config.seconds else 0)
         if self.frame_count < 1:
@@ -123,23 +130,23 @@ class SimSource:
     def cameras(self) -> list[SimCamera]:
         """New cameras in the world, left first. Each thread needs its own."""
         rig = self.worn.true
-        left = [SimCamera(self.world, rig.left, rig.T_b_c)]
+        left = [SimCamera(self.world, rig.left, rig.T_b_c, self._actors)]
         if rig.right is None or rig.T_c_r is None:
             return left
-        return [*left, SimCamera(self.world, rig.right, rig.T_b_c @ rig.T_c_r)]
+        return [*left, SimCamera(self.world, rig.right, rig.T_b_c @ rig.T_c_r, self._actors)]
 
     def render(self, k: int, cameras: list[SimCamera]) -> Frame:
         """Frame k of the flight; independent of the frames rendered before."""
         c = self.config
         pose, velocity, rate = self._motion.T_w_b[k], self._motion.velocity[k], self._motion.rate[k]
         noise = (c.read_noise, c.shot_noise)
-        phase = LAMP_HZ * float(self._exposed_ns[k] - START_NS) * 1e-9 % 1.0
-        shutter = Shutter(c.exposure_s, c.readout_s, c.flicker, phase)
+        t_s = float(self._exposed_ns[k] - START_NS) * 1e-9
+        shutter = Shutter(c.exposure_s, c.readout_s, c.flicker, LAMP_HZ * t_s % 1.0)
         images: list[NDArray[np.uint8]] = []
         for side, camera in enumerate(cameras if self._has_partner[k] else cameras[:1]):
             gain = float(self._gains[k]) * (1.0, 0.97)[side]
             key = (((c.seed * 64 + c.agent) << 36) + (2 * k + side) * 0xD1342543DE82) & ((1 << 63) - 1)
-            images.append(camera.take_image(pose, velocity, rate, shutter, gain, noise, key))
+            images.append(camera.take_image(pose, velocity, rate, shutter, gain, noise, key, t_s))
         right = images[1] if len(images) > 1 else None
         return Frame(int(self._stamps[k]), images[0], right, cameras[0].depth() if c.depth else None)
 

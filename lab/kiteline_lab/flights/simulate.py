@@ -72,7 +72,9 @@ def main(argv: list[str]) -> int:
         with whole_file(out, True) as part:
             samples = record(source, part, o.png)
         truth = out.with_suffix(".rig_truth.json")
-        truth.write_text(json.dumps({"rig": config.rig, "readout_s": config.readout_s, **source.worn.to_json()}, indent=1) + "\n")
+        truth.write_text(
+            json.dumps({"rig": config.rig, "readout_s": config.readout_s, **source.worn.to_json()}, indent=1) + "\n"
+        )
         print(f"{out}: {source.frame_count} frames, {samples} imu samples, {out.stat().st_size / 1e6:.1f} MB")
     assert world is not None
     grid = o.out.with_suffix(".yaml")

@@ -11,9 +11,11 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.sim.sensors.lens import pixel_rays, vignette
 from kiteline_hw.sim.sensors.sensor_kernels import expose, motion_blur
+from kiteline_hw.sim.world.actors import Actors
+from kiteline_hw.sim.world.overlay_kernels import overlay
 from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, TILE, render, tile_lists, visible_boxes
 from kiteline_hw.sim.world.textures import DETAIL_M
-from kiteline_hw.sim.world.world import World
+from kiteline_hw.sim.world.world import NO_GROUND, World
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -48,8 +50,9 @@ class Shutter:
 class SimCamera:
     """A camera in a world. Not thread-safe: its buffers are reused."""
 
-    def __init__(self, world: World, camera: CameraModel, T_b_c: F64) -> None:
+    def __init__(self, world: World, camera: CameraModel, T_b_c: F64, actors: Actors | None = None) -> None:
         self.world = world
+        self._actors = actors
         self.T_b_c = T_b_c
         self._rays = pixel_rays(camera)
         self._vignette = vignette(self._rays)
@@ -59,7 +62,7 @@ class SimCamera:
         self._axis = axis / np.linalg.norm(axis)
         self._half_angle = float(np.arccos(np.clip((inner @ self._axis).min(), -1, 1))) + 0.01
         self._pixel = 2.0 / (camera.fx + camera.fy)
-        n = len(world.boxes)
+        n = max(len(world.boxes), 0 if actors is None else len(actors.faces) // 6)
         tiles = ((camera.height + TILE - 1) // TILE) * ((camera.width + TILE - 1) // TILE)
         self._near = np.empty(n)
         self._items = np.empty(n, np.int32)
@@ -70,10 +73,10 @@ class SimCamera:
         self._distance = np.empty(shape, np.float32)
         self._hits = np.empty(shape, np.int32)
 
-    def cast(self, T_w_b: F64) -> tuple[F32, F32, I32]:
+    def cast(self, T_w_b: F64, t_s: float = 0.0) -> tuple[F32, F32, I32]:
         """Radiance, distance in m along the ray (inf for the sky) and hit of every pixel, each (h, w).
 
-        The arrays are overwritten by the next call.
+        t_s: flight time, of the solids that move. The arrays are overwritten by the next call.
         """
         w = self.world
         t_w_c = T_w_b @ self.T_b_c
@@ -88,7 +91,21 @@ class SimCamera:
             o, rot, self._rays, self._pixel, w.far_m, near, items, self._lists, self._lengths,
             self._radiance, self._distance, self._hits,
         )  # fmt: skip
+        if self._actors is not None:
+            self._draw_actors(self._actors, o, rot, t_s)
         return self._radiance, self._distance, self._hits
+
+    def _draw_actors(self, actors: Actors, o: F64, rot: F64, t_s: float) -> None:
+        """Draw what moves over the still world, as it stands at the middle of the exposure."""
+        w, boxes, near, items = self.world, actors.boxes(t_s), self._near, self._items
+        count = visible_boxes(boxes, NO_SHELL, o, rot @ self._axis, self._half_angle, near, items)
+        count = int(np.searchsorted(near[:count], w.far_m))
+        tile_lists(boxes, items, count, o, rot, self._rays, self._lists, self._lengths)
+        overlay(
+            boxes, actors.faces, NO_GROUND, w.field_frame, w.ground, w.pool.atlas, w.pool.table, DETAIL_M, o, rot,
+            self._rays, self._pixel, w.far_m, near, items, self._lists, self._lengths, len(w.boxes),
+            self._radiance, self._distance, self._hits,
+        )  # fmt: skip
 
     def depth(self) -> F32:
         """Depth (h, w) in m along the optical axis of the last cast, 0 for the sky."""
@@ -96,13 +113,15 @@ class SimCamera:
         return np.where(np.isfinite(z), z, 0.0).astype(np.float32)
 
     def take_image(
-        self, T_w_b: F64, velocity: F64, rate: F64, shutter: Shutter, gain: float, noise: tuple[float, float], key: int
-    ) -> U8:
+        self, T_w_b: F64, velocity: F64, rate: F64, shutter: Shutter, gain: float, noise: tuple[float, float], key: int,
+        t_s: float = 0.0,
+    ) -> U8:  # fmt: skip
         """The image (h, w) of an exposure whose middle row is centred on this pose.
 
         velocity (3,) in w, rate (3,) in b. noise: read and shot (see `expose`), drawn from `key`.
+        t_s: flight time, of the solids that move.
         """
-        radiance, distance, _ = self.cast(T_w_b)
+        radiance, distance, _ = self.cast(T_w_b, t_s)
         to_camera = (T_w_b[:3, :3] @ self.T_b_c[:3, :3]).T
         angular = self.T_b_c[:3, :3].T @ rate
         linear = to_camera @ (velocity + T_w_b[:3, :3] @ (se3.skew(rate) @ self.T_b_c[:3, 3]))

@@ -9,7 +9,8 @@ argument atomically would take longer than the ray.
 
 Arrays shared by the kernels (see world.py for their meaning):
 boxes (n, 8) float64: centre x y z, half-extent x y z, cos yaw, sin yaw. faces (6 n, 8) float64: texels per metre
-along u and v (signed), offset u and v in texels, brightness, contrast, texture, 1 where u and v are swapped.
+along u and v (signed), offset u and v in texels, brightness, contrast, texture, then SWAPPED where u and v are swapped,
+plus GLOSSY where lights are reflected.
 Faces are numbered 2 * axis + (1 where the outward normal is positive). A hit is 6 * box + face, or SKY or GROUND.
 """
 
@@ -28,6 +29,9 @@ TILE = 16  # px, side of a screen tile
 SKY = -1
 GROUND = -2
 NO_SHELL = -1  # outdoors
+SWAPPED = 1.0
+GLOSSY = 2.0
+_LIGHTS = 900.0  # texels a unit of direction: spacing of the reflected lights
 _WRAP = float(1 << 26)  # makes texel coordinates positive; a multiple of every texture's side
 _FACE_LIGHT = (0.86, 0.74, 0.95, 0.80, 0.70, 1.0)  # brightness by outward normal -x +x -y +y -z +z: light from above
 
@@ -169,7 +173,7 @@ def ground_hit(field: F32, frame: F64, o: F64, dx: float, dy: float, dz: float, 
 
 
 @njit(cache=True, nogil=True, _nrt=False, forceinline=True)
-def _cast(
+def cast_ray(
     boxes: F64, shell: int, field: F32, frame: F64, near: F64, items: I32, lists: I32, tile: int, length: int,
     o: F64, dx: float, dy: float, dz: float, far: float,
 ) -> tuple[float, int]:  # fmt: skip
@@ -255,7 +259,7 @@ def _surface(
 
 
 @njit(cache=True, nogil=True, _nrt=False, forceinline=True)
-def _shade(
+def shade_hit(
     boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: NDArray[np.int64],
     detail_m: float, o: F64, dx: float, dy: float, dz: float, t: float, hit: int, pixel: float,
 ) -> float:  # fmt: skip
@@ -294,16 +298,23 @@ def _shade(
         u, v, eu, ev, slope = lx, pz, ex, dz, abs(ey)
     else:
         u, v, eu, ev, slope = lx, ly, ex, ey, abs(dz)
-    if faces[hit, 7] != 0.0:
+    swapped, glossy = faces[hit, 7] % GLOSSY >= SWAPPED, faces[hit, 7] >= GLOSSY
+    if swapped:
         u, v, eu, ev = v, u, ev, eu
     length = np.sqrt(eu * eu + ev * ev) + 1e-12
     light = _FACE_LIGHT[number ^ 1 if index == shell else number]
     floor_gap = pz + boxes[index, 5]
     if number < 4 and index != shell:  # contact shadow where a solid stands on something
         light *= 1.0 - 0.3 * np.exp(-8.0 * floor_gap)
-    return light * _surface(
+    value = light * _surface(
         atlas, table, faces, hit, u, v, eu / length, ev / length, across, across / max(slope, 0.02), detail_m
     )
+    if glossy:  # reflected lights move over the surface with the camera; they brighten it towards grazing views
+        rx, ry, rz = (-ex if number < 2 else ex), (-ey if 2 <= number < 4 else ey), (-dz if number >= 4 else dz)
+        k, m = (1.0 / (abs(rz) + 0.6), int(faces[hit, 6]))
+        lamp = texture_value(atlas, table, m, _LIGHTS * rx * k, _LIGHTS * ry * k, 3.0)
+        value += (0.35 + 0.65 * (1.0 - slope)) * max(0.0, lamp - 150.0) / 100.0
+    return value
 
 
 @njit(cache=True, nogil=True)
@@ -323,10 +334,12 @@ def render(
                 dx = rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2
                 dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
                 dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
-                t, hit = _cast(boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far)
+                t, hit = cast_ray(
+                    boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
+                )
                 hits[y, x] = hit
                 distance[y, x] = t if hit != SKY else np.inf
-                radiance[y, x] = _shade(
+                radiance[y, x] = shade_hit(
                     boxes, faces, shell, field, frame, ground, atlas, table, detail_m, o, dx, dy, dz, t, hit, pixel
                 )
     for y in range(height):
@@ -351,8 +364,10 @@ def render(
                 dx = rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2
                 dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
                 dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
-                t, hit = _cast(boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far)
-                total += _shade(
+                t, hit = cast_ray(
+                    boxes, shell, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
+                )
+                total += shade_hit(
                     boxes, faces, shell, field, frame, ground, atlas, table, detail_m, o, dx, dy, dz, t, hit, pixel
                 )
             radiance[y, x] = 0.25 * total

@@ -269,6 +269,15 @@ def facade(rng: Rng, side: int) -> F32:
     return np.asarray(image + 3.0 * pink(rng, side, 0.8), np.float32)
 
 
+def tiles(rng: Rng, side: int) -> F32:
+    """The same tile again and again, with joints."""
+    tile = min(side, 64)
+    motif = np.zeros((tile, tile), np.float32)
+    paint(*shapes(rng, tile, 1.2, 2.0, 14.0, 40.0), motif)
+    motif[:3] = motif[:, :3] = -60.0
+    return np.asarray(np.tile(motif, (side // tile, side // tile)), np.float32)
+
+
 def clouds(rng: Rng, side: int) -> F32:
     """A soft sky."""
     return pink(rng, side, 1.9)
@@ -310,6 +319,7 @@ MAKERS: dict[str, Callable[[Rng, int], F32]] = {
     "asphalt": asphalt,
     "foliage": foliage,
     "facade": facade,
+    "tiles": tiles,
     "clouds": clouds,
     "detail": detail,
 }
