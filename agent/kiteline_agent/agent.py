@@ -28,6 +28,7 @@ from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
 from kiteline_agent.tracking.image_shift import ImageShift
+from kiteline_agent.tracking.map_anchor import MapAnchor
 from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
@@ -88,6 +89,7 @@ class Agent:
         self._skipped_imu: list[ImuBatch] = []  # of frames that the governor skipped
         self._frame_number = 0
         self._last_t_ns: int | None = None  # of the last processed frame
+        self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
 
@@ -153,6 +155,7 @@ class Agent:
         if not self._was_lost:
             self._image_shift.remember(images.left, camera.pose.T_c_m)
         self._last_t_ns = frame.t_ns
+        self._last_track = None if self._was_lost else track
         return self._estimate(ctx, outcome), outcome.events
 
     # stages of a frame
@@ -215,9 +218,10 @@ class Agent:
 
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame stays. Returns events."""
+        anchor = None if self._last_track is None or not records else MapAnchor(self.map, self._last_track)
         moved, events = self._corrections.take(records, self._channel.take_removed())
         if moved:
-            self._camera.follow_corrections()
+            self._camera.follow_corrections(None if anchor is None else anchor.T_new_old(self._config.pose))
         return events
 
     def _count_images(self, frame: Frame, first: int) -> None:

@@ -185,6 +185,14 @@ class LocalMap:
         order = np.argsort(-self.last_seen[slots], kind="stable")[: self.searched]
         return np.asarray(np.sort(slots[order]))
 
+    def positions(self, rows: I64) -> tuple[F64, F64]:
+        """Positions (n,3) m in the submap of landmarks in rows (n,), and one deviation of depth as a vector (n,3) m."""
+        slots, index = np.divmod(rows, self.slot_size)
+        T, rho = self.T_m_k[slots], self.rho[slots, index]
+        ray = np.einsum("nij,nj->ni", T[:, :3, :2], self.bearing[slots, index]) + T[:, :3, 2]
+        far = self.sigma_rho[slots, index] / rho**2  # d(1/rho) = d(rho) / rho^2
+        return T[:, :3, 3] + ray / rho[:, None], ray * far[:, None]
+
     def update_depths(
         self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float
     ) -> None:

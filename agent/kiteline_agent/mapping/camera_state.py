@@ -115,12 +115,15 @@ class CameraState:
         self.motion.move_map(se3.orthonormalise(self.pose.T_m_c @ se3.inverse(before)))
         self.reference.set_camera(self.pose.T_m_c)
 
-    def follow_corrections(self) -> None:
-        """The base moved keyframes of the local map: move with the reference keyframe."""
-        T_m_k = self.reference.T_m_k
-        if T_m_k is not None:
-            self.move_map(T_m_k @ self.reference.T_k_c)
-            self.covariance.apply_refinement(self.pose)
+    def follow_corrections(self, T_new_old: F64 | None) -> None:
+        """The base moved the local map: move by T_new_old (4,4), or with the reference keyframe if that is None."""
+        if T_new_old is not None:
+            self.move_map(T_new_old @ self.pose.T_m_c)
+        elif self.reference.T_m_k is not None:
+            self.move_map(self.reference.T_m_k @ self.reference.T_k_c)
+        else:
+            return
+        self.covariance.apply_refinement(self.pose)
 
     def return_to(self, found: Relocalisation, frame_number: int) -> None:
         """Continue in the submap in which the frame was relocalised."""

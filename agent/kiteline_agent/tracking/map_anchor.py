@@ -1,0 +1,51 @@
+"""How far corrections move the map at the camera: by the landmarks that the last frame tracked.
+
+Keyframe and landmarks do not move alike: a refined landmark moves relative to its keyframe, and the landmarks in view
+hang on many keyframes. The camera moves with what it sees, so that the next frame is where odometry expects it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import PoseConfig
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.tracking.track import Track
+from kiteline_core.geometry import se3
+from kiteline_core.pose import pose_kernels
+
+F64 = NDArray[np.float64]
+
+
+class MapAnchor:
+    """The landmarks of a frame before corrections are applied; compare them with `T_new_old` afterwards."""
+
+    def __init__(self, local_map: LocalMap, track: Track) -> None:
+        self._map = local_map
+        self._track = track
+        self._rows = track.rows[track.inlier]
+        self._keyframes = local_map.keyframe[self._rows // local_map.slot_size]
+        self._xyz, self._ray = local_map.positions(self._rows)
+
+    def T_new_old(self, config: PoseConfig) -> F64 | None:
+        """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""
+        m = self._map
+        left = m.usable.reshape(-1)[self._rows] & (m.keyframe[self._rows // m.slot_size] == self._keyframes)
+        if np.count_nonzero(left) < config.min_inliers:
+            return None
+        after, _ = m.positions(self._rows[left])
+        T_c_old = self._pose(self._xyz[left], left, config)
+        T_c_new = self._pose(after, left, config)
+        return se3.orthonormalise(se3.inverse(T_c_new) @ T_c_old)
+
+    def _pose(self, xyz: F64, left: NDArray[np.bool_], config: PoseConfig) -> F64:
+        """T_c_m (4,4) from the frame's observations of landmarks at xyz (n,3)."""
+        track = self._track
+        T = track.T_c_m.copy()
+        inlier = np.ones(len(xyz), np.bool_)
+        pose_kernels.optimise_pose(
+            T, xyz, self._ray[left], track.observed[track.inlier][left], track.sigma_px[track.inlier][left],
+            self._map.intrinsics, track.T_c_m, np.zeros(6), 1, config.iterations, config.chi2, inlier, np.zeros((6, 6)),
+        )  # fmt: skip
+        return se3.orthonormalise(T)
