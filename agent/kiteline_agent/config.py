@@ -265,9 +265,10 @@ class MapCacheConfig:
 class SmoothingConfig:
     """How corrections reach the live pose in the world. They never move the odometry frame."""
 
-    max_m_s: float = 0.2  # m/s at which the odometry frame moves in w: no jump, done within a second; 0: at once
-    max_rad_s: float = 0.0  # rad/s at which it rotates; 0: at once
-    snap_m: float = 0.3  # m: larger corrections are map merges and taken at once
+    max_m_s: float = 0.03  # m/s at which the odometry frame moves in w: 3 mm a frame at 10 Hz; 0: at once
+    time_s: float = 10.0  # s in which a larger correction is done, but for the last e-th: it moves faster
+    max_rad_s: float = 0.0  # rad/s at which it rotates about the vehicle; 0: at once, which moves nothing
+    snap_m: float = 1.0  # m: a correction that moves the vehicle farther at once is a map merge, and not smoothed
 
 
 @dataclass(frozen=True, slots=True)

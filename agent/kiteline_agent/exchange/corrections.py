@@ -32,6 +32,8 @@ from kiteline_core.ids import SubmapId
 
 F64 = NDArray[np.float64]
 
+_SAME_TILT = 0.9999  # cosine of the angle, 0.8 degrees, between verticals that agree: gravity is known to half a degree
+
 
 class Corrections:
     """Applies the base's records, one handler for each kind, and holds where submaps lie in the world."""
@@ -42,6 +44,7 @@ class Corrections:
         self._smoothing = Smoothing(smoothing)
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
+        self._upright: GravityAlignment | None = None  # of the submap that began in motion
         self.tiles: dict[tuple[int, int], GridTile] = {}
         # A handler returns whether the local map moved.
         self._handlers: Mapping[type[Record], Callable[[Any], bool]] = {
@@ -76,6 +79,8 @@ class Corrections:
         return moved, self._events
 
     def _place(self, record: SubmapPlacement) -> bool:
+        if not record.recognised and self._contradicts_gravity(record.submap, record.S_w_m):
+            return False  # sent before the base knew of gravity; the upright placement follows
         self._S_w_m[record.submap] = record.S_w_m
         if record.recognised:
             self._recognised.add(record.submap)
@@ -98,8 +103,22 @@ class Corrections:
         return submap in self._recognised
 
     def set_upright(self, alignment: GravityAlignment) -> None:
-        """Place a gravity-aligned submap until the base does, which takes seconds over a thin link."""
-        self._S_w_m.setdefault(alignment.submap, alignment.T_l_m)
+        """Place a gravity-aligned submap until the base's placement is upright too, which takes seconds on a thin link.
+
+        A placement that rests on a merge stands: the world of another agent need not be level.
+        """
+        self._upright = alignment
+        held = self._S_w_m.get(alignment.submap)
+        recognised = alignment.submap in self._recognised
+        if held is None or (not recognised and self._contradicts_gravity(alignment.submap, held)):
+            self._S_w_m[alignment.submap] = alignment.T_l_m
+
+    def _contradicts_gravity(self, submap: SubmapId, S_w_m: F64) -> bool:
+        """True if a placement tilts a submap whose vertical the agent knows."""
+        if self._upright is None or self._upright.submap != submap:
+            return False
+        up, told = self._upright.T_l_m[2, :3], sim3.rigid(S_w_m)[2, :3]
+        return float(up @ told) < _SAME_TILT
 
     def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int) -> F64 | None:
         """T_w_b (4,4), with corrections smoothed; None if the submap is not placed.

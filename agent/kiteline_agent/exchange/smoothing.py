@@ -16,7 +16,8 @@ class Smoothing:
 
     def __init__(self, config: SmoothingConfig) -> None:
         self._config = config
-        self._T_w_o: F64 | None = None
+        self._T_w_o: F64 | None = None  # as reported
+        self._goal: F64 | None = None  # as corrected, at the last call
         self._t_ns = 0
 
     @property
@@ -31,27 +32,33 @@ class Smoothing:
         than o, is applied at once.
         """
         dt_s, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
-        limits = self._config
-        if self._T_w_o is None or not self.on or dt_s <= 0.0:
+        limits, before = self._config, self._goal
+        self._goal = T_w_o
+        if self._T_w_o is None or before is None or not self.on or dt_s <= 0.0:
+            self._T_w_o = T_w_o
+            return T_w_o
+        if float(np.linalg.norm(_shift(before, T_w_o, here_o))) > limits.snap_m:
             self._T_w_o = T_w_o
             return T_w_o
         held = self._T_w_o
-        moved = se3.transform(T_w_o, here_o[None])[0] - se3.transform(held, here_o[None])[0]
+        left = _shift(held, T_w_o, here_o)
         rotation = se3.so3_log(sim3.rigid(T_w_o)[:3, :3] @ sim3.rigid(held)[:3, :3].T)
-        distance, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(rotation))
-        if distance > limits.snap_m:
-            self._T_w_o = T_w_o
-            return T_w_o
-        share = 1.0  # of the correction, applied in this time: translation and rotation end together
+        distance, angle = float(np.linalg.norm(left)), float(np.linalg.norm(rotation))
+        shift_share = turn_share = 1.0  # of what is left of the correction, applied in this time
         if limits.max_m_s > 0.0 and distance > 0.0:
-            share = min(share, limits.max_m_s * dt_s / distance)
+            shift_share = min(1.0, max(limits.max_m_s / distance, 1.0 / limits.time_s) * dt_s)
         if limits.max_rad_s > 0.0 and angle > 0.0:
-            share = min(share, limits.max_rad_s * dt_s / angle)
-        if share >= 1.0:
+            turn_share = min(1.0, limits.max_rad_s * dt_s / angle)
+        if shift_share >= 1.0 and turn_share >= 1.0:
             self._T_w_o = T_w_o
             return T_w_o
-        R = se3.so3_exp(share * rotation) @ sim3.rigid(held)[:3, :3]
-        at = se3.transform(held, here_o[None])[0] + share * moved
+        R = se3.so3_exp(turn_share * rotation) @ sim3.rigid(held)[:3, :3]
+        at = se3.transform(held, here_o[None])[0] + shift_share * left
         scale = sim3.scale_of(T_w_o)
         self._T_w_o = sim3.normalise(sim3.of(scale, se3.from_rt(R, at - scale * R @ here_o)))
         return self._T_w_o
+
+
+def _shift(T_w_a: F64, T_w_b: F64, here: F64) -> F64:
+    """How far (3,) the vehicle at `here` (3,) moves in w from one pose of its frame to another."""
+    return np.asarray((se3.transform(T_w_b, here[None]) - se3.transform(T_w_a, here[None]))[0])
