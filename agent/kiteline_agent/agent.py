@@ -218,10 +218,13 @@ class Agent:
 
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame stays. Returns events."""
-        anchor = None if self._last_track is None or not records else MapAnchor(self.map, self._last_track)
+        anchor = MapAnchor(self.map, self._last_track) if records and self._last_track is not None else None
         moved, events = self._corrections.take(records, self._channel.take_removed())
-        if moved:
-            self._camera.follow_corrections(None if anchor is None else anchor.T_new_old(self._config.pose))
+        if moved and anchor is not None:
+            self.work.posed_points += anchor.landmarks
+            self._camera.follow_corrections(anchor.T_new_old(self._config.pose))
+        elif moved:
+            self._camera.follow_corrections(None)
         return events
 
     def _count_images(self, frame: Frame, first: int) -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
-from kiteline_codec.schema import Key, SubmapPlacement
+from kiteline_codec.schema import GravityAlignment, Key, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, submap_id
@@ -44,3 +47,36 @@ def test_a_withdrawn_placement_recognises_nothing(corrections: Corrections) -> N
     corrections.take([], [Key(SubmapPlacement.KIND, int(SECOND), 0)])
     assert not corrections.is_recognised(SECOND)
     assert corrections.in_world(SECOND, np.eye(4), np.eye(4), 0) is None
+
+
+TILTED = GravityAlignment(FIRST, se3.exp(np.array([0.2, 0.1, 0.0, 0.4, -0.2, 0.0])))
+
+
+def in_world(corrections: Corrections) -> NDArray[np.float64]:
+    """T_w_b of a body at the origin of the first submap, nothing of which was reported before."""
+    placed = copy.deepcopy(corrections).in_world(FIRST, np.eye(4), np.eye(4), 0)
+    assert placed is not None
+    return placed
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_start_in_motion_is_upright_until_the_base_knows(corrections: Corrections, before: bool) -> None:
+    """The base places the first submap before it has heard of gravity."""
+    if before:
+        corrections.take([SubmapPlacement(FIRST, np.eye(4))], [])
+    corrections.set_upright(TILTED)
+    if not before:
+        corrections.take([SubmapPlacement(FIRST, np.eye(4))], [])
+    assert np.allclose(in_world(corrections), TILTED.T_l_m)
+    moved = se3.from_rt(np.eye(3), np.array([3.0, 0.0, 0.0])) @ TILTED.T_l_m
+    corrections.take([SubmapPlacement(FIRST, moved)], [])
+    assert np.allclose(in_world(corrections), moved)
+
+
+def test_a_merge_stands_even_if_the_other_world_is_not_level(corrections: Corrections) -> None:
+    corrections.take([SubmapPlacement(FIRST, FAR, recognised=True)], [])
+    corrections.set_upright(TILTED)
+    assert np.allclose(in_world(corrections), FAR)
+    other = FAR @ se3.exp(np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
+    corrections.take([SubmapPlacement(FIRST, other, recognised=True)], [])
+    assert np.allclose(in_world(corrections), other)

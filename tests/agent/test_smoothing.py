@@ -59,3 +59,29 @@ def test_another_unit_of_length_is_told_at_once_and_the_vehicle_does_not_jump() 
     for n in range(2, 200):
         told = smoothing.follow(goal, here, n * TICK_NS)
     assert np.allclose(told, goal, atol=1e-9)
+
+
+def test_the_vehicle_turns_at_once_and_moves_slowly() -> None:
+    limits = SmoothingConfig()
+    smoothing = Smoothing(limits)
+    here = np.array([20.0, 5.0, 1.0])
+    told = smoothing.follow(np.eye(4), here, 0)
+    turn = se3.from_rt(np.eye(3), here) @ se3.exp(np.array([0, 0, 0, 0, 0, 0.1])) @ se3.from_rt(np.eye(3), -here)
+    goal = se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])) @ turn
+    told = smoothing.follow(goal, here, TICK_NS)
+    assert np.allclose(told[:3, :3], goal[:3, :3])
+    moved = np.linalg.norm(se3.transform(told, here[None])[0] - here)
+    assert np.isclose(moved, limits.max_m_s * 0.05)
+
+
+def test_what_adds_up_to_more_than_a_merge_is_no_jump() -> None:
+    """Many small corrections that run ahead of the reported pose: it moves faster, but never at once."""
+    limits = SmoothingConfig()
+    smoothing = Smoothing(limits)
+    told = smoothing.follow(np.eye(4), np.zeros(3), 0)
+    for n in range(1, 400):
+        goal = se3.from_rt(np.eye(3), np.array([min(n, 100) * 0.05, 0.0, 0.0]))  # 5 m in 5 s
+        last, told = told, smoothing.follow(goal, np.zeros(3), n * TICK_NS)
+        left = goal[0, 3] - last[0, 3]
+        assert 0.0 <= told[0, 3] - last[0, 3] <= max(limits.max_m_s, left / limits.time_s) * 0.05 + 1e-12
+    assert goal[0, 3] - told[0, 3] < goal[0, 3] * np.exp(-14.0 / limits.time_s)

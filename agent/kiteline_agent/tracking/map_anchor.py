@@ -28,6 +28,11 @@ class MapAnchor:
         self._keyframes = local_map.keyframe[self._rows // local_map.slot_size]
         self._xyz, self._ray = local_map.positions(self._rows)
 
+    @property
+    def landmarks(self) -> int:
+        """Number of landmarks that are compared."""
+        return len(self._rows)
+
     def T_new_old(self, config: PoseConfig) -> F64 | None:
         """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""
         m = self._map

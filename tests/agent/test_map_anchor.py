@@ -1,0 +1,117 @@
+"""How far corrections move the map under the camera: with the landmarks in view, not with one keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.tracking.map_anchor import MapAnchor
+from kiteline_agent.tracking.track import Track
+from kiteline_codec.schema import CulledLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+
+F64 = NDArray[np.float64]
+CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
+CONFIG = AgentConfig()
+LANDMARKS, IN_VIEW = 80, 60  # of each of three keyframes; the last one's are not tracked
+
+
+def scene(seed: int = 0) -> tuple[LocalMap, Track]:
+    """Three keyframes with landmarks, and a frame that tracks those of the first two without error."""
+    rng = np.random.default_rng(seed)
+    local_map = LocalMap(CAMERA, CONFIG.local_map, CONFIG.depth_filter)
+    for k in range(3):
+        z = rng.uniform(2.0, 8.0, LANDMARKS)
+        uv = rng.uniform((80.0, 60.0), (680.0, 420.0), (LANDMARKS, 2))
+        T_m_k = se3.exp(rng.normal(0.0, 0.05, 6))
+        local_map.add(
+            KeyframeHeader(KeyframeId(k), 0, NO_KEYFRAME, T_m_k, LANDMARKS), T_m_k, uv, 1.0 / z,
+            np.full(LANDMARKS, 1e-3), np.zeros(LANDMARKS, np.uint8), np.zeros(LANDMARKS, np.uint8),
+            np.zeros((LANDMARKS, 32), np.uint8), np.zeros((LANDMARKS, 3, 21, 21), np.uint8), 0,
+        )  # fmt: skip
+        local_map.share(KeyframeId(k), LANDMARKS)
+    rows = np.concatenate([k * local_map.slot_size + np.arange(IN_VIEW) for k in range(2)]).astype(np.int64)
+    T_c_m = se3.exp(rng.normal(0.0, 0.05, 6))
+    xyz, ray = local_map.positions(rows)
+    p = se3.transform(T_c_m, xyz)
+    n = len(rows)
+    observed = np.column_stack([
+        CAMERA.fx * p[:, 0] / p[:, 2] + CAMERA.cx, CAMERA.fy * p[:, 1] / p[:, 2] + CAMERA.cy, CAMERA.bf / p[:, 2],
+    ])  # fmt: skip
+    return local_map, Track(
+        T_c_m, rows, observed, np.full(n, 0.3), p[:, 2], np.ones(n, np.bool_), np.eye(6), n, 1.0, n, xyz, ray
+    )
+
+
+def pose_record(local_map: LocalMap, k: int, motion: F64) -> KeyframePose:
+    return KeyframePose(KeyframeId(k), motion @ local_map.T_m_k[k])
+
+
+@given(st.integers(0, 1000))
+def test_a_map_that_moves_as_a_whole_takes_the_camera_along(seed: int) -> None:
+    local_map, track = scene(seed)
+    anchor = MapAnchor(local_map, track)
+    motion = se3.exp(np.random.default_rng(seed + 1).normal(0.0, 0.02, 6))
+    for k in range(3):
+        local_map.set_pose(pose_record(local_map, k, motion))
+    T_new_old = anchor.T_new_old(CONFIG.pose)
+    assert T_new_old is not None
+    assert np.allclose(T_new_old, motion, atol=1e-5)
+
+
+def test_a_keyframe_out_of_view_moves_nothing() -> None:
+    local_map, track = scene()
+    anchor = MapAnchor(local_map, track)
+    local_map.set_pose(pose_record(local_map, 2, se3.exp(np.array([0.3, 0.1, 0.0, 0.0, 0.1, 0.0]))))
+    T_new_old = anchor.T_new_old(CONFIG.pose)
+    assert T_new_old is not None
+    assert np.allclose(T_new_old, np.eye(4), atol=1e-7)
+
+
+def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
+    """The base moves the keyframes, and refines their landmarks so that these stay where they are."""
+    local_map, track = scene()
+    anchor = MapAnchor(local_map, track)
+    index = np.arange(LANDMARKS)
+    for k in range(2):
+        xyz, _ = local_map.positions(k * local_map.slot_size + index)
+        local_map.set_pose(pose_record(local_map, k, se3.exp(np.array([0.02, -0.03, 0.04, 0.01, 0.0, -0.01]))))
+        p = se3.transform(se3.inverse(local_map.T_m_k[k]), xyz)
+        uv = np.array([CAMERA.fx, CAMERA.fy]) * p[:, :2] / p[:, 2:] + np.array([CAMERA.cx, CAMERA.cy])
+        offset = (uv - local_map.uv[k, :LANDMARKS]).astype(np.float32)
+        inverse = (1.0 / p[:, 2]).astype(np.float32)
+        local_map.refine(RefinedLandmarks(KeyframeId(k), index.astype(np.uint16), inverse, offset))
+    T_new_old = anchor.T_new_old(CONFIG.pose)
+    assert T_new_old is not None
+    assert np.allclose(T_new_old, np.eye(4), atol=1e-5)
+
+
+@pytest.mark.parametrize("left", [10, 40])
+def test_culled_landmarks_do_not_count(left: int) -> None:
+    local_map, track = scene()
+    anchor = MapAnchor(local_map, track)
+    local_map.set_pose(pose_record(local_map, 0, se3.exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))))
+    local_map.remove(CulledLandmarks(KeyframeId(0), np.arange(LANDMARKS, dtype=np.uint16), 0))
+    local_map.remove(CulledLandmarks(KeyframeId(1), np.arange(left, LANDMARKS, dtype=np.uint16), 0))
+    T_new_old = anchor.T_new_old(CONFIG.pose)
+    if left < CONFIG.pose.min_inliers:
+        assert T_new_old is None
+    else:
+        assert T_new_old is not None
+        assert np.allclose(T_new_old, np.eye(4), atol=1e-7)
+
+
+def test_an_evicted_keyframe_does_not_count() -> None:
+    local_map, track = scene()
+    anchor = MapAnchor(local_map, replace(track, inlier=track.rows < local_map.slot_size))
+    local_map.keyframe[0] = 77
+    assert anchor.T_new_old(CONFIG.pose) is None
