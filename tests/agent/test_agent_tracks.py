@@ -117,7 +117,7 @@ def test_faults_on_frames_are_survived(data_dir: Path, fault: str) -> None:
     assert jump_m(estimates) < 0.35
 
 
-def test_where_the_imu_knows_the_place_the_map_goes_on(data_dir: Path) -> None:
+def test_dead_reckoning_extends_the_map(data_dir: Path) -> None:
     source = open_source(str(data_dir / "room_flight.mcap"))
     items, seen = [], 0
     for item in first_frames(source, 90):

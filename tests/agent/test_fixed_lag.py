@@ -303,7 +303,7 @@ def test_condensed_points_say_what_points_say() -> None:
     assert np.all(np.abs(error_of(one[-1], all_[-1].T_m_b)) < 0.2 * sigma[:6])
 
 
-def test_covariance_is_honest() -> None:
+def test_covariance_is_consistent() -> None:
     """Normalised squared errors of pose, velocity and biases stay within their band over independent flights."""
     pose, rest = [], []
     for seed in range(24):
@@ -330,7 +330,7 @@ def test_biases_and_a_wrong_level_are_found() -> None:
     assert np.abs(s.bias[3:] - bias[3:]).max() < 0.06
 
 
-def test_blind_the_imu_carries_and_the_covariance_grows() -> None:
+def test_in_dead_reckoning_the_imu_carries_and_the_covariance_grows() -> None:
     flight, states, _ = fly(
         8, 80, FixedLagConfig(), bias=np.array([0.01, 0.0, 0.0, 0.05, 0.0, 0.0]), blind=range(41, 81)
     )
@@ -344,7 +344,7 @@ def test_blind_the_imu_carries_and_the_covariance_grows() -> None:
 BLIND = range(21, 141)  # 6 s
 
 
-def test_an_odometer_keeps_a_blind_flight_together() -> None:
+def test_an_odometer_bounds_dead_reckoning() -> None:
     bias = np.array([0.01, 0.0, 0.0, 0.05, 0.0, 0.0])
     off, plain = [], []
     for seed in (8, 9, 10):

@@ -39,7 +39,7 @@ def test_the_accelerometer_alone_sets_the_body_upright() -> None:
         np.testing.assert_allclose(level_rotation(u) @ u, [0.0, 0.0, np.linalg.norm(u)], atol=1e-9)
 
 
-def test_without_an_imu_nobody_waits() -> None:
+def test_without_an_imu_gravity_is_not_awaited() -> None:
     aligner = GravityAligner(CAMERA, None, 0.035, 2.0)
     np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))
     assert aligner.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None

@@ -142,7 +142,7 @@ def test_prediction_is_near_what_comes() -> None:
         tracker.update(step.t_ns, step.visual, step.points)
 
 
-def test_two_seconds_blind() -> None:
+def test_two_seconds_of_dead_reckoning() -> None:
     steps = flight(110, 4)
     tracker, states = run(steps, range(60, 100))
     end = states[99]
@@ -155,7 +155,7 @@ def test_two_seconds_blind() -> None:
     assert tracker.image_loss_s == 0.0
 
 
-def test_blind_for_too_long_says_so() -> None:
+def test_dead_reckoning_for_too_long_is_reported() -> None:
     steps = flight(60, 4)
     config = InertialConfig(max_dead_reckoning_s=0.5)
     tracker, states = run(steps, range(40, 60), config)

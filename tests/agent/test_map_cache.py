@@ -114,7 +114,7 @@ def test_corners_match_cached_landmarks_and_give_the_camera_pose(world: World) -
     assert np.median(np.abs(met.depth_m - truth) / truth) < 0.01
 
 
-def test_copies_of_another_submap_are_not_met(world: World) -> None:
+def test_cached_keyframes_of_another_submap_are_not_matched(world: World) -> None:
     box, rng = window(), np.random.default_rng(1)
     ring(world, box, submap=THERE)
     true = look(0.7)
@@ -155,7 +155,7 @@ def test_what_is_taken_back_is_gone_and_the_number_is_bounded(world: World) -> N
     assert box.find(world.seen(true, rng), {HERE}, 0) is None
 
 
-def test_points_without_their_copy_wait_for_it(world: World) -> None:
+def test_cached_landmarks_wait_for_their_keyframe(world: World) -> None:
     box, rng = window(), np.random.default_rng(6)
     head, *parts = world.copy(keyframe_id(THERE, 0), HERE, look(0.0))
     for part in reversed(parts):

@@ -244,7 +244,7 @@ def test_deviation_of_a_meeting_is_that_of_moved_pixels() -> None:
     np.testing.assert_allclose(triangulated_sigma(bearing, rho, T_c_k, FOCAL, np.array([0.5, 1.0])), [0.5, 1.0] / slope)
 
 
-def test_a_street_is_followed_with_one_eye(data_dir: Path) -> None:
+def test_a_street_is_followed_by_a_monocular_camera(data_dir: Path) -> None:
     source = open_source(str(data_dir / "kitti07_mono"))
     one = Agent(source.rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     estimates: list[Estimate] = []

@@ -104,7 +104,7 @@ def test_two_seconds_without_images_cost_centimetres() -> None:
     assert np.linalg.norm((camera_at(5.95) - camera_at(3.95))[:3, 3]) > 2.0
 
 
-def test_the_covariance_of_a_blind_stretch_is_honest() -> None:
+def test_the_covariance_of_dead_reckoning_is_consistent() -> None:
     """Never flattering; of an odometer without errors that last it tells of those that may."""
     for noise, least in ((0.01, 0.0), (0.05, 0.1), (0.15, 0.3)):
         nees = []
@@ -188,7 +188,7 @@ def test_a_slip_ends_the_trust_at_once_and_it_comes_back() -> None:
     assert flown.odometer.scale == pytest.approx(1.0, abs=0.02)  # a slip is no matter of scale
 
 
-def test_a_short_slip_while_blind_is_passed_over() -> None:
+def test_a_short_slip_in_dead_reckoning_is_passed_over() -> None:
     batch = driven(6.0)
     velocity = batch.velocity.copy()
     velocity[(batch.t_ns > 4.5e9) & (batch.t_ns < 4.7e9)] *= 4.0  # 0.2 s: 0.8 m too far
@@ -198,7 +198,7 @@ def test_a_short_slip_while_blind_is_passed_over() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.6, 3.0])
-def test_a_slip_while_blind_that_lasts_is_not_followed(factor: float) -> None:
+def test_a_lasting_slip_in_dead_reckoning_is_not_followed(factor: float) -> None:
     batch = driven(6.0)
     velocity = batch.velocity.copy()
     velocity[batch.t_ns > 4.2e9] *= factor
@@ -303,7 +303,7 @@ def test_wheels_tell_what_they_measure_alone() -> None:
 
 
 @pytest.mark.parametrize("unit_m", [0.3, 1.0, 7.0])
-def test_the_unit_of_one_eye_becomes_known(unit_m: float) -> None:
+def test_the_monocular_unit_becomes_known(unit_m: float) -> None:
     flown = Flown(driven(6.0, 0.05), 6.0, unit_m=unit_m, metric=False)
     found = flown.odometer.metres_per_unit()
     assert found is not None

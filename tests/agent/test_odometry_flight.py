@@ -105,7 +105,7 @@ def test_a_bad_odometer_costs_nothing_in_sight(flight: Flight, kind: str) -> Non
     assert off < 1.1 * plain + 1e-4
 
 
-def test_one_eye_gets_its_metre(flight: Flight) -> None:
+def test_a_monocular_map_gets_its_metre(flight: Flight) -> None:
     agent, found, events = fly(flight, flight.driven, one_eye=True)
     assert agent.metric
     assert any(event.startswith("mono: metric") for event in events)

@@ -167,7 +167,7 @@ def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
     np.testing.assert_allclose(sigma, [2e-3, 2e-3, 0.0], atol=1e-6)
 
 
-def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
+def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
     X = scene()
     clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
     local_map = map_of(clean)
@@ -192,7 +192,7 @@ def test_blind_flight_grows_uncertain_and_the_odometry_keeps_it() -> None:
     assert after[0, 0] > before[0, 0]
 
 
-def test_where_the_speed_was_not_known_blindness_is_worse() -> None:
+def test_dead_reckoning_from_an_unknown_speed_is_worse() -> None:
     config = replace(CovarianceConfig(), unknown_velocity_m_s=5.0, unknown_rate_rad_s=1.0)
     sigma = []
     for moves in (True, False):

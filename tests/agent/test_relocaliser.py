@@ -194,7 +194,7 @@ def pose_of(agent: Agent, head: KeyframeHeader) -> np.ndarray:
     return agent.map.T_m_k[slot]
 
 
-def test_without_words_the_reference_keyframe_is_still_found(room: Recording) -> None:
+def test_without_a_vocabulary_the_reference_keyframe_is_still_found(room: Recording) -> None:
     shown = [*BEFORE, *WALL, *range(62, 68)]
     flown = fly(room.rig, room.show(shown, 120.0), None)
     assert all(e.tracked for e in flown.estimates[43:]) and set(flown.submaps) == {0}
@@ -257,7 +257,7 @@ def copy_map(agent: Agent, shift_m: np.ndarray) -> None:
         agent._relocaliser.add_keyframe(copy)
 
 
-def test_a_place_that_nothing_can_have_flown_to_is_not_believed(room: Recording, words: Vocabulary) -> None:
+def test_a_place_out_of_reach_is_rejected(room: Recording, words: Vocabulary) -> None:
     frames = room.show([*BEFORE, *[None] * 4, *range(200, 226)], 120.0)  # 2.5 m within a quarter of a second
     flown = fly(room.rig, frames, words)
     assert all(e.tracked for e in flown.estimates[37:]) and flown.submaps[-1] == 1

@@ -132,7 +132,7 @@ def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) ->
     assert "one map already" in base.ask("merge", map="1.1.0", into="0.1.0")["error"]
 
 
-def test_user_requests_a_search_for_overlap(make_flight: MakeFlight, words: Any) -> None:
+def test_user_requests_a_search_for_loops(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=24, turns=0.5)
     b = make_flight(keyframes=24, turns=0.5, start=0.42, variant=1, agent=1, T_w_m=ELSEWHERE)

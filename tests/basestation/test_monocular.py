@@ -146,7 +146,7 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_one_eye_takes_on_the_metre_of_a_pair(make_flight: MakeFlight, words: Any, late: bool) -> None:
+def test_a_monocular_map_takes_the_scale_of_a_stereo_map(make_flight: MakeFlight, words: Any, late: bool) -> None:
     pair = make_flight(keyframes=40, turns=0.8)
     eye = the_other_eye(make_flight)
     flights = [eye, pair] if late else [pair, eye]  # whose map is the world at first
@@ -196,7 +196,7 @@ def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: Ma
     assert abs(scale * 0.37 - 1.0) < 0.1
 
 
-def test_what_one_eye_is_lent_is_said_in_its_unit(make_flight: MakeFlight, words: Any) -> None:
+def test_the_map_cache_of_a_monocular_agent_is_in_its_unit(make_flight: MakeFlight, words: Any) -> None:
     pair, eye = make_flight(keyframes=40, turns=0.8), the_other_eye(make_flight)
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [pair, eye])
@@ -224,7 +224,7 @@ def test_what_one_eye_is_lent_is_said_in_its_unit(make_flight: MakeFlight, words
 
 
 @pytest.mark.parametrize("rooms", ["papered", "half_papered"])
-def test_rooms_with_one_wallpaper_stay_two_for_one_eye_too(
+def test_rooms_with_one_wallpaper_stay_two_for_monocular_agents_too(
     make_flight: MakeFlight, request: pytest.FixtureRequest, words: Any, rooms: str
 ) -> None:
     one, other = request.getfixturevalue(rooms)
@@ -237,7 +237,9 @@ def test_rooms_with_one_wallpaper_stay_two_for_one_eye_too(
         assert mapper.summary()["merges"] == 0
 
 
-def test_a_corridor_that_repeats_fools_one_eye_neither(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
+def test_a_repetitive_corridor_is_not_merged_by_a_monocular_agent(
+    make_flight: MakeFlight, corridor: Any, words: Any
+) -> None:
     a = make_flight(keyframes=40, turns=0.6, scene=corridor)
     b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1, stereo=False)
     b = in_own_unit(b, 0.6)

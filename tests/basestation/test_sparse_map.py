@@ -176,7 +176,7 @@ def test_removed_observations_culled_points_and_culled_keyframes_stop_counting()
     assert sparse_map.pose(kf(2)) is not None
 
 
-def test_fusing_moves_all_observations_and_late_sightings_follow() -> None:
+def test_fusing_moves_all_observations_and_late_observations_follow() -> None:
     sparse_map = chain(3)
     old, new = sparse_map.find_landmarks(np.array([point_id(kf(0), 4), point_id(kf(2), 0)], np.int64))
     assert not sparse_map.observed_together(old, new)
@@ -214,7 +214,7 @@ def test_unknown_parents_leave_no_pose_and_contradictions_are_refused() -> None:
     assert sparse_map.pose(kf(2)) is not None
 
 
-def test_a_sighting_that_names_no_birth_is_kept_apart() -> None:
+def test_an_observation_of_an_unknown_landmark_is_kept_apart() -> None:
     sparse_map = chain(2)
     odd = np.array([point_id(kf(1), 7), point_id(kf(0), 40), point_id(kf(9), 0), -1], np.int64)
     sparse_map.add_keyframe(kf(5), 50, kf(1), np.eye(4), 4)

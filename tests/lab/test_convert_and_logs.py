@@ -75,7 +75,7 @@ def test_convert_leaves_nothing_half_written(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["kitti", "out.mcap"]
 
 
-def test_convert_tells_what_it_passed_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_convert_reports_what_it_passed_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "kitti"
     (folder / "image_0").mkdir(parents=True)
     (folder / "calib.txt").write_text("P0: 60 0 32 0 0 60 24 0 0 0 1 0\n")
@@ -87,7 +87,7 @@ def test_convert_tells_what_it_passed_over(tmp_path: Path, capsys: pytest.Captur
     assert "2 frames" in text and "1 x unreadable image" in text and "1.png" in text
 
 
-def test_info_tells_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_shows_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = flight(tmp_path / "a.mcap")
     assert logs.main(["info", str(path)]) == 0
     text = capsys.readouterr().out

@@ -42,7 +42,7 @@ def test_two_flights_are_alike_to_the_last_byte(recording: Path, tmp_path: Path)
     assert a["base"]["digest_equal"] is True
 
 
-def test_the_log_tells_of_the_link_once_a_second(recording: Path, tmp_path: Path) -> None:
+def test_the_log_describes_the_link_once_a_second(recording: Path, tmp_path: Path) -> None:
     report, _ = fly(Options((str(recording),), tmp_path, "local"), quiet=True)
     with LogReader(tmp_path / "agent0" / "log.mcap") as log:
         told = [message.json() for message in log.messages(("/link",))]

@@ -56,7 +56,7 @@ def test_frames_follow_their_refined_keyframe() -> None:
     np.testing.assert_allclose(T_w_b, refined @ near @ T_c_b, atol=1e-12)
 
 
-def test_one_eye_s_frames_are_as_long_as_the_world_says_and_the_arm_stays_in_metres() -> None:
+def test_monocular_frames_are_as_long_as_the_world_says_and_the_arm_stays_in_metres() -> None:
     refined, near = at(1.0, 2.0, 3.0, 0.1, 0.2, 0.3), at(0.05, 0.0, 0.02, 0.0, 0.01, 0.0)
     begin, late = at(0, 0, 0, 0, 0, 0), at(0.3, 0, 0, 0, 0, 0.1)
     frames = [flown(5, begin, near, 7), flown(6, late, near, 8), flown(7, late, near, 9)]

@@ -67,7 +67,7 @@ def test_every_agent_gets_its_log(tmp_path: Path) -> None:
     assert not np.allclose(first.ground_truth.T_w_b[0], second.ground_truth.T_w_b[0])
 
 
-def test_depth_is_recorded_in_place_of_the_right_eye(tmp_path: Path) -> None:
+def test_depth_is_recorded_in_place_of_the_right_image(tmp_path: Path) -> None:
     out = tmp_path / "d.mcap"
     assert main([SCENE, "--depth", "--no-imu", "--out", str(out)]) == 0
     source = open_source(f"mcap:{out}")

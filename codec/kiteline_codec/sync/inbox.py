@@ -79,11 +79,6 @@ class Inbox:
         """The number of values that have arrived in part."""
         return len(self._assemblies)
 
-    @property
-    def tombstones(self) -> int:
-        """The number of removals that are remembered."""
-        return len(self._removed)
-
     def acknowledgement(self) -> tuple[int, int] | None:
         """The last packet number and a mask of those missing before it; None when nothing has arrived."""
         last = self.packets.highest

@@ -165,7 +165,7 @@ class TwoEnds(RuleBasedStateMachine):
         for i, end in enumerate(self.ends):
             assert end.peer_values() == self.held[1 - i]
             assert {k: v for k, v in self.shown[i].items() if k not in end.earlier_values()} == self.held[1 - i]
-            assert end._in.tombstones == 0
+            assert not end._in._removed
             assert end.stats.dirty == 0
 
     def arrive(self, to: int, packet: bytes) -> None:

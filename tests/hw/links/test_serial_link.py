@@ -16,6 +16,7 @@ from kiteline_hw.links.serial_link import SerialLink
 from kiteline_hw.ports import LinkError
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.serial_port import parse_serial
+from tests.hw.processes import wait_for
 
 
 class CobsFramer:
@@ -39,13 +40,6 @@ class CobsFramer:
             if len(body) >= 4 and zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"):
                 packets.append(body[:-4])
         return packets
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = 8.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "nothing happened in time"
-        time.sleep(0.005)
 
 
 def gather(link: SerialLink, into: list[bytes], count: int) -> Callable[[], bool]:

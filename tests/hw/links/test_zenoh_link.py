@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -19,32 +13,7 @@ from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, QueuedL
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
 from kiteline_hw.links.zenoh_session import open_session
 from kiteline_hw.ports import LinkError
-
-ROOT = Path(__file__).parents[3]
-
-
-def free_endpoint() -> str:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{s.getsockname()[1]}"
-
-
-def start(code: str, *args: object) -> subprocess.Popen[str]:
-    path = os.pathsep.join([str(ROOT / "core"), str(ROOT / "hw"), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, args)],
-        env={**os.environ, "PYTHONPATH": path},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = 8.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "nothing happened in time"
-        time.sleep(0.01)
+from tests.hw.processes import free_endpoint, start, wait_for
 
 
 def test_two_agents_and_a_base_that_starts_late_and_restarts() -> None:

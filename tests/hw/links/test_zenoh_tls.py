@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from kiteline_hw.links.zenoh_link import ZenohHub
+from tests.hw.processes import free_port
 
 NAME = x509.oid.NameOID.COMMON_NAME
 
@@ -109,12 +109,6 @@ def base_config(folder: Path, files: dict[str, str], root: Path) -> str:
     }  # fmt: skip
     path.write_text(json.dumps({"transport": {"link": {"tls": tls}}, "access_control": access}))
     return str(path)
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 def test_access_by_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
 from kiteline_hw.links import zenoh_session
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient, LockstepServer
 from kiteline_hw.ports import LinkError
-
-ROOT = Path(__file__).parents[3]
+from tests.hw.processes import free_endpoint, start
 
 AGENT = """
 import sys
@@ -31,23 +25,6 @@ with LockstepClient(endpoint, agent) as client:
         assert answer == b"to %d at %d" % (agent, tick), answer
 print("done", flush=True)
 """
-
-
-def free_endpoint() -> str:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{s.getsockname()[1]}"
-
-
-def start(code: str, *args: object) -> subprocess.Popen[str]:
-    path = os.pathsep.join([str(ROOT / "core"), str(ROOT / "hw"), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, args)],
-        env={**os.environ, "PYTHONPATH": path},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 def test_two_agents_in_two_processes_stay_in_lock_step() -> None:

@@ -16,8 +16,9 @@ import pytest
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.ports import PoseSample
-from kiteline_hw.sim.links.flight_controller import FlightController
 from kiteline_hw.system.clock import MonotonicClock
+from tests.hw.mavlink.flight_controller import FlightController
+from tests.hw.processes import free_port
 
 CLIENT = """
 import asyncio, sys
@@ -34,13 +35,6 @@ async def main():
 
 asyncio.run(asyncio.wait_for(main(), 20))
 """
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as s:
-        s.bind(("127.0.0.1", 0))
-        port: int = s.getsockname()[1]
-        return port
 
 
 def test_mavsdk_reads_our_odometry() -> None:

@@ -18,9 +18,10 @@ from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Odometry
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.ports import LinkError, PoseSample
-from kiteline_hw.sim.links.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock
+from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
+from tests.hw.processes import free_port
 
 CLOCK = MonotonicClock()
 FLU = mounting("flu")
@@ -34,13 +35,6 @@ def push_while(sink: MavlinkPoseSink, condition: Callable[[], bool], timeout_s: 
         now_ns = CLOCK.now_ns()
         sink.push(PoseSample(now_ns, np.eye(4), True, 90), now_ns)
         time.sleep(0.01)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
-        port: int = s.getsockname()[1]
-        return port
 
 
 def test_udp_out_to_a_controller_with_another_clock() -> None:
@@ -87,7 +81,7 @@ def test_odometry_comes_from_a_controller_with_another_clock() -> None:
 
 
 def test_udp_in_answers_the_last_sender() -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     model = FlightController("ardupilot")
     with UdpFlightController(model) as controller, MavlinkPoseSink(f"udpin:127.0.0.1:{port}", FLU, CLOCK) as sink:
         now_ns = CLOCK.now_ns()
@@ -130,7 +124,7 @@ def test_serial() -> None:
 
 
 def test_without_a_controller_nothing_blocks() -> None:
-    with MavlinkPoseSink(f"udp:127.0.0.1:{free_port()}", FLU, CLOCK) as sink:
+    with MavlinkPoseSink(f"udp:127.0.0.1:{free_port(socket.SOCK_DGRAM)}", FLU, CLOCK) as sink:
         began = time.monotonic()
         for i in range(2000):
             sink.push(PoseSample(i * 1_000_000, np.eye(4), True, 90), i * 1_000_000)
@@ -143,7 +137,7 @@ def test_without_a_controller_nothing_blocks() -> None:
 
 
 def test_datagrams_of_other_hosts_are_ignored() -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     with MavlinkPoseSink(f"udpin:127.0.0.1:{port}", FLU, CLOCK) as sink, socket.socket(type=socket.SOCK_DGRAM) as s:
         for _ in range(200):
             s.sendto(os.urandom(300), ("127.0.0.1", port))

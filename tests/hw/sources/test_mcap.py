@@ -1,7 +1,6 @@
 """ROS 2 bags in every storage form, and their faults."""
 
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,14 @@ import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
+from kiteline_core.frame import UNMEASURED, Frame, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sensors.odometry_buffer import VELOCITY_SIGMA_M_S
 from kiteline_hw.sources.open import open_source
+from tests.hw.sources.camera_messages import START_NS, STEP_NS, T_B_L, T_L_R, D, picture, png, quaternion, read, xyz
 
-START_NS = 1_700_000_000_000_000_000
-STEP_NS = 50_000_000
 LEAVES = """
 ================================================================================
 MSG: std_msgs/Header
@@ -93,35 +91,6 @@ ROS2 = {
     "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist",
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
 }
-T_B_L = se3.exp(np.array([0.02, -0.06, 0.01, 1.2, -1.2, 1.2]))
-T_L_R = se3.exp(np.array([0.11, 0.0, 0.0, 0.001, -0.002, 0.003]))
-D = (-0.28, 0.07, 0.0002, 1.8e-05)
-
-
-def picture(i: int) -> np.ndarray:
-    return np.random.default_rng(i).integers(0, 255, (48, 64), np.uint8)
-
-
-def png(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()
-
-
-def read(source: FrameSource) -> tuple[list[Frame], list[ImuBatch]]:
-    items = list(source)
-    frames, batches = [i for i in items if isinstance(i, Frame)], [i for i in items if isinstance(i, ImuBatch)]
-    assert all(b.t_ns > a.t_ns for a, b in pairwise(frames))
-    stamps = np.concatenate([b.t_ns for b in batches]) if batches else np.zeros(0)
-    assert (np.diff(stamps) > 0).all()
-    return frames, batches
-
-
-def xyz(v: np.ndarray) -> dict[str, float]:
-    return {"x": float(v[0]), "y": float(v[1]), "z": float(v[2])}
-
-
-def quaternion(t: np.ndarray) -> dict[str, float]:
-    q = se3.quaternion_from_rotation(t[:3, :3])
-    return {"w": float(q[0]), "x": float(q[1]), "y": float(q[2]), "z": float(q[3])}
 
 
 class Bag:

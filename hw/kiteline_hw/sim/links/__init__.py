@@ -1,1 +1,1 @@
-"""Models of links, radios and flight controllers: packets and times enter, delayed, lost or forwarded packets leave."""
+"""Models of links and radios: packets and times enter, delayed, lost or forwarded packets leave."""
