@@ -116,7 +116,7 @@ class Agent:
         # 1. Rectify the images and build their pyramids.
         first = config.pyramid.first if has_map and self._loss.failed_searches == 0 else 0
         images = frame_images(frame, self._rectifier, config.pyramid, first, self.map.offset_px)
-        self._count_images(frame, first)
+        self._count_images(frame)
         # 2. Predict the pose: from the IMU, else an odometer, else the last motion.
         dt_s = 0.0 if self._last_t_ns is None else (frame.t_ns - self._last_t_ns) * 1e-9
         T_m_c = camera.predict(frame.t_ns, dt_s, imu)
@@ -150,10 +150,11 @@ class Agent:
             events += self._submaps.join_older(ctx, track)
             events += self._submaps.restart_in_metres(ctx, track)
             outcome = FrameOutcome(True, False, track.inliers, events)
+        self.work.rectified_px += images.rectified_px
         # 9. Report the pose.
         self._was_lost = not outcome.tracked or outcome.bridged
         if not self._was_lost:
-            self._image_shift.remember(images.left, camera.pose.T_c_m)
+            self._image_shift.remember(images.sampled, camera.pose.T_c_m)
         self._last_t_ns = frame.t_ns
         self._last_track = None if self._was_lost else track
         return self._estimate(ctx, outcome), outcome.events
@@ -177,7 +178,7 @@ class Agent:
 
     def _retry_with_image_shift(self, ctx: FrameContext, track: Track) -> Track:
         """The better of a track and another one from where the whole image seems to have rotated."""
-        guess = self._image_shift.rotated_pose(ctx.images.left)
+        guess = self._image_shift.rotated_pose(ctx.images.sampled)
         if guess is None:
             return track
         other = self._tracker.track(ctx, guess)
@@ -227,10 +228,8 @@ class Agent:
             self._camera.follow_corrections(None)
         return events
 
-    def _count_images(self, frame: Frame, first: int) -> None:
+    def _count_images(self, frame: Frame) -> None:
         self.work.frames = 1
-        share = 4 if first else 1
-        self.work.rectified_px += frame.left.size // share if self._rectifier.remaps else 0
         pair = frame.right is not None and self._config.stereo.points
         self.work.pyramid_px += frame.left.size * (2 if pair else 1)
 

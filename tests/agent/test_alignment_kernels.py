@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from kiteline_agent.imaging import alignment_kernels as kernels
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 
 
 def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> NDArray[np.float64]:
@@ -42,8 +44,8 @@ def run(
     out, found, ncc = guess.copy(), np.zeros(n, np.bool_), np.zeros(n)
     warps = np.tile(warp, (n, 1, 1))
     pyramid = build_pyramid(second, 4)
-    kernels.align(pyramid, templates, np.arange(n), octave, warps, out, 2, 1, 8, 7.0, 0.8, found, ncc)
-    kernels.align(pyramid, templates, np.arange(n), octave, warps, out, 1, 0, 8, 3.0, 0.8, found, ncc)
+    kernels.align(pyramid, NO_GRID, templates, np.arange(n), octave, warps, out, 2, 1, 8, 7.0, 0.8, found, ncc)
+    kernels.align(pyramid, NO_GRID, templates, np.arange(n), octave, warps, out, 1, 0, 8, 3.0, 0.8, found, ncc)
     return out, found
 
 
@@ -165,6 +167,28 @@ def test_the_greatest_contrast_does_not_overflow() -> None:
     kernels.cut_templates(pyramid, uv, octave, templates)
     out, found, ncc = uv + 0.7, np.zeros(1, np.bool_), np.zeros(1)
     kernels.align(
-        pyramid, templates, np.zeros(1, np.int64), octave, np.eye(2)[None], out, 0, 0, 8, 3.0, 0.8, found, ncc
+        pyramid, NO_GRID, templates, np.zeros(1, np.int64), octave, np.eye(2)[None], out, 0, 0, 8, 3.0, 0.8, found, ncc
     )
     assert found[0] and abs(out - uv).max() < 0.05 and ncc[0] > 0.99
+
+
+def test_a_raw_image_is_aligned_as_the_rectified_one() -> None:
+    model = CameraModel(320, 240, 220.0, 221.0, 158.0, 121.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
+    rectifier = Rectifier(CameraRig(model, None, np.eye(4), None))
+    assert rectifier.left_grid is not None
+    raw = np.clip(np.round(texture(4)), 0, 255).astype(np.uint8)
+    whole = build_pyramid(rectifier.left(raw), 4)
+    n = len(POINTS)
+    templates = np.empty((n, kernels.TEMPLATE_LEVELS, kernels.TEMPLATE, kernels.TEMPLATE), np.uint8)
+    kernels.cut_templates(whole, POINTS, np.zeros(n, np.uint8), templates)
+    results = []
+    for pyramid, grid in ((whole, NO_GRID), ((raw, *whole[1:]), rectifier.left_grid)):
+        out, found, ncc = POINTS + np.array([2.6, -2.2]), np.zeros(n, np.bool_), np.zeros(n)
+        warps = np.tile(np.eye(2), (n, 1, 1))
+        kernels.align(
+            pyramid, grid, templates, np.arange(n), np.zeros(n, np.uint8), warps, out, 1, 0, 8, 3.0, 0.8, found, ncc
+        )
+        assert found.mean() > 0.9
+        assert abs(out - POINTS)[found].max() < 0.05
+        results.append(found)
+    assert (results[0] == results[1]).all()

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
+from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 
 F64 = NDArray[np.float64]
 
@@ -28,7 +30,7 @@ def search(
     out, found = np.zeros((n, 2)), np.zeros(n, np.int8)
     warps = np.tile(np.eye(2) if warp is None else warp, (n, 1, 1))
     search_segments(
-        other, templates, np.arange(n), octaves, warps, start, end, 0.7, 40, 0.8, 0.9, out, found
+        other, NO_GRID, templates, np.arange(n), octaves, warps, start, end, 0.7, 40, 0.8, 0.9, out, found
     )  # fmt: skip
     return out, found
 
@@ -98,3 +100,23 @@ def test_scores_are_those_of_plain_numpy() -> None:
             if score > best:
                 best, where = score, x
         np.testing.assert_allclose(out[i], [where, y0])
+
+
+def test_a_raw_image_is_searched_as_the_rectified_one() -> None:
+    model = CameraModel(320, 240, 220.0, 221.0, 158.0, 121.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
+    rectifier = Rectifier(CameraRig(model, None, np.eye(4), None))
+    assert rectifier.left_grid is not None
+    raw = picture(3)
+    whole, uv = build_pyramid(rectifier.left(raw), 4), grid()
+    n = len(uv)
+    octaves, warps = np.zeros(n, np.uint8), np.tile(np.eye(2), (n, 1, 1))
+    templates = np.empty((n, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
+    alignment_kernels.cut_templates(whole, uv, octaves, templates)
+    for pyramid, raw_grid in ((whole, NO_GRID), ((raw, *whole[1:]), rectifier.left_grid)):
+        out, found = np.zeros((n, 2)), np.zeros(n, np.int8)
+        search_segments(
+            pyramid, raw_grid, templates, np.arange(n), octaves, warps, uv - 9.0, uv + 11.0, 0.7, 40, 0.8, 0.9, out,
+            found,
+        )  # fmt: skip
+        assert (found == 1).mean() > 0.9
+        assert abs(out - uv)[found == 1].max() < 0.8

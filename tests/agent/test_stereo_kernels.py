@@ -41,7 +41,7 @@ def test_search_then_refinement_recover_the_disparity() -> None:
         found_px, found = np.empty(len(UV)), np.zeros(len(UV), np.bool_)
         stereo_kernels.search_rows(left, right, UV, octave, 80.0, 1.15, found_px)
         assert (found_px >= 0).mean() > 0.9
-        stereo_kernels.refine_rows(left, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.85, found_px, found)
+        stereo_kernels.refine_rows(left, RECTIFIED, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.85, found_px, found)
         assert found.mean() > 0.85
         assert abs(np.median(found_px[found]) - disparity) < 0.04
         assert np.percentile(np.abs(found_px[found] - disparity), 90) < 0.15
@@ -80,7 +80,8 @@ def test_unrelated_rows_are_not_refined() -> None:
     _, right = pair(8, 10.0)
     guess, found = np.full(len(UV), 10.0), np.zeros(len(UV), np.bool_)
     stereo_kernels.refine_rows(
-        build_pyramid(left, 3), build_pyramid(right, 3), RECTIFIED, UV, np.zeros(len(UV), np.uint8), SURE, 6, 3.0, 0.85,
+        build_pyramid(left, 3), RECTIFIED, build_pyramid(right, 3), RECTIFIED, UV, np.zeros(len(UV), np.uint8), SURE, 6,
+        3.0, 0.85,
         guess, found,
     )  # fmt: skip
     assert found.mean() < 0.05
@@ -100,10 +101,27 @@ def test_strips_of_the_raw_image_say_what_the_rectified_one_says() -> None:
         (build_pyramid(raw_right, 3), rectifier.right_grid),
     ):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
-        stereo_kernels.refine_rows(left, right, grid, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
+        stereo_kernels.refine_rows(left, RECTIFIED, right, grid, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))
     (whole, whole_found), (strips, strips_found) = results
     both = whole_found & strips_found
     assert whole_found.sum() > 0.5 * len(UV) and both.sum() > 0.9 * whole_found.sum()
     assert np.median(np.abs(whole[both] - strips[both])) < 0.04
     assert np.percentile(np.abs(whole[both] - strips[both]), 90) < 0.12
+
+
+def test_a_raw_left_image_says_what_the_rectified_one_says() -> None:
+    model = CameraModel(320, 200, 220.0, 221.0, 158.0, 101.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
+    rig = CameraRig(model, model, np.eye(4), from_rt(so3_exp(np.array([0.004, -0.006, 0.003])), np.array([0.1, 0, 0])))
+    rectifier = Rectifier(rig)
+    assert rectifier.left_grid is not None
+    raw_left, raw_right = pair(9, 12.4)
+    whole, right = (build_pyramid(i, 3) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
+    octave, results = np.zeros(len(UV), np.uint8), []
+    for left, grid in ((whole, RECTIFIED), ((raw_left, *whole[1:]), rectifier.left_grid)):
+        guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
+        stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
+        results.append((guess, found))
+    both = results[0][1] & results[1][1]
+    assert results[0][1].sum() > 0.5 * len(UV) and both.sum() > 0.95 * results[0][1].sum()
+    assert np.percentile(np.abs(results[0][0][both] - results[1][0][both]), 90) < 0.03

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kiteline_agent.imaging.rectification_kernels import ROOM, SIDE, _rectify_patch
 from kiteline_core.jit import njit
 
 PATCH_RADIUS = 4  # a patch is 9x9 px of the level at which it is compared
@@ -166,9 +167,10 @@ def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def
 
 
 @njit
-def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
+def _align_level(image, grid, is_raw, whole, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
     """Gauss-Newton on (x, y) until the patch matches the template. Returns (x, y, ncc, inside).
 
+    grid: of raw pixels, used if the image is raw. whole: (SIDE, SIDE) uint8, for its rectified part around the patch.
     patches: (5, LANES) int16: the current patch (out), the template, its gradients (see template_gradients), and ones.
     The steps use gradients made orthogonal to the template and to a constant; their sums follow from the exact sums
     over the plain ones.
@@ -193,10 +195,22 @@ def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # ty
     start_y = y
     ncc = 0.0
     converged = False
+    left = -SIDE  # of `whole` in the image
+    top = -SIDE
     for k in range(iterations + 1):
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             return x, y, 0.0, False
-        sample_patch(image, x, y, raw, across, seen)
+        if is_raw:
+            dx = int(x) - PATCH_RADIUS - left
+            dy = int(y) - PATCH_RADIUS - top
+            if dx < 0 or dy < 0 or dx > 2 * ROOM or dy > 2 * ROOM:
+                left = int(x) - PATCH_RADIUS - ROOM
+                top = int(y) - PATCH_RADIUS - ROOM
+                if not _rectify_patch(image, grid, left, top, whole):
+                    return x, y, 0.0, False
+            sample_patch(whole, x - left, y - top, raw, across, seen)
+        else:
+            sample_patch(image, x, y, raw, across, seen)
         total = float(dot(seen, ones))
         st = dot(seen, t) - mean * total
         gain = st / tt
@@ -210,14 +224,14 @@ def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # ty
             break
         sx = dot(seen, gx) - mean_x * total - share_x * st
         sy = dot(seen, gy) - mean_y * total - share_y * st
-        dx = -2.0 * (h11 * sx - h01 * sy) / (det * gain)
-        dy = -2.0 * (h00 * sy - h01 * sx) / (det * gain)
-        norm = np.sqrt(dx * dx + dy * dy)
+        move_x = -2.0 * (h11 * sx - h01 * sy) / (det * gain)
+        move_y = -2.0 * (h00 * sy - h01 * sx) / (det * gain)
+        norm = np.sqrt(move_x * move_x + move_y * move_y)
         if norm > 2.0:  # beyond the patch's linear range: shorten the step
-            dx *= 2.0 / norm
-            dy *= 2.0 / norm
-        x += dx
-        y += dy
+            move_x *= 2.0 / norm
+            move_y *= 2.0 / norm
+        x += move_x
+        y += move_y
         converged = norm < 0.02
         if abs(x - start_x) > max_step or abs(y - start_y) > max_step:
             return x, y, 0.0, False
@@ -225,10 +239,13 @@ def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # ty
 
 
 @njit
-def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, max_step_px, min_ncc, found, ncc):  # type: ignore[no-untyped-def]
+def align(  # type: ignore[no-untyped-def]
+    pyramid, grid, templates, rows, octave, warp, uv, first, last, iterations, max_step_px, min_ncc, found, ncc
+):
     """Align templates[rows] in `pyramid`, coarse (template level `first`) to fine (`last`).
 
-    pyramid: tuple of uint8 images, each half the size of the one before. templates: (N,3,21,21) uint8.
+    pyramid: tuple of uint8 images, each half the size of the one before; they are rectified, but for level 0 where
+    `grid` is its grid of raw pixels (gh,gw,2) float32 and not (0,0,2). templates: (N,3,21,21) uint8.
     rows: (n,) int64 into templates. octave: (n,) uint8, level at which each template was cut.
     warp: (n,2,2) float64, d(pixel here) / d(pixel in the template's image), both at level 0.
     uv: (n,2) float64 px at level 0: prediction in, result out (unchanged where not found).
@@ -239,6 +256,7 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
     raw = np.zeros(LANES + STRIDE, np.uint8)
     across = np.zeros(LANES + STRIDE, np.int16)
     patches = np.zeros((5, LANES), np.int16)
+    whole = np.empty((SIDE, SIDE), np.uint8)
     for r in range(PATCH):
         for c in range(PATCH):
             patches[4, r * STRIDE + c] = 1
@@ -271,8 +289,9 @@ def align(pyramid, templates, rows, octave, warp, uv, first, last, iterations, m
             template_gradients(reference, patches)
             s = float(1 << level)
             px, py, score, ok = _align_level(
-                pyramid[level], patches, raw, across, x / s, y / s, iterations, max_step_px
-            )
+                pyramid[level], grid, level == 0 and grid.shape[0] > 0, whole, patches, raw, across, x / s, y / s,
+                iterations, max_step_px,
+            )  # fmt: skip
             if ok and (score >= min_ncc or j > last):
                 if score > 0.5:
                     x = px * s

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_agent.imaging.alignment_kernels import GREY, PATCH, PATCH_RADIUS, STRIDE, TEMPLATE_LEVELS, warp_template
+from kiteline_agent.imaging.rectification_kernels import ROOM, SIDE, _rectify_patch
 from kiteline_core.jit import njit
 
 
 @njit
 def search_segments(  # type: ignore[no-untyped-def]
-    pyramid, templates, rows, octave, warp, start, end, step_px, max_steps, min_ncc, distinct, uv, found
+    pyramid, grid, templates, rows, octave, warp, start, end, step_px, max_steps, min_ncc, distinct, uv, found
 ):
     """Best correlation of templates[rows] along segments, at the template's octave or, on long segments, one coarser.
 
-    pyramid: tuple of uint8 images, each half the size of the one before. templates: (N,3,21,21) uint8. rows: (n,).
+    pyramid, grid: as in `align`. templates: (N,3,21,21) uint8. rows: (n,).
     octave: (n,) uint8. warp: (n,2,2), d(pixel here)/d(pixel in the template's image). start, end: (n,2) level-0 px.
     step_px: px of the level between two tries; max_steps: tries at most, the level grows coarser to keep to it.
     min_ncc: least correlation. distinct: the best elsewhere on the segment must stay below this share of the best.
@@ -25,6 +26,7 @@ def search_segments(  # type: ignore[no-untyped-def]
     t0 = np.empty((PATCH, PATCH))
     score = np.empty(max_steps + 1)
     count = float(PATCH * PATCH)
+    whole = np.empty((SIDE, SIDE), np.uint8)
     for i in range(rows.shape[0]):
         found[i] = -1
         det = warp[i, 0, 0] * warp[i, 1, 1] - warp[i, 0, 1] * warp[i, 1, 0]
@@ -70,6 +72,9 @@ def search_segments(  # type: ignore[no-untyped-def]
         best = -1.0
         best_k = -1
         seen = 0
+        raw = grid.shape[0] > 0 and level == 0
+        left = -SIDE  # of `whole` in the image
+        top = -SIDE
         for k in range(steps + 1):
             part = k / steps if steps > 0 else 0.0
             x = (start[i, 0] + part * dx) / s
@@ -77,11 +82,21 @@ def search_segments(  # type: ignore[no-untyped-def]
             score[k] = -1.0
             if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
                 continue
-            seen += 1
             x0 = int(x)
             y0 = int(y)
             fx = x - x0
             fy = y - y0
+            if raw:
+                if abs(x0 - left - PATCH_RADIUS - ROOM) > ROOM or abs(y0 - top - PATCH_RADIUS - ROOM) > ROOM:
+                    left = x0 - PATCH_RADIUS - ROOM
+                    top = y0 - PATCH_RADIUS - ROOM
+                    if not _rectify_patch(pyramid[0], grid, left, top, whole):
+                        left = -SIDE
+                        continue
+                x0 -= left
+                y0 -= top
+                image = whole
+            seen += 1
             w00 = (1.0 - fx) * (1.0 - fy)
             w01 = fx * (1.0 - fy)
             w10 = (1.0 - fx) * fy

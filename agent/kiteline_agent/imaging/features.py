@@ -61,7 +61,7 @@ class Corners:
 
 def build_pyramid(image: U8, levels: int) -> Pyramid:
     """Build a Gaussian pyramid; pixel x of level k is at x * 2^k of level 0."""
-    out = [np.ascontiguousarray(image)]
+    out = [np.require(image, np.uint8, ("C", "W"))]  # kernels are compiled for writable images
     for _ in range(levels - 1):
         out.append(np.asarray(cv2.pyrDown(out[-1]), np.uint8))
     return tuple(out)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core.geometry.cameras import GRID_STEP
+from kiteline_agent.imaging.rectification_kernels import SIDE as PATCH_SIDE
+from kiteline_agent.imaging.rectification_kernels import _raw_at, _rectify_patch
 from kiteline_core.jit import njit
 
 RADIUS = 4
@@ -147,24 +148,6 @@ def _strip_of(image, first, columns, y, strip):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _raw_at(grid, x, y):  # type: ignore[no-untyped-def]
-    """Raw pixel of the rectified pixel (x, y). grid: (gh,gw,2) float32, every GRID_STEP px."""
-    gx = min(max(x * (1.0 / GRID_STEP), 0.0), grid.shape[1] - 1.001)
-    gy = min(max(y * (1.0 / GRID_STEP), 0.0), grid.shape[0] - 1.001)
-    x0 = int(gx)
-    y0 = int(gy)
-    fx = gx - x0
-    fy = gy - y0
-    w00 = (1.0 - fx) * (1.0 - fy)
-    w01 = fx * (1.0 - fy)
-    w10 = (1.0 - fx) * fy
-    w11 = fx * fy
-    u = w00 * grid[y0, x0, 0] + w01 * grid[y0, x0 + 1, 0] + w10 * grid[y0 + 1, x0, 0] + w11 * grid[y0 + 1, x0 + 1, 0]
-    v = w00 * grid[y0, x0, 1] + w01 * grid[y0, x0 + 1, 1] + w10 * grid[y0 + 1, x0, 1] + w11 * grid[y0 + 1, x0 + 1, 1]
-    return u, v
-
-
-@njit
 def _raw_strip_of(image, grid, scale, first, columns, y, strip):  # type: ignore[no-untyped-def]
     """Fill the strip by rectifying the raw image; False outside of it.
 
@@ -235,9 +218,12 @@ def _slide(strip, first, patch, gradient, tt, hess, begin, width, iterations, ma
 
 
 @njit
-def refine_rows(left, right, grid, uv, octave, sure, iterations, max_step_px, min_ncc, disparity, found):  # type: ignore[no-untyped-def]
+def refine_rows(  # type: ignore[no-untyped-def]
+    left, left_grid, right, grid, uv, octave, sure, iterations, max_step_px, min_ncc, disparity, found
+):
     """Sub-pixel disparity by 1-D Lucas-Kanade, invariant to gain and offset, at level `octave` (and one coarser first).
 
+    left_grid: (0,0,2), or the grid of level 0 of `left`, which is then raw; its coarser levels are rectified.
     grid: (0,0,2) if `right` is rectified; else `right` is the raw image's pyramid, and grid (gh,gw,2) float32 the raw
     pixel of every GRID_STEP-th rectified one, so that only the strips are rectified.
     sure: (n,) bool, the prediction is good to a pixel of its octave: the coarser level is skipped.
@@ -249,6 +235,8 @@ def refine_rows(left, right, grid, uv, octave, sure, iterations, max_step_px, mi
     gradient = np.empty((SIDE, SIDE))
     strip = np.empty((SIDE, SIDE + 2 * int(np.ceil(max(max_step_px, FINE_STEP_PX))) + 4))
     raw = grid.shape[0] > 0
+    raw_left = left_grid.shape[0] > 0
+    whole = np.empty((PATCH_SIDE, PATCH_SIDE), np.uint8)
     for i in range(uv.shape[0]):
         found[i] = False
         if disparity[i] < 0.0:
@@ -269,7 +257,14 @@ def refine_rows(left, right, grid, uv, octave, sure, iterations, max_step_px, mi
             begin = x - d / s
             if begin < RADIUS or begin >= w - RADIUS - 1:
                 continue
-            tt, hess = _cut(left[level], x, y, patch, gradient)
+            if raw_left and level == 0:
+                x0 = int(x) - RADIUS - 1
+                y0 = int(y) - RADIUS
+                if not _rectify_patch(left[0], left_grid, x0, y0, whole):
+                    continue
+                tt, hess = _cut(whole, x - x0, y - y0, patch, gradient)
+            else:
+                tt, hess = _cut(left[level], x, y, patch, gradient)
             if hess < 30.0:
                 continue
             first = max(int(begin) - RADIUS - reach, 0)

@@ -19,7 +19,7 @@ from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
-from kiteline_agent.tracking.frame_images import FrameImages
+from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
@@ -115,7 +115,7 @@ class TwoViewStart:
         self._uv0, self._uv, self._octave = corners.uv, corners.uv.copy(), corners.octave
         self._templates = np.empty((len(corners.uv), *self._templates.shape[1:]), np.uint8)
         self._index = np.arange(len(corners.uv))
-        alignment_kernels.cut_templates(images.left, corners.uv, corners.octave, self._templates)
+        alignment_kernels.cut_templates(images.aligned, corners.uv, corners.octave, self._templates)
 
     def _follow(self, images: FrameImages) -> None:
         """Follow the corners by pyramidal optical flow from the last frame, checked backwards."""
@@ -138,7 +138,7 @@ class TwoViewStart:
         uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
         warp = np.tile(self._mean_warp(), (len(uv), 1, 1))
         alignment_kernels.align(
-            images.left, self._templates, self._index, self._octave, warp, uv, 0, 0,
+            images.aligned, NO_GRID, self._templates, self._index, self._octave, warp, uv, 0, 0,
             align.iterations, align.fine_step_px, align.min_ncc, found, ncc,
         )  # fmt: skip
         uv[~found] = self._uv[~found]

@@ -103,13 +103,13 @@ class DepthFromMotion:
         octave = self._map.octave[rows]
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
         search_segments(
-            images.left, self._map.templates, rows, octave, warp, start, end, config.step_px, config.max_steps,
-            config.min_search_ncc, config.distinct, uv, found,
+            images.sampled, images.grid, self._map.templates, rows, octave, warp, start, end, config.step_px,
+            config.max_steps, config.min_search_ncc, config.distinct, uv, found,
         )  # fmt: skip
         seen = np.flatnonzero(found == 1)
         place, aligned, ncc = uv[seen], np.zeros(len(seen), np.bool_), np.zeros(len(seen))
         alignment_kernels.align(
-            images.left, self._map.templates, rows[seen], octave[seen], warp[seen], place, 1, 0,
+            images.sampled, images.grid, self._map.templates, rows[seen], octave[seen], warp[seen], place, 1, 0,
             align.iterations, align.fine_step_px, align.min_ncc, aligned, ncc,
         )  # fmt: skip
         uv[seen] = place

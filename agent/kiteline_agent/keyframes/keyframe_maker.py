@@ -137,7 +137,7 @@ class KeyframeMaker:
         octave, config = landmarks.octave, ctx.config
         side = alignment_kernels.TEMPLATE
         templates = np.empty((len(uv), alignment_kernels.TEMPLATE_LEVELS, side, side), np.uint8)
-        alignment_kernels.cut_templates(ctx.images.left, uv, octave, templates)
+        alignment_kernels.cut_templates(ctx.images.aligned, uv, octave, templates)
         sigma = config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
         if ctx.images.depth_m is not None and not self._camera.stereo:
             sigma = np.maximum(sigma, _DEPTH_CAMERA_SIGMA_RHO)

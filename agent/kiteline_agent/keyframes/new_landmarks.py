@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features, stereo_kernels
-from kiteline_agent.tracking.frame_images import FrameImages, depth_at
+from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages, depth_at
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
@@ -42,10 +42,12 @@ def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config:
         stereo = config.stereo
         widest = min(camera.bf / stereo.min_depth_m, 0.45 * camera.width)
         stereo_kernels.search_rows(
-            images.left, images.right.coarse(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
+            images.aligned, images.right.coarse(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
         )
         found = np.zeros(len(disparity), np.bool_)
-        images.right.refine(images.left, corners.uv, corners.octave, found.copy(), stereo, _SEARCH_PX, disparity, found)
+        images.right.refine(
+            images.aligned, NO_GRID, corners.uv, corners.octave, found.copy(), stereo, _SEARCH_PX, disparity, found
+        )
         disparity[~found] = -1.0
         disparity[disparity < camera.fx / config.local_map.max_far_ratio] = -1.0
     elif images.depth_m is not None:

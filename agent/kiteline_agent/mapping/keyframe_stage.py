@@ -84,5 +84,5 @@ class KeyframeStage:
         self._relocaliser.add_keyframe(keyframe)
         self._camera.covariance.store(keyframe)
         if ctx.images.right is not None and ctx.images.right.needs_rectification:
-            self._work.rectified_px += ctx.images.left[1].size
+            self._work.rectified_px += ctx.images.sampled[1].size
         return keyframe

@@ -13,6 +13,7 @@ from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.step import Identity, StepInput
+from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_codec import warm as codec_warm
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
@@ -79,10 +80,10 @@ def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
     two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
     place = np.array([[160.0, 120.0]])
+    templates = np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
     search_segments(
-        build_pyramid(image, 4), np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8), np.zeros(1, np.int64),
-        np.zeros(1, np.uint8), np.eye(2)[None], place, place + 5.0, 0.7, 40, 0.7, 0.9,
-        place.copy(), np.zeros(1, np.int8),
+        build_pyramid(image, 4), NO_GRID, templates, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.eye(2)[None],
+        place, place + 5.0, 0.7, 40, 0.7, 0.9, place.copy(), np.zeros(1, np.int8),
     )  # fmt: skip
 
 

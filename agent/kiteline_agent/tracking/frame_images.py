@@ -1,9 +1,9 @@
-"""Image pyramids of one frame: the left image rectified, the right one only where it is read."""
+"""Image pyramids of one frame, rectified only where they are read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,10 @@ from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import Rectifier
 
 U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_NO_GRID = np.zeros((0, 0, 2), np.float32)  # the image needs no rectification
+NO_GRID = np.zeros((0, 0, 2), np.float32)  # the image needs no rectification
 
 
 class RightImage:
@@ -51,8 +52,8 @@ class RightImage:
         return self._coarse
 
     def refine(
-        self, left: Pyramid, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig, search_px: float,
-        disparity: F64, found: NDArray[np.bool_],
+        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig,
+        search_px: float, disparity: F64, found: NDArray[np.bool_],
     ) -> None:  # fmt: skip
         """Measure disparities to sub-pixel (stereo_kernels.refine_rows); rectifies only the patches that it reads."""
         grid = self._rectifier.right_grid
@@ -60,8 +61,8 @@ class RightImage:
         offset = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
         disparity[wanted] = np.maximum(disparity[wanted] + offset[wanted], 0.0)
         stereo_kernels.refine_rows(
-            left, self._raw_pyramid(), _NO_GRID if grid is None else grid, uv, octave, sure, config.iterations,
-            search_px, config.min_ncc, disparity, found,
+            left, left_grid, self._raw_pyramid(), NO_GRID if grid is None else grid, uv, octave, sure,
+            config.iterations, search_px, config.min_ncc, disparity, found,
         )  # fmt: skip
         disparity[wanted] = np.maximum(disparity[wanted] - offset[wanted], 0.0)
 
@@ -71,29 +72,62 @@ class RightImage:
         return self._raw
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FrameImages:
-    """Pyramids of one frame. depth_m: (h,w) float32 aligned with left, or None. first: finest level not blank."""
+    """Images of one frame. sampled: pyramid of the left one, rectified, but for level 0 where `grid` is its grid of raw
+    pixels and not (0,0,2). depth_m: (h,w) float32 aligned with left, or None. first: finest level not blank.
+    rectify: makes the whole level 0; None if `sampled` has it.
+    """
 
-    left: Pyramid
+    sampled: Pyramid
     right: RightImage | None
     depth_m: NDArray[np.float32] | None
     first: int = 0
+    grid: F32 = field(default_factory=lambda: NO_GRID)
+    rectify: Callable[[], U8] | None = None
+    _left: Pyramid | None = field(default=None, init=False)
+
+    @property
+    def left(self) -> Pyramid:
+        """Pyramid of the whole rectified left image, for corners and descriptors; made on demand: most frames are read
+        at few places.
+        """
+        if self._left is None:
+            levels = len(self.sampled)
+            self._left = self.sampled if self.rectify is None else build_pyramid(self.rectify(), levels)
+        return self._left
+
+    @property
+    def aligned(self) -> Pyramid:
+        """The whole level 0, and the coarser levels as other frames have them: for templates and disparities."""
+        return (self.left[0], *self.sampled[1:])
+
+    @property
+    def rectified_px(self) -> int:
+        """Pixels that were rectified, but for single patches."""
+        if self.rectify is None and self.first == 0:
+            return 0
+        return self.sampled[1].size + (0 if self._left is None or self.first else self.sampled[0].size)
 
 
 def frame_images(
     frame: Frame, rectifier: Rectifier, config: PyramidConfig, first: int, offset_px: Callable[[F64], F64]
 ) -> FrameImages:
-    """Rectify a frame. first: finest level wanted, 0 or 1; with 1 it costs a third, and level 0 is blank.
+    """Images of a frame. first: finest level wanted, 0 or 1; with 1, level 0 is blank.
 
+    Where images need rectification, the coarser levels are rectified at half size.
     offset_px: see RightImage. Raises CalibrationError for an image of the wrong size.
     """
     right = None if frame.right is None else RightImage(frame.right, rectifier, config.levels, offset_px)
     depth_m = None if frame.depth_m is None else rectifier.depth(frame.depth_m)
-    if first == 0 or not rectifier.remaps:
+    if not rectifier.remaps:
         return FrameImages(build_pyramid(rectifier.rectify(0, frame.left), config.levels), right, depth_m)
-    half = rectifier.half(0, frame.left)
-    return FrameImages((rectifier.blank, *build_pyramid(half, config.levels - 1)), right, depth_m, first)
+    coarse = build_pyramid(rectifier.half(0, frame.left), config.levels - 1)
+    grid = rectifier.left_grid
+    if first or grid is None:
+        return FrameImages((rectifier.blank, *coarse), right, depth_m, 1)
+    image = np.require(frame.left, np.uint8, ("C", "W"))
+    return FrameImages((image, *coarse), right, depth_m, 0, grid, lambda: rectifier.rectify(0, image))
 
 
 def depth_at(depth_m: NDArray[np.float32], uv: F64) -> F64:

@@ -77,8 +77,9 @@ class Tracker:
             some = np.flatnonzero(raised == finest - last)
             place, aligned, score = uv[some], np.zeros(len(some), np.bool_), np.zeros(len(some))
             alignment_kernels.align(
-                images.left, self._map.templates, rows[some], octave[some], candidates.warp[chosen[some]], place,
-                max(first, finest), finest, align.iterations, step, align.min_ncc, aligned, score,
+                images.sampled, images.grid, self._map.templates, rows[some], octave[some],
+                candidates.warp[chosen[some]], place, max(first, finest), finest, align.iterations, step,
+                align.min_ncc, aligned, score,
             )  # fmt: skip
             uv[some], found[some] = place, aligned
         self._work.projected += len(candidates.rows)
@@ -124,7 +125,9 @@ class Tracker:
                 disparity[skipped] = -1.0
             self._work.stereo_points += min(len(uv), stereo.points)
             found = np.zeros(len(uv), np.bool_)
-            images.right.refine(images.left, uv, octave, sure, stereo, stereo.search_px, disparity, found)
+            images.right.refine(
+                images.sampled, images.grid, uv, octave, sure, stereo, stereo.search_px, disparity, found
+            )
             observed[found, 2] = disparity[found]
         elif images.depth_m is not None:
             depth_m = depth_at(images.depth_m, uv)

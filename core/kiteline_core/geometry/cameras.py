@@ -105,10 +105,12 @@ class Rectifier:
         self._depth_map: NDArray[np.int16] | None = None
         self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self.blank = np.zeros((left.height, left.width), np.uint8)
-        self.right_grid: NDArray[np.float32] | None = None  # see _grid; None if the right image needs no rectification
+        self.left_grid: NDArray[np.float32] | None = None  # see _grid; None if the image needs no rectification
+        self.right_grid: NDArray[np.float32] | None = None
         if rig.right is None:
             if left.lens is not Lens.NONE:
                 self._maps[0] = _undistortion_maps(left, np.eye(3), left.matrix())
+                self.left_grid = _grid(left, np.eye(3), left.matrix())
             self.camera = RectifiedCamera(
                 left.width, left.height, left.fx, left.fy, left.cx, left.cy,
                 VIRTUAL_BASELINE_M, False, rig.T_b_c.copy(),
@@ -131,7 +133,7 @@ class Rectifier:
         r_left, r_right, new = _stereo_rotations(rig)
         self._maps[0] = _undistortion_maps(left, r_left, new)
         self._right = (rig.right, r_right, new)
-        self.right_grid = _grid(rig.right, r_right, new)
+        self.left_grid, self.right_grid = _grid(left, r_left, new), _grid(rig.right, r_right, new)
         # r_left rotates points of the raw left camera into the rectified one.
         t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
         self.camera = RectifiedCamera(
