@@ -76,7 +76,7 @@ class Columns:
         """The codes (columns, n), unchecked. Raises WireError."""
         return source.columns(len(self._column_names), source.varint(MAX_KEYPOINTS))
 
-    def read(self, source: Reader) -> dict[str, Any]:
+    def read(self, source: Reader, _values: dict[str, Any] | None = None) -> dict[str, Any]:
         """The arrays by name. Raises WireError."""
         codes = self.read_codes(source)
         if fault := self._fault(codes):
@@ -151,3 +151,18 @@ def read_landmarks(source: Reader, n: int) -> I64:
     """Landmark ids (n,). Raises WireError."""
     keyframes, place, keypoint = read_landmark_table(source, n)
     return np.asarray(np.array(keyframes, np.int64)[place] << KEYPOINT_BITS | keypoint, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """The code of a field of landmark ids (n,), n as the field `index` has."""
+
+    field: str
+
+    def write(self, out: Writer, record: Any) -> None:
+        """Append the ids. Raises ValueError."""
+        write_landmarks(out, getattr(record, self.field))
+
+    def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
+        """The ids by name. Raises WireError."""
+        return {self.field: read_landmarks(source, len(values["index"]))}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,3 +41,18 @@ def read_scale(source: Reader) -> float:
     if not quantise.MIN_SCALE <= scale <= quantise.MAX_SCALE:
         raise WireError(f"found scale {scale}: expected 2^-20 to 2^20")
     return scale
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The code of a field that is a rigid motion (4,4)."""
+
+    field: str
+
+    def write(self, out: Writer, record: Any) -> None:
+        """Append the pose. Raises ValueError."""
+        write_pose(out, getattr(record, self.field))
+
+    def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
+        """The pose by name. Raises WireError."""
+        return {self.field: read_pose(source)}

@@ -8,7 +8,7 @@ Pixels are those of the rectified left camera. Inverse depth is along the optica
 from __future__ import annotations
 
 from enum import Enum, IntEnum
-from typing import ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 from kiteline_codec.coding.packing import Reader, Writer
 
@@ -60,6 +60,18 @@ class Priority(IntEnum):
     GRID = 6
 
 
+class FieldCodec(Protocol):
+    """The code of one field of a record, or of several."""
+
+    def write(self, out: Writer, record: Any) -> None:
+        """Append the fields, quantised. Raises ValueError for values that have no code."""
+        ...
+
+    def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
+        """The fields by name. values: the fields read before. Raises WireError."""
+        ...
+
+
 class Record:
     """A value that one side writes and the other holds; a later record of the same key replaces it."""
 
@@ -71,6 +83,7 @@ class Record:
     FIRST_PARTS: ClassVar[int] = 1  # parts that go at PRIORITY; the others wait until REST
     PREDICTS: ClassVar[bool] = False  # whether residual codes are predicted from it
     IN_WORLD: ClassVar[bool] = False  # whether it is in the world frame of the base that wrote it
+    CODE: ClassVar[tuple[FieldCodec, ...]]  # all but the key, in order; needed where `write` and `read` are not defined
 
     @classmethod
     def written_by_agent(cls) -> bool:
@@ -83,12 +96,19 @@ class Record:
 
     def write(self, out: Writer) -> None:
         """Append all but the key, quantised. Raises ValueError for values that have no code."""
-        raise NotImplementedError
+        for codec in self.CODE:
+            codec.write(out, self)
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
         """The record of a key and a code. Raises WireError."""
-        raise NotImplementedError
+        values: dict[str, Any] = {}
+        for codec in cls.CODE:
+            values |= codec.read(source, values)
+        values[cls.ID.field] = key.id
+        if cls.PARTS > 1:
+            values["part"] = key.part
+        return cls(**values)
 
 
 RECORD_TYPES: dict[int, type[Record]] = {}  # by kind; complete once kiteline_codec.schema is imported

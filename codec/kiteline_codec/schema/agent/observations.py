@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding.packing import Reader, Writer
-from kiteline_codec.schema.columns import Columns, read_landmarks, write_landmarks
-from kiteline_codec.schema.record import MAX_PARTS, IdOf, Key, Priority, Record, register
+from kiteline_codec.schema.columns import Columns, Landmarks
+from kiteline_codec.schema.record import MAX_PARTS, IdOf, Priority, Record, register
 from kiteline_core.ids import KeyframeId
 
 
@@ -26,6 +25,7 @@ class Observations(Record):
     PRIORITY = Priority.OBSERVATIONS
     PARTS = MAX_PARTS
     COLUMNS: ClassVar = Columns("index", "uv", "inv_depth", "octave", increasing=False)
+    CODE = (COLUMNS, Landmarks("point"))
 
     keyframe: KeyframeId
     part: int
@@ -34,14 +34,3 @@ class Observations(Record):
     inv_depth: NDArray[np.float32]
     octave: NDArray[np.uint8]
     point: NDArray[np.int64]
-
-    def write(self, out: Writer) -> None:
-        """Append the rows and the landmark ids."""
-        self.COLUMNS.write(out, self)
-        write_landmarks(out, self.point)
-
-    @classmethod
-    def read(cls, source: Reader, key: Key) -> Self:
-        """The record of a key and a code."""
-        columns = cls.COLUMNS.read(source)
-        return cls(KeyframeId(key.id), key.part, point=read_landmarks(source, len(columns["index"])), **columns)
