@@ -45,7 +45,7 @@ def test_status_says_what_the_snapshot_holds_in_json() -> None:
     assert json.loads(json.dumps(out, allow_nan=False)) == out
     assert out["up_s"] == 60.0
     totals = {n["label"]: (n["value"], n["unit"]) for n in out["totals"]}
-    assert totals["Keyframes"] == (6, "") and totals["Landmarks"] == (5, "")
+    assert totals["Keyframes"] == (6, "") and totals["Landmarks"] == (80, "")
     assert totals["Mapped"] == (round(1023 * 0.25, 1), "m²")
     first, second = out["agents"]
     assert first["position"] == [1.235, -2.0, 0.0] and first["heading_deg"] == 90.0

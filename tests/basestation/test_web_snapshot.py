@@ -44,9 +44,10 @@ def test_overview_follows_a_flight(make_flight: Callable[..., Any]) -> None:
     shown = status(now)
     (only,) = shown["agents"]
     counts = {n["label"]: n["value"] for n in only["counts"]}
+    totals = {n["label"]: n["value"] for n in shown["totals"]}
     assert only["agent"] == 0 and counts["Keyframes"] == 6 and counts["Submaps"] == 1
     assert only["bytes_up"] > 10_000 and only["bytes_down"] > 0
-    assert counts["Landmarks"] > 100
+    assert totals["Landmarks"] == counts["Landmarks"] > 100
     assert now.agents[0].path.shape == (6, 3)
     radius = np.linalg.norm(now.agents[0].path - now.agents[0].path.mean(axis=0), axis=1)
     np.testing.assert_allclose(radius, 1.2, atol=0.1)

@@ -138,7 +138,7 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         browser.call("Page.navigate", url=handle.url)
         browser.wait("document.querySelectorAll('article').length", "2")
-        browser.wait("document.querySelector('#totals [data-label=Landmarks]').textContent", "3,000")
+        browser.wait("document.querySelector('#totals [data-label=Landmarks]').textContent", "2,480")
         browser.wait("document.querySelector('article .quality output').textContent", "86 %")
         browser.wait("document.querySelectorAll('article .traffic dd')[0].textContent", "3.0 kB/s")
         browser.wait("getComputedStyle(document.getElementById('empty')).display", "none")
@@ -151,4 +151,4 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
         assert browser.complaints == []
     finally:
         handle.close()
-    browser.wait("document.getElementById('link').textContent", "base does not answer")
+    browser.wait("document.getElementById('link').textContent", "no connection to the base")

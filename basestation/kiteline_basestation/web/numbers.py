@@ -33,7 +33,7 @@ def mapped_m2(page: PageSnapshot) -> float:
 # In the header of the page, from left to right.
 TOTALS: tuple[Number[PageSnapshot], ...] = (
     Number("Keyframes", "", lambda page: sum(agent.keyframes for agent in page.agents)),
-    Number("Landmarks", "", lambda page: len(page.points)),
+    Number("Landmarks", "", lambda page: sum(agent.landmarks for agent in page.agents)),
     Number("Loops", "", lambda page: page.counts.get("loops", 0)),
     Number("Merges", "", lambda page: page.counts.get("merges", 0)),
     Number("Mapped", "m²", mapped_m2),

@@ -89,11 +89,11 @@ function card(agent) {
 function fill({ node, rates }, a) {
   const link = node.querySelector(".link");
   link.dataset.state = a.link;
-  link.textContent = a.link === "live" ? "live" : a.link === "never" ? "no packet yet" : `${a.link === "lost" ? "lost" : "no packet"} for ${duration(a.silent_s)}`;
+  link.textContent = a.link === "live" ? "live" : a.link === "never" ? "no packet yet" : `no ${a.link === "lost" ? "link" : "packet"} for ${duration(a.silent_s)}`;
 
   const quality = node.querySelector(".quality");
   const failed = a.quality !== null && a.quality < 0, percent = Math.max(a.quality ?? 0, 0);
-  quality.dataset.level = failed ? "failed" : percent < 40 ? "low" : "good";
+  quality.dataset.level = failed ? "failed" : a.link === "lost" ? "old" : percent < 40 ? "low" : "good";
   quality.querySelector(".bar").setAttribute("aria-valuenow", percent);
   quality.querySelector(".bar i").style.width = `${percent}%`;
   quality.querySelector("output").textContent = failed ? "failed" : a.quality === null ? "–" : `${percent} %`;
