@@ -18,7 +18,7 @@ from kiteline_bench.harness.simulated import random_flight
 TITLE = "Consistent poses"
 
 FLIGHTS = 30
-_BAND = (4.82, 7.30)  # 95 % of the means of 30 draws of a chi-square with 6 degrees of freedom lie within
+_NORMAL = 1.96  # 95 % of a normal distribution lie within so many deviations
 _FAULTS_A_FLIGHT = 2
 _LEVEL_S = 0.3  # after which a flight begun in motion must be level
 _LEVEL_RAD = 0.035  # 2 degrees
@@ -29,7 +29,7 @@ _JUMP_M = 0.35  # between two frames of the odometry: 7 m/s at 20 Hz
 
 
 @dataclass(slots=True)
-class _Counts:
+class Counts:
     """Of all flights of one kind. nees: mean of each flight; final_nees: of its last frame. bad, good: frames whose
     error exceeds the limits or not, and how many of them were flagged by their quality.
     """
@@ -42,6 +42,7 @@ class _Counts:
     good_flagged: int = 0
 
     def add(self, errors: list[PoseError]) -> None:
+        """Count a flight."""
         limits = AgentConfig().covariance
         for error in errors:
             flagged = error.estimate.quality < limits.flagged_below
@@ -61,7 +62,7 @@ def run(bench: Bench) -> list[Bar]:
 
 def consistency_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar]:
     """The bars over so many flights; scale: of the images."""
-    counts: dict[tuple[str, bool], _Counts] = defaultdict(_Counts)
+    counts: dict[tuple[str, bool], Counts] = defaultdict(Counts)
     tilts: list[float] = []
     back_after: list[int] = []
     names = list(FAULTS_IN_MID_FLIGHT)[1:]
@@ -80,9 +81,9 @@ def consistency_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar
                 if fault == _BLACK and inertial:
                     first = len(flight.recording.items) // 2 + _BLACK_FRAMES
                     back_after.append(flown.frames_until_tracked(first))
-    bars = [_nees_bar(f"NEES of {flights} flights {'with' if imu else 'without'} IMU", counts["none", imu])
+    bars = [nees_bar(f"NEES of {flights} flights {'with' if imu else 'without'} IMU", counts["none", imu])
             for imu in (True, False)]  # fmt: skip
-    bars += _quality_bars(list(counts.values()))
+    bars += quality_bars(list(counts.values()))
     bars.append(at_most("2 s of black with IMU: frames until tracked again, worst", max(back_after), _BACK_AFTER,
                         "", 0))  # fmt: skip
     if tilts:
@@ -93,13 +94,26 @@ def consistency_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar
     return bars
 
 
-def _nees_bar(name: str, counts: _Counts) -> Bar:
+def nees_band(flights: int) -> tuple[float, float]:
+    """Range in which 95 % of the means of so many draws of a chi-square with 6 degrees of freedom lie.
+
+    E. Wilson, M. Hilferty, "The distribution of chi-square", 1931.
+    """
+    spread = 2.0 / (9.0 * 6.0 * flights)
+    low, high = (6.0 * (1.0 - spread + sign * _NORMAL * np.sqrt(spread)) ** 3 for sign in (-1.0, 1.0))
+    return float(low), float(high)
+
+
+def nees_bar(name: str, counts: Counts) -> Bar:
+    """Whether the mean NEES of flights lies in its band."""
     mean = float(np.mean(counts.nees))
-    return is_true(name, f"{_BAND[0]:g} to {_BAND[1]:g}", _BAND[0] <= mean <= _BAND[1],
+    low, high = nees_band(len(counts.nees))
+    return is_true(name, f"{low:.2f} to {high:.2f}", low <= mean <= high,
                    f"{mean:.2f} (at the flights' ends {np.mean(counts.final_nees):.2f})")  # fmt: skip
 
 
-def _quality_bars(counts: list[_Counts]) -> list[Bar]:
+def quality_bars(counts: list[Counts]) -> list[Bar]:
+    """Whether `quality` tells bad poses from good ones."""
     bad, good = sum(c.bad for c in counts), sum(c.good for c in counts)
     flagged = sum(c.bad_flagged for c in counts) / max(bad, 1)
     wrongly = sum(c.good_flagged for c in counts) / max(good, 1)
@@ -134,7 +148,7 @@ def _no_texture(bench: Bench, scale: float) -> list[Bar]:
     return bars
 
 
-def _table(counts: dict[tuple[str, bool], _Counts]) -> str:
+def _table(counts: dict[tuple[str, bool], Counts]) -> str:
     lines = [
         "| fault | IMU | flights | frames off | of them flagged | others | of them flagged | NEES, median |",
         "|---|---|---|---|---|---|---|---|",

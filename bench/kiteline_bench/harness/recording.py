@@ -66,6 +66,12 @@ class Recording:
         """The recording without inertial samples."""
         return replace(self, imu=None, items=tuple(replace(item, imu=None) for item in self.items))
 
+    def left_only(self) -> Recording:
+        """The recording of the left camera and the IMU alone."""
+        rig = replace(self.rig, right=None, T_c_r=None, has_depth=False)
+        items = (replace(item, frame=replace(item.frame, right=None, depth_m=None)) for item in self.items)
+        return replace(self, rig=rig, items=tuple(items))
+
     def with_odometry(self, batch: OdometryBatch | None) -> Recording:
         """The recording with these velocities in place of its own, each given to the first frame after it."""
         items, first = [], 0

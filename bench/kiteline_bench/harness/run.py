@@ -93,9 +93,10 @@ def fly_alone(recording: Recording, config: AgentConfig | None = None, *, vocabu
 
 @dataclass(slots=True)
 class RecordingRun:
-    """The flight of one agent along a recording, and the base at its end."""
+    """The flight of one agent along a recording, and agent and base at its end."""
 
     agent: AgentRun
+    box: Agent
     station: Station
 
 
@@ -122,7 +123,7 @@ def fly_recording(
         output = station.step({number: list(up)}, jobs.done(now_ns), now_ns)
         jobs.add(output.jobs, now_ns)
         down = dict(output.packets).get(number, ())
-    return RecordingRun(flying.run, station)
+    return RecordingRun(flying.run, flying.box, station)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,7 +113,7 @@ def random_flight(
         path = scratch / f"path{number}.txt"
         _write_path(path, rng, seconds, (1.6, 1.8, 0.4) if scene == "room" else (4.0, 4.0, 0.8))
         options["trajectory"] = str(path)
-    source = open_sim(scene, **options, **more)
+    source = open_sim(scene, os.cpu_count() or 1, **options, **more)
     assert source.imu is not None and source.ground_truth is not None
     recording = Recording(source.rig, source.imu, tuple(items_of(source)))
     return RandomFlight(recording, options["rest"] == 0.0)

@@ -10,6 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.runtime.frame_counts import live_pose
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.station import Station
@@ -33,12 +35,16 @@ _LEAST_PATH_M = 1.0  # in a window: from less the scale is not known
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """A flight and how long it took. refined: the base's path of the agent, T_w_b; empty without a base."""
+    """A flight and how long it took. refined: the base's path of the agent, T_w_b; empty without a base.
+
+    box, station: agent and base at the end; None in a flight without a base.
+    """
 
     run: AgentRun
     refined: Poses
-    station: Station | None
     seconds: float
+    box: Agent | None = None
+    station: Station | None = None
 
     @property
     def begin_ns(self) -> int:
@@ -134,17 +140,17 @@ class Flown:
 
 def flown(
     bench: Bench, what: str, recording: Recording, *, base: bool = True, bytes_s: tuple[int, int] = (0, 0),
-    profile: str = "wifi",
+    profile: str = "wifi", config: AgentConfig | None = None,
 ) -> Flown:  # fmt: skip
     """Fly a recording in this process, and say what was flown and how long it took."""
     begin_s = time.perf_counter()
     if base:
-        flight = fly_recording(recording, bytes_s=bytes_s, profile=profile)
+        flight = fly_recording(recording, config, bytes_s=bytes_s, profile=profile)
         keyframes = {int(k): pose for k, pose in keyframe_poses(flight.station.mapper).items()}
         refined = refined_path(flight.agent.found, keyframes, Rectifier(recording.rig).camera.T_b_c)
-        result = Flown(flight.agent, refined, flight.station, time.perf_counter() - begin_s)
+        result = Flown(flight.agent, refined, time.perf_counter() - begin_s, flight.box, flight.station)
     else:
-        result = Flown(fly_alone(recording), [], None, time.perf_counter() - begin_s)
+        result = Flown(fly_alone(recording, config), [], time.perf_counter() - begin_s)
     bench.say(f"{what}: {len(recording.items)} frames in {result.seconds:.0f} s")
     return result
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kiteline_bench.reality import base, cpu, euroc, motion, street, worn
+from kiteline_bench.reality import base, cpu, difficult, euroc, metric, motion, nees, people, street, worn
 
 PARTS = {
     "euroc": ("Reality: one eye and a real IMU", euroc.run),
@@ -11,5 +11,9 @@ PARTS = {
     "street": ("Reality: a street", street.run),
     "motion": ("Reality: starts in motion", motion.run),
     "base": ("Reality: the base beside the tracker alone", base.run),
+    "metric": ("Reality: metric said from a hundred starts", metric.run),
+    "nees": ("Reality: consistent poses of worn rigs", nees.run),
+    "people": ("Reality: people who walk through", people.run),
+    "difficult": ("Reality: difficult images", difficult.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
 }

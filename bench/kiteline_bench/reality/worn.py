@@ -5,13 +5,20 @@ Seven seeds of world, path and wear for each scene. The seeds are held out: opti
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
 from kiteline_bench.harness.bars import Bar, Bench
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.simulated import render
 from kiteline_bench.reality.flown import Flown, flown, spread, table
+from kiteline_hw.logs.rig_json import rig_from_json
 
 SEEDS = tuple(range(901, 908))  # of world and wear
 SECONDS = 16.0
@@ -19,15 +26,19 @@ _PATHS = {"room": ("V1_02_medium.txt", 8.0, 9.0), "hall": ("MH_03_medium.txt", 1
 _LIVE, _LIVE_M = 4.0, 0.02  # times the clean flight's error, or m, whichever is larger
 _BASE, _BASE_M = 2.5, 0.01
 _JUMP_MM = 3.0
+_LEFT = 1.0 / 3.0  # of what the told calibration is off by
+_UNHURT = 1.05
 
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A flight by a true rig and the same one by a worn rig."""
+    """A flight by a true rig, also without self-calibration, and the same one by a worn rig."""
 
     seed: int
     clean: Flown
+    plain: Flown
     worn: Flown
+    found: dict[str, float]
 
     def over_bound(self, path: str, times: float, least_m: float) -> float:
         """Error of the worn rig over what it may be."""
@@ -58,12 +69,16 @@ def hall(bench: Bench) -> list[Bar]:
 def _bars(bench: Bench, scene: str) -> list[Bar]:
     pairs = []
     for seed in bench.chosen(SEEDS):
-        clean, worn = (flown(bench, f"{scene} {seed}, {rig} rig", recording(bench, scene, seed, rig))
-                       for rig in ("true", "worn"))  # fmt: skip
-        pairs.append(_Pair(seed, clean, worn))
+        true_rig = recording(bench, scene, seed, "true")
+        clean = flown(bench, f"{scene} {seed}, true rig", true_rig)
+        plain = flown(bench, f"{scene} {seed}, true rig, no self-calibration", true_rig, config=_uncalibrated())
+        worn = flown(bench, f"{scene} {seed}, worn rig", recording(bench, scene, seed, "worn"))
+        truth = json.loads((bench.folder / f"{scene}_{seed}_worn.rig_truth.json").read_text())
+        pairs.append(_Pair(seed, clean, plain, worn, unfound(worn.box, truth)))
         bench.say(
             f"  clean live {clean.ate_m('live'):.4f} base {clean.ate_m('base'):.4f} m; "
-            f"worn live {worn.ate_m('live'):.4f} base {worn.ate_m('base'):.4f} m, jump {_jump_mm(worn):.1f} mm"
+            f"worn live {worn.ate_m('live'):.4f} base {worn.ate_m('base'):.4f} m, jump {_jump_mm(worn):.1f} mm, "
+            f"not found: {', '.join(f'{name} {share:.2f}' for name, share in pairs[-1].found.items())}"
         )
     _table(bench, scene, pairs)
     return [
@@ -73,8 +88,40 @@ def _bars(bench: Bench, scene: str) -> list[Bar]:
                 [pair.over_bound("base", _BASE, _BASE_M) for pair in pairs], 1.0, "", 2),
         *spread(f"worn {scene}: largest live jump beside the motion", [_jump_mm(pair.worn) for pair in pairs],
                 _JUMP_MM, "mm", 1),
+        *(bar for name in pairs[0].found
+          for bar in spread(f"worn {scene}: {name}, error that is left over that of the calibration",
+                            [pair.found.get(name, 1.0) for pair in pairs], _LEFT, "", 2)),
+        *spread(f"true {scene}: ATE live over that without self-calibration",
+                [pair.clean.ate_m("live") / pair.plain.ate_m("live") for pair in pairs], _UNHURT, "", 2),
         *spread(f"worn {scene}: frames without a pose", [float(pair.worn.run.lost) for pair in pairs], 0.0, "", 0),
     ]  # fmt: skip
+
+
+def _uncalibrated() -> AgentConfig:
+    """The agent without self-calibration of the IMU."""
+    config = AgentConfig()
+    off = replace(config.inertial.calibration, apply_axes=False, apply_offset=False)
+    return replace(config, inertial=replace(config.inertial, calibration=off))
+
+
+def unfound(box: Agent | None, truth: dict[str, Any]) -> dict[str, float]:
+    """What the agent's calibration is off by at the end, over what the told one was off by, for each part of the rig.
+
+    truth: rig_truth.json. Axes of the IMU are those of the body by the camera, as the agent has them: an error of the
+    camera's rotation is one of both.
+    """
+    found, offset = (None, None) if box is None else (box.imu_calibration_report(), box.time_offset_report())
+    if found is None or offset is None:
+        return {}
+    told, true = (rig_from_json(truth[name])[0].T_b_c[:3, :3] for name in ("told", "true"))
+    shares = {}
+    for name in ("gyro", "accel"):
+        wanted = np.array(truth[f"{name}_matrix"]) @ true @ told.T
+        off = np.linalg.norm(np.array(found[name]["matrix"]) - wanted)
+        shares[f"axes of the {name}"] = float(off / np.linalg.norm(wanted - np.eye(3)))
+    late_ms = 1000.0 * truth["frame_stamps_late_s"]
+    shares["time offset"] = abs(offset["ms"] + late_ms) / late_ms
+    return shares
 
 
 def _jump_mm(flight: Flown) -> float:

@@ -65,9 +65,10 @@ def test_textures_depend_only_on_the_seed() -> None:
 
 
 def test_no_texture_is_periodic() -> None:
-    """No shift other than none brings a texture near to itself."""
-    pool = make_pool(tuple(MAKERS), 2, 9)
-    for name in MAKERS:
+    """No shift other than none brings a texture near to itself, but for the one that is asked to repeat."""
+    names = tuple(name for name in MAKERS if name != "tiles")
+    pool = make_pool(names, 2, 9)
+    for name in names:
         f = pool.image(name).astype(float)
         f -= cv2.GaussianBlur(f, (0, 0), 12)  # the fine structure, by which features are matched
         spectrum = np.abs(np.fft.fft2(f)) ** 2
