@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.frame_counts import live_pose
+from kiteline_bench.agent.consistency import nees_band
 from kiteline_bench.harness.bars import Bench
 from kiteline_bench.harness.recording import load
 from kiteline_bench.reality.flown import Flown, flown, spread
+from kiteline_bench.reality.worn import unfound
 from kiteline_core.geometry import se3
+from kiteline_hw.sim.source import open_sim
 
 
 def quiet(tmp_path: Path, data: Path = Path(), starts: int = 0) -> Bench:
@@ -73,3 +79,31 @@ def test_bars_of_several_flights_and_the_starts_of_a_quick_look(tmp_path: Path) 
     assert spread("x", [3.0], 2.5, "", worst=3.5)[1].met
     assert quiet(tmp_path, starts=3).chosen(range(10)) == [0, 3, 6]
     assert quiet(tmp_path).chosen((4, 5)) == [4, 5] == quiet(tmp_path, starts=9).chosen((4, 5))
+
+
+def test_what_a_calibration_leaves_is_measured_against_the_true_rig() -> None:
+    """A box that reports the true axes and offset has found all; one that reports the told ones, nothing."""
+    worn = open_sim("room", rig="worn", seconds=1.0, scale=0.2, texture_bits=6).worn
+    truth = json.loads(json.dumps(worn.to_json()))
+    turn = worn.true.T_b_c[:3, :3] @ worn.told.T_b_c[:3, :3].T
+
+    class Box:
+        def __init__(self, share: float) -> None:
+            self.share = share
+
+        def imu_calibration_report(self) -> dict[str, Any]:
+            matrices = {"gyro": worn.imu.gyro_matrix @ turn, "accel": worn.imu.accel_matrix @ turn}
+            return {n: {"matrix": (np.eye(3) + self.share * (m - np.eye(3))).tolist()} for n, m in matrices.items()}
+
+        def time_offset_report(self) -> dict[str, float]:
+            return {"ms": -1000.0 * self.share * worn.late_s}
+
+    for share in (1.0, 0.6, 0.0):
+        found = unfound(cast(Agent, Box(share)), truth)
+        assert set(found) == {"axes of the gyro", "axes of the accel", "time offset"}
+        assert all(left == pytest.approx(1.0 - share, abs=1e-9) for left in found.values())
+
+
+def test_the_band_of_the_nees_narrows_with_the_number_of_flights() -> None:
+    assert nees_band(30) == pytest.approx((4.82, 7.30), abs=0.01)
+    assert nees_band(1) == pytest.approx((1.24, 14.45), abs=0.15)
