@@ -34,12 +34,12 @@ class SelfCalibrationConfig:
     position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows
     axes_sigma: float = 0.012  # of scales and axes of gyro and accelerometer: 1 % and 0.7 degrees
     scale_sigma: float = 0.015  # relative, of lengths by the images
-    significance: float = 40.0  # squared deviations of 9 axes from a true rig, above which they are applied
+    significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
     apply_s: float = 0.5  # time constant with which applied axes follow
     offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
     offset_sigma_s: float = 0.02  # cameras without a trigger line
     offset_trusted_s: float = 3e-3  # deviation below which the offset is applied
-    offset_significance: float = 3.0  # deviations from the applied offset below which it stays: most rigs have none
+    offset_significance: float = 3.0  # deviations from the configured offset below which it stays: most rigs have none
     offset_rate: float = 0.05  # s/s, how fast the applied offset follows
     apply_axes: bool = True  # False: axes are only estimated
     apply_offset: bool = True  # False: only the configured offset is used
@@ -61,7 +61,7 @@ class SelfCalibration:
         self._before: tuple[Window, Link, float] | None = None  # the last window of moves, its density
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
-        self._corrects_gyro = self._corrects_accel = False
+        self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
         self._events: list[str] = []
 
     def correct(self, samples: Samples) -> Samples:
@@ -137,7 +137,8 @@ class SelfCalibration:
         if not config.apply_offset or self.gyro.offset_sigma_s >= config.offset_trusted_s:
             return
         step = self.gyro.offset_s - self.offset_s
-        if abs(step) > config.offset_significance * self.gyro.offset_sigma_s:
+        self._corrects_offset |= abs(step) > config.offset_significance * self.gyro.offset_sigma_s
+        if self._corrects_offset:
             self.offset_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
 
     def _follow_axes(self, buffer: SampleBuffer, dt_s: float) -> F64:
