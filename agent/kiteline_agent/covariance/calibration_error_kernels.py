@@ -38,7 +38,8 @@ def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float
 @njit
 def sensitivity(
     T_c_m: F64, camera: F64, half_px: float, rows: I64, inlier: Bools, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
-    per_keyframe: int, T_m_k: F64, anchor_px: F64, rho: F64, of_keyframes: F64, h: F64, g: F64,
+    per_keyframe: int, T_m_k: F64, anchor_px: F64, rho: F64, of_keyframes: F64, h: F64, g: F64, of_errors: F64,
+    side: F64,
 ) -> None:  # fmt: skip
     """Normal equations of a pose (left perturbation of T_c_m, [translation, rotation]) by the calibration errors.
 
@@ -46,13 +47,19 @@ def sensitivity(
     inlier: (n,). xyz, ray, observed, sigma_px: as in pose_kernels.optimise_pose. T_m_k: (K,4,4) of slots. anchor_px:
     (K*per_keyframe,2) px. rho: (K*per_keyframe,) 1/m. of_keyframes: (K,6,11) effect on the
     keyframes, as a left perturbation of T_m_k. Out: h (6,6) information, g (6,11): the pose moves by -h^-1 g for a
-    pixel of each error.
+    pixel of each error. of_errors (10,10): information of the calibration errors, side (16,): right-hand side of pose
+    and errors, both by the residuals at T_c_m.
     """
     fx, fy, bf = camera[0], camera[1], camera[4]
     here, there = np.empty((3, SHAPES)), np.empty((3, SHAPES))
     jac, pj, e = np.zeros((3, 6)), np.zeros((3, 3)), np.empty((3, SHAPES))
-    v, dk, dm, jv, ev = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(SHAPES)
+    v, dk, dm, jv, ev, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(SHAPES), np.empty(3)
+    for a in range(CALIBRATION):
+        side[6 + a] = 0.0
+        for b in range(CALIBRATION):
+            of_errors[a, b] = 0.0
     for a in range(6):
+        side[a] = 0.0
         for b in range(6):
             h[a, b] = 0.0
         for b in range(SHAPES):
@@ -68,6 +75,9 @@ def sensitivity(
             continue
         measured = 3 if observed[i, 2] >= 0.0 else 2
         iz = 1.0 / z
+        res[0] = fx * x * iz + camera[2] - observed[i, 0]
+        res[1] = fy * y * iz + camera[3] - observed[i, 1]
+        res[2] = bf * iz - observed[i, 2]
         pj[0, 0], pj[0, 2] = fx * iz, -fx * x * iz * iz
         pj[1, 1], pj[1, 2] = fy * iz, -fy * y * iz * iz
         pj[2, 2] = -bf * iz * iz
@@ -106,16 +116,33 @@ def sensitivity(
         for k in range(measured):
             v[k] = pj[k, 0] * dm[0] + pj[k, 1] * dm[1] + pj[k, 2] * dm[2]
             vv += v[k] * v[k]
+        rv = 0.0
+        for k in range(measured):
+            rv += res[k] * v[k]
         for s in range(SHAPES):
             t = 0.0
             for k in range(measured):
                 t += e[k, s] * v[k]
             ev[s] = t
+        for a in range(CALIBRATION):
+            t = 0.0
+            for k in range(measured):
+                t += e[k, a] * res[k]
+            side[6 + a] += (t - ev[a] * rv / vv) / s2
+            for b in range(a + 1):
+                t = 0.0
+                for k in range(measured):
+                    t += e[k, a] * e[k, b]
+                of_errors[a, b] += (t - ev[a] * ev[b] / vv) / s2
         for a in range(6):
             t = 0.0
             for k in range(measured):
                 t += jac[k, a] * v[k]
             jv[a] = t
+            t = 0.0
+            for k in range(measured):
+                t += jac[k, a] * res[k]
+            side[a] += (t - jv[a] * rv / vv) / s2
         for a in range(6):
             for b in range(6):
                 t = 0.0
@@ -127,6 +154,9 @@ def sensitivity(
                 for k in range(measured):
                     t += jac[k, a] * e[k, s]
                 g[a, s] += (t - jv[a] * ev[s] / vv) / s2
+    for a in range(CALIBRATION):
+        for b in range(a):
+            of_errors[b, a] = of_errors[a, b]
 
 
 @njit

@@ -4,7 +4,8 @@
   against, plus that of its own measurement. A revisited place is as certain as its old keyframes.
 - *Calibration errors* are the same in every frame, so they bend and stretch the whole map instead of averaging out.
   Their few parameters are not estimated; only their effect on each keyframe is tracked (S. F. Schmidt's consider
-  filter, 1966; for maps J. Civera et al., "Drift-free real-time sequential mosaicing").
+  filter, 1966; for maps J. Civera et al., "Drift-free real-time sequential mosaicing"). Residuals tell whether they are
+  those of a good calibration or of a worn one.
 - *IMU bias on poses*: the mean offset between poses fused with the IMU and those from images alone.
 - *Dead reckoning* has the covariance of the IMU or odometer, or that of unknown accelerations.
 """
@@ -25,6 +26,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
     pose_covariance,
     sensitivity,
 )
+from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -56,9 +58,11 @@ class PoseCovariance:
         self._calibration = np.full(SHAPES, config.calibration_px**2)
         self._calibration[CALIBRATION] = config.imu_offset_share**2
         self._calibration[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # a disparity has the errors of two cameras
-        extrinsic = np.repeat([config.extrinsic_m, config.extrinsic_rad], 3) if has_body else np.zeros(6)
-        a = adjoint(T_b_c)
-        self._extrinsic = a @ np.diag(extrinsic**2) @ a.T
+        self._evidence = CalibrationEvidence(self._calibration[:CALIBRATION])
+        self._good_calibration = self._calibration.copy()
+        self._has_body = has_body
+        self._camera_rotation_rad = 0.0  # found against the IMU
+        self._extrinsic = self._extrinsic_cov()
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))  # of the camera in m
         self._T_o_left: dict[SubmapId, F64] = {}  # T_o_m of earlier submaps, while all motion since was measured
         self._has_imu_motion = False  # an IMU measures all motion
@@ -78,6 +82,7 @@ class PoseCovariance:
         self._T_m_b0: F64 = np.eye(4)  # first pose of the submap
         self._T_o_b0: F64 | None = None  # first pose of the flight
         self._h, self._g = np.zeros((6, 6)), np.zeros((6, SHAPES))
+        self._of_errors, self._side = np.zeros((CALIBRATION, CALIBRATION)), np.zeros(6 + CALIBRATION)
 
     # updates
 
@@ -117,13 +122,29 @@ class PoseCovariance:
         d -= self._imu_offset
         self._imu_offset_cov += share * (np.outer(d, d) - self._imu_offset_cov)
 
+    def set_camera_rotation(self, angle_rad: float) -> None:
+        """Set by which angle the camera was found to be rotated against the body, which poses do not correct."""
+        if angle_rad != self._camera_rotation_rad:
+            self._camera_rotation_rad = angle_rad
+            self._extrinsic = self._extrinsic_cov()
+
+    def _extrinsic_cov(self) -> F64:
+        """(6,6) of the camera in the body."""
+        if not self._has_body:
+            return np.zeros((6, 6))
+        rotation = self._config.extrinsic_rad**2 + self._camera_rotation_rad**2 / 3.0
+        a = adjoint(self._T_b_c)
+        return np.asarray(a @ np.diag(np.repeat([self._config.extrinsic_m**2, rotation], 3)) @ a.T)
+
     def _evaluate(self, track: Track) -> None:
         m = self._map
         sensitivity(
             track.T_c_m, m.intrinsics, 0.5 * m.camera.width, track.rows, track.inlier, track.xyz, track.ray,
             track.observed, track.sigma_px, m.slot_size, m.T_m_k, m.uv.reshape(-1, 2), m.rho.reshape(-1), self._shift_k,
-            self._h, self._g,
+            self._h, self._g, self._of_errors, self._side,
         )  # fmt: skip
+        if self._evidence.add(self._h, self._g, self._of_errors, self._side):
+            self._calibration[:CALIBRATION] = self._good_calibration[:CALIBRATION] * self._evidence.level**2
         inverse = np.linalg.inv(self._h + 1e-6 * np.eye(6))
         a = adjoint(se3.inverse(track.T_c_m))
         noise = max(track.rms, self._config.least_rms) ** 2 * self._config.inflation * inverse

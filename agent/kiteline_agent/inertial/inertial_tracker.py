@@ -91,6 +91,11 @@ class InertialTracker:
         values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self._self_calibration.offset_s}
         return {name: round(1e3 * value, 2) for name, value in values.items()}
 
+    @property
+    def camera_rotation_rad(self) -> float:
+        """Angle by which the camera was found to be rotated against the IMU; 0 while that is not significant."""
+        return self._self_calibration.camera_rotation_rad
+
     def calibration_report(self) -> dict[str, Any]:
         """SelfCalibration.report."""
         return self._self_calibration.report()

@@ -62,6 +62,7 @@ class SelfCalibration:
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
+        self.camera_rotation_rad = 0.0  # against the gyro, once that is corrected
         self._events: list[str] = []
 
     def correct(self, samples: Samples) -> Samples:
@@ -121,6 +122,8 @@ class SelfCalibration:
             window = self._integrate(turn)
             variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
             self.gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance)
+            if self._corrects_gyro:
+                self.camera_rotation_rad = float(np.linalg.norm(_measured(self.gyro.matrix)[1]))
         if gravity is not None:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
