@@ -28,8 +28,11 @@ class Work:
 
     def clear(self) -> None:
         """Reset all counts for a new step."""
-        for field in fields(self):
-            setattr(self, field.name, 0)
+        for name in _COUNTS:
+            setattr(self, name, 0)
+
+
+_COUNTS = tuple(field.name for field in fields(Work))
 
 
 # ns each on the modelled core, an x86 laptop's: fitted to measured steps at every effort, and rounded.
@@ -55,4 +58,4 @@ PRICES_NS: dict[str, float] = {
 
 def cost_ns(work: Work) -> int:
     """CPU time in ns of a step on the modelled core."""
-    return round(sum(price * int(getattr(work, name)) for name, price in PRICES_NS.items()))
+    return round(sum([price * int(getattr(work, name)) for name, price in PRICES_NS.items()]))

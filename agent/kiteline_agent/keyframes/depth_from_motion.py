@@ -17,6 +17,7 @@ from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.track import Track
+from kiteline_core.order_statistics import quantiles
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -46,9 +47,9 @@ class DepthFromMotion:
         near = 1.0 / track.depth_m[track.inlier]
         if len(near) < self._config.pose.min_inliers:
             return 0
-        typical, steepest = np.quantile(near, [0.5, 0.95])
-        ceiling = float(steepest) * config.nearer
-        self._map.initialise_seeds(float(typical), float(ceiling))
+        typical, steepest = quantiles(near, (0.5, 0.95))
+        ceiling = steepest * config.nearer
+        self._map.initialise_seeds(typical, ceiling)
         seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, self._config.align.max_scale, seeds=True)
         chosen = self._choose(seeds, images.first)
         if len(chosen) == 0:
@@ -67,7 +68,7 @@ class DepthFromMotion:
         scale = (1 << self._map.octave[rows]).astype(np.float64)
         hit = (found == 1) & agree & (off_line < config.off_line_px * scale) & np.isfinite(variance)
         self._count(rows, hit, failed=(found == 0) | ((found == 1) & ~hit))
-        return self._fuse(rows[hit], measured[hit], variance[hit], float(typical))
+        return self._fuse(rows[hit], measured[hit], variance[hit], typical)
 
     def _choose(self, seeds: Candidates, first: int) -> I64:
         """The seeds to search in this frame: most hits first, then the newest. first: finest pyramid level."""

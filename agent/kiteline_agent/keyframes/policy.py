@@ -12,6 +12,7 @@ from kiteline_agent.config import KeyframeConfig
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ def situation(
     covered = np.zeros((rows, columns), np.bool_)
     covered[row, column] = True
     T_c_k = track.T_c_m @ T_m_k
-    depth = float(np.median(track.depth_m[track.inlier])) if len(uv) else 1.0
+    depth = median(track.depth_m[track.inlier]) if len(uv) else 1.0
     return Situation(
         frames_since,
         seconds_since,

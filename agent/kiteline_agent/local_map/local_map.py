@@ -144,8 +144,7 @@ class LocalMap:
         return slot
 
     def _bearings(self, uv: F64) -> F64:
-        c = self.camera
-        return np.asarray((uv - np.array([c.cx, c.cy])) / np.array([c.fx, c.fy]))
+        return np.asarray((uv - self.intrinsics[2:4]) / self.intrinsics[:2])
 
     def _free_slot(self, parent: KeyframeId) -> int:
         empty = np.flatnonzero(self.keyframe == NO_KEYFRAME)

@@ -20,6 +20,9 @@ STEP, IMU, ODOMETER, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
 )  # fmt: skip
 
 
+_ESTIMATE = tuple(field.name for field in fields(Estimate))
+
+
 class StepLog(Protocol):
     """The part of a log that steps are written with; kiteline_hw.mcap_log.LogWriter is one."""
 
@@ -71,9 +74,9 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
 def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
     """Every field of an estimate; matrices as their numbers in rows."""
     out: dict[str, Any] = {}
-    for field in fields(estimate):
-        value = getattr(estimate, field.name)
-        out[field.name] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+    for name in _ESTIMATE:
+        value = getattr(estimate, name)
+        out[name] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
     return out
 
 

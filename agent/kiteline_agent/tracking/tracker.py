@@ -49,9 +49,11 @@ class Tracker:
     def _choose(self, candidates: Candidates, frame_number: int, limit: int, per_cell: int, cell_px: int) -> I64:
         """Candidates spread over image cells: landmarks of the last frame first, then those of least uncertainty."""
         rows = candidates.rows
-        recent = frame_number - self._map.last_hit[rows] <= 1
-        sigma = self._map.sigma_rho.reshape(-1)[rows]
-        order = np.lexsort((rows, sigma, ~recent))
+        recent = frame_number - self._map.last_hit.take(rows) <= 1
+        sigma = self._map.sigma_rho.take(rows)
+        order = np.argsort(sigma, kind="stable")  # candidates come in order of rows, which decides between equals
+        seen_last = recent[order]
+        order = np.concatenate((order[seen_last], order[~seen_last]))
         camera = self._map.camera
         cells = np.zeros((-(-camera.height // cell_px), -(-camera.width // cell_px)), np.int32)
         chosen = np.empty(limit, np.int64)
@@ -64,29 +66,31 @@ class Tracker:
     ) -> Track:  # fmt: skip
         """Align the templates of the chosen candidates (n,), and optimise the pose from T_c_m (4,4)."""
         align = config.align
-        rows = candidates.rows[chosen]
-        uv = candidates.uv[chosen]
-        octave = self._map.octave[rows]
+        rows, uv, warp = candidates.rows.take(chosen), candidates.uv.take(chosen, 0), candidates.warp.take(chosen, 0)
+        octave = self._map.octave.take(rows)
         found = np.zeros(len(rows), np.bool_)
         last = 1 if coarse_only else 0
         step = align.coarse_step_px if coarse_only else align.fine_step_px
         first = 2 if coarse_only else align.fine_from
         # Templates from a finer level than this frame has are aligned one level up.
         raised = np.maximum(octave, 0 if coarse_only else images.first) - octave
-        for finest in (last, last + 1) if raised.any() else (last,):
-            some = np.flatnonzero(raised == finest - last)
-            place, aligned, score = uv[some], np.zeros(len(some), np.bool_), np.zeros(len(some))
+        parts = (last, last + 1) if raised.any() else (last,)
+        for finest in parts:
+            some = slice(None) if len(parts) == 1 else np.flatnonzero(raised == finest - last)
+            place, aligned = uv[some], found[some]  # views, or copies that are written back
             alignment_kernels.align(
-                images.sampled, images.grid, self._map.templates, rows[some], octave[some],
-                candidates.warp[chosen[some]], place, max(first, finest), finest, align.iterations, step,
-                align.min_ncc, aligned, score,
+                images.sampled, images.grid, self._map.templates, rows[some], octave[some], warp[some], place,
+                max(first, finest), finest, align.iterations, step, align.min_ncc, aligned, np.empty(len(place)),
             )  # fmt: skip
-            uv[some], found[some] = place, aligned
+            if len(parts) > 1:
+                uv[some], found[some] = place, aligned
         self._work.projected += len(candidates.rows)
         self._work.alignments += len(rows) * (first - last + 1)
         self._work.posed_points += int(np.count_nonzero(found))
-        uv, octave, chosen = uv[found], (octave + raised)[found], chosen[found]
-        observed = np.column_stack([uv, np.full(len(uv), -1.0)])
+        kept = np.flatnonzero(found)
+        octave, chosen = (octave + raised).take(kept), chosen.take(kept)
+        observed = np.full((len(kept), 3), -1.0)
+        observed[:, :2] = uv.take(kept, 0)
         if not coarse_only:
             self._add_disparities(images, candidates.rows[chosen], octave, candidates.depth[chosen], observed, config)
         sigma_px = align.sigma_px * (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
@@ -99,7 +103,7 @@ class Tracker:
         """The pose from observations (n,3) of the chosen candidates (n,), by robust motion-only optimisation."""
         pose, n = config.pose, len(chosen)
         T, inlier, information = T_c_m.copy(), np.ones(n, np.bool_), np.zeros((6, 6))
-        xyz, ray = candidates.xyz[chosen], candidates.ray[chosen]
+        xyz, ray = candidates.xyz.take(chosen, 0), candidates.ray.take(chosen, 0)
         inliers, rms = pose_kernels.optimise_pose(
             T, xyz, ray, observed, sigma_px, self._map.intrinsics, T_c_m, self._no_prior, pose.rounds, pose.iterations,
             pose.chi2, inlier, information,

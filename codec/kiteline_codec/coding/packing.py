@@ -57,6 +57,9 @@ class Writer:
         if value < 0:
             raise ValueError(f"an unsigned number is expected, found {value}")
         out = self._out
+        if value < 128:  # most numbers
+            out.append(value)
+            return
         while value >= 128:
             out.append(value & 127 | 128)
             value >>= 7
@@ -123,6 +126,9 @@ class Reader:
     def varint(self, limit: int = (1 << 63) - 1) -> int:
         """An unsigned number of at most `limit`, in its shortest form."""
         data, at = self._data, self._at
+        if at < len(data) and data[at] < 128 and data[at] <= limit:  # most numbers
+            self._at = at + 1
+            return data[at]
         value = 0
         for i in range(_MAX_VARINT_BYTES):
             if at + i >= len(data):

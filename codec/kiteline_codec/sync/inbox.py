@@ -57,10 +57,12 @@ class Inbox:
 
     def held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value, None when there is none."""
-        if key.kind in KEYFRAME_KINDS and key.id in self._archive:
+        held = self._values.get(key)
+        if held is None and key.kind in KEYFRAME_KINDS and key.id in self._archive:  # archived are all values of an id
             self._fetch(key.id)
             self._make_room(key.id)
-        return self._values.get(key)
+            held = self._values.get(key)
+        return held
 
     def codes(self) -> dict[Key, bytes]:
         """The codes of all values."""

@@ -142,7 +142,8 @@ class Outbox:
                 self._resident.uncount(key, entry.size)
             self.pending += entry.clean
             self.pending_bytes -= 0 if entry.clean else entry.size
-            entry.version, entry.code, entry.order = self.newest, code, order
+            entry.version, entry.order = self.newest, order
+            entry.set_code(code)
         entry.acknowledged = ranges.NONE
         entry.unsent = ((0, entry.size),)
         entry.residual = entry.residual_state = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from kiteline_codec.coding.packing import varint_bytes, zigzag
 from kiteline_codec.schema import Key
@@ -35,16 +35,20 @@ class Entry:
     residual: bytes | None = None  # its residual code, if there is one
     residual_state: int | None = None  # state of the predictors for which `residual` was made; None: not made
     hashed: int = 0  # its part of the digest
+    size: int = field(default=1, init=False)  # extent of `unsent` and `acknowledged`; a removal or no code is one byte
 
-    @property
-    def size(self) -> int:
-        """Extent of `unsent` and `acknowledged`; a removal and an empty value count as one byte."""
-        return max(1, len(self.code or b""))
+    def __post_init__(self) -> None:
+        self.set_code(self.code)
+
+    def set_code(self, code: bytes | None) -> None:
+        """Set another code."""
+        self.code = code
+        self.size = max(1, len(code or b""))
 
     @property
     def clean(self) -> bool:
         """True if the peer is known to hold it."""
-        return self.acknowledged == ((0, self.size),)
+        return bool(self.acknowledged) and self.acknowledged == ((0, self.size),)
 
     @property
     def idle(self) -> bool:

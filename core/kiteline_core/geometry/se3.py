@@ -92,17 +92,17 @@ def orthonormalise(t: F64) -> F64:
 
 def quaternion_from_rotation(r: F64) -> F64:
     """Unit quaternion [w, x, y, z], w >= 0, of a rotation matrix (3,3) (Shepperd's method)."""
-    trace = r[0, 0] + r[1, 1] + r[2, 2]
-    d = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
-    i = int(np.argmax(d))
-    if i == 0:
-        q = np.array([1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    elif i == 1:
-        q = np.array([r[2, 1] - r[1, 2], 1.0 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]])
-    elif i == 2:
-        q = np.array([r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]])
+    (a, b, c), (d, e, f), (g, h, k) = r.tolist()
+    trace = a + e + k
+    largest = max(trace, a, e, k)
+    if trace == largest:
+        q = np.array([1.0 + trace, h - f, c - g, d - b])
+    elif a == largest:
+        q = np.array([h - f, 1.0 + a - e - k, b + d, c + g])
+    elif e == largest:
+        q = np.array([c - g, b + d, 1.0 - a + e - k, f + h])
     else:
-        q = np.array([r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2]])
+        q = np.array([d - b, c + g, f + h, 1.0 - a - e + k])
     q = q / np.sqrt(q @ q)
     return np.asarray(-q if q[0] < 0 else q)
 
