@@ -65,7 +65,7 @@ class AgentRuntime:
             kernel_cache.fill("kiteline_agent.runtime.warm")
         begin_ns = time.process_time_ns()
         codec_warm.warm()
-        warm(source.rig, config)
+        warm(config)
         if whole_process:
             release_memory()
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9

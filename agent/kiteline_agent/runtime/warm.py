@@ -24,7 +24,7 @@ from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pose.pnp import solve_pnp
 
 
-def warm(rig: CameraRig | None = None, config: AgentConfig | None = None) -> None:
+def warm(config: AgentConfig | None = None) -> None:
     """Run every kernel once, on the types that flights use. A filled cache makes this take a fraction of a second."""
     state, pixels = 1, np.empty(240 * 320, np.uint8)
     for i in range(pixels.size):  # deterministic noise: corners everywhere

@@ -66,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
         print(json.dumps({"seconds": _first_pose_s(a.source)}))
         return 0
     recording = load(a.source, imu=not a.no_imu, frames=a.begin + a.frames if a.frames else None).part(a.begin)
-    warm(recording.rig)
+    warm()
     release_memory()
     with contextlib.ExitStack() as stack:
         if a.trial == "soak":
@@ -154,7 +154,7 @@ def _read(source: Any) -> tuple[list[bytes], int] | None:
 def _first_pose_s(source: str) -> float:
     """Seconds from the start of this process to its first pose."""
     opened = open_source(source)
-    warm(opened.rig)
+    warm()
     agent = FlyingAgent(opened.rig, opened.imu, vocabulary=False)
     for item in items_of(opened):
         agent.step(item)
