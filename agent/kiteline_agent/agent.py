@@ -14,6 +14,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import FULL, Extra, Governor, governed
+from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
@@ -78,9 +79,11 @@ class Agent:
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
+        inertial_start = None if self._has_depth or imu is None else InertialStart(camera, imu, config, self.work)
+        self._inertial_start = inertial_start
         self._submaps = SubmapStage(
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
-            self._two_view_start, self._governor, channel,
+            self._two_view_start, inertial_start, self._governor, channel,
         )  # fmt: skip
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
@@ -142,6 +145,8 @@ class Agent:
             # 6. Update the depths of landmarks, and search those without a depth.
             if self._two_view_start is not None:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
+            if self._inertial_start is not None:
+                self._inertial_start.clear()
             self._depth.update_landmarks(ctx, track)
             self._depth.search_seeds(images, track)
             # 7. Make a keyframe if the policy needs one.
@@ -298,6 +303,7 @@ class Agent:
             cov_o,
             camera.gravity.R_l_o,
             T_w_b if tracked else None,
+            not camera.submaps.any,
         )
 
     def _knows_place(self) -> bool:

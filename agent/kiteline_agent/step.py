@@ -50,6 +50,7 @@ class Estimate:
     cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes].
     R_l_o: (3,3) odometry frame to gravity-aligned frame, constant once it is known; None before, if a flight begins in
     motion.
+    initialising: there is no map yet, and so no pose: T_o_b means nothing.
     """
 
     t_ns: int
@@ -66,6 +67,7 @@ class Estimate:
     cov_o: F64
     R_l_o: F64 | None
     T_w_b: F64 | None
+    initialising: bool = False
 
     @property
     def T_l_b(self) -> F64 | None:

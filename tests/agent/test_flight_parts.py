@@ -113,9 +113,17 @@ def test_frames_are_tracked_lost_or_dropped() -> None:
     for e in (estimate(), estimate(keyframe=4), replace(estimate(), bridged=True), estimate(tracked=False), None):
         tally.count(e)
     assert tally.as_report() == {
-        "frames": 7, "tracked": 3, "bridged": 1, "lost": 1, "dropped": 3, "submaps": 1, "keyframes": 2, "bytes_up": 700,
-        "bytes_down": 0, "bytes_per_keyframe": 350.0,
+        "frames": 7, "tracked": 3, "bridged": 1, "lost": 1, "initialising": 0, "dropped": 3, "submaps": 1,
+        "keyframes": 2, "bytes_up": 700, "bytes_down": 0, "bytes_per_keyframe": 350.0,
     }  # fmt: skip
+
+
+def test_a_frame_before_the_first_map_is_lost_and_has_no_line() -> None:
+    before = replace(estimate(tracked=False), initialising=True)
+    counts = FrameCounts()
+    counts.count(before)
+    assert (counts.lost, counts.initialising, counts.tracked) == (1, 1, 0)
+    assert live_line(before) == "" and odometry_line(before) == ""
 
 
 def test_a_lost_frame_has_odometry_but_no_live_line() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
 from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_agent.inertial.inertial_tracker import InertialStartState, InertialTracker
+from kiteline_agent.inertial.scale_filter import camera_scaled
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -204,27 +205,48 @@ def test_a_configured_time_offset_holds_and_changes_are_told() -> None:
     assert tracker.take_calibration_events() == []
 
 
-def test_scale_of_a_map_without_one() -> None:
-    """Camera positions in a unit of 2.5 m: the scale is found, and after `rescale` the smoother starts."""
-    steps, unit = flight(90, 7), 2.5
+def mono_start(tracker: InertialTracker, step: Step, velocity: F64, unit: float) -> F64:
+    """Start at a step, in a map of which one unit is `unit` metres. Returns the body's pose there."""
+    pose = camera_scaled(step.truth, 1.0 / unit, T_B_C[:3, 3])
+    cov = np.diag(np.repeat([0.01, 0.01, 0.05, 0.002, 0.05, 0.01], [3, 3, 3, 3, 3, 2]) ** 2)
+    gravity = np.array([0.0, 0.0, -9.81])
+    tracker.start(step.t_ns, pose, InertialStartState(pose, velocity / unit, np.zeros(6), gravity, cov))
+    return pose
+
+
+def in_unit(points: VisualPoints, unit: float) -> VisualPoints:
+    return replace(
+        points,
+        xyz=points.xyz / unit,
+        observed=np.append(points.observed[:, :2], -np.ones((len(points.xyz), 1)), axis=1),
+    )
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.94, 1.06])
+def test_a_wrong_scale_is_found_and_corrected(unit: float) -> None:
+    """A monocular map that is 6 % off is found within seconds, a right one is left alone."""
+    steps = flight(260, 7)
     tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig(), metric=False)
-    scaled = False
-    for k, step in enumerate(steps):
+    tracker.predict(steps[10].imu, steps[10].t_ns)
+    velocity = (steps[11].truth[:3, 3] - steps[9].truth[:3, 3]) / 0.1
+    mono_start(tracker, steps[10], velocity, unit)
+    total = unit
+    corrections = []
+    for step in steps[11:]:
         tracker.predict(step.imu, step.t_ns)
-        visual = step.visual.copy()
-        if not scaled:
-            offset = visual[:3, :3] @ T_B_C[:3, 3]
-            visual[:3, 3] = (visual[:3, 3] + offset) / unit - offset
-        tracker.update(step.t_ns, visual, step.points)
-        if k == 60:
-            assert not tracker.running
-            found = tracker.metric_scale()
-            assert found is not None
-            assert found[0] == pytest.approx(unit, rel=0.04)
-            tracker.rescale(unit)
-            scaled = True
-    assert tracker.running and tracker.state is not None
-    assert apart_m(tracker.state, steps[-1].truth) < 0.004
+        visual = camera_scaled(step.visual, 1.0 / total, T_B_C[:3, 3])
+        tracker.update(step.t_ns, visual, in_unit(step.points, total))
+        found = tracker.scale_correction()
+        if found is not None:
+            factor, sigma = found
+            corrections.append(factor)
+            assert sigma < 0.03
+            tracker.rescale(factor)
+            total /= factor
+    assert tracker.metric and tracker.running
+    assert total == pytest.approx(1.0, abs=0.025)
+    assert len(corrections) <= 3
+    assert bool(corrections) == (unit != 1.0)
 
 
 def test_a_moved_map_and_a_new_one() -> None:

@@ -156,8 +156,10 @@ class FixedLagSmoother:
             se3.from_rt(self._rot[k], s[:3]), s[3:6].copy(), s[6:].copy(), self._tilt.copy(), self._cov.copy()
         )
 
-    def start(self, T_m_b: F64, velocity: F64, bias: F64, gravity: F64, deviations: StartDeviations) -> None:
-        """Start with one state. gravity: (3,) in m, of which only the direction is used."""
+    def start(
+        self, T_m_b: F64, velocity: F64, bias: F64, gravity: F64, deviations: StartDeviations, cov: F64 | None = None
+    ) -> None:
+        """Start with one state. gravity: (3,) in m, of which only the direction is used. cov: (17,17), if known."""
         self._n = 1
         self._samples = []
         self._rot[0] = T_m_b[:3, :3]
@@ -168,8 +170,8 @@ class FixedLagSmoother:
             [d.turn_rad, d.position_m, d.velocity_m_s, d.gyro_bias_rad_s, d.accel_bias_m_s2, d.tilt_rad],
             [3, 3, 3, 3, 3, 2],
         )
-        self._cov = np.diag(sigma**2)
-        self._prior_h[:] = np.diag(sigma**-2.0)
+        self._cov = np.diag(sigma**2) if cov is None else cov.copy()
+        self._prior_h[:] = np.diag(sigma**-2.0) if cov is None else np.linalg.inv(cov)
         self._prior_b[:] = 0.0
         self._prior_r[:], self._prior_s[:], self._prior_tilt[:] = self._rot[0], self._state[0], self._tilt
         self._counts[0] = 0

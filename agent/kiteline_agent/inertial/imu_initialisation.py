@@ -19,7 +19,6 @@ from kiteline_core.frame import ImuCalibration
 F64 = NDArray[np.float64]
 
 _MIN_FRAMES = 5
-_SCALE_FRAMES = 20  # with fewer, acceleration and scale are not distinguishable
 _REST_SAMPLES = 20
 
 
@@ -75,15 +74,6 @@ class ImuInitialiser:
         found = initial_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
         fits = found is not None and found.residual_m < config.max_residual_m
         return found.gravity if found is not None and fits and found.gravity_error < config.level_error else None
-
-    def metric_scale(self, bias: F64) -> tuple[float, float] | None:
-        """Metres per unit of a map without scale, and its standard deviation; None while unknown. bias: (6,)."""
-        poses, motions = self._window(self._config.window_frames, bias)
-        if len(poses) < _SCALE_FRAMES or len(motions) < len(poses) - 1:
-            return None
-        bias = np.concatenate([initial_alignment.gyro_bias(poses, motions), bias[3:]])
-        found = initial_alignment.align(poses, self._p_b_c, motions, bias, self._config.gravity_m_s2, with_scale=True)
-        return None if found is None else (found.scale, self._config.scale_inflation * found.scale_sigma)
 
     def start(self, smoother: FixedLagSmoother, bias: F64) -> Literal["rest", "motion"] | None:
         """Start the smoother at the last pose if the window allows it; returns how. bias: (6,) last known."""

@@ -9,11 +9,33 @@ from kiteline_agent.inertial.fixed_lag import FixedLagConfig
 
 
 @dataclass(frozen=True, slots=True)
+class ScaleFilterConfig:
+    """How the scale of a monocular map is watched after its start."""
+
+    interval_s: float = 0.14  # between two poses that are compared
+    start_scale: float = 0.05  # relative deviations and deviations of the start: those of a short first window
+    start_gravity_m_s2: float = 0.3
+    start_velocity_m_s: float = 0.1
+    start_bias_m_s2: float = 0.15
+    accel_walk: float = 0.04  # m/s^2 per sqrt(s): errors of scale and axes, vibration
+    scale_walk: float = 0.002  # per sqrt(s): the map's own scale drifts while it grows
+    image_rad: float = 5e-4  # error of a position by images, over the depth that they see
+    imu_inflation: float = 3.0  # of the calibration's noise densities: vibration
+    gravity_sigma_m_s2: float = 0.01  # of the length of gravity
+    chi2: float = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
+    known_sigma: float = 0.025  # deviation below which the scale may be corrected
+    least: float = 0.01  # smallest correction: each begins a new submap
+    least_deviations: float = 0.8  # the same in deviations
+    least_s: float = 4.0  # time between two corrections
+
+
+@dataclass(frozen=True, slots=True)
 class InertialConfig:
     """How the inertial state is initialised, and how long dead reckoning is trusted."""
 
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
     calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
+    scale_filter: ScaleFilterConfig = field(default_factory=ScaleFilterConfig)
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     silent_s: float = 3.0  # time without a sample after which an event is logged
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked
@@ -32,5 +54,3 @@ class InertialConfig:
     trusted_dead_reckoning_s: float = 1.0  # dead reckoning by the IMU counts as tracking for this long
     min_tilt_rad: float = 0.035  # tilt above which the map is gravity-aligned: two degrees
     max_dead_reckoning_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it
-    scale_inflation: float = 2.0  # of the deviation of a scale: errors of a young map are correlated over frames
-    unit_sigma: float = 0.03  # relative error of the scale by an IMU or odometer that their deviations leave out

@@ -9,16 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
-from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
+from kiteline_agent.inertial.fixed_lag import (
+    BodyVelocity,
+    FixedLagSmoother,
+    InertialState,
+    StartDeviations,
+    VisualPoints,
+    tilt_of,
+)
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
+
+_PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +38,20 @@ class Prediction:
     T_m_b: F64
     velocity: F64
     R_b0_b1: F64
+
+
+@dataclass(frozen=True, slots=True)
+class InertialStartState:
+    """A known state at a frame, in any frame w.
+
+    T_w_b: (4,4). velocity: (3,) m/s. bias: (6,). gravity: (3,) m/s^2. cov: (17,17) as in InertialState, of full rank.
+    """
+
+    T_w_b: F64
+    velocity: F64
+    bias: F64
+    gravity: F64
+    cov: F64
 
 
 class InertialTracker:
@@ -44,13 +68,15 @@ class InertialTracker:
         self._initialiser = ImuInitialiser(config, calibration, self._p_b_c, self._buffer)
         self._self_calibration = SelfCalibration(calibration, config.calibration, self._p_b_c, config.gravity_m_s2)
         self._reported_s = config.calibration.offset_s
+        self._scale = ScaleFilter(config.scale_filter, calibration, config.gravity_m_s2, self._p_b_c)
+        self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
         self._incomplete: tuple[int, int] | None = None  # the last interval, if samples at its end were missing
         self._bias = np.zeros(6)
         self._last: tuple[int, F64] | None = None  # stamp and T_m_b of the last frame
         self._interval_end_ns = 0  # IMU time
         self._image_loss_s = 0.0
         self.started: str | None = None  # "rest" or "motion": how the smoother was last started
-        self.metric = metric  # False: the map's scale is unknown, and only `metric_scale` is estimated
+        self.metric = metric  # False: the map's scale is unknown, and the IMU is only compared with rotations
 
     # state
 
@@ -63,6 +89,16 @@ class InertialTracker:
     def state(self) -> InertialState | None:
         """The newest state; None before the initialisation."""
         return self._smoother.state if self._smoother.running else None
+
+    @property
+    def bias_prior(self) -> BiasPrior | None:
+        """Biases of the tracking so far, and how far they may have moved; None if never estimated."""
+        return BiasPrior(self._bias.copy(), _PRIOR_SIGMA) if self.started is not None else None
+
+    @property
+    def applied_offset_s(self) -> float:
+        """Camera stamp + offset = IMU time, as applied now."""
+        return self._self_calibration.offset_s
 
     @property
     def image_loss_s(self) -> float:
@@ -143,6 +179,7 @@ class InertialTracker:
         state = None
         if self._smoother.running:
             state = self._advance(samples, points, velocity)
+        self._watch_scale(t_ns, T_m_b_visual, points, state)
         if state is None:
             self._initialiser.add(TimedPose(t_ns, T_m_b_visual.copy(), samples))
             self._set_last(t_ns, T_m_b_visual)
@@ -162,6 +199,7 @@ class InertialTracker:
         samples = self._interval(t_ns)
         self._self_calibration.clear()
         self._initialiser.clear()
+        self._scale_from = None
         if self._last is not None:
             self._image_loss_s += (t_ns - self._last[0]) * 1e-9
         state = None
@@ -182,6 +220,9 @@ class InertialTracker:
         if self._last is not None:
             self._last = (self._last[0], T_new_old @ self._last[1])
         self._self_calibration.move_map(T_new_old)
+        if self._scale_from is not None:
+            self._scale_from = (self._scale_from[0], T_new_old @ self._scale_from[1])
+        self._scale.rotate_map(T_new_old[:3, :3])
 
     def begin_map(self, t_ns: int, T_m_b: F64) -> None:
         """Begin a new map at this frame, with the body at T_m_b (4,4) by definition.
@@ -191,12 +232,22 @@ class InertialTracker:
         if self._smoother.running:
             self._smoother.begin_map(T_m_b)
         self._self_calibration.begin_map()
+        self._scale_from = None
         self._incomplete = None
         self._initialiser.clear()
         self._set_last(t_ns, T_m_b)
         self._image_loss_s = 0.0
         if not self._smoother.running:
             self._initialiser.add(TimedPose(t_ns, T_m_b.copy(), None))
+
+    def start(self, t_ns: int, T_m_b: F64, start: InertialStartState) -> None:
+        """Begin a map in metres at this frame, with the body at T_m_b (4,4) by definition, in a known state."""
+        self.metric, self.started = True, "motion"
+        self._bias = start.bias.copy()
+        self._smoother.start(start.T_w_b, start.velocity, start.bias, start.gravity, StartDeviations(), start.cov)
+        self.begin_map(t_ns, T_m_b)
+        state = self._smoother.state
+        self._scale.start(state.velocity, self._smoother.gravity, state.bias)
 
     def reset(self) -> None:
         """Begin a new map at an unknown pose relative to the old one. Biases are kept."""
@@ -207,22 +258,25 @@ class InertialTracker:
         self._incomplete = None
         self._image_loss_s = 0.0
 
-    def metric_scale(self) -> tuple[float, float] | None:
-        """Metres per unit of a map without scale, and its standard deviation; None while unknown."""
-        return self._initialiser.metric_scale(self._bias)
+    def scale_correction(self) -> tuple[float, float] | None:
+        """Factor by which a monocular map is to be scaled, and its deviation; None if it is right as far as known."""
+        factor = self._scale.correction()
+        return None if factor is None else (factor, self._scale.scale[1])
 
     def rescale(self, scale: float) -> None:
-        """Scale the map by `scale`, so that it is metric from now on and the smoother may start."""
-
-        def scaled(T_m_b: F64) -> F64:
-            T = T_m_b.copy()
-            offset = T[:3, :3] @ self._p_b_c
-            T[:3, 3] = scale * (T[:3, 3] + offset) - offset
-            return T
-
+        """Scale the map by `scale`, so that it is metric from now on."""
         self.metric = True
-        self._initialiser.transform(scaled)
-        self._last = None if self._last is None else (self._last[0], scaled(self._last[1]))
+        self._initialiser.transform(lambda T_m_b: camera_scaled(T_m_b, scale, self._p_b_c))
+        if self._last is None:
+            return
+        self._last = (self._last[0], camera_scaled(self._last[1], scale, self._p_b_c))
+        self._scale_from = None
+        self._scale.rescale(scale)
+        if self._smoother.running:
+            state, gravity = self._smoother.state, self._smoother.gravity
+            velocity = scale * state.velocity
+            self._smoother.start(self._last[1], velocity, state.bias, gravity, StartDeviations(), state.cov)
+            self._scale.resume(velocity)
 
     # steps
 
@@ -259,6 +313,24 @@ class InertialTracker:
         newest = self._buffer.newest_t_ns
         self._incomplete = (self._interval_end_ns, end_ns) if newest is not None and newest < end_ns else None
         return state
+
+    def _watch_scale(self, t_ns: int, T_m_b: F64, points: VisualPoints, state: InertialState | None) -> None:
+        """Compare a pose by images, and one some frames before, with the IMU in between."""
+        if not self._scale.running or state is None:
+            self._scale.stop()
+            return
+        if self._scale_from is None:
+            self._scale.resume(state.velocity)
+            self._scale_from = (t_ns, T_m_b)
+        elif (t_ns - self._scale_from[0]) * 1e-9 >= self._config.scale_filter.interval_s:
+            samples = self._between(self._scale_from[0] + self._offset_ns, t_ns + self._offset_ns)
+            seen = points.xyz[points.inlier]
+            if samples is not None and len(seen):
+                depth_m = float(np.median(np.linalg.norm(seen - T_m_b[:3, 3], axis=1)))
+                self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
+            else:
+                self._scale.resume(state.velocity)
+            self._scale_from = (t_ns, T_m_b)
 
     def _complete_interval(self) -> None:
         """Replace the last interval if its final samples came after its frame: IMU stamps ahead of the camera's."""

@@ -34,6 +34,14 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
+class BiasPrior:
+    """Biases (6,) [gyro rad/s, accel m/s^2] known before, and their deviations (6,)."""
+
+    bias: F64
+    sigma: F64
+
+
+@dataclass(frozen=True, slots=True)
 class Preintegrated:
     """Relative motion in the body frame of the first instant, without gravity.
 

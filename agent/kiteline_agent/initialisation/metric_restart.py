@@ -16,6 +16,7 @@ from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[np.float64]
@@ -39,17 +40,24 @@ class MetricPoints:
 
 def metric_points(ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: float) -> MetricPoints:
     """The inliers of a track as new landmarks of its frame. unit_m: metres in one unit of the old map."""
-    camera = local_map.camera
-    octave = local_map.octave[track.rows]
-    uv = track.observed[:, :2]
+    keep = np.flatnonzero(track.inlier)
+    depth = track.depth_m[keep]
+    relative = np.linalg.norm(track.ray[keep], axis=1) / depth
+    octave = local_map.octave[track.rows[keep]]
+    uv = track.observed[keep, :2]
+    return metric_points_at(ctx, uv, octave, unit_m * depth, relative, local_map.camera)
+
+
+def metric_points_at(
+    ctx: FrameContext, uv: F64, octave: NDArray[np.uint8], depth_m: F64, depth_sigma: F64, camera: RectifiedCamera
+) -> MetricPoints:
+    """Pixels (n,2) of a frame as new landmarks, at depths (n,). depth_sigma: (n,) their relative deviations."""
     margin = (BORDER + 1.0) * (1 << octave.astype(np.int64))[:, None]
     inside = (uv >= margin).all(axis=1) & (uv < np.array([camera.width, camera.height]) - margin).all(axis=1)
-    keep = np.flatnonzero(track.inlier & inside)
-    relative = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]  # deviation of depth over depth
-    keep = keep[np.argsort(relative, kind="stable")[: local_map.slot_size]]
+    keep = np.flatnonzero(inside)
+    keep = keep[np.argsort(depth_sigma[keep], kind="stable")[: ctx.config.local_map.landmarks]]
     keep = keep[np.lexsort((uv[keep, 0], uv[keep, 1] // ctx.config.detector.cell_px))]
-    rho = 1.0 / (unit_m * track.depth_m[keep])
-    relative = np.linalg.norm(track.ray[keep], axis=1) / track.depth_m[keep]
+    rho = 1.0 / depth_m[keep]
     angle, descriptor = features.describe(ctx.images.left, uv[keep], octave[keep])
     points = NewPoints(uv[keep], camera.bf * rho, octave[keep], angle, descriptor)
-    return MetricPoints(points, np.maximum(relative * rho, _MIN_SIGMA_PX / camera.bf))
+    return MetricPoints(points, np.maximum(depth_sigma[keep] * rho, _MIN_SIGMA_PX / camera.bf))

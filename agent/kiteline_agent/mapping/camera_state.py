@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.covariance.pose_covariance import PoseCovariance
-from kiteline_agent.inertial.gravity_alignment import GravityAligner
+from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rotation
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.submaps import Submaps
@@ -146,6 +146,10 @@ class CameraState:
     def set_first_pose(self, imu: ImuBatch | None) -> None:
         """Set the camera where the flight begins: body at the origin, z up."""
         self.pose.T_m_c = self.gravity.first_pose(imu)
+
+    def set_first_gravity(self, gravity_b: F64) -> None:
+        """Set the camera where the flight begins: body at the origin, z up. gravity_b: (3,) in the body."""
+        self.pose.T_m_c = se3.from_rt(level_rotation(-gravity_b), np.zeros(3)) @ se3.inverse(self.T_c_b)
 
     def leave_submap(self) -> None:
         """Leave the active submap for a new one that begins here."""

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kiteline_agent.governor.governor import Extra, Governor
+from kiteline_agent.inertial.inertial_tracker import InertialStartState
+from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
@@ -32,12 +34,12 @@ class OpenedSubmap:
 
 
 class SubmapStage:
-    """Changes of the active submap. two_view_start: None with stereo or a depth camera."""
+    """Changes of the active submap. The starts are None with stereo or depth, inertial_start also without IMU."""
 
     def __init__(
         self, camera: CameraState, local_map: LocalMap, tracker: Tracker, maker: KeyframeMaker,
         keyframes: KeyframeStage, relocaliser: Relocaliser, depth: DepthFromMotion, two_view_start: TwoViewStart | None,
-        governor: Governor, channel: RecordChannel,
+        inertial_start: InertialStart | None, governor: Governor, channel: RecordChannel,
     ) -> None:  # fmt: skip
         self._camera = camera
         self._map = local_map
@@ -47,6 +49,7 @@ class SubmapStage:
         self._relocaliser = relocaliser
         self._depth = depth
         self._two_view_start = two_view_start
+        self._inertial_start = inertial_start
         self._governor = governor
         self._channel = channel
 
@@ -60,6 +63,8 @@ class SubmapStage:
 
     def open(self, ctx: FrameContext) -> OpenedSubmap | None:
         """Begin a submap with this frame; None if it shows too little."""
+        if self._inertial_start is not None and self._inertial_start.hears(ctx) and not self._camera.motion.drives:
+            return self._open_from_inertial_window(ctx, self._inertial_start)
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
         points = self._maker.first_points(ctx)
@@ -75,6 +80,29 @@ class SubmapStage:
         camera.pose.reset_motion()
         self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)
         return OpenedSubmap(True, ["submap: opened"])
+
+    def _open_from_inertial_window(self, ctx: FrameContext, start: InertialStart) -> OpenedSubmap | None:
+        """Begin a monocular submap in metres at this frame; None until its scale is known."""
+        camera = self._camera
+        assert camera.motion.tracker is not None
+        found = start.add(ctx, camera.motion.tracker.bias_prior, camera.motion.tracker.applied_offset_s)
+        if found is None:
+            return None
+        solution = found.solution
+        if camera.submaps.any:
+            camera.leave_submap()
+        else:
+            camera.set_first_gravity(solution.T_w_b[:3, :3].T @ solution.gravity)
+        submap = camera.open_submap()
+        camera.pose.reset_motion()
+        keyframe = self._keyframes.make(ctx, None, found.points.points, camera.pose.T_m_c, Extra.SUBMAP)
+        found.points.set_sigma(self._map, keyframe)
+        self._channel.put(SubmapScale(submap, 1.0))
+        state = InertialStartState(solution.T_w_b, solution.velocity, solution.bias, solution.gravity, found.cov)
+        camera.motion.begin_metric_map(ctx.t_ns, state)
+        start.clear()
+        text = f"mono: metric within {100.0 * found.scale_sigma:.1f} %, from {found.duration_s:.1f} s of images and IMU"
+        return OpenedSubmap(True, ["submap: opened", text])
 
     def _open_from_two_views(self, ctx: FrameContext, start: TwoViewStart) -> OpenedSubmap | None:
         """Begin a monocular submap: its first keyframe is an earlier frame, the second one this frame.
@@ -135,7 +163,8 @@ class SubmapStage:
         limits, camera = ctx.config.two_view_start, self._camera
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
-        unit_m = camera.motion.metres_per_unit(limits.scale_sigma)
+        correction = camera.motion.scale_correction()
+        unit_m = camera.motion.metres_per_unit(limits.scale_sigma) if correction is None else correction[0]
         if unit_m is None:
             return []
         metric = metric_points(ctx, track, self._map, unit_m)
@@ -143,7 +172,9 @@ class SubmapStage:
             return []
         self._restart(ctx, unit_m, metric)
         self._two_view_start.rescale(unit_m)
-        return [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
+        if correction is None:
+            return [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
+        return [f"mono: scale corrected by {unit_m:.4f}, within {100.0 * correction[1]:.1f} %", "submap: opened"]
 
     def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> None:
         camera = self._camera

@@ -11,7 +11,7 @@ from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_agent.inertial.inertial_tracker import InertialStartState, InertialTracker
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -66,6 +66,11 @@ class MotionModel:
     def metric(self) -> bool:
         """True if the map's lengths are in metres."""
         return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
+
+    @property
+    def drives(self) -> bool:
+        """True if an odometer gives samples."""
+        return self.odometer.has_samples
 
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""
@@ -132,6 +137,13 @@ class MotionModel:
             self.tracker.reset()
             self.tracker.metric = False
 
+    def begin_metric_map(self, t_ns: int, state: InertialStartState) -> None:
+        """Begin a map in metres at the present pose, in a known inertial state."""
+        assert self.tracker is not None
+        self.tracker.start(t_ns, self._pose.T_m_c @ self._T_c_b, state)
+        self.odometer.set_metric(True)
+        self.odometer.restart(self._pose.T_m_c, t_ns)
+
     def metres_per_unit(self, sigma: float) -> float | None:
         """Metres per unit of the map, once known to the relative deviation `sigma`.
 
@@ -139,14 +151,12 @@ class MotionModel:
         """
         if self.metric:
             return None
-        from_imu = None if self.tracker is None else self.tracker.metric_scale()
-        from_odometer = self.odometer.metres_per_unit()
-        known = [(scale, dev / scale) for scale, dev in filter(None, (from_imu, from_odometer)) if dev <= sigma * scale]
-        # While the odometer is about to measure the scale, wait for it: two sources are better than one.
-        if not known or (from_odometer is None and self.odometer.measures_scale):
-            return None
-        weight = [1.0 / (dev * dev + self._config.unit_sigma**2) for _, dev in known]
-        return sum(w * scale for w, (scale, _) in zip(weight, known, strict=True)) / sum(weight)
+        found = self.odometer.metres_per_unit()
+        return found[0] if found is not None and found[1] <= sigma * found[0] else None
+
+    def scale_correction(self) -> tuple[float, float] | None:
+        """Factor by which the map in metres is to be scaled, and its deviation; None if nothing says so."""
+        return None if self._metric or self.tracker is None else self.tracker.scale_correction()
 
     def set_scale(self, metres_per_unit: float, T_new_old: F64) -> None:
         """Scale the state to metres, in a submap in which the old one lies at T_new_old (4,4)."""

@@ -61,7 +61,8 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
     estimate = output.estimate
     if estimate is not None:
         log.json(ESTIMATE, log_ns, estimate_to_json(estimate))
-        log.pose("/odometry", log_ns, "odometry", estimate.T_o_b)
+        if not estimate.initialising:
+            log.pose("/odometry", log_ns, "odometry", estimate.T_o_b)
         pose = estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
         if estimate.tracked and pose is not None:
             log.pose("/pose", log_ns, "submap" if estimate.T_w_b is None else "world", pose)

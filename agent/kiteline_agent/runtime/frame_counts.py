@@ -16,11 +16,12 @@ F64 = NDArray[float64]
 
 @dataclass(slots=True)
 class FrameCounts:
-    """frames = tracked + lost + dropped. bridged: tracked frames placed by dead reckoning."""
+    """frames = tracked + lost + dropped. bridged: tracked, by dead reckoning. initialising: lost, before the map."""
 
     tracked: int = 0
     bridged: int = 0
     lost: int = 0
+    initialising: int = 0
     dropped: int = 0
     bytes_up: int = 0
     bytes_down: int = 0
@@ -38,6 +39,7 @@ class FrameCounts:
             self.dropped += 1
         elif live_pose(estimate) is None:
             self.lost += 1
+            self.initialising += estimate.initialising
         else:
             self.tracked += 1
             self.bridged += estimate.bridged
@@ -53,6 +55,7 @@ class FrameCounts:
             "tracked": self.tracked,
             "bridged": self.bridged,
             "lost": self.lost,
+            "initialising": self.initialising,
             "dropped": self.dropped,
             "submaps": len(self.submaps),
             "keyframes": keyframes,
@@ -76,5 +79,5 @@ def live_line(estimate: Estimate) -> str:
 
 
 def odometry_line(estimate: Estimate) -> str:
-    """The frame's line in odometry.tum."""
-    return tum.line(estimate.t_ns, estimate.T_o_b)
+    """The frame's line in odometry.tum; empty before there is a map."""
+    return "" if estimate.initialising else tum.line(estimate.t_ns, estimate.T_o_b)

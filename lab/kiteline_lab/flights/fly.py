@@ -103,7 +103,7 @@ def fly(o: Options, quiet: bool = False) -> tuple[Report, FlightOutcome]:
         distributed = o.mode == "distributed"
         outcome = fly_processes(made, o.link, o.realtime) if distributed else fly_in_process(made, o.mode)
         repair_logs(o.out)
-        report = write_results(o.out, made, outcome, align_scale=o.mono)
+        report = write_results(o.out, made, outcome)
     return report, outcome
 
 

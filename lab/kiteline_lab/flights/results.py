@@ -26,9 +26,8 @@ from kiteline_lab.plots.plot import Line, plot_trajectories
 F64 = NDArray[np.float64]
 
 
-def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome, align_scale: bool = False) -> Report:
+def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report:
     """Write what the processes themselves did not, and report.json; returns the report."""
-    alignment = TrajectoryAlignment.SIM3 if align_scale else TrajectoryAlignment.SE3
     report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": sorted(outcome.notes)}
     lines: list[Line] = []
     for k, (source, spec) in enumerate(zip(plan.sources, plan.agents, strict=True)):
@@ -37,13 +36,16 @@ def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome, align_sca
         mine: Report = _with_statistics(part) if part is not None else _from_log(source, estimates)
         mine.pop("drain", None)
         truth = source.ground_truth
+        # Without a scale in metres a trajectory has a unit of its own.
+        alignment = TrajectoryAlignment.SIM3 if mine.get("scale") == "own" else TrajectoryAlignment.SE3
+        odometry = [(e.t_ns, e.T_o_b) for e in estimates if not e.initialising]
         live = [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]
         if part is None:  # it may have ended between writing its trajectories and its log: the log counts
             write_tum(out / f"agent{k}" / "live.tum", live)
-            write_tum(out / f"agent{k}" / "odometry.tum", [(e.t_ns, e.T_o_b) for e in estimates])
+            write_tum(out / f"agent{k}" / "odometry.tum", odometry)
         mine["accuracy"] = {
             "live": _accuracy(live, truth, alignment),
-            "odometry": _accuracy([(e.t_ns, e.T_o_b) for e in estimates], truth, alignment),
+            "odometry": _accuracy(odometry, truth, alignment),
         }
         label = f"agent {k}" if len(plan.sources) > 1 else ""
         lines.append(Line(f"{label} live".strip(), _trajectory(live)))

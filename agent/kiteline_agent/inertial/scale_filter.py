@@ -1,0 +1,132 @@
+"""Scale of a monocular map in metres, watched while it is tracked: images give displacements, the IMU their length.
+
+An iterated Kalman filter over [1 / scale, gravity, velocity, accelerometer bias]; rotations are known from images and
+gyro. Neither displacements of images nor those of the IMU are free of noise, so that a linear regression of one on the
+other would be biased: the update is linearised at the displacement that both give together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.inertial_config import ScaleFilterConfig
+from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+_ITERATIONS = 3
+_UNITS, _GRAVITY, _VELOCITY, _BIAS = 0, slice(1, 4), slice(4, 7), slice(7, 10)
+
+
+class ScaleFilter:
+    """Metres per unit of the map. Call `start`, then `add` with each interval."""
+
+    def __init__(self, config: ScaleFilterConfig, calibration: ImuCalibration, gravity_m_s2: float, p_b_c: F64) -> None:
+        """p_b_c: (3,) m, camera in the body."""
+        self._config = config
+        self._calibration = calibration
+        self._length = gravity_m_s2
+        self._p_b_c = p_b_c
+        self._x = np.zeros(10)
+        self._cov = np.eye(10)
+        self.running = False
+        self.age_s = 0.0  # since the start or the last correction
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Metres per unit of the map, and the standard deviation."""
+        q = max(float(self._x[_UNITS]), 1e-3)
+        return 1.0 / q, float(np.sqrt(self._cov[_UNITS, _UNITS])) / q**2
+
+    def correction(self) -> float | None:
+        """Factor by which the map is to be scaled; None if it is right as far as is known."""
+        c = self._config
+        scale, sigma = self.scale
+        if not self.running or self.age_s < c.least_s or sigma > c.known_sigma * scale:
+            return None
+        return scale if abs(np.log(scale)) > max(c.least, c.least_deviations * sigma / scale) else None
+
+    def stop(self) -> None:
+        """Forget all."""
+        self.running = False
+
+    def start(self, velocity: F64, gravity: F64, bias: F64) -> None:
+        """Start with unit scale. velocity, gravity: (3,) in m. bias: (6,)."""
+        c = self._config
+        self._x = np.concatenate([[1.0], gravity, velocity, bias[3:]])
+        sigma = np.repeat([c.start_scale, c.start_gravity_m_s2, c.start_velocity_m_s, c.start_bias_m_s2], [1, 3, 3, 3])
+        self._cov = np.diag(sigma**2)
+        self.running, self.age_s = True, 0.0
+
+    def resume(self, velocity: F64) -> None:
+        """Continue after frames without images, at this velocity (3,) m/s in m."""
+        self._x[_VELOCITY] = velocity
+        self._cov[_VELOCITY], self._cov[:, _VELOCITY] = 0.0, 0.0
+        self._cov[_VELOCITY, _VELOCITY] = self._config.start_velocity_m_s**2 * np.eye(3)
+
+    def add(self, T_m_b0: F64, T_m_b1: F64, samples: Samples, gyro_bias: F64, depth_m: float) -> None:
+        """Process an interval between two poses (4,4) by images, `depth_m` from what they see."""
+        c, x = self._config, self._x
+        samples = replace(samples, density=None)  # which is vibration, and averages out, and fast motion
+        bias = np.concatenate([gyro_bias, x[_BIAS]])
+        motion = preintegrate(samples, bias, self._calibration, c.imu_inflation)
+        r, dt = T_m_b0[:3, :3], motion.dt_s
+        # predict the state, and behind it the displacement of the camera in metres
+        f = np.zeros((13, 10))
+        f[:10] = np.eye(10)
+        f[_VELOCITY, _GRAVITY], f[_VELOCITY, _BIAS] = dt * np.eye(3), r @ motion.jac[3:6, 3:]
+        f[10:, _GRAVITY], f[10:, _VELOCITY] = 0.5 * dt * dt * np.eye(3), dt * np.eye(3)
+        f[10:, _BIAS] = r @ motion.jac[6:, 3:]
+        lever = (T_m_b1[:3, :3] - r) @ self._p_b_c
+        before = np.append(x, x[_VELOCITY] * dt + 0.5 * dt * dt * x[_GRAVITY] + r @ motion.vp[3:] + lever)
+        before[_VELOCITY] += x[_GRAVITY] * dt + r @ motion.vp[:3]
+        cov = f @ self._cov @ f.T
+        rotate = np.kron(np.eye(2), r)
+        both = np.r_[4:7, 10:13]
+        cov[np.ix_(both, both)] += rotate @ motion.cov[3:, 3:] @ rotate.T
+        cov[_UNITS, _UNITS] += c.scale_walk**2 * dt
+        cov[_BIAS, _BIAS] += (c.accel_walk**2 + self._calibration.accel_walk**2) * dt * np.eye(3)
+        # update by the displacement that the images give, and by the length of gravity
+        seen = (T_m_b1[:3, 3] + T_m_b1[:3, :3] @ self._p_b_c) - (T_m_b0[:3, 3] + r @ self._p_b_c)
+        noise = np.diag(np.append(np.full(3, 2.0 * (c.image_rad * depth_m) ** 2), c.gravity_sigma_m_s2**2))
+        self.age_s += dt
+        now = before
+        for _ in range(_ITERATIONS):  # at the updated displacement: noise of the prediction would bias the scale
+            h = np.zeros((4, 13))
+            h[:3, _UNITS], h[:3, 10:] = now[10:], now[_UNITS] * np.eye(3)
+            length = float(np.linalg.norm(now[_GRAVITY]))
+            h[3, _GRAVITY] = now[_GRAVITY] / length
+            expected = np.append(now[_UNITS] * now[10:], length)
+            off = np.append(seen, self._length) - expected - h @ (before - now)
+            s = h @ cov @ h.T + noise
+            gain = np.linalg.solve(s, h @ cov).T
+            if float(off[:3] @ np.linalg.solve(s[:3, :3], off[:3])) > c.chi2:
+                gain[:] = 0.0  # the images jumped
+            now = before + gain @ off
+        self._x = now[:10]
+        cov = (cov - gain @ h @ cov)[:10, :10]
+        self._cov = 0.5 * (cov + cov.T)
+
+    def rescale(self, factor: float) -> None:
+        """The map was scaled by `factor`."""
+        self.age_s = 0.0
+        self._x[_UNITS] *= factor
+        self._cov[_UNITS] *= factor
+        self._cov[:, _UNITS] *= factor
+
+    def rotate_map(self, R_new_old: F64) -> None:
+        """The map's axes were rotated."""
+        q = np.eye(10)
+        q[_GRAVITY, _GRAVITY], q[_VELOCITY, _VELOCITY] = R_new_old, R_new_old
+        self._x, self._cov = q @ self._x, q @ self._cov @ q.T
+
+
+def camera_scaled(T_m_b: F64, scale: float, p_b_c: F64) -> F64:
+    """T_m_b (4,4) after the map was scaled: the camera's position scales, its lever arm p_b_c (3,) does not."""
+    offset = T_m_b[:3, :3] @ p_b_c
+    return se3.from_rt(T_m_b[:3, :3], scale * (T_m_b[:3, 3] + offset) - offset)

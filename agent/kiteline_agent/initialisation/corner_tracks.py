@@ -1,0 +1,134 @@
+"""Corners followed by optical flow over a window of monocular keyframes, before there is a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import CornerTracksConfig
+from kiteline_agent.imaging import features
+from kiteline_agent.imaging.features import DetectorConfig, Pyramid
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedKeyframe:
+    """Corners in one keyframe. left: its pyramid. uv: (n,2) px of the corners with these ids (n,), increasing."""
+
+    t_ns: int
+    left: Pyramid
+    ids: I64
+    uv: F64
+
+
+@dataclass(frozen=True, slots=True)
+class CornerObservations:
+    """Corners seen by K keyframes. xy: (K,P,2) x/z, y/z in the camera. seen: (K,P). ids: (P,)."""
+
+    xy: F64
+    seen: Bools
+    ids: I64
+
+    def part(self, keep: Bools | I64) -> CornerObservations:
+        """The corners in these columns."""
+        return CornerObservations(
+            np.ascontiguousarray(self.xy[:, keep]), np.ascontiguousarray(self.seen[:, keep]), self.ids[keep]
+        )
+
+
+class CornerTracks:
+    """Follows corners from frame to frame, and from keyframe to keyframe, which drifts less."""
+
+    def __init__(self, camera: RectifiedCamera, detector: DetectorConfig, config: CornerTracksConfig) -> None:
+        self._camera = camera
+        self._detector = detector
+        self._config = config
+        self.keyframes: list[TrackedKeyframe] = []
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.keyframes = []
+        self._last: U8 | None = None
+        self._next_id = 0
+        self._ids: I64 = np.zeros(0, np.int64)
+        self._uv = np.zeros((0, 2))
+        self._keyframe_uv = np.zeros((0, 2))  # of the same corners in the last keyframe
+
+    def add(self, t_ns: int, left: Pyramid) -> bool:
+        """Follow the corners into a frame. True if it became a keyframe."""
+        if self._last is not None and len(self._uv):
+            self._keep(*self._followed(self._last, left[0], self._uv, None, 3))
+        self._last = left[0]
+        if self.keyframes and (t_ns - self.keyframes[-1].t_ns) * 1e-9 < self._config.keyframe_s:
+            return False
+        if self.keyframes and len(self._uv):
+            uv, good = self._followed(self.keyframes[-1].left[0], left[0], self._keyframe_uv, self._uv, 1)
+            good &= np.linalg.norm(uv - self._uv, axis=1) < self._config.drift_px
+            self._keep(uv, good)
+        self._replenish(left)
+        self._keyframe_uv = self._uv.copy()
+        self.keyframes.append(TrackedKeyframe(t_ns, left, self._ids.copy(), self._uv.copy()))
+        return True
+
+    def drop_before(self, t_ns: int) -> None:
+        """Forget keyframes that are older than this."""
+        self.keyframes = [k for k in self.keyframes if k.t_ns >= t_ns]
+
+    def flow_px(self) -> float:
+        """Median motion of the corners that the newest keyframe shares with the oldest one that has half of them."""
+        newest = self.keyframes[-1]
+        for keyframe in self.keyframes[:-1]:
+            _, a, b = np.intersect1d(keyframe.ids, newest.ids, assume_unique=True, return_indices=True)
+            if 2 * len(a) >= len(newest.ids) > 0:
+                return float(np.median(np.linalg.norm(keyframe.uv[a] - newest.uv[b], axis=1)))
+        return np.inf
+
+    def observations(self) -> CornerObservations:
+        """Corners that at least three of the keyframes see, longest tracks first."""
+        camera = self._camera
+        ids = np.unique(np.concatenate([k.ids for k in self.keyframes]))
+        xy, seen = np.zeros((len(self.keyframes), len(ids), 2)), np.zeros((len(self.keyframes), len(ids)), np.bool_)
+        for row, keyframe in enumerate(self.keyframes):
+            column = np.searchsorted(ids, keyframe.ids)
+            xy[row, column] = (keyframe.uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+            seen[row, column] = True
+        length = seen.sum(axis=0)
+        order = np.argsort(-length, kind="stable")
+        return CornerObservations(xy, seen, ids).part(order[length[order] >= 3])
+
+    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bools]:
+        """Pixels (n,2) of corners in the next image, and which of them are found, forward and backward."""
+        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": levels}
+        flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+        start = uv.astype(np.float32)
+        there = None if guess is None else guess.astype(np.float32)
+        found, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there, flags=flags, **size)  # type: ignore[call-overload]
+        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, found, start.copy(), flags=flags, **size)  # type: ignore[call-overload]
+        limit = np.array([after.shape[1], after.shape[0]]) - _BORDER_PX
+        inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
+        same = np.linalg.norm(back - start, axis=1) < self._config.backward_px
+        return found.astype(np.float64), (ok.ravel() == 1) & (ok_back.ravel() == 1) & inside & same
+
+    def _keep(self, uv: F64, good: Bools) -> None:
+        self._uv, self._ids, self._keyframe_uv = uv[good], self._ids[good], self._keyframe_uv[good]
+
+    def _replenish(self, left: Pyramid) -> None:
+        """Find new corners where none is followed."""
+        config = self._config
+        if len(self._uv) >= config.replenish * config.corners:
+            return
+        found = features.detect(left, self._uv, self._detector).uv[: config.corners - len(self._uv)]
+        self._uv = np.concatenate([self._uv, found])
+        self._ids = np.concatenate([self._ids, self._next_id + np.arange(len(found))])
+        self._next_id += len(found)

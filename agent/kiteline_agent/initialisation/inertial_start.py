@@ -1,0 +1,210 @@
+"""Starts a monocular map in metres from corners and IMU, once the scale is known; until then there is no pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.inertial.preintegration import BiasPrior, Samples
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
+from kiteline_agent.initialisation.inertial_bundle import InertialBundle, WarmStart, WindowSolution
+from kiteline_agent.initialisation.landmark_realignment import realigned
+from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class InertialMap:
+    """The first keyframe of a map in metres, which is this frame, and the state there.
+
+    points: new landmarks. solution: its window. cov: (17,17) of the state, as in InertialState. scale_sigma: relative
+    deviation of the scale. duration_s: length of the window.
+    """
+
+    points: MetricPoints
+    solution: WindowSolution
+    cov: F64
+    scale_sigma: float
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """A solution, stamps of its K keyframes, ids (P,) of its corners and their places (P,3) m."""
+
+    t_ns: tuple[int, ...]
+    ids: NDArray[np.int64]
+    xyz: F64
+    solution: WindowSolution
+
+
+class InertialStart:
+    """Follows corners and solves their window about twice a second. Call `add` with every frame that has no map."""
+
+    def __init__(self, camera: RectifiedCamera, calibration: ImuCalibration, config: AgentConfig, work: Work) -> None:
+        self._camera = camera
+        self._calibration = calibration
+        self._config = config
+        self._work = work
+        start = config.inertial_start
+        detector = replace(
+            config.detector, cell_px=start.corner_tracks.cell_px, max_corners=start.corner_tracks.corners
+        )
+        self._tracks = CornerTracks(camera, detector, start.corner_tracks)
+        self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
+        self._before: _Window | None = None
+        self._tried_ns: int | None = None
+        self._heard_ns: int | None = None  # frame with the last samples
+
+    def hears(self, ctx: FrameContext) -> bool:
+        """Take in the samples of a frame. False if none has come for `silent_s`."""
+        self._buffer.push(ctx.imu)
+        if self._heard_ns is None or (ctx.imu is not None and len(ctx.imu.t_ns)):
+            self._heard_ns = ctx.t_ns
+        return (ctx.t_ns - self._heard_ns) * 1e-9 <= self._config.inertial.silent_s
+
+    def clear(self) -> None:
+        """A map is tracked: begin anew after it."""
+        self._tracks.clear()
+        self._before = self._tried_ns = None
+
+    def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
+        """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
+
+        prior: biases of earlier tracking. offset_s: frame stamp + offset = IMU time.
+        """
+        self._work.searches += 1
+        if not self._tracks.add(ctx.t_ns, ctx.images.left):
+            return None
+        config = self._config.inertial_start
+        self._tracks.drop_before(ctx.t_ns - round(config.max_span_s * 1e9))
+        keyframes = self._tracks.keyframes
+        span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
+        waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= config.attempt_s
+        if span_s < config.min_span_s or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
+            return None
+        self._tried_ns = ctx.t_ns
+        intervals = self._intervals(keyframes, round(offset_s * 1e9))
+        if intervals is None:
+            return None
+        return self._attempt(ctx, keyframes, intervals, self._default_prior() if prior is None else prior)
+
+    def _attempt(
+        self, ctx: FrameContext, keyframes: list[TrackedKeyframe], intervals: list[Samples], prior: BiasPrior
+    ) -> InertialMap | None:
+        """Solve the window; align its landmarks again and solve it once more when the scale seems to be known."""
+        config = self._config.inertial_start
+        all_corners = self._tracks.observations()
+        if len(all_corners.ids) < self._config.local_map.first_points:
+            return None
+        observations = all_corners.part(_covering(all_corners, config.landmarks, config.landmarks_each))
+        before, stamps = self._before, tuple(k.t_ns for k in keyframes)
+        bundle = self._bundle(observations, intervals, prior)
+        solution = None if before is None else bundle.solve(_warm(before, stamps, observations))
+        if solution is None or not self._fits(solution):
+            bundle = self._bundle(observations, intervals, prior)
+            solution = bundle.solve()
+        if solution is None:
+            self._before = None
+            return None
+        xyz, first = bundle.landmarks_of(solution.state)
+        if self._sigma(solution) < 1.2 * config.scale_sigma:
+            aligned = realigned(keyframes, observations, solution.state, xyz, first, self._camera, self._config.align)
+            keep = aligned.seen.sum(axis=0) >= 3
+            again = self._bundle(aligned.part(keep), intervals, prior)
+            solution = again.solve(WarmStart(solution.state, xyz[keep])) or solution
+        self._before = _Window(stamps, observations.ids, xyz, solution)
+        if not self._is_known(solution) or before is None or not self._agrees(before, self._before):
+            return None
+        placed = self._bundle(all_corners, intervals, prior).place_landmarks(solution.state)
+        points = None if placed is None else self._points(ctx, keyframes[-1], all_corners, placed)
+        if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
+            return None
+        cov = config.state_inflation**2 * solution.cov
+        return InertialMap(points, solution, cov, self._sigma(solution), (stamps[-1] - stamps[0]) * 1e-9)
+
+    def _is_known(self, solution: WindowSolution) -> bool:
+        """True if the scale's deviation is small, and images and IMU agree."""
+        return self._fits(solution) and self._sigma(solution) < self._config.inertial_start.scale_sigma
+
+    def _fits(self, solution: WindowSolution) -> bool:
+        """True if the errors of images and IMU are as expected: the solver has converged."""
+        config = self._config.inertial_start
+        return solution.reprojection_px < config.max_reprojection_px and solution.imu_chi2 < config.max_imu_chi2
+
+    def _agrees(self, before: _Window, now: _Window) -> bool:
+        """True if later frames confirm the scale: the keyframes of both solutions are as far apart in both."""
+        common = [t for t in now.t_ns if t in set(before.t_ns)]
+        if len(common) < 3:
+            return False
+        a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
+        length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
+        return bool(abs(np.log(length_b / length_a)) < self._config.inertial_start.agreement)
+
+    def _sigma(self, solution: WindowSolution) -> float:
+        return self._config.inertial_start.sigma_inflation * solution.scale_sigma
+
+    def _points(
+        self, ctx: FrameContext, newest: TrackedKeyframe, corners: CornerObservations, solution: WindowSolution
+    ) -> MetricPoints | None:
+        """The corners of the newest keyframe whose depth is known."""
+        config = self._config.inertial_start
+        seen = corners.seen[-1] & (solution.depth_m > 0.1) & (solution.depth_sigma < config.depth_sigma)
+        fits = bool(seen.any()) and np.isfinite(solution.depth_sigma[seen]).all()
+        if not fits:
+            return None
+        uv = newest.uv[np.searchsorted(newest.ids, corners.ids[seen])]
+        octave = np.zeros(len(uv), np.uint8)
+        return metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
+
+    def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
+        return InertialBundle(
+            corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
+            self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
+        )  # fmt: skip
+
+    def _default_prior(self) -> BiasPrior:
+        bundle = self._config.inertial_start.bundle
+        return BiasPrior(np.zeros(6), np.repeat([bundle.gyro_bias_rad_s, bundle.accel_bias_m_s2], 3))
+
+    def _intervals(self, keyframes: list[TrackedKeyframe], offset_ns: int) -> list[Samples] | None:
+        """Samples between the keyframes; None if some are missing, when the window begins anew."""
+        found = [self._buffer.between(a.t_ns + offset_ns, b.t_ns + offset_ns) for a, b in pairwise(keyframes)]
+        complete = [samples for samples in found if samples is not None]
+        if len(complete) < len(found):
+            self.clear()
+            return None
+        return complete
+
+
+def _covering(corners: CornerObservations, longest: int, each: int) -> NDArray[np.int64]:
+    """Columns of the longest tracks, and of the `each` longest ones of every keyframe."""
+    chosen = np.arange(len(corners.ids)) < longest
+    for seen in corners.seen:
+        chosen[np.flatnonzero(seen)[:each]] = True
+    return np.flatnonzero(chosen)
+
+
+def _warm(before: _Window, t_ns: tuple[int, ...], corners: CornerObservations) -> WarmStart | None:
+    """The solution before as a start for the window of these keyframes; None if they have none in common."""
+    rows = [before.t_ns.index(t) for t in t_ns if t in before.t_ns]
+    if not rows:
+        return None
+    state = before.solution.state
+    xyz = np.full((len(corners.ids), 3), np.nan)
+    _, new, old = np.intersect1d(corners.ids, before.ids, return_indices=True)
+    xyz[new] = before.xyz[old]
+    part = replace(
+        state, R=state.R[rows], p=state.p[rows], v=state.v[rows], accel_bias=state.accel_bias[rows]
+    )  # fmt: skip
+    return WarmStart(part, xyz)

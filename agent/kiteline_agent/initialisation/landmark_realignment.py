@@ -1,0 +1,74 @@
+"""Aligns the landmarks of a window with their first image again, where the window's geometry predicts them.
+
+Optical flow drifts from keyframe to keyframe; an alignment with one template, warped by the geometry, does not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AlignConfig
+from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
+from kiteline_agent.initialisation.inertial_bundle import WindowState
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_OFFSET_PX = 4.0  # px: half of a patch, over which the warp is linear
+_MARGIN_PX = 12.0  # px to the image's border
+_MAX_STEP_PX = 3.0  # px that the alignment may move on a level
+_MAX_OFF_PX = 6.0  # px between prediction and result
+_MAX_SCALE = 3.0  # of areas
+
+
+def realigned(
+    keyframes: list[TrackedKeyframe], observations: CornerObservations, state: WindowState, xyz: F64, first: I64,
+    camera: RectifiedCamera, config: AlignConfig,
+) -> CornerObservations:  # fmt: skip
+    """Observations by alignment. xyz: (P,3) m landmarks in w. first: (P,) keyframe that saw each first."""
+    f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    R, centre = state.R @ camera.T_b_c[:3, :3], state.p + state.R @ camera.T_b_c[:3, 3]
+    columns = np.arange(len(xyz))
+    xy0 = observations.xy[first, columns]
+    templates = _templates(keyframes, xy0 * f + c, first)
+    depth = np.einsum("pi,pi->p", xyz - centre[first], R[first, :, 2])
+    corners = [xyz]
+    for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        ray = np.column_stack([xy0 + np.array([du, dv]) * _OFFSET_PX / f, np.ones(len(xyz))])
+        corners.append(centre[first] + np.einsum("pij,pj->pi", R[first], ray * depth[:, None]))
+    xy, seen = observations.xy.copy(), np.zeros_like(observations.seen)
+    octave = np.zeros(len(xyz), np.uint8)
+    size = np.array([camera.width, camera.height]) - _MARGIN_PX
+    for k, keyframe in enumerate(keyframes):
+        local = [(x - centre[k]) @ R[k] for x in corners]
+        uv = [p[:, :2] / np.maximum(p[:, 2:], 1e-3) * f + c for p in local]
+        warp = np.stack([uv[1] - uv[2], uv[3] - uv[4]], axis=2) / (2.0 * _OFFSET_PX)
+        area = np.abs(np.linalg.det(warp))
+        inside = (uv[0] > _MARGIN_PX).all(axis=1) & (uv[0] < size).all(axis=1) & (local[0][:, 2] > 0.1)
+        rows = np.flatnonzero((first < k) & inside & (area > 1.0 / _MAX_SCALE) & (area < _MAX_SCALE))
+        place = np.where(observations.seen[k][:, None], observations.xy[k] * f + c, uv[0])[rows].copy()
+        found, ncc = np.zeros(len(rows), np.bool_), np.zeros(len(rows))
+        alignment_kernels.align(
+            keyframe.left, templates, rows, octave[rows], np.ascontiguousarray(warp[rows]), place, 1, 0,
+            config.iterations, _MAX_STEP_PX, config.min_ncc, found, ncc,
+        )  # fmt: skip
+        good = found & (np.linalg.norm(place - uv[0][rows], axis=1) < _MAX_OFF_PX)
+        xy[k, rows[good]], seen[k, rows[good]] = (place[good] - c) / f, True
+    seen[first, columns] = True
+    return CornerObservations(xy, seen, observations.ids)
+
+
+def _templates(keyframes: list[TrackedKeyframe], uv: F64, first: I64) -> NDArray[np.uint8]:
+    """Templates (P,3,21,21) of the landmarks, each from the keyframe that saw it first, there at uv (P,2)."""
+    templates = np.zeros((len(uv), TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
+    for k, keyframe in enumerate(keyframes):
+        rows = np.flatnonzero(first == k)
+        if len(rows):
+            part = np.zeros((len(rows), TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
+            alignment_kernels.cut_templates(keyframe.left, uv[rows], np.zeros(len(rows), np.uint8), part)
+            templates[rows] = part
+    return templates

@@ -1,0 +1,139 @@
+"""The window of a monocular start in metres: scale, gravity, biases and honest deviations, from simulated corners."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.config import InertialBundleConfig
+from kiteline_agent.inertial.preintegration import BiasPrior, Samples
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.inertial_bundle import InertialBundle, WarmStart, WindowSolution
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_hw.sim.sensors import imu as sim_imu
+from kiteline_hw.sim.world.built_in_paths import built_in_path
+from kiteline_hw.sim.world.path import Path
+
+F64 = NDArray[np.float64]
+
+T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
+FOCAL = 450.0
+CONFIG = InertialBundleConfig()
+PRIOR = BiasPrior(np.zeros(6), np.repeat([0.1, 0.2], 3))
+CALIBRATION = ImuCalibration()
+
+
+def window(
+    seed: int, keyframes: int = 13, haste: float = 0.4, noise_px: float = 0.5, still: bool = False
+) -> tuple[CornerObservations, list[Samples], F64]:
+    """Corners, samples and true poses T_w_b (K,4,4) of keyframes 0.25 s apart."""
+    rng = np.random.default_rng(seed)
+    path = built_in_path("room", 12.0 / haste, T_B_C, seed)
+    path = Path(path.coefficients, path.knot_s * haste, path.length_s * haste, 0.7, 8.0 if still else 0.0)
+    t_ns = 500_000_000 + 250_000_000 * np.arange(keyframes, dtype=np.int64)
+    imu_t = np.arange(0, int(t_ns[-1]) + 10_000_000, 5_000_000, dtype=np.int64)
+    samples = sim_imu.measure(path, imu_t, 0, CALIBRATION, seed)
+    buffer = SampleBuffer(100.0, 0.05)
+    buffer.push(samples)
+    truth = path.motion(t_ns * 1e-9).T_w_b
+    cloud = truth[:, :3, 3].mean(axis=0) + rng.uniform(-5.0, 5.0, (400, 3))
+    xy, seen = np.zeros((keyframes, len(cloud), 2)), np.zeros((keyframes, len(cloud)), np.bool_)
+    for k, T in enumerate(truth):
+        p = se3.transform(se3.inverse(T @ T_B_C), cloud)
+        z = np.maximum(p[:, 2:], 1e-3)
+        seen[k] = (p[:, 2] > 0.4) & (np.abs(p[:, :2] / z) < np.array([0.8, 0.5])).all(axis=1)
+        xy[k] = p[:, :2] / z + noise_px / FOCAL * rng.normal(size=(len(cloud), 2))
+    corners = CornerObservations(xy, seen, np.arange(len(cloud)))
+    corners = corners.part(np.flatnonzero(seen.sum(axis=0) >= 3)[:120])
+    between = [buffer.between(int(a), int(b)) for a, b in pairwise(t_ns)]
+    return corners, [s for s in between if s is not None], truth
+
+
+def bundle(corners: CornerObservations, samples: list[Samples]) -> InertialBundle:
+    return InertialBundle(corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG)
+
+
+def scale_of(solution: WindowSolution, truth: F64) -> float:
+    p, q = solution.state.p, truth[:, :3, 3]
+    return float(np.linalg.norm(p - p.mean(axis=0)) / np.linalg.norm(q - q.mean(axis=0)))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_scale_gravity_and_motion_are_found_without_a_first_guess(seed: int) -> None:
+    corners, samples, truth = window(seed)
+    found = bundle(corners, samples).solve()
+    assert found is not None
+    assert abs(np.log(scale_of(found, truth))) < max(4.0 * found.scale_sigma, 0.01)
+    assert found.scale_sigma < 0.05
+    down_b = found.T_w_b[:3, :3].T @ found.gravity / 9.81
+    assert np.degrees(np.arccos(np.clip(down_b @ truth[-1, :3, :3].T @ [0.0, 0.0, -1.0], -1.0, 1.0))) < 1.5
+    moved = se3.inverse(truth[0]) @ truth[-1]
+    np.testing.assert_allclose(
+        (se3.inverse(se3.from_rt(found.state.R[0], found.state.p[0])) @ found.T_w_b)[:3, :3], moved[:3, :3], atol=0.02
+    )
+    assert found.reprojection_px == pytest.approx(0.5 * np.sqrt(2.0), rel=0.35)
+
+
+def test_deviations_of_the_scale_are_honest() -> None:
+    """Over seeds, errors are as large as their deviations say: not larger, and not ten times smaller."""
+    ratios = []
+    for seed in range(12):
+        corners, samples, truth = window(seed, keyframes=11)
+        found = bundle(corners, samples).solve()
+        assert found is not None
+        ratios.append(np.log(scale_of(found, truth)) / found.scale_sigma)
+    assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_a_still_camera_tells_no_scale() -> None:
+    corners, samples, _ = window(3, still=True)
+    found = bundle(corners, samples).solve()
+    assert found is None or found.scale_sigma > 0.1
+
+
+def test_a_warm_start_ends_where_a_cold_one_does() -> None:
+    corners, samples, truth = window(4, keyframes=14)
+    first = bundle(replace(corners, xy=corners.xy[:12], seen=corners.seen[:12]), samples[:11])
+    before = first.solve()
+    assert before is not None
+    xyz, _ = first.landmarks_of(before.state)
+    xyz[::7] = np.nan  # new corners
+    warm, cold = bundle(corners, samples).solve(WarmStart(before.state, xyz)), bundle(corners, samples).solve()
+    assert warm is not None and cold is not None
+    assert abs(np.log(scale_of(warm, truth) / scale_of(cold, truth))) < 0.5 * cold.scale_sigma
+
+
+def test_the_state_is_that_of_the_newest_keyframe() -> None:
+    corners, samples, truth = window(5)
+    found = bundle(corners, samples).solve()
+    assert found is not None
+    xyz = np.full(3, np.nan)
+    assert found.cov.shape == (17, 17) and np.linalg.eigvalsh(found.cov).min() > 0.0 and np.isnan(xyz).all()
+    speed = np.linalg.norm(truth[-1, :3, 3] - truth[-2, :3, 3]) / 0.25
+    assert np.linalg.norm(found.velocity) == pytest.approx(speed, rel=0.4, abs=0.1)
+
+
+def test_landmarks_are_placed_with_known_poses() -> None:
+    corners, samples, truth = window(2)
+    few = bundle(corners.part(np.arange(min(60, len(corners.ids)))), samples).solve()
+    assert few is not None
+    every = bundle(corners, samples).place_landmarks(few.state)
+    assert every is not None
+    known = (every.depth_sigma < 0.1) & corners.seen[-1]
+    assert known.sum() > 10
+    # true depths by the observations themselves: the ray through the newest pixel at that depth meets the others
+    T = truth @ T_B_C
+    ray = np.append(corners.xy[-1], np.ones((len(known), 1)), axis=1) * every.depth_m[:, None] / scale_of(few, truth)
+    world = se3.transform(T[-1], ray)
+    off = []
+    for k in range(len(truth)):
+        p = se3.transform(se3.inverse(T[k]), world)
+        good = corners.seen[k] & known
+        off.append(np.linalg.norm(p[good, :2] / p[good, 2:] - corners.xy[k][good], axis=1) * FOCAL)
+    assert np.median(np.concatenate(off)) < 6.0
