@@ -76,6 +76,7 @@ class InertialTracker:
         self._interval_end_ns = 0  # IMU time
         self._image_loss_s = 0.0
         self.started: str | None = None  # "rest" or "motion": how the smoother was last started
+        self._images_have_scale = metric
         self.metric = metric  # False: the map's scale is unknown, and the IMU is only compared with rotations
 
     # state
@@ -340,7 +341,7 @@ class InertialTracker:
                 self._smoother.replace_last(samples)
 
     def _calibrate(self, t_ns: int, T_m_b_visual: F64, dt_s: float) -> None:
-        gravity = self._smoother.gravity if self._smoother.running and self.metric else None
+        gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None
         self._self_calibration.add(t_ns, T_m_b_visual)
         change = self._self_calibration.update(self._buffer, gravity, dt_s)
         if change.any():
