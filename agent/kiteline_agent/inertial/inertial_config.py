@@ -24,8 +24,8 @@ class ScaleFilterConfig:
     gravity_sigma_m_s2: float = 0.01  # of the length of gravity
     chi2: float = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
     known_sigma: float = 0.025  # deviation below which the scale may be corrected
-    least: float = 0.01  # smallest correction: each begins a new submap
-    least_deviations: float = 0.8  # the same in deviations
+    least: float = 0.012  # smallest correction: each begins a new submap
+    least_deviations: float = 1.0  # the same in deviations
     least_s: float = 4.0  # time between two corrections
 
 

@@ -13,6 +13,7 @@ from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import WindowState
+from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
@@ -23,7 +24,6 @@ _MARGIN_PX = 12.0  # px to the image's border
 _MAX_STEP_PX = 3.0  # px that the alignment may move on a level
 _MAX_OFF_PX = 6.0  # px between prediction and result
 _MAX_SCALE = 3.0  # of areas
-_RECTIFIED = np.zeros((0, 0, 2), np.float32)  # no grid of raw pixels
 
 
 def realigned(
@@ -54,7 +54,7 @@ def realigned(
         place = np.where(observations.seen[k][:, None], observations.xy[k] * f + c, uv[0])[rows].copy()
         found, ncc = np.zeros(len(rows), np.bool_), np.zeros(len(rows))
         alignment_kernels.align(
-            keyframe.left, _RECTIFIED, templates, rows, octave[rows], np.ascontiguousarray(warp[rows]), place, 1, 0,
+            keyframe.left, NO_GRID, templates, rows, octave[rows], np.ascontiguousarray(warp[rows]), place, 1, 0,
             config.iterations, _MAX_STEP_PX, config.min_ncc, found, ncc,
         )  # fmt: skip
         good = found & (np.linalg.norm(place - uv[0][rows], axis=1) < _MAX_OFF_PX)
