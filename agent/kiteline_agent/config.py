@@ -126,6 +126,7 @@ class KeyframeConfig:
     min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
     rotation_rad: float = 0.30  # rad: a rotation that has replaced a quarter of the view
+    wait_right_frames: int = 5  # frames that a keyframe waits for a lost right image; without it points have no depth
     thin: float = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
 

@@ -78,6 +78,22 @@ def test_kitti_is_followed(data_dir: Path) -> None:
     assert np.sqrt((step_errors_m(source, estimates) ** 2).mean()) < 0.025
 
 
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_frames_without_their_right_image_are_tracked(data_dir: Path, with_imu: bool) -> None:
+    """Three of ten are lost, then all for one second."""
+    source = open_source(str(data_dir / "room_flight.mcap"), imu=with_imu)
+    rng = np.random.default_rng(2)
+    frames, k = [], 0
+    for item in first_frames(source, 120):
+        if isinstance(item, Frame):
+            lost = (k > 0 and rng.random() < 0.3) or 40 <= k < 60
+            item, k = replace(item, right=None, encoded=()) if lost else item, k + 1
+        frames.append(item)
+    estimates = fly(source, frames)
+    assert all(e.tracked for e in estimates) and len({e.submap for e in estimates}) == 1
+    assert np.sqrt(np.mean(step_errors_m(source, estimates) ** 2)) < 0.005
+
+
 def test_two_runs_give_the_same_bits(data_dir: Path) -> None:
     runs = []
     for _ in range(2):

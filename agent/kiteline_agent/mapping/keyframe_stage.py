@@ -33,17 +33,19 @@ class KeyframeStage:
         self._governor = governor
         self._channel = channel
         self._work = work
+        self._without_right = 0  # frames since the last right image of a stereo camera
 
     def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
         """Make a keyframe if the policy needs one, and link and CPU time allow it. Returns events."""
+        self._without_right = self._without_right + 1 if self._maker.lacks_right_image(ctx) else 0
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
             return []
         urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
             return ["governor: keyframe postponed"]
-        if not urgent and self._maker.lacks_right_image(ctx):  # its new landmarks would have no depth
-            return []
+        if not urgent and 0 < self._without_right <= ctx.config.keyframe.wait_right_frames:
+            return []  # its new landmarks would have no depth
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             return []
         self.add(ctx, track)
