@@ -31,13 +31,9 @@ class Outbox:
     """Values to share, with their versions, in one relation between two sessions after another."""
 
     def __init__(
-        self,
-        order: Callable[[Key], Order],
-        oldest_every: int,
-        compress: Compress | None = None,
-        resident_bytes: int | None = None,
-        spill: Spill | None = None,
-    ) -> None:
+        self, order: Callable[[Key], Order], oldest_every: int, compress: Compress | None = None,
+        resident_bytes: int | None = None, spill: Spill | None = None,
+    ) -> None:  # fmt: skip
         """order: of keys whose values come back from the archive. resident_bytes: memory for values that are not
         archived, roughly; None for no limit. spill: keeps the codes of archived values.
         """
