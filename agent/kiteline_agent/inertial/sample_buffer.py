@@ -26,7 +26,9 @@ class SampleBuffer:
     """The newest IMU samples in order of time.
 
     The white part of the noise is measured by second differences, to which motion hardly contributes: vibration is
-    often far above the noise density of a data sheet. Steps across missing or clipped samples have more.
+    often far above the noise density of a data sheet. Tones near half the rate of the samples average out over a frame,
+    so differences of pairs of samples count where they are smaller. Steps across missing or clipped samples have more
+    noise.
     """
 
     def __init__(self, keep_s: float, max_gap_s: float) -> None:
@@ -38,7 +40,7 @@ class SampleBuffer:
         self._clipped: Bools = np.zeros((0, 2), np.bool_)
         self._largest = np.array([_RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2])  # magnitudes so far
         self._step_ns: float | None = None  # usual time between two samples
-        self._variance = np.zeros(2)  # of the noise of one sample: gyro, accel
+        self._variance = np.zeros((2, 2))  # of the noise of one sample, by samples and by pairs: gyro, accel
 
     def push(self, imu: ImuBatch | None) -> None:
         """Append samples that are finite and newer than the newest one."""
@@ -71,7 +73,7 @@ class SampleBuffer:
     @property
     def density(self) -> F64:
         """Measured noise density (2,) of gyro (rad/s/sqrt(Hz)) and accelerometer (m/s^2/sqrt(Hz))."""
-        return np.asarray(np.sqrt(self._variance * (self._step_ns or 0.0) * 1e-9))
+        return np.asarray(np.sqrt(self._variance.min(axis=0) * (self._step_ns or 0.0) * 1e-9))
 
     def between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Samples from one instant to another, ends interpolated (held beyond the newest); None with a gap."""
@@ -147,9 +149,16 @@ class SampleBuffer:
         even = (longest <= _EVEN * np.minimum(steps[1:], steps[:-1])) & (longest <= _GAP * self._step_ns)
         if not even.any():
             return
-        # white noise of variance v has second differences of variance 6 v
+        # white noise of variance v has second differences of variance 6 v, that of pairs 3 v
         bent = (values[2:] - 2.0 * values[1:-1] + values[:-2])[even]
-        found = np.mean(bent.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 6.0
         share = 1.0 - float(np.exp(-len(bent) * self._step_ns * 1e-9 / _NOISE_MEMORY_S))
-        averaged = self._variance + share * (found - self._variance)
-        self._variance = np.where(found > _ATTACK * self._variance, found, averaged)
+        self._follow_noise(0, np.mean(bent.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 6.0, share)
+        if even.all() and len(values) >= 6:
+            pairs = 0.5 * (values[1:] + values[:-1])
+            bent = pairs[4:] - 2.0 * pairs[2:-2] + pairs[:-4]
+            self._follow_noise(1, np.mean(bent.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 3.0, share)
+
+    def _follow_noise(self, scale: int, found: F64, share: float) -> None:
+        """Average a variance (2,) of gyro and accelerometer."""
+        before = self._variance[scale]
+        self._variance[scale] = np.where(found > _ATTACK * before, found, before + share * (found - before))

@@ -28,9 +28,9 @@ F64 = NDArray[np.float64]
 class SelfCalibrationConfig:
     """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
 
-    turn_window_s: float = 0.15  # over which rotations are compared
+    turn_window_s: float = 0.25  # over which rotations are compared
     move_window_s: float = 0.3  # of two windows over which velocities are compared
-    turn_sigma_rad: float = 3e-4  # error of a rotation by images over a window
+    turn_sigma_rad: float = 4e-4  # error of a rotation by images over a window
     position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows
     axes_sigma: float = 0.012  # of scales and axes of gyro and accelerometer: 1 % and 0.7 degrees
     scale_sigma: float = 0.015  # relative, of lengths by the images
@@ -140,7 +140,8 @@ class SelfCalibration:
         if not config.apply_offset or self.gyro.offset_sigma_s >= config.offset_trusted_s:
             return
         step = self.gyro.offset_s - self.offset_s
-        self._corrects_offset |= abs(step) > config.offset_significance * self.gyro.offset_sigma_s
+        sigma = self.gyro.offset_sigma_s * max(self.gyro.excess, 1.0) ** 0.5
+        self._corrects_offset |= abs(step) > config.offset_significance * sigma
         if self._corrects_offset:
             self.offset_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
 
