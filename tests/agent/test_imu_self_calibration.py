@@ -134,8 +134,10 @@ def test_a_worn_imu_is_found_and_corrected(seed: int) -> None:
 def test_a_camera_that_turned_against_the_imu_is_found(seed: int) -> None:
     """The camera defines the body's axes, so both sensors seem to have turned."""
     turned = se3.so3_exp(np.array([4e-3, -3e-3, 2e-3]))
-    gyro, _ = applied(calibrated(flight(25.0, seed, turned, turned)))
+    calibration = calibrated(flight(25.0, seed, turned, turned))
+    gyro, _ = applied(calibration)
     assert np.linalg.norm(se3.so3_log(gyro @ turned)) < 1.8e-3
+    assert calibration.camera_rotation_rad == pytest.approx(np.linalg.norm(se3.so3_log(turned)), rel=0.3)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -145,6 +147,7 @@ def test_a_true_imu_is_left_alone(seed: int) -> None:
     assert calibration.correct(samples).gyro is samples.gyro
     assert calibration.correct(samples).accel is samples.accel
     assert abs(calibration.offset_s) < 5e-4
+    assert calibration.camera_rotation_rad < 5e-4  # a rotation that is not clear is most likely none
 
 
 def test_without_motion_nothing_is_learned() -> None:

@@ -130,7 +130,7 @@ class InertialTracker:
 
     @property
     def camera_rotation_rad(self) -> float:
-        """Angle by which the camera was found to be rotated against the IMU; 0 while that is not significant."""
+        """Expected angle, rms, by which the camera is rotated against the IMU; near 0 for a true rig."""
         return self._self_calibration.camera_rotation_rad
 
     def calibration_report(self) -> dict[str, Any]:

@@ -62,7 +62,7 @@ class SelfCalibration:
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
-        self.camera_rotation_rad = 0.0  # against the gyro, once that is corrected
+        self.camera_rotation_rad = 0.0  # against the gyro, rms as expected
         self._events: list[str] = []
 
     def correct(self, samples: Samples) -> Samples:
@@ -122,8 +122,7 @@ class SelfCalibration:
             window = self._integrate(turn)
             variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
             self.gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance)
-            if self._corrects_gyro:
-                self.camera_rotation_rad = float(np.linalg.norm(_measured(self.gyro.matrix)[1]))
+            self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, self._config.axes_sigma)
         if gravity is not None:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
@@ -193,6 +192,22 @@ def _measured(matrix: F64) -> tuple[F64, F64]:
     measured = np.asarray(np.linalg.inv(matrix), np.float64)
     u, _, vt = np.linalg.svd(measured)
     return measured, se3.so3_log(u @ vt)
+
+
+def _rotation_rad(matrix: F64, cov: F64, axes_sigma: float) -> float:
+    """Size of the rotation in the correction `matrix` (3,3), rad. cov: (9,9) of its elements.
+
+    Its square is weighted with the probability that there is one at all, by the Bayes factor of a rotation as large as
+    axes_sigma allows against none.
+    """
+    turned = 0.5 * np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    j = np.zeros((3, 9))
+    j[0, [7, 5]], j[1, [2, 6]], j[2, [3, 1]] = [0.5, -0.5], [0.5, -0.5], [0.5, -0.5]
+    own = j @ cov @ j.T
+    log_factor = 0.5 * float(turned @ np.linalg.solve(own, turned))
+    log_factor += 0.5 * float(np.linalg.slogdet(own)[1]) - 1.5 * float(np.log(0.5 * axes_sigma**2))
+    probability = 1.0 / (1.0 + float(np.exp(-np.clip(log_factor, -50.0, 50.0))))
+    return float(np.sqrt(probability * (turned @ turned)))
 
 
 def _event(sensor: str, matrix: F64) -> str:
