@@ -94,7 +94,7 @@ class Columns:
         if i >= 0:
             found = f"{codes[i].min()}..{codes[i].max()}"
             return f"{self._column_names[i]} is {found}, expected {self._low[i]}..{self._high[i]}"
-        if self._increasing and codes.shape[1] > 1 and np.diff(codes[0]).min() <= 0:
+        if self._increasing and codes.shape[1] > 1 and (codes[0, 1:] <= codes[0, :-1]).any():
             return "indices must increase"
         return ""
 

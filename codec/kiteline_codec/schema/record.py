@@ -37,15 +37,9 @@ class IdOf(Enum):
     CACHED_KEYFRAME = "keyframe", MAX_KEYFRAME_ID, "cached"  # of a map cache: made anew by each base process
     TILE = "tile", MAX_TILE_ID
 
-    @property
-    def field(self) -> str:
-        """The record's field that holds the id."""
-        return str(self.value[0])
-
-    @property
-    def max_id(self) -> int:
-        """The largest id."""
-        return int(self.value[1])
+    def __init__(self, field: str, max_id: int, _sort: str = "") -> None:
+        self.field = field  # the record's field that holds the id
+        self.max_id = max_id
 
 
 class Priority(IntEnum):

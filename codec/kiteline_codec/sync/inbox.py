@@ -40,6 +40,7 @@ class Inbox:
     def __init__(self, resident_bytes: int | None = None, spill: Spill | None = None) -> None:
         """resident_bytes: memory for values of keyframes, roughly; without it, or without a spill, unlimited."""
         self._values: dict[Key, tuple[int, bytes]] = {}
+        self._hashed: dict[Key, int] = {}  # parts of the digest, of values that were not archived since they came
         self._archive = Archive(spill)
         self._resident = ResidentValues(None if spill is None else resident_bytes, _VALUE_BYTES)
         self.digest = Digest()
@@ -141,7 +142,8 @@ class Inbox:
         self._removed.pop(key, None)
         self._values[key] = (version, data)
         self.value_bytes += len(data)
-        self.digest.add(hash_value(key, version, data))
+        hashed = self._hashed[key] = hash_value(key, version, data)
+        self.digest.add(hashed)
         self._resident.count(key, len(data))
         self._make_room(key.id)
         return Update(key, data)
@@ -173,7 +175,8 @@ class Inbox:
     def _drop_value(self, key: Key) -> None:
         held = self._values.pop(key, None)
         if held is not None:
-            self.digest.discard(hash_value(key, *held))
+            hashed = self._hashed.pop(key, None)
+            self.digest.discard(hash_value(key, *held) if hashed is None else hashed)
             self.value_bytes -= len(held[1])
             self._resident.uncount(key, len(held[1]))
 
@@ -202,6 +205,7 @@ class Inbox:
             return False
         for key in keys:
             self._resident.uncount(key, len(self._values.pop(key)[1]))
+            self._hashed.pop(key, None)
         return True
 
     def _fetch_all(self) -> None:
