@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kiteline_bench.reality import base, cpu, difficult, euroc, metric, motion, nees, people, street, worn
+from kiteline_bench.reality import base, cpu, difficult, euroc, metric, motion, nees, people, places, street, worn
 
 PARTS = {
     "euroc": ("Reality: one eye and a real IMU", euroc.run),
@@ -15,5 +15,6 @@ PARTS = {
     "nees": ("Reality: consistent poses of worn rigs", nees.run),
     "people": ("Reality: people who walk through", people.run),
     "difficult": ("Reality: difficult images", difficult.run),
+    "places": ("Reality: places on real images", places.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
 }
