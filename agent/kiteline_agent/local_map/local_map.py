@@ -23,7 +23,7 @@ from kiteline_codec.schema import (
     RefinedLandmarks,
     RemovedObservations,
 )
-from kiteline_core.geometry import disparity_offset
+from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId, point_id
 
@@ -82,6 +82,8 @@ class LocalMap:
         self.hits = np.zeros(k * b, np.int32)
         self.misses = np.zeros(k * b, np.int32)  # of a seed: searches without a match
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
+        self._new_poses: dict[KeyframeId, F64] = {}  # sent by the base, and not taken over yet
+        self._poses_due = False  # one of them differs by more than both maps' errors
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
@@ -119,6 +121,7 @@ class LocalMap:
         angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21).
         """
         slot = self._free_slot(head.parent)
+        self._new_poses.pop(KeyframeId(int(self.keyframe[slot])), None)
         n = min(len(uv), self.slot_size)
         rows = slice(slot * self.slot_size, slot * self.slot_size + n)
         self.keyframe[slot], self.parent[slot] = head.keyframe, head.parent
@@ -228,19 +231,45 @@ class LocalMap:
     def drop_submap(self, submap: SubmapId) -> None:
         """Drop the keyframes of a submap."""
         slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == submap)
+        for keyframe in self.keyframe[slots].tolist():
+            self._new_poses.pop(KeyframeId(keyframe), None)
         self.keyframe[slots] = NO_KEYFRAME
         self.counts[slots] = 0
 
     # records of the base
 
     def set_pose(self, record: KeyframePose) -> bool:
-        """Take over a keyframe's pose. False if the keyframe is not stored; likewise in the other records."""
+        """Hold a keyframe's pose ready for `apply_poses`. False: nothing moves yet."""
         slot = self.slot_of(record.keyframe)
-        if slot < 0:
+        if slot >= 0:
+            self._new_poses[record.keyframe] = record.T_m_k
+            self._poses_due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
+        return False
+
+    def apply_poses(self) -> bool:
+        """Take over all poses that the base sent, if one of them moves its landmarks far enough.
+
+        Smaller differences are within the errors of both maps; taken over one by one, they disturb a map that the
+        frames of this agent keep consistent. Returns True if the map moved.
+        """
+        if not self._poses_due:
             return False
-        self.T_m_k[slot] = record.T_m_k
-        self.from_base[slot] = True
+        for keyframe, T_m_k in self._new_poses.items():
+            slot = self.slot_of(keyframe)
+            if slot >= 0:
+                self.T_m_k[slot] = T_m_k
+                self.from_base[slot] = True
+        self._new_poses.clear()
+        self._poses_due = False
         return True
+
+    def _shift_px(self, slot: int, T_m_k: F64) -> float:
+        """By how much landmarks at the keyframe's typical depth move in its image if its pose is set to T_m_k (4,4)."""
+        change = se3.inverse(self.T_m_k[slot]) @ T_m_k
+        usable = self.usable[slot]
+        inverse_m = float(np.median(self.rho[slot, usable])) if usable.any() else 0.0
+        turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
+        return self.camera.fx * (float(np.linalg.norm(change[:3, 3])) * inverse_m + turn)
 
     def remove(self, record: RemovedObservations | CulledLandmarks) -> bool:
         """Stop searching for landmarks that the base removed."""

@@ -1,0 +1,108 @@
+"""Poses of the base for keyframes of the local map: taken over together, once they differ by more than errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_codec.schema import KeyframeHeader, KeyframePose
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+
+F64 = NDArray[np.float64]
+CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
+CONFIG = AgentConfig()
+DEPTH_M = 4.0
+LEAST_M = CONFIG.local_map.moved_px * DEPTH_M / CAMERA.fx  # of a shift that counts
+
+
+def local_map(keyframes: int = 4, slots: int = 8) -> LocalMap:
+    out = LocalMap(CAMERA, replace(CONFIG.local_map, keyframes=slots), CONFIG.depth_filter)
+    for k in range(keyframes):
+        add(out, k)
+    return out
+
+
+def add(held: LocalMap, k: int) -> None:
+    n = 30
+    held.add(
+        KeyframeHeader(KeyframeId(k), k, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0),
+        np.full(n, 1.0 / DEPTH_M), np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
+        np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), k,
+    )  # fmt: skip
+
+
+def told(held: LocalMap, k: int, shift_m: float, turn_rad: float = 0.0) -> None:
+    T = se3.from_rt(se3.so3_exp(np.array([0.0, turn_rad, 0.0])), np.array([shift_m, 0.0, 0.0]))
+    assert not held.set_pose(KeyframePose(KeyframeId(k), T))  # nothing moves record by record
+
+
+def shifts(held: LocalMap, keyframes: int = 4) -> list[float]:
+    return [float(held.T_m_k[held.slot_of(k)][0, 3]) for k in range(keyframes)]
+
+
+def test_differences_within_the_errors_are_left() -> None:
+    held = local_map()
+    for k in range(4):
+        told(held, k, 0.9 * LEAST_M)
+    assert not held.apply_poses()
+    assert shifts(held) == [0.0] * 4
+    assert not held.from_base.any()
+
+
+@pytest.mark.parametrize("turn", [False, True])
+def test_one_that_counts_brings_all_that_wait(turn: bool) -> None:
+    held = local_map()
+    told(held, 0, 0.5 * LEAST_M)
+    told(held, 2, -0.3 * LEAST_M)
+    assert not held.apply_poses()
+    told(held, 1, 0.2 * LEAST_M if turn else 1.1 * LEAST_M, 1.1 * CONFIG.local_map.moved_px / CAMERA.fx if turn else 0)
+    assert held.apply_poses()
+    assert np.allclose(shifts(held), [0.5 * LEAST_M, (0.2 if turn else 1.1) * LEAST_M, -0.3 * LEAST_M, 0.0])
+    assert held.from_base[:4].tolist() == [True, True, True, False]
+    assert not held.apply_poses()  # once
+
+
+def test_differences_count_against_what_is_held_however_they_came_about() -> None:
+    """Small steps of the base add up; a step back before they count leaves the map as it is."""
+    held = local_map()
+    for share in (0.4, 0.8, 0.4):
+        told(held, 0, share * LEAST_M)
+        assert not held.apply_poses()
+    for share in (0.6, 0.9, 1.2):
+        told(held, 0, share * LEAST_M)
+    assert held.apply_poses()
+    assert np.isclose(shifts(held)[0], 1.2 * LEAST_M)
+
+
+def test_evicted_keyframes_are_forgotten() -> None:
+    held = local_map(keyframes=8)
+    told(held, 0, 0.5 * LEAST_M)
+    add(held, 8)  # takes the slot of keyframe 0
+    add(held, 0)
+    told(held, 1, 2.0 * LEAST_M) if held.slot_of(1) >= 0 else told(held, 3, 2.0 * LEAST_M)
+    assert held.apply_poses()
+    assert held.T_m_k[held.slot_of(0)][0, 3] == 0.0
+    held = local_map()
+    told(held, 0, 0.5 * LEAST_M)
+    held.drop_submap(SubmapId(0))
+    assert not held.apply_poses()
+
+
+@given(st.permutations(range(4)), st.lists(st.floats(0.0, 3.0), min_size=4, max_size=4))
+def test_the_order_of_records_does_not_matter(order: list[int], share: list[float]) -> None:
+    one, other = local_map(), local_map()
+    for k in range(4):
+        told(one, k, share[k] * LEAST_M)
+    for k in order:
+        told(other, k, share[k] * LEAST_M)
+    assert one.apply_poses() == other.apply_poses()
+    assert shifts(one) == shifts(other)
