@@ -269,7 +269,7 @@ class LocalMap:
         usable = self.usable[slot]
         inverse_m = float(np.median(self.rho[slot, usable])) if usable.any() else 0.0
         turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
-        return self.camera.fx * (float(np.linalg.norm(change[:3, 3])) * inverse_m + turn)
+        return float(self.camera.fx * (float(np.linalg.norm(change[:3, 3])) * inverse_m + turn))
 
     def remove(self, record: RemovedObservations | CulledLandmarks) -> bool:
         """Stop searching for landmarks that the base removed."""
