@@ -151,7 +151,7 @@ class Agent:
             self._depth.search_seeds(images, track)
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
-            # 8. Join an older submap, or restart a monocular one in metres.
+            # 8. Join an older submap, or continue a monocular one in metres.
             events += self._submaps.join_older(ctx, track)
             events += self._submaps.restart_in_metres(ctx, track)
             outcome = FrameOutcome(True, False, track.inliers, events)
