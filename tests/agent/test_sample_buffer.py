@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -43,6 +44,22 @@ def interval(buffer: SampleBuffer, begin: int, end: int) -> Samples:
     samples = buffer.between(begin * STEP_NS, end * STEP_NS)
     assert samples is not None
     return samples
+
+
+def test_second_differences_agree_with_a_plain_reference() -> None:
+    rng = np.random.default_rng(4)
+    t_ns = np.cumsum(rng.choice([5, 5, 5, 5, 5, 5, 6, 9, 30], 300)).astype(np.int64)
+    values, sums = rng.normal(size=(300, 6)), np.empty((2, 2))
+    counts = imu_kernels.second_differences(t_ns, values, 5.0, 1.5, 2.5, sums)
+    dt = np.diff(t_ns)
+    longest = np.maximum(dt[1:], dt[:-1])
+    even = (longest <= 1.5 * np.minimum(dt[1:], dt[:-1])) & (longest <= 12.5)
+    single = (values[2:] - 2.0 * values[1:-1] + values[:-2])[even]
+    means = 0.5 * (values[1:] + values[:-1])
+    double = (means[4:] - 2.0 * means[2:-2] + means[:-4])[np.lib.stride_tricks.sliding_window_view(even, 4).all(1)]
+    assert counts == (len(single), len(double)) and len(double) > 20
+    for found, bent, variance in zip(sums, (single, double), (6.0, 3.0), strict=True):
+        np.testing.assert_allclose(found, (bent.reshape(-1, 2, 3) ** 2).mean(axis=2).sum(axis=0) / variance)
 
 
 @pytest.mark.parametrize("factor", [1.0, 10.0, 40.0])

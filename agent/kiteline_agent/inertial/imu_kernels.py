@@ -205,3 +205,36 @@ def preintegrate(
             vp[i] += aa[i] * dt
             for j in range(3):
                 turn[i, j] = after[i, j]
+
+
+@njit
+def second_differences(
+    t_ns: NDArray[np.int64], values: F64, usual_ns: float, even: float, gap: float, sums: F64
+) -> tuple[int, int]:
+    """Sums (2,2) of the squared second differences of samples (n,6), by samples and by means of two neighbours.
+
+    Columns: gyro, accelerometer; each is a mean over three axes, and over the variance of white noise. Samples count
+    where the longer of both steps is at most `even` times the shorter one and `gap` times the usual one; pairs where
+    all steps are such. Returns the numbers of differences.
+    """
+    n = t_ns.shape[0]
+    for i in range(2):
+        sums[i, 0] = sums[i, 1] = 0.0
+    count, pairs, run = 0, 0, 0
+    for k in range(1, n - 1):
+        a, b = float(t_ns[k] - t_ns[k - 1]), float(t_ns[k + 1] - t_ns[k])
+        if max(a, b) > even * min(a, b) or max(a, b) > gap * usual_ns:
+            run = 0
+            continue
+        count += 1
+        run += 1
+        for c in range(6):
+            d = values[k + 1, c] - 2.0 * values[k, c] + values[k - 1, c]
+            sums[0, c // 3] += d * d / 18.0
+        if run >= 4:  # six samples in even steps
+            pairs += 1
+            for c in range(6):
+                d = values[k + 1, c] + values[k, c] + values[k - 3, c] + values[k - 4, c]
+                d = 0.5 * d - values[k - 1, c] - values[k - 2, c]
+                sums[1, c // 3] += d * d / 9.0
+    return count, pairs

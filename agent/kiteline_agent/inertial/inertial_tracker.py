@@ -66,10 +66,15 @@ class InertialTracker:
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
         self._initialiser = ImuInitialiser(config, calibration, self._p_b_c, self._buffer)
-        self._self_calibration = SelfCalibration(calibration, config.calibration, self._p_b_c, config.gravity_m_s2)
+        self._self_calibration = SelfCalibration(
+            calibration, config.calibration, self._p_b_c, config.gravity_m_s2, metric=metric
+        )
         self._reported_s = config.calibration.offset_s
         self._scale = ScaleFilter(config.scale_filter, calibration, config.gravity_m_s2, self._p_b_c)
         self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
+        self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = (
+            None  # interval that was asked for last
+        )
         self._incomplete: tuple[int, int] | None = None  # the last interval, if samples at its end were missing
         self._bias = np.zeros(6)
         self._last: tuple[int, F64] | None = None  # stamp and T_m_b of the last frame
@@ -289,8 +294,12 @@ class InertialTracker:
         return self._between(begin, t_ns + self._offset_ns)
 
     def _between(self, from_ns: int, to_ns: int) -> Samples | None:
-        samples = self._buffer.between(from_ns, to_ns)
-        return None if samples is None else self._self_calibration.correct(samples)
+        """Corrected samples; the prediction and the update of a frame ask for the same ones."""
+        key = (from_ns, to_ns, self._buffer.newest_t_ns)
+        if self._cached is None or self._cached[0] != key:
+            samples = self._buffer.between(from_ns, to_ns)
+            self._cached = key, None if samples is None else self._self_calibration.correct(samples)
+        return self._cached[1]
 
     @property
     def _offset_ns(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_core.frame import ImuBatch
 
@@ -13,6 +14,7 @@ I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 _NOISE_MEMORY_S = 0.5  # over which the noise is averaged: rotors change speed faster than biases do
+_AT_ONCE = 20  # samples whose noise is measured together
 _ATTACK = 4.0  # factor of variance above which new noise is believed at once: motors start
 _RECENT = 10  # samples whose mean is without vibration
 _EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
@@ -39,6 +41,7 @@ class SampleBuffer:
         self._values = np.zeros((0, 6))
         self._clipped: Bools = np.zeros((0, 2), np.bool_)
         self._largest = np.array([_RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2])  # magnitudes so far
+        self._unmeasured = 0  # new samples whose noise was not measured yet
         self._step_ns: float | None = None  # usual time between two samples
         self._variance = np.zeros((2, 2))  # of the noise of one sample, by samples and by pairs: gyro, accel
 
@@ -58,7 +61,10 @@ class SampleBuffer:
         self._clipped = np.concatenate([self._clipped, np.zeros((new, 2), np.bool_)])[first:]
         if new:
             self._find_clipped(new)
-            self._measure_noise(new)
+            self._unmeasured += new
+            if self._unmeasured >= _AT_ONCE:
+                self._measure_noise(min(self._unmeasured, len(self._t)))
+                self._unmeasured = 0
 
     @property
     def newest_t_ns(self) -> int | None:
@@ -98,7 +104,8 @@ class SampleBuffer:
 
     def mean(self, from_ns: int, to_ns: int) -> tuple[F64, F64, int]:
         """Mean (6,) and standard deviation (6,) of the samples between two instants, and their number."""
-        chosen = self._values[(self._t >= from_ns) & (self._t <= to_ns)]
+        first, last = np.searchsorted(self._t, from_ns, "left"), np.searchsorted(self._t, to_ns, "right")
+        chosen = self._values[first:last]
         if len(chosen) == 0:
             return np.zeros(6), np.zeros(6), 0
         return chosen.mean(axis=0), chosen.std(axis=0), len(chosen)
@@ -139,24 +146,19 @@ class SampleBuffer:
                 self._clipped[-len(values) :, sensor] |= at_end
 
     def _measure_noise(self, new: int) -> None:
-        t, values = self._t[-new - 2 :], self._values[-new - 2 :]
-        steps = np.diff(t)
-        if len(steps) < 2:
+        t, values = self._t[-new - 5 :], self._values[-new - 5 :]
+        if len(t) < 3:
             return
-        usual = float(np.median(steps))
+        usual = float(np.median(np.diff(t)))
         self._step_ns = usual if self._step_ns is None else self._step_ns + 0.1 * (usual - self._step_ns)
-        longest = np.maximum(steps[1:], steps[:-1])
-        even = (longest <= _EVEN * np.minimum(steps[1:], steps[:-1])) & (longest <= _GAP * self._step_ns)
-        if not even.any():
+        sums = np.empty((2, 2))
+        count, pairs = imu_kernels.second_differences(t, values, self._step_ns, _EVEN, _GAP, sums)
+        if count == 0:
             return
-        # white noise of variance v has second differences of variance 6 v, that of pairs 3 v
-        bent = (values[2:] - 2.0 * values[1:-1] + values[:-2])[even]
-        share = 1.0 - float(np.exp(-len(bent) * self._step_ns * 1e-9 / _NOISE_MEMORY_S))
-        self._follow_noise(0, np.mean(bent.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 6.0, share)
-        if even.all() and len(values) >= 6:
-            pairs = 0.5 * (values[1:] + values[:-1])
-            bent = pairs[4:] - 2.0 * pairs[2:-2] + pairs[:-4]
-            self._follow_noise(1, np.mean(bent.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 3.0, share)
+        share = 1.0 - float(np.exp(-count * self._step_ns * 1e-9 / _NOISE_MEMORY_S))
+        self._follow_noise(0, sums[0] / count, share)
+        if pairs > 0:
+            self._follow_noise(1, sums[1] / pairs, share)
 
     def _follow_noise(self, scale: int, found: F64, share: float) -> None:
         """Average a variance (2,) of gyro and accelerometer."""

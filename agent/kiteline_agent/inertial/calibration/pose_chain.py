@@ -59,6 +59,8 @@ class PoseChain:
         if newest is None or len(self._poses) < 2:
             return False
         begin_ns, begin = self._poses[0]
+        if (self._poses[-1][0] - begin_ns) * 1e-9 < self._window_s:
+            return False
         ready = (k for k in range(1, len(self._poses)) if (self._poses[k][0] - begin_ns) * 1e-9 >= self._window_s)
         last = next(ready, None)
         if last is None or self._poses[last][0] + shift + _RATE_NS > newest:

@@ -49,9 +49,11 @@ class SelfCalibration:
     """Call `add` with each pose by images, then `update`."""
 
     def __init__(
-        self, calibration: ImuCalibration, config: SelfCalibrationConfig, p_b_c: F64, gravity_m_s2: float
-    ) -> None:
-        """p_b_c: (3,) m, camera in the body."""
+        self, calibration: ImuCalibration, config: SelfCalibrationConfig, p_b_c: F64, gravity_m_s2: float, *,
+        metric: bool = True,
+    ) -> None:  # fmt: skip
+        """p_b_c: (3,) m, camera in the body. metric: images alone measure in metres."""
+        self._metric = metric
         self._calibration, self._config, self._p_b_c = calibration, config, p_b_c
         self._gravity_m_s2 = gravity_m_s2
         self.gyro = GyroCalibration(config.axes_sigma, config.offset_sigma_s, config.offset_s, calibration.gyro_walk)
@@ -122,17 +124,33 @@ class SelfCalibration:
             window = self._integrate(turn)
             variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
             self.gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance)
-            self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, self._config.axes_sigma)
+            self._judge_gyro()
         if gravity is not None:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
             move = self._moves.take(buffer, self.gyro.offset_s)
             if isinstance(move, Link):
                 self._add_move(move)
+                self._judge_accel()
             elif move:
                 self._before = None
         self._follow_offset(dt_s)
         return self._follow_axes(buffer, dt_s)
+
+    def _judge_gyro(self) -> None:
+        config = self._config
+        self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, config.axes_sigma)
+        if config.apply_axes and not self._corrects_gyro and self.gyro.significance() > config.significance:
+            self._corrects_gyro = True
+            self._events.append(_event("gyro", self.gyro.matrix))
+
+    def _judge_accel(self) -> None:
+        """Lengths of a monocular map come from the accelerometer itself: they do not calibrate it."""
+        config = self._config
+        may = config.apply_axes and self._metric and not self._corrects_accel
+        if may and self.accel.significance() > config.significance:
+            self._corrects_accel = True
+            self._events.append(_event("accelerometer", self.accel.matrix))
 
     def _follow_offset(self, dt_s: float) -> None:
         config = self._config
@@ -145,17 +163,8 @@ class SelfCalibration:
             self.offset_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
 
     def _follow_axes(self, buffer: SampleBuffer, dt_s: float) -> F64:
-        config = self._config
         change = np.zeros(3)
-        if not config.apply_axes:
-            return change
-        share = 1.0 - float(np.exp(-dt_s / config.apply_s))
-        if not self._corrects_gyro and self.gyro.significance() > config.significance:
-            self._corrects_gyro = True
-            self._events.append(_event("gyro", self.gyro.matrix))
-        if not self._corrects_accel and self.accel.significance() > config.significance:
-            self._corrects_accel = True
-            self._events.append(_event("accelerometer", self.accel.matrix))
+        share = 1.0 - float(np.exp(-dt_s / self._config.apply_s))
         if self._corrects_gyro:
             self._gyro_matrix = self._gyro_matrix + share * (self.gyro.matrix - self._gyro_matrix)
         if self._corrects_accel:
