@@ -91,6 +91,18 @@ def test_deviations_of_the_scale_are_honest() -> None:
     assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
+def test_a_noisier_model_of_the_imu_knows_the_scale_less_well() -> None:
+    corners, samples, _ = window(1)
+    found = [
+        InertialBundle(corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, noise).solve()
+        for noise in (0.5, 1.0, 3.0)
+    ]
+    sigma = [s.scale_sigma for s in found if s is not None]
+    chi2 = [s.imu_chi2 for s in found if s is not None]
+    assert sigma[0] < sigma[1] < sigma[2] and chi2[0] > chi2[1] > chi2[2]
+    assert all(s is not None and s.converged for s in found)
+
+
 def test_a_still_camera_tells_no_scale() -> None:
     corners, samples, _ = window(3, still=True)
     found = bundle(corners, samples).solve()

@@ -61,7 +61,8 @@ class WindowSolution:
 
     T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. cov: (17,17) as in
     InertialState, of that keyframe. scale_sigma: relative deviation of all lengths. reprojection_px: rms of inliers.
-    imu_chi2: mean squared error of the inertial factors in deviations. depth_m: (P,) in the newest camera, and
+    cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared error of the
+    inertial factors in deviations. depth_m: (P,) in the newest camera, and
     depth_sigma: (P,) its relative deviation with known poses.
     """
 
@@ -72,6 +73,8 @@ class WindowSolution:
     gravity: F64
     cov: F64
     scale_sigma: float
+    cost: float
+    converged: bool
     reprojection_px: float
     imu_chi2: float
     depth_m: F64
@@ -103,8 +106,9 @@ class InertialBundle:
         gravity_m_s2: float,
         prior: BiasPrior,
         config: InertialBundleConfig,
+        noise: float = 1.0,
     ) -> None:
-        """intervals: K - 1, between the keyframes."""
+        """intervals: K - 1, between the keyframes. noise: factor on the inertial error model."""
         self._obs = observations
         # The measured noise is not used: it is vibration, which averages out over an interval, and fast motion.
         self._intervals = [replace(s, density=None) for s in intervals]
@@ -114,7 +118,9 @@ class InertialBundle:
         self._length = gravity_m_s2
         self._prior = prior
         self._config = config
-        self._walk = float(np.hypot(calibration.accel_walk, config.accel_walk))
+        self._inflation = noise * config.imu_inflation
+        self._walk = noise * float(np.hypot(calibration.accel_walk, config.accel_walk))
+        self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
         self._origin = np.zeros((self._landmarks, 3))
         self._axes = np.zeros((self._landmarks, 3, 3))
@@ -180,7 +186,7 @@ class InertialBundle:
         R, p, v, bias = (list(x) for x in (old.R, old.p, old.v, old.accel_bias))
         for samples in self._intervals[len(R) - 1 :]:
             both = np.concatenate([old.gyro_bias, bias[-1]])
-            motion = preintegrate(samples, both, self._calibration, self._config.imu_inflation)
+            motion = preintegrate(samples, both, self._calibration, self._inflation)
             T, velocity = motion.propagate(se3.from_rt(R[-1], p[-1]), v[-1], both, old.gravity)
             R, p, v, bias = [*R, T[:3, :3]], [*p, T[:3, 3]], [*v, velocity], [*bias, bias[-1]]
         state = replace(old, R=np.array(R), p=np.array(p), v=np.array(v), accel_bias=np.array(bias))
@@ -215,7 +221,7 @@ class InertialBundle:
         self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
     ) -> tuple[WindowState, _System]:
         """Levenberg-Marquardt over the unknowns with these columns."""
-        damping = 1e-4 if inertial else 1e-3
+        self._converged, damping = False, 1e-4 if inertial else 1e-3
         system = self._linearise(state, inertial=inertial)
         for _ in range(iterations):
             h = system.h[np.ix_(unknown, unknown)]
@@ -236,6 +242,7 @@ class InertialBundle:
                 self._integrate(state)
             system = self._linearise(state, inertial=inertial)
             if settled:
+                self._converged = True
                 break
         return state, system
 
@@ -265,7 +272,7 @@ class InertialBundle:
         return WindowSolution(
             state, se3.from_rt(state.R[-1], state.p[-1]), state.v[-1],
             np.concatenate([state.gyro_bias, state.accel_bias[-1]]), state.gravity, cov[np.ix_(order, order)],
-            float(np.sqrt(variance)), float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf,
+            float(np.sqrt(variance)), system.cost, self._converged, float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf,
             float(np.mean([e @ i @ e for e, i in zip(self._imu_errors, self._info, strict=True)])) / 9.0,
             scaled[:, 2] / state.rho, np.sqrt(np.maximum(system.inv[:, 2, 2], 0.0)) / state.rho,
         )  # fmt: skip
@@ -274,9 +281,8 @@ class InertialBundle:
 
     def _integrate(self, state: WindowState) -> None:
         """Integrate the samples with the state's biases."""
-        inflation = self._config.imu_inflation
         self._motions = [
-            preintegrate(samples, np.concatenate([state.gyro_bias, bias]), self._calibration, inflation)
+            preintegrate(samples, np.concatenate([state.gyro_bias, bias]), self._calibration, self._inflation)
             for samples, bias in zip(self._intervals, state.accel_bias, strict=False)
         ]
         floor = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)

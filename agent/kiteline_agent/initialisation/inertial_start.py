@@ -63,6 +63,7 @@ class InertialStart:
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
         self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
         self._before: _Window | None = None
+        self._noise = 1.0  # factor on the inertial error model, as the windows so far show it
         self._tried_ns: int | None = None
         self._heard_ns: int | None = None  # frame with the last samples
 
@@ -77,6 +78,7 @@ class InertialStart:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
         self._before = self._tried_ns = None
+        self._noise = 1.0
 
     def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
@@ -109,22 +111,22 @@ class InertialStart:
             return None
         observations = all_corners.part(_covering(all_corners, config.landmarks, config.landmarks_each))
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
-        bundle = self._bundle(observations, intervals, prior)
-        solution = None if before is None else bundle.solve(_warm(before, stamps, observations))
-        if solution is None or not self._fits(solution):
-            bundle = self._bundle(observations, intervals, prior)
-            solution = bundle.solve()
-        if solution is None:
+        found = self._solve(
+            observations, intervals, prior, None if before is None else _warm(before, stamps, observations)
+        )
+        if found is None:
             self._before = None
             return None
-        xyz, first = bundle.landmarks_of(solution.state)
+        solution, xyz, first = found
         if self._sigma(solution) < 1.2 * config.scale_sigma:
             aligned = realigned(keyframes, observations, solution.state, xyz, first, self._camera, self._config.align)
             keep = aligned.seen.sum(axis=0) >= 3
             again = self._bundle(aligned.part(keep), intervals, prior)
             solution = again.solve(WarmStart(solution.state, xyz[keep])) or solution
         self._before = _Window(stamps, observations.ids, xyz, solution)
-        if not self._is_known(solution) or before is None or not self._agrees(before, self._before):
+        known = self._is_known(solution)
+        self._noise = self._found_noise(solution)
+        if not known or before is None or not self._agrees(before, self._before):
             return None
         placed = self._bundle(all_corners, intervals, prior).place_landmarks(solution.state)
         points = None if placed is None else self._points(ctx, keyframes[-1], all_corners, placed)
@@ -133,9 +135,38 @@ class InertialStart:
         cov = config.state_inflation**2 * solution.cov
         return InertialMap(points, solution, cov, self._sigma(solution), (stamps[-1] - stamps[0]) * 1e-9)
 
+    def _solve(
+        self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
+    ) -> tuple[WindowSolution, F64, NDArray[np.int64]] | None:
+        """The solution of the lowest cost, its landmarks (P,3) and the keyframe that saw each first.
+
+        A warm start costs less than a cold one, but may stay in a wrong minimum: before a decision both are tried.
+        """
+        best: tuple[WindowSolution, F64, NDArray[np.int64]] | None = None
+        for start in [None] if warm is None else [warm, None]:
+            if (
+                best is not None
+                and self._fits(best[0])
+                and self._sigma(best[0]) > 1.5 * self._config.inertial_start.scale_sigma
+            ):
+                break
+            bundle = self._bundle(corners, intervals, prior)
+            solution = bundle.solve(start)
+            if solution is not None and (best is None or solution.cost < best[0].cost):
+                best = (solution, *bundle.landmarks_of(solution.state))
+        return best
+
+    def _found_noise(self, solution: WindowSolution) -> float:
+        """Factor on the inertial error model with which its errors are as expected."""
+        config = self._config.inertial_start
+        factor = self._noise * np.sqrt(solution.imu_chi2 / config.expected_imu_chi2)
+        return float(np.clip(factor, config.least_noise, config.most_noise))
+
     def _is_known(self, solution: WindowSolution) -> bool:
         """True if the scale's deviation is small, and images and IMU agree."""
-        return self._fits(solution) and self._sigma(solution) < self._config.inertial_start.scale_sigma
+        noise, before = self._found_noise(solution), self._noise
+        sigma = self._sigma(solution) * max(noise / before, 1.0)
+        return solution.converged and self._fits(solution) and sigma < self._config.inertial_start.scale_sigma
 
     def _fits(self, solution: WindowSolution) -> bool:
         """True if the errors of images and IMU are as expected: the solver has converged."""
@@ -170,7 +201,7 @@ class InertialStart:
     def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
         return InertialBundle(
             corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
-            self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
+            self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle, self._noise,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:
