@@ -17,6 +17,7 @@ from kiteline_agent.config import InertialBundleConfig
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
@@ -27,58 +28,6 @@ _STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, acc
 _SHARED = 5  # unknowns of the window: gyro bias, direction of gravity
 _MAX_DAMPING = 1e4
 _PLACE_ITERATIONS = 4  # of landmarks alone, which converge fast
-
-
-@dataclass(frozen=True, slots=True)
-class WindowState:
-    """Unknowns of the window, in the body frame of its first keyframe, w.
-
-    R: (K,3,3) R_w_b. p: (K,3) m. v: (K,3) m/s. accel_bias: (K,3) m/s^2. gyro_bias: (3,) rad/s. gravity: (3,) m/s^2.
-    m: (P,2) and rho: (P,) 1/m: landmark at origin + axes @ (m, 1) / rho.
-    """
-
-    R: F64
-    p: F64
-    v: F64
-    accel_bias: F64
-    gyro_bias: F64
-    gravity: F64
-    m: F64
-    rho: F64
-
-
-@dataclass(frozen=True, slots=True)
-class WarmStart:
-    """An earlier solution. state: of the first keyframes of the window, without landmarks of use. xyz: (P,3) m in w."""
-
-    state: WindowState
-    xyz: F64
-
-
-@dataclass(frozen=True, slots=True)
-class WindowSolution:
-    """Result of a window.
-
-    T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. cov: (17,17) as in
-    InertialState, of that keyframe. scale_sigma: relative deviation of all lengths. reprojection_px: rms of inliers.
-    cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared error of the
-    inertial factors in deviations. depth_m: (P,) in the newest camera, and
-    depth_sigma: (P,) its relative deviation with known poses.
-    """
-
-    state: WindowState
-    T_w_b: F64
-    velocity: F64
-    bias: F64
-    gravity: F64
-    cov: F64
-    scale_sigma: float
-    cost: float
-    converged: bool
-    reprojection_px: float
-    imu_chi2: float
-    depth_m: F64
-    depth_sigma: F64
 
 
 @dataclass(slots=True)
@@ -272,7 +221,8 @@ class InertialBundle:
         return WindowSolution(
             state, se3.from_rt(state.R[-1], state.p[-1]), state.v[-1],
             np.concatenate([state.gyro_bias, state.accel_bias[-1]]), state.gravity, cov[np.ix_(order, order)],
-            float(np.sqrt(variance)), system.cost, self._converged, float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf,
+            float(np.sqrt(variance)), system.cost, self._converged,
+            float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf,
             float(np.mean([e @ i @ e for e, i in zip(self._imu_errors, self._info, strict=True)])) / 9.0,
             scaled[:, 2] / state.rho, np.sqrt(np.maximum(system.inv[:, 2, 2], 0.0)) / state.rho,
         )  # fmt: skip

@@ -13,7 +13,8 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
-from kiteline_agent.initialisation.inertial_bundle import InertialBundle, WarmStart, WindowSolution
+from kiteline_agent.initialisation.inertial_bundle import InertialBundle
+from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
 from kiteline_agent.tracking.frame_context import FrameContext

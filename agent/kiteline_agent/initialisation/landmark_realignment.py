@@ -12,7 +12,7 @@ from kiteline_agent.config import AlignConfig
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
-from kiteline_agent.initialisation.inertial_bundle import WindowState
+from kiteline_agent.initialisation.inertial_window import WindowState
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.geometry.cameras import RectifiedCamera
 

@@ -1,0 +1,62 @@
+"""States of a window of monocular keyframes with an IMU, and its solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WindowState:
+    """Unknowns of the window, in the body frame of its first keyframe, w.
+
+    R: (K,3,3) R_w_b. p: (K,3) m. v: (K,3) m/s. accel_bias: (K,3) m/s^2. gyro_bias: (3,) rad/s. gravity: (3,) m/s^2.
+    m: (P,2) and rho: (P,) 1/m: landmark at origin + axes @ (m, 1) / rho.
+    """
+
+    R: F64
+    p: F64
+    v: F64
+    accel_bias: F64
+    gyro_bias: F64
+    gravity: F64
+    m: F64
+    rho: F64
+
+
+@dataclass(frozen=True, slots=True)
+class WarmStart:
+    """An earlier solution. state: of the first keyframes of the window, without landmarks of use. xyz: (P,3) m in w."""
+
+    state: WindowState
+    xyz: F64
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSolution:
+    """Result of a window.
+
+    T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. cov: (17,17) as in
+    InertialState, of that keyframe. scale_sigma: relative deviation of all lengths. reprojection_px: rms of inliers.
+    cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared error of the
+    inertial factors in deviations. depth_m: (P,) in the newest camera, and
+    depth_sigma: (P,) its relative deviation with known poses.
+    """
+
+    state: WindowState
+    T_w_b: F64
+    velocity: F64
+    bias: F64
+    gravity: F64
+    cov: F64
+    scale_sigma: float
+    cost: float
+    converged: bool
+    reprojection_px: float
+    imu_chi2: float
+    depth_m: F64
+    depth_sigma: F64
