@@ -139,17 +139,25 @@ def test_a_worn_calibration_widens_the_covariance() -> None:
     error[:5] = 0.4, -0.1, 0.2, 0.3, 0.1
     X, poses = scene(), PoseState()
     local_map = map_of(seen_with(error, X, np.eye(4)))
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance, mounted = (
+        PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=body, has_depth=True)
+        for body in (False, True)
+    )
+    new_mount = mounted._extrinsic.copy()
     nees = []
     for view in VIEWS * 12:
         T_c_m = se3.exp(view)
         track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
         covariance._evaluate(track)
+        mounted._evaluate(track)
         T_m_b = se3.inverse(track.T_c_m)
         wrong = T_m_b[:3, 3] - se3.inverse(T_c_m)[:3, 3]
         nees.append(float(wrong @ np.linalg.solve(covariance.of_poses(poses, T_m_b)[0][:3, :3], wrong)))
     assert np.mean(nees[:12]) > 20.0
     assert np.mean(nees[-12:]) < 9.0
+    # what wears the lenses wears their mount, too
+    assert np.trace(mounted._extrinsic[3:, 3:]) > 20.0 * np.trace(new_mount[3:, 3:])
+    np.testing.assert_array_equal(covariance._extrinsic, 0.0)
 
 
 def test_a_camera_that_is_rotated_in_the_body_widens_the_covariance() -> None:

@@ -38,6 +38,7 @@ F64 = NDArray[np.float64]
 _CACHE_PX = 1.0  # px, error of a corner at octave 0 that matched a landmark of the map cache
 _CACHE_DEPTH_M = 4.0  # typical depth of such corners
 _EVERY = 4  # frames between two evaluations
+_MOUNT = 2.0  # growth of the error of the extrinsic rotation with that of the lenses: .15 degrees an axis if worn
 _FEWER = 0.7  # share of the inliers of the last evaluation below which the next one is due at once
 
 
@@ -132,7 +133,9 @@ class PoseCovariance:
         """(6,6) of the camera in the body."""
         if not self._has_body:
             return np.zeros((6, 6))
-        rotation = self._config.extrinsic_rad**2 + self._camera_rotation_rad**2 / 3.0
+        # what wears the lenses wears their mount, too
+        mount = self._config.extrinsic_rad * (1.0 + _MOUNT * (self._evidence.level - 1.0))
+        rotation = mount**2 + self._camera_rotation_rad**2 / 3.0
         a = adjoint(self._T_b_c)
         return np.asarray(a @ np.diag(np.repeat([self._config.extrinsic_m**2, rotation], 3)) @ a.T)
 
@@ -145,6 +148,7 @@ class PoseCovariance:
         )  # fmt: skip
         if self._evidence.add(self._h, self._g, self._of_errors, self._side):
             self._calibration[:CALIBRATION] = self._good_calibration[:CALIBRATION] * self._evidence.level**2
+            self._extrinsic = self._extrinsic_cov()
         inverse = np.linalg.inv(self._h + 1e-6 * np.eye(6))
         a = adjoint(se3.inverse(track.T_c_m))
         noise = max(track.rms, self._config.least_rms) ** 2 * self._config.inflation * inverse
