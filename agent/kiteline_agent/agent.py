@@ -25,7 +25,7 @@ from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
-from kiteline_agent.step import Estimate, Identity, StepInput, StepOutput
+from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
 from kiteline_agent.tracking.image_shift import ImageShift
@@ -89,10 +89,11 @@ class Agent:
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,
         )  # fmt: skip
-        self._skipped_imu: list[ImuBatch] = []  # of frames that the governor skipped
+        self._skipped_imu: list[ImuBatch] = []  # since the last processed frame
         self._frame_number = 0
         self._last_t_ns: int | None = None  # of the last processed frame
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
+        self._last_estimate: Estimate | None = None
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
 
@@ -102,7 +103,7 @@ class Agent:
         self.work.steps = 1
         events = self._take_corrections(self._channel.receive(step_input.packets, now_ns))
         self._camera.motion.add_odometry(step_input.odometry)
-        estimate = None
+        estimate = predicted = None
         if step_input.frame is not None:
             tracked, more = self._govern(step_input.frame.t_ns, step_input)
             events += more
@@ -111,7 +112,36 @@ class Agent:
                 self.work.inertial_samples = 0 if imu is None else len(imu.t_ns)
                 estimate, more = self._process(step_input.frame, imu)
                 events += more
-        return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events))
+            else:
+                predicted = self.predict(step_input.frame.t_ns)
+        else:
+            if step_input.imu is not None:
+                self._skipped_imu.append(step_input.imu)
+            if step_input.predict_ns is not None:
+                predicted = self.predict(step_input.predict_ns)
+        return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
+
+    def predict(self, t_ns: int) -> PredictedPose | None:
+        """Predict the pose at t_ns by the samples since the last processed frame. Changes no state.
+
+        None before there is a map, at or before the last frame, and when that is too long ago.
+        """
+        last, camera, config = self._last_estimate, self._camera, self._full_config
+        dt_s = 0.0 if last is None else (t_ns - last.t_ns) * 1e-9
+        if last is None or last.initialising or not 0.0 < dt_s <= config.prediction.max_s:
+            return None
+        moved = camera.motion.extrapolate(t_ns, joined(self._skipped_imu), dt_s)
+        R_o_m, growth = camera.pose.T_o_m[:3, :3], moved.growth
+        if growth is None:
+            growth = camera.covariance.unmeasured_growth(dt_s, moves=camera.pose.moves)
+        turn = np.eye(6)
+        turn[:3, :3] = R_o_m
+        cov_o = last.cov_o + turn @ growth @ turn.T
+        quality = min(last.quality, self.odometry_quality(last), camera.covariance.quality(cov_o, None))
+        return PredictedPose(
+            t_ns, moved.source.value, last.tracked, camera.pose.T_o_m @ moved.T_m_b, R_o_m @ moved.velocity, moved.rate,
+            quality, cov_o, camera.gravity.R_l_o,
+        )  # fmt: skip
 
     def _process(self, frame: Frame, imu: ImuBatch | None) -> tuple[Estimate, list[str]]:
         """The algorithm of one frame. Returns the estimate and events."""
@@ -162,7 +192,8 @@ class Agent:
             self._image_shift.remember(images.sampled, camera.pose.T_c_m)
         self._last_t_ns = frame.t_ns
         self._last_track = None if self._was_lost else track
-        return self._estimate(ctx, outcome), outcome.events
+        self._last_estimate = self._estimate(ctx, outcome)
+        return self._last_estimate, outcome.events
 
     # stages of a frame
 

@@ -328,6 +328,14 @@ class SmoothingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PredictionConfig:
+    """Poses of frames that the governor skips, and between frames."""
+
+    rate_hz: float = 30.0  # 1/s: poses to a flight controller, predicted to the time of sending; 0: frames only
+    max_s: float = 1.0  # s after the last processed frame: later no pose is predicted
+
+
+@dataclass(frozen=True, slots=True)
 class GovernorConfig:
     """How CPU time is kept within a budget."""
 
@@ -377,6 +385,7 @@ class AgentConfig:
     odometer: OdometerConfig = field(default_factory=OdometerConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     governor: GovernorConfig = field(default_factory=GovernorConfig)
+    prediction: PredictionConfig = field(default_factory=PredictionConfig)
     depth_from_motion: DepthFromMotionConfig = field(default_factory=DepthFromMotionConfig)
     two_view_start: TwoViewStartConfig = field(default_factory=TwoViewStartConfig)
     inertial_start: InertialStartConfig = field(default_factory=InertialStartConfig)

@@ -25,7 +25,8 @@ class Identity:
 class StepInput:
     """All that enters a step.
 
-    imu, odometry: samples since the last frame. cpu_ns: CPU time of the last frame, measured or modelled outside.
+    imu, odometry: samples since the last step that had some. cpu_ns: CPU time of the last frame, measured or modelled
+    outside. predict_ns: without a frame, the time for which a pose is predicted; None: none.
     """
 
     frame: Frame | None = None
@@ -33,6 +34,7 @@ class StepInput:
     packets: tuple[bytes, ...] = ()
     cpu_ns: int = 0
     odometry: OdometryBatch | None = None
+    predict_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,24 +74,73 @@ class Estimate:
     @property
     def T_l_b(self) -> F64 | None:
         """(4,4) body in the gravity-aligned odometry frame, for a flight controller; None until that is known."""
-        if self.R_l_o is None:
-            return None
-        T = self.T_o_b.copy()
-        T[:3] = self.R_l_o @ T[:3]
-        return T
+        return level_pose(self.T_o_b, self.R_l_o)
 
     @property
     def cov_l(self) -> F64:
         """cov_o with translations in the gravity-aligned frame."""
-        rotation = np.eye(6)
-        rotation[:3, :3] = np.eye(3) if self.R_l_o is None else self.R_l_o
-        return np.asarray(rotation @ self.cov_o @ rotation.T)
+        return level_cov(self.cov_o, self.R_l_o)
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedPose:
+    """Pose of an instant after the last tracked frame: of a skipped frame, or between frames.
+
+    source: what measured the motion since then: imu, odometer, or velocity (nothing: it is that of the last frames).
+    tracked: the last frame was. T_o_b, quality, cov_o, R_l_o: as in Estimate. velocity_o: (3,) m/s of the body's origin
+    in o. rate_b: (3,) rad/s in b.
+    """
+
+    t_ns: int
+    source: str
+    tracked: bool
+    T_o_b: F64
+    velocity_o: F64
+    rate_b: F64
+    quality: int
+    cov_o: F64
+    R_l_o: F64 | None
+
+    @property
+    def T_l_b(self) -> F64 | None:
+        """As in Estimate."""
+        return level_pose(self.T_o_b, self.R_l_o)
+
+    @property
+    def cov_l(self) -> F64:
+        """As in Estimate."""
+        return level_cov(self.cov_o, self.R_l_o)
+
+    @property
+    def velocity_l(self) -> F64:
+        """velocity_o in the gravity-aligned frame."""
+        return self.velocity_o if self.R_l_o is None else np.asarray(self.R_l_o @ self.velocity_o)
+
+
+def level_pose(T_o_b: F64, R_l_o: F64 | None) -> F64 | None:
+    """(4,4) body in the gravity-aligned odometry frame; None until that is known."""
+    if R_l_o is None:
+        return None
+    T = T_o_b.copy()
+    T[:3] = R_l_o @ T[:3]
+    return T
+
+
+def level_cov(cov_o: F64, R_l_o: F64 | None) -> F64:
+    """A covariance (6,6) of a pose in o with translations in the gravity-aligned frame."""
+    rotation = np.eye(6)
+    rotation[:3, :3] = np.eye(3) if R_l_o is None else R_l_o
+    return np.asarray(rotation @ cov_o @ rotation.T)
 
 
 @dataclass(frozen=True, slots=True)
 class StepOutput:
-    """All that leaves a step. events: short texts for the log, in order."""
+    """All that leaves a step. events: short texts for the log, in order.
+
+    predicted: of a skipped frame, whose estimate is None, or at the time that the step asks for.
+    """
 
     estimate: Estimate | None
     packets: tuple[bytes, ...]
     events: tuple[str, ...]
+    predicted: PredictedPose | None = None

@@ -114,7 +114,8 @@ class PoseSample:
     t_ns: capture time, on the clock whose times are handed to the sink. T_o_b: (4,4) body in the continuous odometry
     frame, z up. quality: -1 failed, 0 unknown, 1..100. epoch: incremented only when the odometry frame itself was reset
     (a restart of the agent), never for a map correction. cov: (6,6) of T_o_b, [translation in o in m, rotation about
-    the body's axes in rad]; None if unknown.
+    the body's axes in rad]; None if unknown. velocity: (3,) m/s of the body's origin in o, and rate: (3,) rad/s in b,
+    at t_ns; None: taken from the poses before.
     """
 
     t_ns: int
@@ -123,6 +124,8 @@ class PoseSample:
     quality: int
     epoch: int = 0
     cov: NDArray[np.float64] | None = None
+    velocity: NDArray[np.float64] | None = None
+    rate: NDArray[np.float64] | None = None
 
 
 class PoseSink(Protocol):

@@ -113,8 +113,8 @@ def test_frames_are_tracked_lost_or_dropped() -> None:
     for e in (estimate(), estimate(keyframe=4), replace(estimate(), bridged=True), estimate(tracked=False), None):
         tally.count(e)
     assert tally.as_report() == {
-        "frames": 7, "tracked": 3, "bridged": 1, "lost": 1, "initialising": 0, "dropped": 3, "submaps": 1,
-        "keyframes": 2, "bytes_up": 700, "bytes_down": 0, "bytes_per_keyframe": 350.0,
+        "frames": 7, "tracked": 3, "bridged": 1, "lost": 1, "initialising": 0, "dropped": 3, "predicted": 0,
+        "submaps": 1, "keyframes": 2, "bytes_up": 700, "bytes_down": 0, "bytes_per_keyframe": 350.0,
     }  # fmt: skip
 
 

@@ -70,6 +70,10 @@ def test_the_imu_of_a_flight_controller_reaches_the_agent(recording: Path, tmp_p
         # the body is the controller's, which stands upright: its down is down, although the camera looks 20 degrees off
         R_l_b = last.R_l_o @ last.T_o_b[:3, :3]
         assert R_l_b[:, UP] == pytest.approx([0.0, 0.0, -1.0], abs=0.05)
+        # poses are predicted between the frames, and a replay makes the same ones
+        predicted = [message.json() for message in log.messages(["/predicted"])]
+        assert len(predicted) > 10
+        assert {p["source"] for p in predicted} <= {"imu", "velocity"}
         assert replay_agent(log).difference is None
 
 

@@ -178,20 +178,28 @@ class PoseCovariance:
         sensor_cov: (6,6) of the pose by IMU or odometer, [translation in m, rotation about the body's axes]; None if
         no sensor measures the motion. moves: the velocity was known when images were lost.
         """
-        c = self._config
         before = self._unmeasured_s or 0.0
         self._unmeasured_s = before
         if sensor_cov is not None:
             self._reckoned = sensor_cov
             return
         self._unmeasured_s = before + dt_s
+        self._reckoned = self._reckoned + self.unmeasured_growth(dt_s, moves=moves, before_s=before)
+
+    def unmeasured_growth(self, dt_s: float, *, moves: bool, before_s: float | None = None) -> F64:
+        """Covariance (6,6) that unknown accelerations add in dt_s without measured motion.
+
+        before_s: time without it before that; None: as it is now. moves: as in `dead_reckon`.
+        """
+        c = self._config
+        before = (self._unmeasured_s or 0.0) if before_s is None else before_s
+        after = before + dt_s
         speed = (c.lost_velocity_m_s, c.lost_rate_rad_s) if moves else (c.unknown_velocity_m_s, c.unknown_rate_rad_s)
         (m0, m1), (t0, t1) = (
-            tuple(v * s + 0.5 * a * s * s for s in (before, self._unmeasured_s))
+            tuple(v * s + 0.5 * a * s * s for s in (before, after))
             for v, a in zip(speed, (c.unmeasured_accel_m_s2, c.unmeasured_turn_rad_s2), strict=True)
         )
-        growth = np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3)
-        self._reckoned = self._reckoned + np.diag(growth)
+        return np.diag(np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3))
 
     def dead_reckoning_within(self, m: float, rad: float) -> bool:
         """True if dead reckoning has a standard deviation up to m in any direction and rad about any axis."""

@@ -19,7 +19,7 @@ from kiteline_agent.inertial.fixed_lag import (
 )
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -38,6 +38,20 @@ class Prediction:
     T_m_b: F64
     velocity: F64
     R_b0_b1: F64
+
+
+@dataclass(frozen=True, slots=True)
+class InertialMotion:
+    """The body at an instant after the last frame.
+
+    T_m_b: (4,4). velocity: (3,) m/s in m. rate: (3,) rad/s in b. growth: (6,6) covariance of the motion since that
+    frame, [translation in m, rotation about the body's axes].
+    """
+
+    T_m_b: F64
+    velocity: F64
+    rate: F64
+    growth: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +184,34 @@ class InertialTracker:
         T[:3, 3] += velocity * (t_ns - last_ns) * 1e-9
         T[:3, :3] = T[:3, :3] @ motion.turn
         return Prediction(T, velocity, motion.turn)
+
+    def extrapolate(self, imu: ImuBatch | None, t_ns: int) -> InertialMotion | None:
+        """The body at t_ns, after the last frame, by the samples so far and `imu`. The state stays as it is.
+
+        None without samples, or while the velocity is unknown.
+        """
+        if self._last is None or not self._smoother.running:
+            return None
+        begin_ns, end_ns = self._interval_end_ns, t_ns + self._offset_ns
+        samples = self._buffer.extended(imu).between(begin_ns, end_ns)
+        if samples is None:
+            return None
+        state, gravity = self._smoother.state, self._smoother.gravity
+        samples = self._self_calibration.correct(samples)
+        motion = preintegrate(samples, state.bias, self._calibration, self._config.smoother.imu_inflation)
+        T_m_b, velocity = motion.propagate(state.T_m_b, state.velocity, state.bias, gravity)
+        T_m_b, rate = se3.orthonormalise(T_m_b), samples.gyro[-1] - state.bias[:3]
+        return InertialMotion(T_m_b, velocity, rate, self._growth(state, motion))
+
+    def _growth(self, state: InertialState, motion: Preintegrated) -> F64:
+        """Covariance (6,6) of the motion after a state: errors of velocity, biases and vertical, and noise."""
+        dt, r, cov = motion.dt_s, state.T_m_b[:3, :3], state.cov
+        level = self._config.gravity_m_s2**2 * float(np.trace(cov[15:, 15:]) + np.trace(cov[:3, :3])) * np.eye(3)
+        out = np.zeros((6, 6))
+        out[:3, :3] = dt**2 * cov[6:9, 6:9] + r @ motion.cov[6:9, 6:9] @ r.T
+        out[:3, :3] += (0.5 * dt * dt) ** 2 * (r @ cov[12:15, 12:15] @ r.T + level)
+        out[3:, 3:] = motion.cov[:3, :3] + dt**2 * cov[9:12, 9:12]
+        return out
 
     def update(
         self, t_ns: int, T_m_b_visual: F64, points: VisualPoints, velocity: BodyVelocity | None = None

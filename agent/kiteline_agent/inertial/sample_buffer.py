@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,6 +67,13 @@ class SampleBuffer:
             if self._unmeasured >= _AT_ONCE:
                 self._measure_noise(min(self._unmeasured, len(self._t)))
                 self._unmeasured = 0
+
+    def extended(self, imu: ImuBatch | None) -> SampleBuffer:
+        """A copy with more samples; this buffer stays as it is."""
+        other = copy(self)
+        other._largest = self._largest.copy()
+        other.push(imu)
+        return other
 
     @property
     def newest_t_ns(self) -> int | None:

@@ -8,10 +8,12 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from kiteline_agent.config import OdometerConfig
+from kiteline_agent.covariance.pose_covariance import adjoint
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialStartState, InertialTracker
+from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -85,6 +87,21 @@ class MotionModel:
             return se3.orthonormalise(inertial.T_m_b @ self._T_b_c)
         predicted = self.odometer.predict(self._pose.T_m_c, t_ns)
         return self._pose.predict(dt_s) if predicted is None else predicted
+
+    def extrapolate(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> Extrapolation:
+        """The body dt_s after the last frame, from IMU, else odometer, else constant velocity. No state changes.
+
+        imu: samples since the last frame.
+        """
+        inertial = None if self.tracker is None else self.tracker.extrapolate(imu, t_ns)
+        if inertial is not None:
+            return Extrapolation(inertial.T_m_b, inertial.velocity, inertial.rate, inertial.growth, MotionSource.IMU)
+        T_m_b = self._pose.T_m_c @ self._T_c_b
+        driven = self.odometer.extrapolate(T_m_b, t_ns)
+        if driven is not None:
+            return driven
+        twist = adjoint(self._T_b_c) @ self._pose.twist(dt_s)
+        return along_twist(T_m_b, twist, dt_s, None, MotionSource.VELOCITY)
 
     def fuse(self, track: Track, t_ns: int) -> Track:
         """Fuse the pose from images with IMU and odometer; returns the track with the fused pose."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import BodyVelocity
+from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
@@ -126,6 +127,25 @@ class Odometer:
         self._carried = True
         T_b0_b1 = se3.exp(dt * np.concatenate([self._velocity, self._rate]))
         return se3.orthonormalise(T_m_c @ self._T_c_b @ T_b0_b1 @ self._T_b_c)
+
+    def extrapolate(self, T_m_b: F64, t_ns: int) -> Extrapolation | None:
+        """The body at t_ns, after the last frame at T_m_b (4,4). No state changes; None if it cannot be used."""
+        if not self.has_samples or not self._trusted or not self.metric or self._last is None:
+            return None
+        c, dt = self._config, (t_ns - self._last[0]) * 1e-9
+        mean = self._samples.between(self._last[0], t_ns)
+        if mean is None or dt <= 0.0:
+            return None
+        z, prior = self.scale * mean.velocity, self._velocity_cov + (c.accel_m_s2 * dt) ** 2 * np.eye(3)
+        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
+        update = _blend(self._velocity, prior, z, mean.velocity_cov, slow, c.surprise)
+        slow = (self._rate_noise + c.floor_rad_s**2) * np.eye(3)
+        rate_prior = self._rate_cov + (c.turn_rad_s2 * dt) ** 2 * np.eye(3)
+        rate = _blend(self._rate, rate_prior, mean.rate, mean.rate_cov, slow, np.inf)
+        r, growth = T_m_b[:3, :3], np.zeros((6, 6))
+        growth[:3, :3], growth[3:, 3:] = dt**2 * (r @ update.cov @ r.T), dt**2 * rate.cov
+        twist = np.concatenate([update.value, rate.value])
+        return along_twist(T_m_b, twist, dt, growth, MotionSource.ODOMETER)
 
     def _correct_velocity(self, mean: MeanVelocity, prior: F64, rate_prior: F64) -> bool:
         """Kalman update of the velocity; False if the sample is rejected: a wheel slips or the sensor is dead."""

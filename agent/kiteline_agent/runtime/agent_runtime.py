@@ -155,18 +155,18 @@ class AgentRuntime:
 
     def step(
         self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int,
-        odometry: OdometryBatch | None = None,
+        odometry: OdometryBatch | None = None, predict_ns: int | None = None,
     ) -> list[bytes]:  # fmt: skip
         """One step of the agent, logged and counted. Returns the packets to send."""
         self._account.begin()
-        step_input = StepInput(frame, imu, tuple(packets), self._last_cpu_ns, odometry)
+        step_input = StepInput(frame, imu, tuple(packets), self._last_cpu_ns, odometry, predict_ns)
         self.output = output = self.agent.step(step_input, now_ns)
         if self._record is not None:
             self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
-            self.counts.count(output.estimate)
-            if output.estimate is not None and self._record is not None:
-                self._record.pose(output.estimate)
+            self.counts.count(output.estimate, output.predicted)
+            if self._record is not None:
+                self._record.pose(output)
             if not self._live_clock:
                 ops = cost_ns(self.agent.work)
                 self._core.spend(ops, now_ns)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
+from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
 )
-from kiteline_hw.ports import ControllerLink, FrameSource, LinkError
+from kiteline_agent.step import Estimate, PredictedPose, StepOutput
+from kiteline_hw.ports import ControllerLink, FrameSource, LinkError, PoseSample
 from kiteline_hw.sources.overrides import with_other_imu
 from kiteline_hw.system.clock import MonotonicClock
 
@@ -27,10 +29,15 @@ def controller_link(
     return stack.enter_context(
         connect(
             options.mavlink, source.rig, options.axes, clock, odometry=options.odometry,
-            imu_rate_hz=own.noise.rate_hz if options.imu_of else 0.0,
+            pose_rate_hz=pose_rate_hz(options), imu_rate_hz=own.noise.rate_hz if options.imu_of else 0.0,
             body_is_controller=bool(options.imu_of and own.T_f_c), report=source.report,
         )
     )  # fmt: skip
+
+
+def pose_rate_hz(options: AgentOptions) -> float:
+    """Rate of the poses to a flight controller, predicted to the time of sending; 0: those of the frames."""
+    return agent_config(options.config).prediction.rate_hz
 
 
 def with_controller_imu(options: AgentOptions, source: FrameSource) -> FrameSource:
@@ -49,3 +56,13 @@ def with_controller_imu(options: AgentOptions, source: FrameSource) -> FrameSour
             "that knows its body)"
         )
     return with_other_imu(source, own.noise, own.camera())
+
+
+def pose_sample(agent: Agent, output: StepOutput, t_ns: int, epoch: int) -> PoseSample | None:
+    """The pose of a step for a flight controller, as of t_ns of its clock; None without a gravity-aligned one."""
+    pose: Estimate | PredictedPose | None = output.estimate or output.predicted
+    if pose is None or pose.T_l_b is None:
+        return None
+    if isinstance(pose, PredictedPose):
+        return PoseSample(t_ns, pose.T_l_b, pose.tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)
+    return PoseSample(t_ns, pose.T_l_b, pose.tracked, agent.odometry_quality(pose), epoch, pose.cov_l)

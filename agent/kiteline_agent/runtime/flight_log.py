@@ -12,15 +12,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.step import Estimate, StepInput, StepOutput
+from kiteline_agent.step import Estimate, PredictedPose, StepInput, StepOutput
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
-STEP, IMU, ODOMETER, PACKETS_IN, PACKETS_OUT, ESTIMATE, EVENTS = (
-    "/step", "/imu", "/odometer", "/packets/in", "/packets/out", "/estimate", "/events",
+STEP, IMU, ODOMETER, PACKETS_IN, PACKETS_OUT, ESTIMATE, PREDICTED, EVENTS = (
+    "/step", "/imu", "/odometer", "/packets/in", "/packets/out", "/estimate", "/predicted", "/events",
 )  # fmt: skip
 
 
 _ESTIMATE = tuple(field.name for field in fields(Estimate))
+_PREDICTED = tuple(field.name for field in fields(PredictedPose))
 
 
 class StepLog(Protocol):
@@ -46,6 +47,7 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
             "frame_ns": None if frame is None else frame.t_ns,
             "imu": imu is not None,
             "odometer": step_input.odometry is not None,
+            "predict_ns": step_input.predict_ns,
             "packets_in": len(step_input.packets),
             "packets_out": len(output.packets),
         },
@@ -66,6 +68,8 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
         pose = estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
         if estimate.tracked and pose is not None:
             log.pose("/pose", log_ns, "submap" if estimate.T_w_b is None else "world", pose)
+    if output.predicted is not None:
+        log.json(PREDICTED, log_ns, predicted_to_json(output.predicted))
     if output.events:
         log.json(EVENTS, log_ns, {"events": list(output.events)})
     for packet in output.packets:
@@ -74,11 +78,17 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
 
 def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
     """Every field of an estimate; matrices as their numbers in rows."""
-    out: dict[str, Any] = {}
-    for name in _ESTIMATE:
-        value = getattr(estimate, name)
-        out[name] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
-    return out
+    return _to_json(estimate, _ESTIMATE)
+
+
+def predicted_to_json(predicted: PredictedPose) -> dict[str, Any]:
+    """Every field of a predicted pose; matrices as their numbers in rows."""
+    return _to_json(predicted, _PREDICTED)
+
+
+def _to_json(value: object, names: Sequence[str]) -> dict[str, Any]:
+    found = {name: getattr(value, name) for name in names}
+    return {name: v.ravel().tolist() if isinstance(v, np.ndarray) else v for name, v in found.items()}
 
 
 def estimate_from_json(value: Mapping[str, Any]) -> Estimate:

@@ -11,7 +11,7 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.flight_log import StepLog, write_step
 from kiteline_agent.runtime.frame_counts import live_line, odometry_line
 from kiteline_agent.runtime.options import AgentOptions
-from kiteline_agent.step import Estimate, StepInput, StepOutput
+from kiteline_agent.step import StepInput, StepOutput
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.schema import record_log
 from kiteline_core import config as configuration
@@ -48,10 +48,10 @@ class FlightRecord:
             for key, code in self._channel.take_noted().items():
                 self._log.blob(record_log.TOPIC, log_ns, record_log.write_record(self._agent, key, code))
 
-    def pose(self, estimate: Estimate) -> None:
+    def pose(self, output: StepOutput) -> None:
         """Write the poses of a frame."""
-        self._live.write(live_line(estimate))
-        self._odometry.write(odometry_line(estimate))
+        self._live.write(live_line(output.estimate))
+        self._odometry.write(odometry_line(output.estimate or output.predicted))
 
 
 def metadata(options: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:

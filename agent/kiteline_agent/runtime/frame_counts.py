@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from numpy import float64
 from numpy.typing import NDArray
 
-from kiteline_agent.step import Estimate
+from kiteline_agent.step import Estimate, PredictedPose
 from kiteline_core.geometry import tum
 from kiteline_core.ids import KeyframeId, SubmapId
 
@@ -16,13 +16,17 @@ F64 = NDArray[float64]
 
 @dataclass(slots=True)
 class FrameCounts:
-    """frames = tracked + lost + dropped. bridged: tracked, by dead reckoning. initialising: lost, before the map."""
+    """frames = tracked + lost + dropped.
+
+    bridged: tracked, by dead reckoning. initialising: lost, before the map. predicted: dropped, with a predicted pose.
+    """
 
     tracked: int = 0
     bridged: int = 0
     lost: int = 0
     initialising: int = 0
     dropped: int = 0
+    predicted: int = 0
     bytes_up: int = 0
     bytes_down: int = 0
     keyframes: set[KeyframeId] = field(default_factory=set)
@@ -33,10 +37,11 @@ class FrameCounts:
         """Number of frames that the source gave."""
         return self.tracked + self.lost + self.dropped
 
-    def count(self, estimate: Estimate | None) -> None:
+    def count(self, estimate: Estimate | None, predicted: PredictedPose | None = None) -> None:
         """Count one frame that was given to the agent. estimate: None if the governor skipped it."""
         if estimate is None:
             self.dropped += 1
+            self.predicted += predicted is not None
         elif live_pose(estimate) is None:
             self.lost += 1
             self.initialising += estimate.initialising
@@ -57,6 +62,7 @@ class FrameCounts:
             "lost": self.lost,
             "initialising": self.initialising,
             "dropped": self.dropped,
+            "predicted": self.predicted,
             "submaps": len(self.submaps),
             "keyframes": keyframes,
             "bytes_up": self.bytes_up,
@@ -72,12 +78,14 @@ def live_pose(estimate: Estimate) -> F64 | None:
     return estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
 
 
-def live_line(estimate: Estimate) -> str:
-    """The frame's line in live.tum; empty if it has no pose."""
-    pose = live_pose(estimate)
-    return "" if pose is None else tum.line(estimate.t_ns, pose)
+def live_line(estimate: Estimate | None) -> str:
+    """The frame's line in live.tum; empty if it was skipped or has no pose."""
+    pose = None if estimate is None else live_pose(estimate)
+    return "" if estimate is None or pose is None else tum.line(estimate.t_ns, pose)
 
 
-def odometry_line(estimate: Estimate) -> str:
+def odometry_line(pose: Estimate | PredictedPose | None) -> str:
     """The frame's line in odometry.tum; empty before there is a map."""
-    return "" if estimate.initialising else tum.line(estimate.t_ns, estimate.T_o_b)
+    if pose is None or (isinstance(pose, Estimate) and pose.initialising):
+        return ""
+    return tum.line(pose.t_ns, pose.T_o_b)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch, joined
 
@@ -41,6 +43,15 @@ class FrameReader:
         self._advance()
         return frame, imu, odometry_batch
 
+    def take_imu(self, until_ns: int) -> ImuBatch | None:
+        """IMU samples up to a time before the next frame, since those taken before; None if there are none."""
+        pending = joined(self._imu)
+        if pending is None:
+            return None
+        n = int(np.searchsorted(pending.t_ns, until_ns, "right"))
+        self._imu = [_samples(pending, slice(n, None))] if n < len(pending.t_ns) else []
+        return _samples(pending, slice(n)) if n else None
+
     def drop(self) -> None:
         """Drop the next frame; its samples come with the one after."""
         self._advance()
@@ -63,3 +74,7 @@ class FrameReader:
         if self._frame is not None:
             self.decode_ms.append(spent_ns / 1e6)
             self.period_ns = 0 if last is None else self._frame.t_ns - last.t_ns
+
+
+def _samples(batch: ImuBatch, some: slice) -> ImuBatch:
+    return ImuBatch(batch.t_ns[some], batch.gyro[some], batch.accel[some])

@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
-from kiteline_agent.runtime.controller import controller_link, with_controller_imu
+from kiteline_agent.runtime.controller import controller_link, pose_rate_hz, pose_sample, with_controller_imu
 from kiteline_agent.runtime.options import (
     AgentOptions,
 )
+from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_codec.channel import settled
 from kiteline_codec.transport.framing import StreamFramer
@@ -19,7 +20,7 @@ from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
-from kiteline_hw.ports import ByteLink, LinkError, PoseSample
+from kiteline_hw.ports import ByteLink, LinkError
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
@@ -56,13 +57,15 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         runtime.begin_at(begin_ns)
         if controller is not None:
             controller.take_imu(begin_ns)  # drop what was measured before the flight
+        schedule = PoseSchedule(0.0 if controller is None else pose_rate_hz(options), begin_ns)
         shift_ns = runtime.options.start_ns - begin_ns
         while not stop and runtime.next_ns is not None:
-            wait_s = (begin_ns + runtime.next_ns - clock.now_ns()) / 1e9
+            due_ns = min(begin_ns + runtime.next_ns, schedule.next_ns or begin_ns + runtime.next_ns)
+            wait_s = (due_ns - clock.now_ns()) / 1e9
             if wait_s > 0.0 and stop.wait(min(wait_s, _IDLE_TICK_S)):
                 break
-            now_ns = clock.now_ns()
-            frame = imu = odometry = None
+            now_ns = captured_ns = clock.now_ns()
+            frame = imu = odometry = predict_ns = None
             if now_ns >= begin_ns + runtime.next_ns:
                 if not runtime.drop_stale(now_ns - begin_ns):
                     break
@@ -73,14 +76,17 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                 # IMU samples that arrive late come with the next frame.
                 samples = None if controller is None else controller.take_imu(captured_ns)
                 imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
-            for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry):
+            elif controller is not None and schedule.take_due(now_ns):
+                predict_ns = now_ns + shift_ns
+                samples = controller.take_imu(now_ns) if options.imu_of else None
+                imu = runtime.reader.take_imu(predict_ns)
+                imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
+            for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns):
                 link.send(packet)
-            e = runtime.output.estimate if runtime.output is not None else None
-            if controller is not None and e is not None and e.T_l_b is not None:
-                quality = runtime.agent.odometry_quality(e)
-                controller.push(
-                    PoseSample(captured_ns, e.T_l_b, e.tracked, quality, options.boot, e.cov_l), clock.now_ns()
-                )
+            if controller is not None and runtime.output is not None and schedule.on == (frame is None):
+                pose = pose_sample(runtime.agent, runtime.output, captured_ns, options.boot)
+                if pose is not None:
+                    controller.push(pose, clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is None:
                 process.print_lines(

@@ -39,6 +39,10 @@ class PoseState:
             step = se3.exp(dt_s / self._step_s * se3.log(step))
         return se3.orthonormalise(self.T_m_c @ step)
 
+    def twist(self, dt_s: float) -> F64:
+        """Twist (6,) [m/s, rad/s] of the camera in its own axes, by which it moves in dt_s at constant velocity."""
+        return np.asarray(se3.log(se3.inverse(self.T_m_c) @ self.predict(dt_s)) / dt_s)
+
     def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
         """Set a measured pose (4,4). dt_s: since the last one. repeated: from an old image, no motion is derived."""
         before, self.T_m_c = self.T_m_c, T_m_c

@@ -123,7 +123,7 @@ _INTRODUCTION = """# The CPU governor, measured
 
 Made by `kiteline bench agent/governor`. Each flight is flown without a limit first; then with a share of that load
 as its budget, with the governor and without it (the newest frame wins on a core that is too slow). A frame that is
-skipped has no pose and counts as dropped; errors are those of the frames that have one. The busiest second is the
+skipped counts as dropped; errors are those of the others. The busiest second is the
 largest sum in any one-second window after the third second. How the rows of the ladder were put in order:
 [decisions/governor-ladder.md](decisions/governor-ladder.md). Tables and figures are of one start; in
 `docs/results.md` errors at a half and a quarter of the load are medians over several.

@@ -20,6 +20,7 @@ from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
 from kiteline_hw.mavlink.coordinate_frames import (
     body_rates,
     controller_covariance,
+    controller_rates,
     local_covariance,
     local_pose,
     upper_triangle,
@@ -112,14 +113,13 @@ class ControllerSession:
             return None
         before = self._earlier_pose(pose.t_ns)
         self._past.append(pose)
-        if before is None:
+        if before is None and pose.velocity is None:
             self.counters.without_velocity += 1  # ArduPilot would take NaN velocities into its filter
             return None
         if not self._is_due(now_ns):
             self.counters.rate_limited += 1
             return None
-        dt_s = (pose.t_ns - before.t_ns) * 1e-9
-        velocity, rate = body_rates(before.T_o_b, pose.T_o_b, dt_s, self._T_b_f)
+        velocity, rate = self._rates(before, pose)
         position, q = local_pose(pose.T_o_b, self._T_b_f)
         quality = max(-1, min(100, pose.quality)) if pose.tracked else -1
         pose_cov, velocity_cov = self._covariances(pose, quality)
@@ -134,6 +134,13 @@ class ControllerSession:
             reset_counter=pose.epoch & 0xFF,
             quality=quality,
         )
+
+    def _rates(self, before: PoseSample | None, pose: PoseSample) -> tuple[F64, F64]:
+        """Velocity and angular rate (3,) in f: the pose's own, else between two poses, as of half-way between them."""
+        if pose.velocity is not None and pose.rate is not None:
+            return controller_rates(pose.T_o_b, pose.velocity, pose.rate, self._T_b_f)
+        assert before is not None
+        return body_rates(before.T_o_b, pose.T_o_b, (pose.t_ns - before.t_ns) * 1e-9, self._T_b_f)
 
     def _earlier_pose(self, t_ns: int) -> PoseSample | None:
         """The newest pose old enough to take a velocity from, or None. Drops poses that are too old."""

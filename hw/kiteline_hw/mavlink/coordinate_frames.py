@@ -55,6 +55,16 @@ def body_rates(T_o_b_before: F64, T_o_b_now: F64, dt_s: float, T_b_f: F64) -> tu
     return np.asarray(velocity), np.asarray(rate)
 
 
+def controller_rates(T_o_b: F64, velocity: F64, rate: F64, T_b_f: F64) -> tuple[F64, F64]:
+    """Velocity (3,) m/s of the flight controller's origin and angular rate (3,) rad/s, both in f.
+
+    velocity: (3,) m/s of the body's origin in o. rate: (3,) rad/s in b.
+    """
+    r_f_b = T_b_f[:3, :3].T
+    at_origin = T_o_b[:3, :3].T @ velocity + np.cross(rate, T_b_f[:3, 3])
+    return np.asarray(r_f_b @ at_origin), np.asarray(r_f_b @ rate)
+
+
 def upper_triangle(covariance: F64) -> list[float]:
     """The upper right triangle of a (6,6) matrix by rows: the 21 numbers of a covariance in MAVLink."""
     return [float(v) for v in covariance[np.triu_indices(6)]]

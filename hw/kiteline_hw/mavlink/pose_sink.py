@@ -9,7 +9,7 @@ from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.connection import MavlinkConnection
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
-from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryCounters
+from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryConfig, OdometryCounters
 from kiteline_hw.mavlink.messages import Heartbeat
 from kiteline_hw.ports import Clock, PoseSample
 from kiteline_hw.system.closing import Closing
@@ -26,12 +26,12 @@ class MavlinkPoseSink(Closing):
     """
 
     def __init__(
-        self, url: str, T_b_f: F64, clock: Clock, *, required: bool = True,
+        self, url: str, T_b_f: F64, clock: Clock, *, required: bool = True, config: OdometryConfig | None = None,
         odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None,
     ) -> None:  # fmt: skip
         self._clock = clock
         self._lock = threading.Lock()
-        self._session = ControllerSession(T_b_f, odometry=odometry, imu=imu)
+        self._session = ControllerSession(T_b_f, config, odometry=odometry, imu=imu)
         self.refused = 0  # messages that could not be sent
         self._connection = MavlinkConnection(
             url, "mavlink", self._on_data, self._on_tick, _TICK_S, _MAX_QUEUED, required=required

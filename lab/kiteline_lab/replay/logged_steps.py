@@ -103,4 +103,5 @@ def agent_input(step: Step) -> StepInput:
         frame = read_frame(images, step.head["frame_ns"], bool(step.of(DEPTH)))
     imu = step.one_of(flight_log.IMU).imu() if step.head["imu"] else None
     odometry = step.one_of(flight_log.ODOMETER).odometry() if step.head.get("odometer") else None
-    return StepInput(frame, imu, step.blobs(flight_log.PACKETS_IN), step.head["cpu_ns"], odometry)
+    packets, predict_ns = step.blobs(flight_log.PACKETS_IN), step.head.get("predict_ns")
+    return StepInput(frame, imu, packets, step.head["cpu_ns"], odometry, predict_ns)

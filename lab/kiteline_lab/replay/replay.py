@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -46,6 +47,16 @@ class ReplayResult:
         if self.difference is None:
             self.difference = f"step {step.number} at {step.head['now_ns'] / 1e9:.3f} s: {what}"
 
+    def compare_pose(self, step: Step, topic: str, name: str, made: dict[str, Any] | None) -> None:
+        """Note a difference between a pose, if the step made one, and the logged one."""
+        logged = [m.json() for m in step.of(topic)]
+        if len(logged) != (made is not None):
+            self.note_difference(step, f"{int(made is not None)} {name}s, {len(logged)} in the log")
+        elif made is not None:
+            wrong = [key for key in logged[0].keys() | made.keys() if logged[0].get(key) != made.get(key)]
+            if wrong:
+                self.note_difference(step, f"the {name} has another {', '.join(sorted(wrong))}")
+
     def compare_packets(self, step: Step, topic: str, sent: tuple[bytes, ...]) -> None:
         """Note a difference between packets and the logged ones."""
         logged = step.blobs(topic)
@@ -70,20 +81,15 @@ def replay_agent(
         output = agent.step(given, step.head["now_ns"])
         if watch is not None:
             watch(step, agent)
-        logged = [m.json() for m in step.of(agent_log.ESTIMATE)]
-        made = [] if output.estimate is None else [agent_log.estimate_to_json(output.estimate)]
-        for a, b in zip(logged, made):
-            wrong = [name for name in a.keys() | b.keys() if a.get(name) != b.get(name)]
-            if wrong:
-                out.note_difference(step, f"the estimate has another {', '.join(sorted(wrong))}")
-        if len(logged) != len(made):
-            out.note_difference(step, f"{len(made)} estimates, {len(logged)} in the log")
+        made = None if output.estimate is None else agent_log.estimate_to_json(output.estimate)
+        out.compare_pose(step, agent_log.ESTIMATE, "estimate", made)
+        made = None if output.predicted is None else agent_log.predicted_to_json(output.predicted)
+        out.compare_pose(step, agent_log.PREDICTED, "predicted pose", made)
         out.compare_packets(step, agent_log.PACKETS_OUT, output.packets)
         if given.frame is not None:
-            out.counts.count(output.estimate)
-            if output.estimate is not None:
-                out.live.append(live_line(output.estimate))
-                out.odometry.append(odometry_line(output.estimate))
+            out.counts.count(output.estimate, output.predicted)
+            out.live.append(live_line(output.estimate))
+            out.odometry.append(odometry_line(output.estimate or output.predicted))
         if _finish_step(out, progress, stop_at_first):
             break
     return out

@@ -230,3 +230,18 @@ def test_a_poses_own_covariance_is_sent() -> None:
     want = np.diag([0.09, 0.04]) + 0.01 * np.outer(along, along) + 1e-4 * np.eye(2)
     np.testing.assert_allclose(full[:2, :2], np.triu(want * [[1, -1], [-1, 1]]), atol=1e-6)
     np.testing.assert_allclose(np.diag(full)[2:], [0.0101, 2.5e-5, 2.5e-5, 0.0025 + 2.5e-5], atol=1e-6)
+
+
+def test_a_pose_with_velocity_and_rate_is_sent_at_once_and_as_of_its_time() -> None:
+    stream, T_b_f = ControllerSession(mounting("flu", (0.2, 0.1, 0.0))), mounting("flu", (0.2, 0.1, 0.0))
+    pose = circling(S)
+    velocity, rate = np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, 0.4])
+    message = stream._pose_message(replace(pose, velocity=velocity, rate=rate), S)
+    assert message is not None
+    step_s = 1e-5
+    moved = pose.T_o_b.copy()
+    moved[:3, 3] += step_s * velocity
+    moved[:3, :3] = moved[:3, :3] @ np.array([[1.0, -0.4 * step_s, 0.0], [0.4 * step_s, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    speed = np.linalg.inv(pose.T_o_b @ T_b_f)[:3, :3] @ ((moved - pose.T_o_b) @ T_b_f)[:3, 3] / step_s
+    assert message.velocity_m_s == pytest.approx(speed.tolist(), abs=1e-4)
+    assert message.rate_rad_s == pytest.approx([0.0, 0.0, -0.4])

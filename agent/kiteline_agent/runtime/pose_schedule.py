@@ -1,0 +1,29 @@
+"""When poses go to a flight controller. No clock."""
+
+from __future__ import annotations
+
+
+class PoseSchedule:
+    """Times at a fixed rate. A late one does not delay those after it."""
+
+    def __init__(self, rate_hz: float, begin_ns: int) -> None:
+        """rate_hz: 0: never."""
+        self._period_ns = round(1e9 / rate_hz) if rate_hz > 0.0 else 0
+        self._next_ns = begin_ns
+
+    @property
+    def on(self) -> bool:
+        """True if poses are sent at a rate of their own, else those of the frames are sent."""
+        return self._period_ns > 0
+
+    @property
+    def next_ns(self) -> int | None:
+        """The next time; None: never."""
+        return self._next_ns if self.on else None
+
+    def take_due(self, now_ns: int) -> bool:
+        """True if a pose is due, which then counts as sent."""
+        if not self.on or now_ns < self._next_ns:
+            return False
+        self._next_ns += ((now_ns - self._next_ns) // self._period_ns + 1) * self._period_ns
+        return True
