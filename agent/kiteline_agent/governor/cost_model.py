@@ -25,6 +25,7 @@ class Work:
     observations: int = 0
     bearings: int = 0
     searches: int = 0
+    window_keyframes: int = 0
 
     def clear(self) -> None:
         """Reset all counts for a new step."""
@@ -53,6 +54,7 @@ PRICES_NS: dict[str, float] = {
     "observations": 1_600,  # code
     "bearings": 7_500,  # an epipolar segment searched for a landmark without depth
     "searches": 5_000_000,  # a relocalisation attempt
+    "window_keyframes": 3_500_000,  # a keyframe of a solved window of the inertial start
 }
 
 

@@ -17,7 +17,7 @@ from kiteline_agent.config import InertialBundleConfig
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
-from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState
+from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState, tangent
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
@@ -27,7 +27,7 @@ I64 = NDArray[np.int64]
 _STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, accelerometer bias
 _SHARED = 5  # unknowns of the window: gyro bias, direction of gravity
 _MAX_DAMPING = 1e4
-_PLACE_ITERATIONS = 4  # of landmarks alone, which converge fast
+_PLACE_ITERATIONS = 4  # of landmarks alone
 
 
 @dataclass(slots=True)
@@ -71,8 +71,7 @@ class InertialBundle:
         self._walk = noise * float(np.hypot(calibration.accel_walk, config.accel_walk))
         self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
-        self._origin = np.zeros((self._landmarks, 3))
-        self._axes = np.zeros((self._landmarks, 3, 3))
+        self._origin, self._axes = np.zeros((self._landmarks, 3)), np.zeros((self._landmarks, 3, 3))
         self._motions: list[Preintegrated] = []
         self._info: list[F64] = []
         self._imu_errors = np.zeros((0, 9))
@@ -346,7 +345,7 @@ class InertialBundle:
         n, cost = self._keyframes, 0.0
         errors = self._imu_errors = self._inertial_errors(state)
         infos = self._used_info(inertial=inertial)
-        tilt = self._length * _tangent(state.gravity)
+        tilt = self._length * tangent(state.gravity)
         shared = _STATE * n
         for k, motion in enumerate(self._motions):
             back, dt, o = state.R[k].T, motion.dt_s, _STATE * k
@@ -391,7 +390,7 @@ class InertialBundle:
         R = np.array([r @ se3.so3_exp(phi) for r, phi in zip(state.R, x[:, :3], strict=True)])
         gravity = state.gravity
         if gravity.any():
-            gravity = gravity + self._length * _tangent(gravity) @ step[_STATE * n + 3 :]
+            gravity = gravity + self._length * tangent(gravity) @ step[_STATE * n + 3 :]
             gravity = self._length * gravity / np.linalg.norm(gravity)
         landmark = -(system.inv @ system.bp[..., None])[..., 0] - system.iw @ x[:, :6].ravel()
         return WindowState(
@@ -399,11 +398,3 @@ class InertialBundle:
             state.gyro_bias + step[_STATE * n : _STATE * n + 3], gravity,
             state.m + landmark[:, :2], np.maximum(state.rho + landmark[:, 2], 1e-4),
         )  # fmt: skip
-
-
-def _tangent(direction: F64) -> F64:
-    """(3,2) unit vectors across a direction; zero without one."""
-    length = float(np.linalg.norm(direction))
-    if length == 0.0:
-        return np.zeros((3, 2))
-    return np.asarray(np.linalg.svd(direction[None, :] / length)[2][1:].T)

@@ -200,6 +200,7 @@ class InertialStart:
         return metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
 
     def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
+        self._work.window_keyframes += len(intervals) + 1
         return InertialBundle(
             corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle, self._noise,

@@ -60,3 +60,11 @@ class WindowSolution:
     imu_chi2: float
     depth_m: F64
     depth_sigma: F64
+
+
+def tangent(direction: F64) -> F64:
+    """(3,2) unit vectors across a direction; zero without one."""
+    length = float(np.linalg.norm(direction))
+    if length == 0.0:
+        return np.zeros((3, 2))
+    return np.asarray(np.linalg.svd(direction[None, :] / length)[2][1:].T)
