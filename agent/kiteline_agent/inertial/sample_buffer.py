@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_core.frame import ImuBatch
+from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -58,7 +59,7 @@ class SampleBuffer:
         t = np.concatenate([self._t, imu.t_ns[good]])
         if len(t) == 0:
             return
-        first = int(np.searchsorted(t, t[-1] - self._keep_ns))
+        first = int(t.searchsorted(t[-1] - self._keep_ns))
         self._t, self._values = t[first:], np.concatenate([self._values, values[good]])[first:]
         self._clipped = np.concatenate([self._clipped, np.zeros((new, 2), np.bool_)])[first:]
         if new:
@@ -95,9 +96,9 @@ class SampleBuffer:
         t = self._t
         if len(t) < 2 or to_ns <= from_ns:
             return None
-        lo, hi = int(np.searchsorted(t, from_ns, "right")), int(np.searchsorted(t, to_ns, "left"))
+        lo, hi = int(t.searchsorted(from_ns, "right")), int(t.searchsorted(to_ns, "left"))
         stamps = np.concatenate([[from_ns], t[lo:hi], [to_ns]])
-        steps = np.diff(stamps)
+        steps = stamps[1:] - stamps[:-1]
         if from_ns < t[0] - self._gap_ns or to_ns > t[-1] + self._gap_ns or steps.max() > self._gap_ns:
             return None
         values = np.empty((hi - lo + 2, 6))
@@ -121,7 +122,7 @@ class SampleBuffer:
 
     def _at(self, t_ns: int) -> F64:
         t = self._t
-        k = int(np.searchsorted(t, t_ns))
+        k = int(t.searchsorted(t_ns))
         if k == 0 or k == len(t):
             return np.asarray(self._values[min(k, len(t) - 1)])
         share = (t_ns - int(t[k - 1])) / (int(t[k]) - int(t[k - 1]))
@@ -158,7 +159,7 @@ class SampleBuffer:
         t, values = self._t[-new - 5 :], self._values[-new - 5 :]
         if len(t) < 3:
             return
-        usual = float(np.median(np.diff(t)))
+        usual = median((t[1:] - t[:-1]).astype(np.float64))
         self._step_ns = usual if self._step_ns is None else self._step_ns + 0.1 * (usual - self._step_ns)
         sums = np.empty((2, 2))
         count, pairs = imu_kernels.second_differences(t, values, self._step_ns, _EVEN, _GAP, sums)
