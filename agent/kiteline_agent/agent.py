@@ -14,6 +14,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import FULL, Extra, Governor, governed
+from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
@@ -75,7 +76,8 @@ class Agent:
         self._relocaliser = Relocaliser(
             self.map, self._tracker, config, vocabulary, self.map_cache, self._is_consistent_place, self.work
         )
-        maker = KeyframeMaker(self.map, channel, self.work)
+        self._rows = None if rig.right is None else RowAlignment(self._rectifier, config.rows)
+        maker = KeyframeMaker(self.map, channel, self._rows, self.work)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
@@ -185,6 +187,8 @@ class Agent:
             events += self._submaps.join_older(ctx, track)
             events += self._submaps.restart_in_metres(ctx, track)
             outcome = FrameOutcome(True, False, track.inliers, events)
+        if self._rows is not None:
+            outcome.events.extend(self._rows.take_events())
         self.work.rectified_px += images.rectified_px
         # 9. Report the pose.
         self._was_lost = not outcome.tracked or outcome.bridged

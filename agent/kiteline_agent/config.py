@@ -89,6 +89,21 @@ class StereoConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RowConfig:
+    """Estimation of how far the right image lies off the rows of the left one, from the points of keyframes."""
+
+    on: bool = True
+    min_points: int = 40  # points of a keyframe with a measured offset; five numbers are estimated from them
+    sigma_px: float = 0.5  # px at octave 0; of a measured offset, with what points of a keyframe have in common
+    prior_px: float = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's
+    max_px: float = 3.5  # px of the level; offset beyond which the patch is another one
+    iterations: int = 10  # Gauss-Newton steps; it converges in 4 from 1 px
+    min_ncc: float = 0.9  # correlation of the two patches; lower at occlusions
+    min_px: float = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
+    min_significance: float = 4.0  # standard deviations of a change that is applied
+
+
+@dataclass(frozen=True, slots=True)
 class AlignConfig:
     """Template alignment."""
 
@@ -375,6 +390,7 @@ class AgentConfig:
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
+    rows: RowConfig = field(default_factory=RowConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

@@ -171,6 +171,8 @@ class DisparityConfig:
     retry_growth: float = 1.1  # growth of the map after which an insignificant offset is estimated again
     prior_px: float = 0.1  # px; standard deviation of a constant offset: the accuracy of calibrations
     prior_rad: float = 3e-4  # rad; of the right camera's rotation (times the focal length: px where x or y is 1)
+    tail: float = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
+    determined: float = 0.7  # share of the prior's deviation; a term yields that data alone determine better
     inflation: float = (
         3.0  # factor on the estimated standard deviations: lens distortion biases depths from motion, too
     )

@@ -108,3 +108,30 @@ def test_where_it_begins_does_not_matter_and_no_border_is_as_before() -> None:
         return result.T_c_m.tobytes() + result.points.tobytes() + result.offset.tobytes()
 
     assert key(bundle(problem, EASY)) == key(a)
+
+
+def test_a_prior_yields_to_data_that_determine_a_large_offset() -> None:
+    problem = passage(0.02)
+    assert problem.border is not None
+    normal = bundle(problem, EASY)
+    yields = replace(problem, border=replace(problem.border, tail=2.0, determined=10.0))
+    holds = replace(problem, border=replace(problem.border, tail=2.0, determined=0.0))
+    large = np.abs(TRUE) > 0.1
+    off = np.abs(normal.offset - TRUE)[large].mean()
+    assert np.abs(bundle(yields, EASY).offset - TRUE)[large].mean() < 0.6 * off
+    assert np.array_equal(bundle(holds, EASY).offset, normal.offset)  # the data determine too little
+
+
+def test_the_cost_of_a_yielding_prior_is_minimal() -> None:
+    problem = passage(0.02)
+    assert problem.border is not None
+    ours = bundle(replace(problem, border=replace(problem.border, tail=2.0, determined=10.0)), EASY)
+
+    def cost(offset: F64) -> float:
+        """Of poses and points as found, and another offset."""
+        plain = residuals(problem, ours.T_c_m, ours.points, offset)[: -offset.size]
+        return float(np.sum(plain**2) + 4.0 * np.sum(np.log1p((offset / 0.02) ** 2 / 4.0)))
+
+    assert cost(ours.offset) == pytest.approx(ours.final_cost, rel=1e-6)
+    for step in 1e-3 * np.concatenate([np.eye(4), -np.eye(4)]):
+        assert cost(ours.offset + step.reshape(2, 2)) > ours.final_cost

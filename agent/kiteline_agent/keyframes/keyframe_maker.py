@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.keyframes.new_landmarks import NewPoints, new_points
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -25,8 +26,10 @@ _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant
 class KeyframeMaker:
     """Turns a frame into records for the base and a slot of the local map."""
 
-    def __init__(self, local_map: LocalMap, channel: RecordChannel, work: Work) -> None:
+    def __init__(self, local_map: LocalMap, channel: RecordChannel, rows: RowAlignment | None, work: Work) -> None:
+        """rows: of the right image; None without one."""
         self._map = local_map
+        self._rows = rows
         self._camera = local_map.camera
         self._channel = channel
         self._work = work
@@ -37,13 +40,25 @@ class KeyframeMaker:
 
     def first_points(self, ctx: FrameContext) -> NewPoints | None:
         """New landmarks for a keyframe without a track; None if too few of them have a depth."""
-        points = new_points(ctx.images, np.zeros((0, 2)), self._camera, ctx.config)
+        points = self._points(ctx, np.zeros((0, 2)))
         enough = int(np.count_nonzero(points.disparity > 0.0)) >= ctx.config.local_map.first_points
         return points if enough else None
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
         """New landmarks where a tracked frame has none."""
-        return new_points(ctx.images, self._inliers(track)[1][:, :2], self._camera, ctx.config)
+        return self._points(ctx, self._inliers(track)[1][:, :2])
+
+    def _points(self, ctx: FrameContext, taken: F64) -> NewPoints:
+        """New landmarks away from pixels `taken` (n,2); they also tell how the right image's rows lie."""
+        points = new_points(ctx.images, taken, self._camera, ctx.config)
+        right = ctx.images.right
+        if self._rows is None or right is None:
+            return points
+        raw = np.where(points.disparity > 0.0, points.disparity + self._map.offset_px(points.uv), -1.0)
+        self._rows.add(ctx.images.aligned, right.raw(), points.uv, points.octave, raw)
+        if self._rows.apply() > 0.0:
+            points = new_points(ctx.images, taken, self._camera, ctx.config)
+        return points
 
     def make(
         self, ctx: FrameContext, track: Track | None, points: NewPoints, keyframe: KeyframeId, parent: KeyframeId,

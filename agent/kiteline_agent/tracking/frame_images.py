@@ -44,7 +44,7 @@ class RightImage:
     def coarse(self) -> Pyramid:
         """Pyramid of the rectified image; level 0 is blank if the camera needs rectification."""
         if self._coarse is None:
-            raw = self._raw_pyramid()
+            raw = self.raw()
             self._coarse = raw
             if self._rectifier.remaps:
                 half = self._rectifier.halved(1, raw[1])
@@ -61,12 +61,13 @@ class RightImage:
         offset = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
         disparity[wanted] = np.maximum(disparity[wanted] + offset[wanted], 0.0)
         stereo_kernels.refine_rows(
-            left, left_grid, self._raw_pyramid(), NO_GRID if grid is None else grid, uv, octave, sure,
+            left, left_grid, self.raw(), NO_GRID if grid is None else grid, uv, octave, sure,
             config.iterations, search_px, config.min_ncc, disparity, found,
         )  # fmt: skip
         disparity[wanted] = np.maximum(disparity[wanted] - offset[wanted], 0.0)
 
-    def _raw_pyramid(self) -> Pyramid:
+    def raw(self) -> Pyramid:
+        """Pyramid of the image as it came."""
         if self._raw is None:
             self._raw = build_pyramid(self._image, self._levels)
         return self._raw

@@ -58,7 +58,9 @@ def with_border(
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
     sigma = np.array([config.prior_px, *[config.prior_rad * focal] * (TERMS - 1)])
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
-    border = Border(group, at_keypoints(sparse_map, slots), start, sigma / config.inflation)
+    border = Border(
+        group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined
+    )
     return replace(problem, measured=measured, border=border), agents
 
 

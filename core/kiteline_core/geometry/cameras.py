@@ -104,6 +104,7 @@ class Rectifier:
         self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and camera matrix for its maps
         self._depth_map: NDArray[np.int16] | None = None
         self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self._told_right_grid: NDArray[np.float32] | None = None  # that of the calibration, once rows were set
         self.blank = np.zeros((left.height, left.width), np.uint8)
         self.left_grid: NDArray[np.float32] | None = None  # see _grid; None if the image needs no rectification
         self.right_grid: NDArray[np.float32] | None = None
@@ -152,6 +153,31 @@ class Rectifier:
     def remaps(self) -> bool:
         """True if images must be remapped."""
         return self._maps[0] is not None
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """Rows and columns of a grid of raw pixels."""
+        return (self._size[1] + GRID_STEP - 1) // GRID_STEP + 1, (self._size[0] + GRID_STEP - 1) // GRID_STEP + 1
+
+    def set_right_rows(self, offset_px: F64) -> None:
+        """Read the right image so much lower (`grid_shape`) than its calibration says, where points are read singly.
+
+        Level 1 of its pyramid follows if images are remapped at all; a whole right image does not.
+        """
+        if self._told_right_grid is None:
+            rows, columns = self.grid_shape
+            x, y = np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows))
+            plain = np.stack([x, y], -1).astype(np.float32)
+            self._told_right_grid = plain if self.right_grid is None else self.right_grid
+        told = self._told_right_grid.astype(np.float64)
+        lower = np.gradient(told, float(GRID_STEP), axis=0) * offset_px[:, :, None]
+        self.right_grid = np.ascontiguousarray(told + lower, np.float32)
+        if self.remaps:
+            height, width = (self._size[1] + 1) // 2, (self._size[0] + 1) // 2
+            x, y = np.meshgrid(np.arange(width) * (2.0 / GRID_STEP), np.arange(height) * (2.0 / GRID_STEP))
+            raw = cv2.remap(self.right_grid, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+            fixed = cv2.convertMaps(0.5 * raw[:, :, 0], 0.5 * raw[:, :, 1], cv2.CV_16SC2)
+            self._halves[1] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
 
     def rectify(self, side: int, image: U8) -> U8:
         """Rectify an image (h, w) of a side (0 left, 1 right). Raises CalibrationError for a wrong size."""

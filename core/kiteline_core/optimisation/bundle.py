@@ -43,13 +43,17 @@ class Border:
     """Disparity offsets that are estimated with the poses and points.
 
     group: (m,) int32 group of each observation, -1 for no offset. terms: (m,t): the offset to subtract from the
-    disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) px, standard deviation of c about 0.
+    disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) px, standard deviation of c about 0. tail: standard
+    deviations beyond which the prior flattens (a t distribution), so that it yields to data that show a large offset;
+    only for terms whose standard deviation by the data alone is below this share `determined` of sigma.
     """
 
     group: I32
     terms: F64
     start: F64
     sigma: F64
+    tail: float = np.inf
+    determined: float = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +104,7 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     solver = _Solver(problem, config) if problem.border is None else _BorderSolver(problem, problem.border, config)
     squared = solver.squared_residuals()
     active = (squared < kernels.BEHIND).astype(np.uint8)
+    solver.let_priors_yield(active)
     cost = initial = solver.robust_cost(active)
     has_disparity = problem.measured[:, 2] >= 0
     limit = np.where(has_disparity, config.chi2_stereo, config.chi2_mono)
@@ -196,6 +201,9 @@ class _Solver:
         """Offsets (g,t) and their covariance; empty without a border."""
         return np.empty((0, 0)), np.empty((0, 0))
 
+    def let_priors_yield(self, active: U8) -> None:
+        """Nothing without a border."""
+
     def _linearise(self, active: U8) -> float:
         return float(
             kernels.linearise(
@@ -250,7 +258,8 @@ class _BorderSolver(_Solver):
         b, f = border.start.size, self._n_free
         self._raw, self._border = problem.measured, border
         self._c = self._new_c = border.start.astype(np.float64, copy=True)
-        self._prior_weight = 1.0 / np.square(np.tile(border.sigma, len(border.start)))
+        self._sigma = np.tile(border.sigma, len(border.start))
+        self._yields = np.zeros(b, np.bool_)  # terms whose prior flattens
         self._blocks = (np.empty((b, b)), np.empty(b), np.empty((b, 6 * f)), np.empty((len(problem.camera), 3)))
         self._points_rhs = np.empty_like(self.points)
         self._measured = problem.measured.copy()
@@ -266,11 +275,28 @@ class _BorderSolver(_Solver):
         inverse = np.linalg.inv(factor)
         return self._c, inverse @ inverse.T
 
+    def let_priors_yield(self, active: U8) -> None:
+        """Let the priors of terms flatten that the data determine, each beside all other unknowns."""
+        if np.isinf(self._border.tail):
+            return
+        variance = np.diag(self.border_estimate(active)[1])
+        if not np.isfinite(variance).all():
+            return
+        by_data = 1.0 / np.maximum(1.0 / variance - 1.0 / np.square(self._sigma), 1e-12)
+        self._yields = by_data < np.square(self._border.determined * self._sigma)
+
     def _correct(self, c: F64) -> None:
         border_kernels.correct(self._raw, self._border.group, self._border.terms, c, self._measured)
 
     def _prior(self, c: F64) -> float:
-        return float(np.sum(self._prior_weight * np.square(c.ravel())))
+        squared = np.square(c.ravel() / self._sigma)
+        tail = self._border.tail if self._yields.any() else 1.0
+        return float(np.sum(np.where(self._yields, tail**2 * np.log1p(squared / tail**2), squared)))
+
+    def _prior_weights(self) -> F64:
+        """Weight (b,) of the present offsets' squares that has the slope of the prior's cost."""
+        ratio = np.where(self._yields, self._c.ravel() / (self._sigma * self._border.tail), 0.0)
+        return np.asarray(1.0 / np.square(self._sigma) / (1.0 + np.square(ratio)))
 
     def _linearise(self, active: U8) -> float:
         cost = super()._linearise(active)
@@ -278,8 +304,9 @@ class _BorderSolver(_Solver):
             self.cameras, self._lens, self.points, self._starts, self._camera, self._measured, self._weight, active,
             self._bound, self._free, self._border.group, self._border.terms, *self._blocks,
         )  # fmt: skip
-        self._blocks[0][np.diag_indices(len(self._prior_weight))] += self._prior_weight
-        self._blocks[1][:] -= self._prior_weight * self._c.ravel()
+        weights = self._prior_weights()
+        self._blocks[0][np.diag_indices(len(weights))] += weights
+        self._blocks[1][:] -= weights * self._c.ravel()
         return cost + self._prior(self._c)
 
     def _solve(self, active: U8, damping: float) -> bool:

@@ -1,0 +1,95 @@
+"""Finds how far the right image lies off the rows of the left one, and reads it there from then on.
+
+A right camera that was turned by 0.06 degrees, or a lens whose centre moved, shifts rows by one or two pixels. A
+row-wise disparity is then off by the shift times the slope of the texture, which depends on the place in the image: it
+passes for a curved disparity offset. Offsets of rows need no depth and no motion: one keyframe shows them to a tenth of
+a pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import RowConfig
+from kiteline_agent.imaging import row_kernels
+from kiteline_core.geometry.cameras import GRID_STEP, Rectifier
+
+F64 = NDArray[np.float64]
+
+TERMS = 5
+_ROUNDS = 4  # of robust weighting
+
+
+def terms(xy: F64) -> F64:
+    """1, x, y, x y, y^2 (n,5) of normalised image coordinates (n,2): pitch, roll, focal length and yaw of the right
+    camera, and pitch again, to second order.
+    """
+    x, y = xy[:, 0], xy[:, 1]
+    return np.stack([np.ones(len(xy)), x, y, x * y, y * y], 1)
+
+
+class RowAlignment:
+    """Sums of row offsets over keyframes, and the offset that is applied."""
+
+    def __init__(self, rectifier: Rectifier, config: RowConfig) -> None:
+        self._rectifier = rectifier
+        self._config = config
+        self._information = np.diag(np.full(TERMS, config.prior_px**-2.0))
+        self._vector = np.zeros(TERMS)
+        self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
+        self._events: list[str] = []
+        self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
+
+    def add(
+        self, left: tuple[NDArray[np.uint8], ...], right: tuple[NDArray[np.uint8], ...], uv: F64,
+        octave: NDArray[np.uint8], disparity: F64,
+    ) -> None:  # fmt: skip
+        """Measure rows at points (n,) of a keyframe. left: rectified pyramid; right: raw. disparity: as measured."""
+        config, grid = self._config, self._rectifier.right_grid
+        if not config.on:
+            return
+        offset, found = np.zeros(len(uv)), np.zeros(len(uv), np.bool_)
+        row_kernels.measure_rows(
+            left, right, np.zeros((0, 0, 2), np.float32) if grid is None else grid, uv, octave, disparity,
+            config.iterations, config.max_px, config.min_ncc, offset, found,
+        )  # fmt: skip
+        if np.count_nonzero(found) < config.min_points:
+            return
+        at = terms(self._normalised(uv[found] - np.stack([disparity[found], np.zeros(np.count_nonzero(found))], 1)))
+        total = offset[found] + at @ self.applied_px
+        sigma = config.sigma_px * (1 << octave[found]).astype(np.float64)
+        weight: F64 = np.ones(len(total), np.float64)
+        for _ in range(_ROUNDS):
+            scaled = at * (weight / sigma**2)[:, None]
+            information, vector = self._information + scaled.T @ at, self._vector + scaled.T @ total
+            residual = np.abs(total - at @ np.linalg.solve(information, vector)) / sigma
+            weight = 1.0 / np.maximum(residual, 1.0) ** 2  # a point on an occluding edge counts little
+        self._information, self._vector, self._at = information, vector, at
+
+    def apply(self) -> float:
+        """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0."""
+        estimate = np.linalg.solve(self._information, self._vector)
+        change = estimate - self.applied_px
+        config = self._config
+        at = self._at
+        rms = float(np.sqrt(np.mean((at @ change) ** 2)))
+        sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
+        if rms < config.min_px or rms < config.min_significance * sigma:
+            return 0.0
+        self.applied_px = np.asarray(estimate, np.float64)
+        rows, columns = self._rectifier.grid_shape
+        pixels = np.stack(np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows)), -1)
+        offset = terms(self._normalised(pixels.reshape(-1, 2).astype(np.float64))) @ estimate
+        self._rectifier.set_right_rows(offset.reshape(rows, columns))
+        self._events.append(f"rows of the right image are {estimate[0]:+.2f} px off in the middle")
+        return rms
+
+    def take_events(self) -> list[str]:
+        """Changes since the last call, for the log."""
+        events, self._events = self._events, []
+        return events
+
+    def _normalised(self, uv: F64) -> F64:
+        camera = self._rectifier.camera
+        return np.asarray((uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy])

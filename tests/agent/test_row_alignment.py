@@ -1,0 +1,146 @@
+"""Rows of the right image: offsets are measured in two dimensions, and a worn right camera is read where it looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.config import RowConfig
+from kiteline_agent.imaging import row_kernels
+from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.imaging.row_alignment import RowAlignment, terms
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
+
+U8 = NDArray[np.uint8]
+NO_GRID = np.zeros((0, 0, 2), np.float32)
+WIDTH, HEIGHT, FOCAL, DEPTH_M = 640, 400, 420.0, 3.0
+TURNED = np.array([2.5e-3, -1e-3, 1.5e-3])  # rad: pitch, yaw and roll of the right camera
+UV = np.array([[float(x), float(y)] for y in range(40, 370, 18) for x in range(90, 600, 22)])
+
+
+def wall(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> U8:
+    """Texture of a wall at points in m, with edges in all directions; without repetition."""
+    rng = np.random.default_rng(3)
+    waves = rng.normal(0.0, 14.0, (60, 2))
+    phase = rng.uniform(0.0, 2 * np.pi, 60)
+    value = sum(np.sin(a * x_m + b * y_m + p) for (a, b), p in zip(waves, phase, strict=True))
+    return np.clip(128 + 12 * np.asarray(value), 0, 255).astype(np.uint8)
+
+
+def image(camera: CameraModel, T_c_w: NDArray[np.float64]) -> U8:
+    """A camera's image of the wall, which lies in z = DEPTH_M of w."""
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
+    pixels = np.stack([u.ravel(), v.ravel()], 1)[:, None]
+    xy = cv2.undistortPoints(pixels, camera.matrix(), np.array(camera.distortion or (0.0,) * 4))[:, 0]
+    T_w_c = se3.inverse(T_c_w)
+    rays = np.column_stack([xy, np.ones(len(xy))]) @ T_w_c[:3, :3].T
+    at = T_w_c[:3, 3] + rays * ((DEPTH_M - T_w_c[2, 3]) / rays[:, 2])[:, None]
+    return wall(at[:, 0], at[:, 1]).reshape(HEIGHT, WIDTH)
+
+
+def flight(lens: Lens, turned: NDArray[np.float64]) -> tuple[Rectifier, U8, U8]:
+    """The rectifier of a told calibration, and a pair by a rig whose right camera is turned against it."""
+    distortion = () if lens is Lens.NONE else (-0.25, 0.06, 0.0, 0.0)
+    camera = CameraModel(WIDTH, HEIGHT, FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1), lens, distortion)
+    T_c_r = se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))
+    true = T_c_r @ se3.from_rt(se3.so3_exp(turned), np.zeros(3))
+    rig = CameraRig(camera, camera, np.eye(4), T_c_r)
+    return Rectifier(rig), image(camera, np.eye(4)), image(camera, se3.inverse(true))
+
+
+def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Row offsets of UV."""
+    pyramid = build_pyramid(rectifier.left(left), 3)
+    grid = NO_GRID if rectifier.right_grid is None else rectifier.right_grid
+    disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    offset, found = np.zeros(len(UV)), np.zeros(len(UV), np.bool_)
+    row_kernels.measure_rows(
+        pyramid, build_pyramid(right, 3), grid, UV, np.zeros(len(UV), np.uint8), disparity, 10, 3.5, 0.9, offset, found
+    )
+    return offset, found
+
+
+def expected(rectifier: Rectifier, uv: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows in the image of a turned right camera less those of a true one."""
+    camera = rectifier.camera
+    right = uv - [camera.bf / DEPTH_M, 0.0]
+    rays = np.column_stack([(right - [camera.cx, camera.cy]) / camera.fx, np.ones(len(uv))]) @ se3.so3_exp(turned)
+    return np.asarray(rays[:, 1] / rays[:, 2] * camera.fy + camera.cy - right[:, 1])
+
+
+@pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
+def test_offsets_of_rows_are_measured(lens: Lens) -> None:
+    rectifier, left, right = flight(lens, TURNED)
+    offset, found = measured(rectifier, left, right)
+    assert found.mean() > 0.7
+    error = offset - expected(rectifier, UV, TURNED)
+    assert abs(np.median(error[found])) < 0.05
+    assert np.percentile(np.abs(error[found]), 90) < 0.2
+
+
+@pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
+def test_a_turned_right_camera_is_read_at_its_rows(lens: Lens) -> None:
+    rectifier, left, right = flight(lens, TURNED)
+    before, found_before = measured(rectifier, left, right)
+    rows = RowAlignment(rectifier, RowConfig())
+    disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    rows.add(
+        build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3), UV, np.zeros(len(UV), np.uint8), disparity
+    )
+    assert rows.apply() > 0.5
+    assert len(rows.take_events()) == 1
+    assert rows.take_events() == []
+    after, found = measured(rectifier, left, right)
+    assert np.sqrt(np.mean(before[found_before] ** 2)) > 0.8
+    assert np.sqrt(np.median(after[found] ** 2)) < 0.1
+    assert rows.apply() == 0.0  # nothing new
+
+
+@pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
+def test_a_true_rig_is_left_alone(lens: Lens) -> None:
+    rectifier, left, right = flight(lens, np.zeros(3))
+    grid = rectifier.right_grid
+    rows = RowAlignment(rectifier, RowConfig())
+    disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
+    rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
+    assert rows.apply() == 0.0
+    assert rectifier.right_grid is grid
+
+
+def test_offsets_of_few_points_or_without_texture_count_for_nothing() -> None:
+    rectifier, left, right = flight(Lens.NONE, TURNED)
+    rows = RowAlignment(rectifier, RowConfig())
+    few = UV[:20]
+    disparity = np.full(len(few), rectifier.camera.bf / DEPTH_M)
+    octave = np.zeros(len(UV), np.uint8)
+    rows.add(build_pyramid(left, 3), build_pyramid(right, 3), few, octave[:20], disparity)
+    grey = build_pyramid(np.full_like(left, 90), 3)
+    rows.add(grey, grey, UV, octave, np.full(len(UV), 10.0))
+    assert rows.apply() == 0.0
+    off = RowAlignment(rectifier, replace(RowConfig(), on=False))
+    off.add(build_pyramid(left, 3), build_pyramid(right, 3), UV, octave, np.full(len(UV), 15.0))
+    assert off.apply() == 0.0
+
+
+def test_the_right_half_image_follows() -> None:
+    rectifier, _, right = flight(Lens.RADTAN, TURNED)
+    before = rectifier.half(1, right).astype(np.float64)
+    rectifier.set_right_rows(np.full(rectifier.grid_shape, 4.0))  # two rows of level 1
+    after = rectifier.half(1, right).astype(np.float64)
+    inside = np.s_[30:150, 30:280]
+    lower = np.roll(before, -2, axis=0)
+    assert np.mean(np.abs(after[inside] - lower[inside])) < 0.2 * np.mean(np.abs(after[inside] - before[inside]))
+
+
+def test_terms_describe_small_rotations() -> None:
+    rectifier, _, _ = flight(Lens.NONE, TURNED)
+    at = terms((UV - [0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1)]) / FOCAL)
+    rows = expected(rectifier, UV + [rectifier.camera.bf / DEPTH_M, 0.0], TURNED)
+    left = rows - at @ np.linalg.lstsq(at, rows, rcond=None)[0]
+    assert np.abs(left).max() < 0.01
