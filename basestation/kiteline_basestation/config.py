@@ -54,6 +54,7 @@ class OdometryFactorConfig:
     )
     run: int = 20  # keyframes; consecutive rotations whose common error is estimated together
     sigma_px: float = 0.15  # px; of each of 12 synthetic points if the keyframe has no observations
+    scale_sigma_px: float = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
 
 
 @dataclass(frozen=True, slots=True)

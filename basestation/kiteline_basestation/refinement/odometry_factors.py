@@ -4,7 +4,8 @@ The agent tracked all frames in between, with an IMU if it has one, and with ten
 carries. A relative pose is added as synthetic points that both keyframes observe exactly where that pose puts them. For
 a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the
 agent measures best (0.1 to 0.2 mrad an axis between keyframes). A disparity offset biases the agent's translations and,
-all in one direction, its rotations: the weight decreases where rotations differ.
+all in one direction, its rotations: the weight decreases where rotations differ. Images of a monocular submap in metres
+tell no scale: there weak points nearby hold the agent's, which rests on its IMU.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_core.geometry import se3
-from kiteline_core.ids import KeyframeId, agent_of_keyframe
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 
 F64 = NDArray[np.float64]
@@ -43,23 +44,25 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
         agent = agent_of_keyframe(KeyframeId(int(table.id[row])))
-        has_depth = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
-        if p is None or not has_depth or not (problem.free[k] or problem.free[p]):
+        submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
+        if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
             continue
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
         point_sigma = 1.0 / np.hypot(few / config.sigma_px, 1.0 / rotation_sigma)
-        synthetic = _synthetic_points(
-            sparse_map, problem, k, p, table.T_p_k[row], _DEPTHS if few > 0.0 else _ROTATION_DEPTHS
-        )
-        if synthetic is None:
-            continue
-        in_k, in_p, world = synthetic
-        points.append(world)
-        first, second = (p, k) if p < k else (k, p)
-        for i in range(len(world)):
-            camera += [first, second]
-            measured += [in_p[i], in_k[i]] if p < k else [in_k[i], in_p[i]]
-            sigma += [[point_sigma, point_sigma]] * 2
+        sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
+        if not (sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth):
+            sets.append((_DEPTHS, config.scale_sigma_px))
+        for depths, set_sigma in sets:
+            synthetic = _synthetic_points(sparse_map, problem, k, p, table.T_p_k[row], depths)
+            if synthetic is None:
+                continue
+            in_k, in_p, world = synthetic
+            points.append(world)
+            first, second = (p, k) if p < k else (k, p)
+            for i in range(len(world)):
+                camera += [first, second]
+                measured += [in_p[i], in_k[i]] if p < k else [in_k[i], in_p[i]]
+                sigma += [[set_sigma, set_sigma]] * 2
     if not points:
         return problem
     added = np.concatenate(points)
@@ -112,7 +115,7 @@ def _synthetic_points(
     """Observations (n,3) of synthetic points in keyframes k and p, and their positions (n,3); None if too few fit."""
     own = problem.camera == k
     depth = problem.measured[own, 2]
-    depth = depth[depth > 0]
+    depth = depth[depth > 0]  # px
     typical = problem.lens[k, 4] / float(np.median(depth)) if len(depth) else 3.0
     local = np.concatenate([np.column_stack([_GRID, np.ones(len(_GRID))]) * typical * d for d in depths])
     in_parent = se3.transform(T_p_k, local)
