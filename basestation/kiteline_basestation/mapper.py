@@ -257,7 +257,8 @@ class Mapper:
     def _send_calibrations(self) -> None:
         """Send new disparity offsets to the agents, which track on corrected disparities."""
         for agent, offset in sorted(self.map.disparity_offset_px.items(), key=lambda item: item[0]):
-            if not np.array_equal(self._sent_offsets.get(agent, 0.0), offset):
+            sent = self._sent_offsets.get(agent)
+            if sent is None or not np.array_equal(sent, offset):
                 self._sent_offsets[agent] = offset
                 self._publisher.send(agent, DisparityCalibration(agent, offset))
 

@@ -14,7 +14,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_codec.schema import CameraIntrinsics, NewLandmarks, Observations, Record
+from kiteline_codec.schema import CameraIntrinsics, DisparityCalibration, NewLandmarks, Observations, Record
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 
@@ -70,3 +70,28 @@ def test_disparities_that_are_right_are_left_alone(make_flight: MakeFlight, word
     assert any(job.kind == "full" for job in jobs)
     assert mapper.map.disparity_offset_px == {}
     assert mapper.idle
+
+
+def test_the_next_flight_begins_with_the_offset_unless_the_rig_was_calibrated_again(
+    make_flight: MakeFlight, words: Any
+) -> None:
+    flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    mapper = Mapper(replace(BaseConfig(), disparity=replace(BaseConfig().disparity, inflation=1.0)), words)
+    fly(mapper, flight, CONSTANT)
+    kept = mapper.map.disparity_offset_px[AgentId(0)].copy()
+    assert np.any(kept != 0.0)
+
+    def told(base: Mapper, focal: float) -> list[DisparityCalibration]:
+        """Offsets that are sent when an agent begins with a camera of this focal length."""
+        camera = replace(flight.camera, fx=focal, fy=focal)
+        output = base.step(MapperInput(((flight.agent, (CameraIntrinsics(flight.agent, camera),)),), ()), 10**12)
+        records = [record for _, batch in output.publish for record in batch]
+        return [record for record in records if isinstance(record, DisparityCalibration)]
+
+    after = Mapper(BaseConfig(), words)  # a later base, with the saved state
+    after.map.set_camera(AgentId(0), flight.camera)
+    after.restore_state(mapper.state())
+    assert [r.disparity_px.tolist() for r in told(after, flight.camera.fx)] == [kept.tolist()]
+    assert told(after, flight.camera.fx) == []
+    assert [r.disparity_px.tolist() for r in told(after, flight.camera.fx + 1.0)] == [NONE.tolist()]
+    assert AgentId(0) not in after.map.disparity_calibrated

@@ -25,7 +25,7 @@ from kiteline_basestation.map.map_tables import (
     grow,
 )
 from kiteline_basestation.map.map_view import MapView
-from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry import disparity_offset, se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import (
     KEYPOINT_BITS,
@@ -53,7 +53,14 @@ class SparseMap(MapView):
     # -- values of the agents ------------------------------------------------------------------------------------------
 
     def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
-        """Set the rectified camera of an agent, also for its keyframes so far."""
+        """Set the rectified camera of an agent, also for its keyframes so far.
+
+        Disparity offsets outlive the flight: the agent's next one begins with them. They end with the calibration told.
+        """
+        before = self.cameras.get(agent)
+        if before is not None and _parameters(before) != _parameters(camera) and agent in self.disparity_offset_px:
+            self.disparity_offset_px[agent] = disparity_offset.none()
+            self.disparity_calibrated.discard(agent)
         self.cameras[agent] = camera
         for keyframe, row in self.rows.items():
             if agent_of_keyframe(keyframe) == agent:
