@@ -1,0 +1,96 @@
+"""`kiteline rig`: what was found of a rig, shown and in the forms of other tools."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from kiteline_basestation.mapper import Mapper
+from kiteline_basestation.mapper_state import MapperState, MapState
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.state_texts import texts_of
+from kiteline_basestation.store.store import Store, batch_of
+from kiteline_codec.schema import CameraIntrinsics, messages
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.disparity_offset import terms
+from kiteline_core.ids import AgentId
+from kiteline_lab.tools.rig import RigError, exported, found_rig, main, summary
+
+T_b_c = se3.from_rt(se3.so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.05, 0.01, -0.02]))
+CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 363.0, 254.0, 0.11, True, T_b_c)
+OFFSET = np.array([0.5, -0.35, -0.1, 0.45, 0.6])
+
+
+def known(offset: bool = True) -> Mapper:
+    mapper = Mapper()
+    mapper.map.set_camera(AgentId(0), CAMERA)
+    if offset:
+        mapper.map.disparity_offset_px[AgentId(0)] = OFFSET
+    return mapper
+
+
+def test_the_rig_that_is_found_has_these_disparities() -> None:
+    rig = found_rig(CAMERA, OFFSET)
+    assert rig.right is not None
+    assert rig.T_c_r is not None
+    rng = np.random.default_rng(2)
+    xyz = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)]) * rng.uniform(8.0, 40.0, (200, 1))
+    right = se3.transform(se3.inverse(rig.T_c_r), xyz)
+    u = [m.fx * p[:, 0] / p[:, 2] + m.cx for m, p in ((rig.left, xyz), (rig.right, right))]
+    at = xyz[:, :2] / xyz[:, 2:] - np.column_stack([CAMERA.baseline_m / xyz[:, 2], np.zeros(200)])
+    assert np.allclose(u[0] - u[1] - CAMERA.bf / xyz[:, 2], terms(at) @ OFFSET, atol=0.01)
+
+
+def test_without_an_offset_it_is_the_rectified_pair() -> None:
+    rig = found_rig(CAMERA, np.zeros(5))
+    assert rig.left == rig.right
+    assert rig.T_c_r is not None
+    assert np.array_equal(rig.T_c_r, se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0])))
+
+
+def test_both_forms_hold_the_same_rig() -> None:
+    mapper = known()
+    chain = yaml.safe_load(exported(mapper, None, "kalibr")["camchain-imucam.yaml"])
+    sensors = [yaml.safe_load(text) for _, text in sorted(exported(mapper, 0, "euroc").items())]
+    T_b = [np.array(s["T_BS"]["data"]).reshape(4, 4) for s in sensors]
+    assert np.allclose(T_b[0], T_b_c)
+    rig = found_rig(CAMERA, OFFSET)
+    assert rig.T_c_r is not None
+    assert np.allclose(np.linalg.inv(T_b[0]) @ T_b[1], rig.T_c_r)
+    for k, sensor in enumerate(sensors):
+        assert chain[f"cam{k}"]["intrinsics"] == sensor["intrinsics"]
+        assert np.allclose(np.array(chain[f"cam{k}"]["T_cam_imu"]) @ T_b[k], np.eye(4))
+    assert np.allclose(chain["cam1"]["T_cn_cnm1"], np.linalg.inv(rig.T_c_r))
+    assert np.isclose(
+        cv2.Rodrigues(np.array(chain["cam1"]["T_cn_cnm1"])[:3, :3])[0][1, 0], -OFFSET[3] / 430.0, rtol=0.01
+    )
+
+
+def test_unknown_agents_are_named() -> None:
+    with pytest.raises(RigError, match="no agent 3: expected one of 0"):
+        exported(known(), 3, "euroc")
+    with pytest.raises(RigError, match="0 agents"):
+        exported(Mapper(), None, "euroc")
+
+
+def test_the_command_reads_a_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record = CameraIntrinsics(AgentId(0), CAMERA)
+    state = MapperState(map=MapState(disparity_offset_px={AgentId(0): OFFSET}))
+    store = Store(tmp_path)
+    values = SavedValues({messages.key(record): messages.encode(record)}, {})
+    store.write(batch_of(SavedMap({AgentId(0): values}, texts_of(state)), SavedMap()))
+    store.close()
+    assert main(["show", "--json", str(tmp_path)]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == summary(known())
+    assert np.allclose(shown["0"]["disparity_offset_px"], OFFSET)
+    assert main(["show", str(tmp_path)]) == 0
+    assert "+0.500 -0.350 -0.100 +0.450 +0.600 px" in capsys.readouterr().out
+    assert main(["export", str(tmp_path), "--format", "kalibr", "--out", str(tmp_path / "new")]) == 0
+    assert (tmp_path / "new" / "camchain-imucam.yaml").exists()
