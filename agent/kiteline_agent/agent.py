@@ -31,6 +31,7 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
 from kiteline_agent.tracking.image_shift import ImageShift
 from kiteline_agent.tracking.map_anchor import MapAnchor
+from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
@@ -42,6 +43,8 @@ from kiteline_core.ids import NO_KEYFRAME, SubmapId
 from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
+
+_STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
 
 
 class Agent:
@@ -96,6 +99,7 @@ class Agent:
         self._last_t_ns: int | None = None  # of the last processed frame
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
         self._last_estimate: Estimate | None = None
+        self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
 
@@ -158,7 +162,15 @@ class Agent:
         stuck = has_map and self._stuck_camera.update(frame.left, camera.pose.T_o_m @ T_m_c)
         self._frame_number += 1
         ctx = FrameContext(
-            self._frame_number, frame.t_ns, dt_s, imu, images, T_m_c, self._stuck_camera.repeated, config
+            self._frame_number,
+            frame.t_ns,
+            dt_s,
+            imu,
+            images,
+            T_m_c,
+            self._stuck_camera.repeated,
+            config,
+            self._shutter(frame.t_ns, dt_s),
         )
         # 3. Track the landmarks of the local map.
         track = self._track(ctx) if has_map and not stuck else None
@@ -180,7 +192,7 @@ class Agent:
             if self._inertial_start is not None:
                 self._inertial_start.clear()
             self._depth.update_landmarks(ctx, track)
-            self._depth.search_seeds(images, track)
+            self._depth.search_seeds(ctx, track)
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
             # 8. Join an older submap, or continue a monocular one in metres.
@@ -200,6 +212,19 @@ class Agent:
         return self._last_estimate, outcome.events
 
     # stages of a frame
+
+    def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
+        """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
+        readout_s, rectifier, motion = self._rectifier.readout_s, self._rectifier, self._camera.motion
+        if readout_s == 0.0 or dt_s <= 0.0 or not (motion.measures_motion or self._camera.pose.moves):
+            self._motion_known = False
+            return None
+        twist = motion.camera_twist(t_ns, dt_s)
+        shutter = RollingShutter(rectifier.camera, readout_s, rectifier.camera.height, rectifier.left_grid, twist)
+        if not self._motion_known and shutter.largest_px() < _STILL_PX:
+            self.map.rolled[:] = False  # the vehicle stood still when its motion was unknown
+        self._motion_known = True
+        return shutter
 
     def _track(self, ctx: FrameContext) -> Track | None:
         """Track from the predicted pose, then retry if most landmarks were missed; None if the pose is not credible."""

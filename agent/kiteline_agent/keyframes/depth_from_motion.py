@@ -41,9 +41,9 @@ class DepthFromMotion:
             track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, ctx.config.depth_filter.inflation
         )
 
-    def search_seeds(self, images: FrameImages, track: Track) -> int:
+    def search_seeds(self, ctx: FrameContext, track: Track) -> int:
         """Search seeds in a tracked frame, and update their depths. Returns how many became landmarks."""
-        config = self._config.depth_from_motion
+        config, images = self._config.depth_from_motion, ctx.images
         near = 1.0 / track.depth_m[track.inlier]
         if len(near) < self._config.pose.min_inliers:
             return 0
@@ -63,6 +63,9 @@ class DepthFromMotion:
         start = self._pixels(direction, centre, np.maximum(rho - reach, 1e-6))
         end = self._pixels(direction, centre, np.minimum(rho + reach, ceiling))
         uv, found = self._search(images, rows, warp, start, end)
+        if ctx.shutter is not None:
+            at_frame = ctx.shutter.to_frame(uv, rho / np.maximum(direction[:, 2] + centre[:, 2] * rho, 1e-3))[:, :2]
+            uv = np.where(self._map.rolled[rows // self._map.slot_size, None], uv, at_frame)
         measured, variance, off_line = self._intersect(direction, centre, uv, rows)
         agree = np.square(measured - rho) < config.gate**2 * (variance + sigma**2)
         scale = (1 << self._map.octave[rows]).astype(np.float64)

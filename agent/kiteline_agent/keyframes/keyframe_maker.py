@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
-from kiteline_agent.keyframes.new_landmarks import NewPoints, new_points
+from kiteline_agent.keyframes.new_landmarks import NewPoints, moved_to_frame, new_points
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
@@ -49,7 +49,12 @@ class KeyframeMaker:
         return self._points(ctx, self._inliers(track)[1][:, :2])
 
     def _points(self, ctx: FrameContext, taken: F64) -> NewPoints:
-        """New landmarks away from pixels `taken` (n,2); they also tell how the right image's rows lie."""
+        """New landmarks away from pixels `taken` (n,2), at the frame's stamp."""
+        points = self._points_of_image(ctx, taken)
+        return points if ctx.shutter is None else moved_to_frame(points, self._camera, ctx.shutter)
+
+    def _points_of_image(self, ctx: FrameContext, taken: F64) -> NewPoints:
+        """New landmarks where the image shows them; they also tell how the right image's rows lie."""
         points = new_points(ctx.images, taken, self._camera, ctx.config)
         right = ctx.images.right
         if self._rows is None or right is None:
@@ -90,7 +95,8 @@ class KeyframeMaker:
             self._channel.put(section)
         rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         T_m_k = self._pose_of(header)
-        self._store(ctx, header, T_m_k, uv, rho, landmarks)
+        seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
+        self._store(ctx, header, T_m_k, uv, seen_uv, rho, landmarks)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         return T_m_k
 
@@ -146,16 +152,18 @@ class KeyframeMaker:
         return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(header.parent)] @ header.T_p_k)
 
     def _store(
-        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, landmarks: NewLandmarks
+        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, seen_uv: F64, rho: F64,
+        landmarks: NewLandmarks,
     ) -> None:  # fmt: skip
-        """Cut the templates, and add the keyframe to the local map."""
+        """Cut the templates at seen_uv (n,2), where the image shows them, and add the keyframe to the local map."""
         octave, config = landmarks.octave, ctx.config
         side = alignment_kernels.TEMPLATE
         templates = np.empty((len(uv), alignment_kernels.TEMPLATE_LEVELS, side, side), np.uint8)
-        alignment_kernels.cut_templates(ctx.images.aligned, uv, octave, templates)
+        alignment_kernels.cut_templates(ctx.images.aligned, seen_uv, octave, templates)
         sigma = config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
         if ctx.images.depth_m is not None and not self._camera.stereo:
             sigma = np.maximum(sigma, _DEPTH_CAMERA_SIGMA_RHO)
-        self._map.add(
+        slot = self._map.add(
             header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number
         )  # fmt: skip
+        self._map.rolled[slot] = ctx.shutter is None

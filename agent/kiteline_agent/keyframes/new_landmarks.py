@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features, stereo_kernels
 from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages, depth_at
+from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
@@ -21,7 +22,8 @@ _SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse
 class NewPoints:
     """New landmarks of a keyframe, strongest first.
 
-    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32).
+    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32). roll_px:
+    (n,2) by which they are away from uv in the image of a rolling shutter; None: of a global one.
     """
 
     uv: F64
@@ -29,6 +31,7 @@ class NewPoints:
     octave: NDArray[np.uint8]
     angle: NDArray[np.uint8]
     descriptor: NDArray[np.uint8]
+    roll_px: F64 | None = None
 
 
 def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:
@@ -58,3 +61,11 @@ def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config:
     uv, octave = corners.uv[order], corners.octave[order]
     angle, descriptor = features.describe(images.left, uv, octave)
     return NewPoints(uv, disparity[order], octave, angle, descriptor)
+
+
+def moved_to_frame(points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter) -> NewPoints:
+    """Landmarks where they are at the frame's stamp; one without a depth is taken as far away."""
+    moved = shutter.to_frame(points.uv, np.maximum(points.disparity, 0.0) / camera.bf)
+    uv = np.clip(moved[:, :2], 0.0, [camera.width - 1.0, camera.height - 1.0])
+    disparity = np.where(points.disparity > 0.0, points.disparity * moved[:, 2], points.disparity)
+    return replace(points, uv=uv, disparity=disparity, roll_px=points.uv - uv)

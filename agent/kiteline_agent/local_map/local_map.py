@@ -63,6 +63,7 @@ class LocalMap:
         self.T_m_k = np.tile(np.eye(4), (k, 1, 1))
         self.T_p_k = np.tile(np.eye(4), (k, 1, 1))
         self.from_base = np.zeros(k, np.bool_)  # the pose was set by the base
+        self.rolled = np.zeros(k, np.bool_)  # the pixels are as a rolling shutter took them: its motion was unknown
         self.last_seen = np.zeros(k, np.int64)  # number of the frame that last tracked a landmark of the slot
         self.counts = np.zeros(k, np.int64)
         self.shared = np.zeros(k, np.int64)  # number of landmarks in each slot that the base knows: the first ones

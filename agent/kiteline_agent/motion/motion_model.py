@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 from numpy import float64
 from numpy.typing import NDArray
 
@@ -102,6 +103,13 @@ class MotionModel:
             return driven
         twist = adjoint(self._T_b_c) @ self._pose.twist(dt_s)
         return along_twist(T_m_b, twist, dt_s, None, MotionSource.VELOCITY)
+
+    def camera_twist(self, t_ns: int, dt_s: float) -> F64:
+        """Twist (6,) [m/s, rad/s] of the camera in its own axes at a frame, after `predict` was called for it."""
+        moved = self.extrapolate(t_ns, None, dt_s)
+        R_b_m, R_c_b = moved.T_m_b[:3, :3].T, self._T_c_b[:3, :3]
+        linear = R_b_m @ moved.velocity + np.cross(moved.rate, self._T_b_c[:3, 3])
+        return np.concatenate([R_c_b @ linear, R_c_b @ moved.rate])
 
     def fuse(self, track: Track, t_ns: int) -> Track:
         """Fuse the pose from images with IMU and odometer; returns the track with the fused pose."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.tracking.frame_images import FrameImages
+from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 
@@ -21,7 +22,7 @@ class FrameContext:
 
     number: counts processed frames from 1. dt_s: time since the last processed frame; 0 for the first. T_m_c: (4,4)
     predicted pose of the camera in the active submap. repeated: the image equals the one before. config: at the effort
-    that the governor allows.
+    that the governor allows. shutter: None for a global one, and while the motion is unknown.
     """
 
     number: int
@@ -32,6 +33,7 @@ class FrameContext:
     T_m_c: F64
     repeated: bool
     config: AgentConfig
+    shutter: RollingShutter | None = None
 
     @property
     def T_c_m(self) -> F64:

@@ -33,18 +33,18 @@ class Tracker:
 
     def track(self, ctx: FrameContext, predicted_T_c_m: F64) -> Track:
         """Measure the pose of a frame from a prediction (4,4) that is good to some 28 px."""
-        align, images = ctx.config.align, ctx.images
+        align = ctx.config.align
         T_c_m = predicted_T_c_m.copy()
         # Coarse pass: few landmarks and large steps on small images correct the prediction.
         coarse = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
         chosen = self._choose(coarse, ctx.number, align.coarse_points, 1, 2 * align.cell_px)
-        rough = self._measure(images, coarse, chosen, T_c_m, ctx.config, coarse_only=True)
+        rough = self._measure(ctx, coarse, chosen, T_c_m, coarse_only=True)
         if rough.inliers >= ctx.config.pose.min_inliers // 2:
             T_c_m = rough.T_c_m
         # Fine pass: many landmarks, sub-pixel, with disparities.
         fine = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
         chosen = self._choose(fine, ctx.number, align.points, 2, align.cell_px)
-        return self._measure(images, fine, chosen, T_c_m, ctx.config, coarse_only=False)
+        return self._measure(ctx, fine, chosen, T_c_m, coarse_only=False)
 
     def _choose(self, candidates: Candidates, frame_number: int, limit: int, per_cell: int, cell_px: int) -> I64:
         """Candidates spread over image cells: landmarks of the last frame first, then those of least uncertainty."""
@@ -61,12 +61,15 @@ class Tracker:
         return chosen[:n]
 
     def _measure(
-        self, images: FrameImages, candidates: Candidates, chosen: I64, T_c_m: F64, config: AgentConfig,
-        *, coarse_only: bool,
-    ) -> Track:  # fmt: skip
+        self, ctx: FrameContext, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool
+    ) -> Track:
         """Align the templates of the chosen candidates (n,), and optimise the pose from T_c_m (4,4)."""
+        images, config, shutter = ctx.images, ctx.config, ctx.shutter
         align = config.align
         rows, uv, warp = candidates.rows.take(chosen), candidates.uv.take(chosen, 0), candidates.warp.take(chosen, 0)
+        if shutter is not None:
+            at_row = shutter.to_rows(uv, 1.0 / candidates.depth.take(chosen))[:, :2]
+            uv = np.where(self._map.rolled[rows // self._map.slot_size, None], uv, at_row)
         octave = self._map.octave.take(rows)
         found = np.zeros(len(rows), np.bool_)
         last = 1 if coarse_only else 0
@@ -93,6 +96,11 @@ class Tracker:
         observed[:, :2] = uv.take(kept, 0)
         if not coarse_only:
             self._add_disparities(images, candidates.rows[chosen], octave, candidates.depth[chosen], observed, config)
+        if shutter is not None:
+            at_frame = shutter.to_frame(observed[:, :2], 1.0 / candidates.depth.take(chosen))
+            at_frame[:, 2] = np.where(observed[:, 2] >= 0.0, observed[:, 2] * at_frame[:, 2], observed[:, 2])
+            rolled = self._map.rolled[candidates.rows.take(chosen) // self._map.slot_size]
+            observed = np.where(rolled[:, None], observed, at_frame)
         sigma_px = align.sigma_px * (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
         return self._solve(candidates, chosen, observed, sigma_px, T_c_m, config, tried=len(found))
 

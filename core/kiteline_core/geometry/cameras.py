@@ -38,7 +38,11 @@ class Lens(Enum):
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A pinhole camera with lens distortion. Focal lengths, centre and size in px."""
+    """A pinhole camera with lens distortion. Focal lengths, centre and size in px.
+
+    readout_s: from the first row's exposure to the last row's, of a rolling shutter whose frames are stamped at the
+    middle row; 0: a global shutter.
+    """
 
     width: int
     height: int
@@ -48,6 +52,7 @@ class CameraModel:
     cy: float
     lens: Lens = Lens.NONE
     distortion: tuple[float, ...] = ()
+    readout_s: float = 0.0
 
     def matrix(self) -> F64:
         """The 3x3 camera matrix."""
@@ -100,6 +105,7 @@ class Rectifier:
     def __init__(self, rig: CameraRig) -> None:
         left = rig.left
         self._size = (left.width, left.height)
+        self.readout_s = left.readout_s
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and camera matrix for its maps
         self._depth_map: NDArray[np.int16] | None = None

@@ -53,4 +53,6 @@ def _camera_to_json(camera: CameraModel) -> dict[str, Any]:
 def _camera_from_json(value: Mapping[str, Any]) -> CameraModel:
     distortion = tuple(float(d) for d in value["distortion"])
     fx, fy, cx, cy = (float(value[key]) for key in ("fx", "fy", "cx", "cy"))
-    return CameraModel(int(value["width"]), int(value["height"]), fx, fy, cx, cy, Lens(value["lens"]), distortion)
+    readout_s = float(value.get("readout_s", 0.0))
+    size = int(value["width"]), int(value["height"])
+    return CameraModel(*size, fx, fy, cx, cy, Lens(value["lens"]), distortion, readout_s)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path as FilePath
 
@@ -77,7 +78,8 @@ class SimSource:
         self.report = SourceReport()  # stays empty
         self.imu = ImuCalibration(rate_hz=1e9 / IMU_NS) if config.imu else None
         stereo = not (config.mono or config.depth)
-        self.rig: CameraRig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale)
+        rig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale)
+        self.rig: CameraRig = replace(rig, left=replace(rig.left, readout_s=config.readout_s))
         self.worn = _worn_rig(config, self.rig)
         self.path = self._choose_path()
         self.world = world if world is not None else build_world(config, self.rig.T_b_c)

@@ -14,6 +14,8 @@ from kiteline_hw.sources.text_files import Yaml, yaml_number
 
 F64 = NDArray[np.float64]
 
+_LONGEST_READOUT_S = 0.2  # no video camera is slower
+
 _EQUIDISTANT = ("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4", "kb4")
 _RADTAN = ("radialtangential", "radtan", "plumbbob", "rationalpolynomial", "opencv", "browncornrady", "brown")
 
@@ -58,7 +60,18 @@ def camera_from_yaml(table: Yaml, path: Path) -> CameraModel:
     width, height = (int(yaml_number(table, key, path)) for key in ("width", "height"))
     d = tuple(yaml_number(table, key, path, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     lens, d = (Lens.RADTAN, d) if any(d) else (Lens.NONE, ())
-    return checked_camera(CameraModel(width, height, fx, fy, cx, cy, lens, d), str(path))
+    readout_s = read_out(table, height, path)
+    return checked_camera(CameraModel(width, height, fx, fy, cx, cy, lens, d, readout_s), str(path))
+
+
+def read_out(table: Yaml, height: int, path: Path) -> float:
+    """The read-out of a rolling shutter in s: `readout_s` of all rows, or Kalibr's `line_delay` of one; 0 without."""
+    readout_s = yaml_number(table, "readout_s", path, yaml_number(table, "line_delay", path, 0.0) * height)
+    if not 0.0 <= readout_s < _LONGEST_READOUT_S:
+        raise SourceError(
+            f"{path}: a read-out of {readout_s:g} s: expected readout_s or line_delay in s, 0 for a global shutter"
+        )
+    return readout_s
 
 
 def checked_baseline(T_c_r: F64, where: str) -> F64:

@@ -16,7 +16,7 @@ from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sensors.imu_buffer import ImuSamples, ImuTable
-from kiteline_hw.sources.calibration import checked_baseline, checked_camera, checked_rigid, parse_lens
+from kiteline_hw.sources.calibration import checked_baseline, checked_camera, checked_rigid, parse_lens, read_out
 from kiteline_hw.sources.recording import Recording, Stamped, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import (
     Yaml,
@@ -97,7 +97,8 @@ def _read_camera(folder: Path) -> tuple[CameraModel, F64]:
     if not isinstance(distortion, list):
         raise SourceError(f"{path}: expected distortion_coefficients with a list of numbers, found {distortion!r}")
     lens, coefficients = parse_lens(str(table.get("distortion_model", "none")), distortion, str(path))
-    camera = CameraModel(width, height, fx, fy, cx, cy, lens, coefficients)
+    readout_s = read_out(table, height, path)
+    camera = CameraModel(width, height, fx, fy, cx, cy, lens, coefficients, readout_s)
     return checked_camera(camera, str(path)), _read_extrinsics(table, path)
 
 

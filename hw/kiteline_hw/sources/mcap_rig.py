@@ -8,7 +8,7 @@ of a rectified pair. The body frame is that of the IMU, else the root of the tra
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,7 +183,7 @@ def _camera(images: ImageTopic, c: CameraCalibration, name: str) -> _CameraTopic
 
 
 def _floats(m: CameraModel) -> CameraModel:
-    return CameraModel(m.width, m.height, float(m.fx), float(m.fy), float(m.cx), float(m.cy), m.lens, m.distortion)
+    return replace(m, fx=float(m.fx), fy=float(m.fy), cx=float(m.cx), cy=float(m.cy))
 
 
 def _extrinsics(left: _CameraTopic, right: _CameraTopic, tree: TransformTree) -> F64 | None:

@@ -123,6 +123,22 @@ def euroc(
     return root
 
 
+@pytest.mark.parametrize(("text", "readout_s"), [("readout_s: 0.02", 0.02), ("line_delay: 0.0005", 0.024), ("", 0.0)])
+def test_the_read_out_of_a_rolling_shutter_is_part_of_the_calibration(
+    tmp_path: Path, text: str, readout_s: float
+) -> None:
+    root = euroc(tmp_path)
+    for name in ("cam0", "cam1"):
+        with (root / "mav0" / name / "sensor.yaml").open("a") as file:
+            file.write(text + "\n")
+    left = open_source(str(tmp_path)).rig.left
+    assert left.readout_s == pytest.approx(readout_s)
+    with (tmp_path / "mav0/cam0/sensor.yaml").open("a") as file:
+        file.write("readout_s: 20\n")
+    with pytest.raises(SourceError, match="read-out"):
+        open_source(str(tmp_path))
+
+
 def add_imu(root: Path, t_b_i: np.ndarray, rows: list[str]) -> None:
     folder = root / "mav0" / "imu0"
     folder.mkdir()

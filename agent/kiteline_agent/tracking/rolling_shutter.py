@@ -1,0 +1,67 @@
+"""Rolling shutter: pixels moved from the time of their row to that of the frame, by the camera's predicted motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry.cameras import GRID_STEP, RectifiedCamera
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RollingShutter:
+    """Motion of a camera while the rows of one image were exposed; a frame's stamp is that of its middle row.
+
+    readout_s: from the first row to the last. height: rows of the raw image. grid: (gh,gw,2) raw pixels of every
+    GRID_STEP-th rectified one, None if the image needs no rectification. twist: (6,) [m/s, rad/s] of the camera, in
+    its own axes.
+    """
+
+    camera: RectifiedCamera
+    readout_s: float
+    height: int
+    grid: NDArray[np.float32] | None
+    twist: F64
+
+    def to_frame(self, uv: F64, rho: F64) -> F64:
+        """Where pixels (n,2), of landmarks at inverse depths (n,) 1/m, would be at the frame's stamp.
+
+        Returns (n,3): u, v, and the factor by which the inverse depth changes.
+        """
+        return self._moved(uv, rho, self.row_times_s(uv))
+
+    def to_rows(self, uv: F64, rho: F64) -> F64:
+        """The inverse of `to_frame`, to first order of the readout time."""
+        return self._moved(uv, rho, -self.row_times_s(uv))
+
+    def largest_px(self) -> float:
+        """Largest shift of a pixel at the image's border, of a landmark 2 m away."""
+        w, h = self.camera.width - 1.0, self.camera.height - 1.0
+        border = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h], [0.5 * w, 0.0], [0.5 * w, h]])
+        return float(np.abs(self.to_frame(border, np.full(len(border), 0.5))[:, :2] - border).max())
+
+    def row_times_s(self, uv: F64) -> F64:
+        """Times (n,) of the rows of pixels (n,2) after the frame's stamp."""
+        v = uv[:, 1]
+        if self.grid is not None:
+            gh, gw = self.grid.shape[:2]
+            column = np.clip(np.rint(uv[:, 0] / GRID_STEP).astype(np.int64), 0, gw - 1)
+            line = np.clip(np.rint(v / GRID_STEP).astype(np.int64), 0, gh - 1)
+            v = self.grid[line, column, 1] + (v - GRID_STEP * line)
+        share = np.clip((v + 0.5) / self.height, 0.0, 1.0)
+        return np.asarray(self.readout_s * (share - 0.5))
+
+    def _moved(self, uv: F64, rho: F64, dt_s: F64) -> F64:
+        """Pixels of landmarks seen at uv, after the camera has moved back by dt_s (n,)."""
+        c = self.camera
+        x, y = (uv[:, 0] - c.cx) / c.fx, (uv[:, 1] - c.cy) / c.fy
+        v, w = self.twist[:3], self.twist[3:]
+        # the point (x, y, 1) / rho moves by w x p + v, in units of its depth
+        px = x + dt_s * (w[1] - w[2] * y + v[0] * rho)
+        py = y + dt_s * (w[2] * x - w[0] + v[1] * rho)
+        pz = np.maximum(1.0 + dt_s * (w[0] * y - w[1] * x + v[2] * rho), 0.1)
+        return np.column_stack([px / pz * c.fx + c.cx, py / pz * c.fy + c.cy, 1.0 / pz])

@@ -1,0 +1,94 @@
+"""Rows of a rolling shutter: moved to the frame's time as the true motion says, and flights that gain by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.step import Identity, StepInput
+from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Rectifier
+from kiteline_core.ids import AgentId
+from kiteline_hw.sim.sensors.rig import make_rig
+from kiteline_hw.sim.source import SimSource, open_sim
+
+F64 = NDArray[np.float64]
+READOUT_S = 0.02
+TWIST = np.array([0.8, -0.5, 0.9, 0.6, -0.7, 0.5])
+
+
+def shutter(twist: F64, readout_s: float = READOUT_S) -> RollingShutter:
+    rectifier = Rectifier(make_rig())
+    return RollingShutter(rectifier.camera, readout_s, rectifier.camera.height, rectifier.left_grid, twist)
+
+
+def test_a_pixel_is_moved_to_where_the_frame_would_show_it() -> None:
+    rolling, rng = shutter(TWIST), np.random.default_rng(1)
+    camera = rolling.camera
+    uv = rng.uniform([20.0, 20.0], [camera.width - 20.0, camera.height - 20.0], (200, 2))
+    rho = rng.uniform(0.1, 1.0, 200)
+    centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+    seen = np.column_stack([(uv - centre) / focal, np.ones(200)]) / rho[:, None]
+    T_c0_ct = np.array([se3.exp(t * TWIST) for t in rolling.row_times_s(uv)])
+    at_frame = np.einsum("nij,nj->ni", T_c0_ct[:, :3, :3], seen) + T_c0_ct[:, :3, 3]
+    true = at_frame[:, :2] / at_frame[:, 2:] * focal + centre
+    moved = rolling.to_frame(uv, rho)
+    assert np.abs(moved[:, :2] - uv).max() > 5.0
+    assert moved[:, :2] == pytest.approx(true, abs=0.1)  # of second order
+    assert rho * moved[:, 2] == pytest.approx(1.0 / at_frame[:, 2], rel=1e-3)
+    back = rolling.to_rows(moved[:, :2], rho * moved[:, 2])
+    assert back[:, :2] == pytest.approx(uv, abs=0.35)
+
+
+def test_rows_are_those_of_the_raw_image_and_the_middle_one_stays() -> None:
+    rolling = shutter(TWIST)
+    assert rolling.grid is not None
+    v, u = 200, 600
+    times = rolling.row_times_s(np.array([[u, v], [u, 10.0], [u, 470.0]], np.float64))
+    assert times[0] == pytest.approx(READOUT_S * ((rolling.grid[v // 4, u // 4, 1] + 0.5) / 480 - 0.5))
+    assert times[1] < times[0] < times[2]
+    assert np.abs(times).max() <= 0.5 * READOUT_S
+    assert shutter(np.zeros(6)).largest_px() == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def rolled() -> SimSource:
+    """4 s at half size, in full motion after 2 s at rest."""
+    return open_sim("room", seconds=5.0, seed=5, scale=0.5, texture_bits=9, readout_s=READOUT_S)
+
+
+def step_error_m(source: SimSource, readout_s: float, begin: int) -> float:
+    """Error rms of the motion between frames, from frame `begin` on. readout_s: as the calibration tells it."""
+    rig = replace(source.rig, left=replace(source.rig.left, readout_s=readout_s))
+    agent = Agent(rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+    found, imu, frames, truth = [], None, 0, source.ground_truth
+    assert truth is not None
+    for item in source:
+        if isinstance(item, ImuBatch):
+            imu = item
+        elif isinstance(item, Frame):
+            frames += 1
+            if frames > begin:
+                estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
+                assert estimate is not None
+                assert estimate.tracked
+                found.append(estimate.T_o_b)
+    true = truth.T_w_b[begin:]
+    moved = zip(pairwise(found), pairwise(true), strict=True)
+    off = [se3.inverse(se3.inverse(c) @ d) @ se3.inverse(a) @ b for (a, b), (c, d) in moved]
+    return float(np.sqrt(np.mean([np.sum(T[:3, 3] ** 2) for T in off])))
+
+
+@pytest.mark.parametrize("begin", [0, 50])
+def test_a_calibrated_read_out_makes_the_motion_truer(rolled: SimSource, begin: int) -> None:
+    assert rolled.rig.left.readout_s == READOUT_S
+    assert step_error_m(rolled, READOUT_S, begin) < 0.9 * step_error_m(rolled, 0.0, begin)
