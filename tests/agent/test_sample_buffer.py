@@ -118,3 +118,13 @@ def test_clipped_samples_are_doubted() -> None:
     assert (error**2 < 9.0 * np.diag(doubtful.cov)[3:]).all()
     # the gyro was not at its end
     np.testing.assert_allclose(doubtful.cov[:3, :3], sure.cov[:3, :3])
+
+
+def test_an_extended_copy_leaves_the_buffer_as_it_is() -> None:
+    gyro, accel = lively(200, noise=3.0)
+    buffer, alone = filled(gyro[:100], accel[:100]), filled(gyro[:100], accel[:100])
+    stamps = (np.arange(200) * STEP_NS).astype(np.int64)
+    longer = buffer.extended(ImuBatch(stamps[100:], 50.0 * gyro[100:], 50.0 * accel[100:]))
+    assert longer.newest_t_ns == stamps[-1]
+    for name, value in vars(alone).items():
+        assert np.array_equal(getattr(buffer, name), value), name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
+from copy import deepcopy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +71,7 @@ class SampleBuffer:
 
     def extended(self, imu: ImuBatch | None) -> SampleBuffer:
         """A copy with more samples; this buffer stays as it is."""
-        other = copy(self)
-        other._largest = self._largest.copy()
+        other = deepcopy(self)
         other.push(imu)
         return other
 
