@@ -347,7 +347,7 @@ class Agent:
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
         if keyframe != NO_KEYFRAME:
             self._channel.put(LivePose(self._identity.agent, ctx.t_ns, keyframe, T_k_c, quality))
-        T_w_b = self._corrections.in_world(self.submap, T_m_b, T_o_m, ctx.t_ns)
+        T_w_b = self._corrections.in_world(self.submap, T_m_b, T_o_m, ctx.t_ns, metric=self.metric)
         return Estimate(
             ctx.t_ns,
             tracked,

@@ -121,14 +121,16 @@ class Corrections:
         up, told = self._upright.T_l_m[2, :3], sim3.rigid(S_w_m)[2, :3]
         return float(up @ told) < _SAME_TILT
 
-    def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int) -> F64 | None:
+    def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int, *, metric: bool) -> F64 | None:
         """T_w_b (4,4), with corrections smoothed; None if the submap is not placed.
 
+        A new submap in metres continues where odometry puts it in the world, until it is placed.
         m and o share a unit of length; if w has another one, as with a monocular camera, the placement has a scale.
         """
         S_w_m = self._S_w_m.get(submap)
         if S_w_m is None:
-            return None
+            held = self._smoothing.held
+            return None if held is None or not metric or sim3.scale_of(held) != 1.0 else held @ T_o_m @ T_m_b
         if not self._smoothing.on:
             return self._body_in_world(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b

@@ -25,6 +25,11 @@ class Smoothing:
         """True if corrections are smoothed."""
         return self._config.max_m_s > 0.0 or self._config.max_rad_s > 0.0
 
+    @property
+    def held(self) -> F64 | None:
+        """T_w_o (4,4) as last reported; None before the first correction."""
+        return self._T_w_o
+
     def follow(self, T_w_o: F64, here_o: F64, t_ns: int) -> F64:
         """The pose (4,4) to report for the corrected T_w_o (4,4). here_o: (3,) m, vehicle in o.
 

@@ -13,10 +13,10 @@ class ScaleFilterConfig:
     """How the scale of a monocular map is watched after its start."""
 
     interval_s: float = 0.14  # between two poses that are compared
-    start_scale: float = 0.05  # relative deviations and deviations of the start: those of a short first window
-    start_gravity_m_s2: float = 0.3
+    start_scale: float = 0.035  # relative deviations and deviations of the start: those of a short first window
+    start_gravity_m_s2: float = 0.1
     start_velocity_m_s: float = 0.1
-    start_bias_m_s2: float = 0.15
+    start_bias_m_s2: float = 0.1
     accel_walk: float = 0.04  # m/s^2 per sqrt(s): errors of scale and axes, vibration
     scale_walk: float = 0.002  # per sqrt(s): the map's own scale drifts while it grows
     image_rad: float = 5e-4  # error of a position by images, over the depth that they see
@@ -24,8 +24,8 @@ class ScaleFilterConfig:
     gravity_sigma_m_s2: float = 0.01  # of the length of gravity
     chi2: float = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
     known_sigma: float = 0.025  # deviation below which the scale may be corrected
-    least: float = 0.012  # smallest correction: each begins a new submap
-    least_deviations: float = 1.0  # the same in deviations
+    least: float = 0.015  # smallest correction: each begins a new submap
+    least_deviations: float = 1.1  # the same in deviations
     least_s: float = 4.0  # time between two corrections
 
 
