@@ -226,7 +226,7 @@ class InertialStartConfig:
     sigma_inflation: float = 1.0  # of that deviation: errors of corners are correlated over keyframes
     agreement: float = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
     max_reprojection_px: float = 0.9  # rms of a solution's inliers
-    expected_imu_chi2: float = 0.12  # of those where the error model is right: velocities take up most of them
+    expected_imu_chi2: float = 0.15  # of those where the error model is right: velocities take up most of them
     least_noise: float = 0.4  # smallest factor on that model: few windows tell
     most_noise: float = 4.0  # largest one
     max_imu_chi2: float = 1.5  # mean squared error of its inertial factors, in deviations
