@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial_start_config import InertialStartConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 from kiteline_core.pose.pnp import RansacConfig
@@ -180,60 +181,6 @@ class TwoViewStartConfig:
     scale_every: int = 10  # frames between two tests of the metric scale
     scale_sigma: float = 0.02  # relative deviation below which the metric scale is used
     two_view: TwoViewConfig = field(default_factory=TwoViewConfig)
-
-
-@dataclass(frozen=True, slots=True)
-class CornerTracksConfig:
-    """How corners are found and followed."""
-
-    corners: int = 200  # followed at once; a bundle of 100 long tracks is as accurate as one of 300
-    cell_px: int = 32  # px: one corner a cell
-    replenish: float = 0.85  # share of the corners below which a keyframe adds new ones
-    window_px: int = 15  # px: window of the optical flow; the smallest that keeps hold of corners
-    backward_px: float = 0.5  # px between a corner and its image followed back
-    drift_px: float = 2.0  # px between flow over frames and flow from the last keyframe
-    keyframe_s: float = 0.24  # time between two keyframes: short enough for flow, long enough for parallax
-
-
-@dataclass(frozen=True, slots=True)
-class InertialBundleConfig:
-    """Error models of the window, and effort of the solver."""
-
-    sigma_px: float = 0.7  # px of an observation; corners that are followed from keyframe to keyframe drift by as much
-    huber: float = 1.5  # deviations beyond which an observation counts linearly
-    imu_inflation: float = 3.0  # of the calibration's noise densities: vibration
-    accel_walk: float = 0.015  # m/s^2 per sqrt(s), beside the calibration's: errors of scale and axes, vibration
-    gyro_bias_rad_s: float = 0.1  # deviation of an unknown gyro bias
-    accel_bias_m_s2: float = 0.2  # the same of the accelerometer
-    first_depth_m: float = 3.0  # at which all landmarks start; only the sign matters
-    structure_iterations: int = 25  # steps of the first stage: none of it is known
-    iterations: int = 15  # steps of the last stage
-    structure_settled: float = 1e-3  # relative fall of the cost below which the first stage ends
-    settled: float = 0.02  # fall of the cost below which the last one ends: a deviation of the scale is worth 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class InertialStartConfig:
-    """When a monocular camera with an IMU knows its scale, and begins a map in metres."""
-
-    min_span_s: float = 2.4  # before which a window tells no scale
-    max_span_s: float = 8.0  # longest window; older keyframes are dropped
-    attempt_s: float = 0.45  # time between two solutions: each costs as much as some frames
-    landmarks: int = 70  # of the window, with the longest tracks, and
-    landmarks_each: int = 20  # in each keyframe: in fast turns no track is long
-    min_flow: float = 0.02  # of the focal length, median: with less the camera has not moved
-    scale_sigma: float = 0.02  # relative deviation of the scale below which it is metric
-    sigma_inflation: float = 1.0  # of that deviation: errors of corners are correlated over keyframes
-    agreement: float = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
-    max_reprojection_px: float = 0.9  # rms of a solution's inliers
-    expected_imu_chi2: float = 0.15  # of those where the error model is right: velocities take up most of them
-    least_noise: float = 0.4  # smallest factor on that model: few windows tell
-    most_noise: float = 4.0  # largest one
-    max_imu_chi2: float = 1.5  # mean squared error of its inertial factors, in deviations
-    state_inflation: float = 2.0  # of the deviations of the state with which tracking begins
-    depth_sigma: float = 0.25  # relative deviation above which a landmark has no depth yet
-    corner_tracks: CornerTracksConfig = field(default_factory=CornerTracksConfig)
-    bundle: InertialBundleConfig = field(default_factory=InertialBundleConfig)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.config import InertialBundleConfig
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import CornerTracksConfig
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
+from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 U8 = NDArray[np.uint8]

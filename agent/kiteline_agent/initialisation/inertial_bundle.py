@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import InertialBundleConfig
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState, tangent
 from kiteline_core.frame import ImuCalibration
