@@ -152,7 +152,7 @@ class Agent:
     def _process(self, frame: Frame, imu: ImuBatch | None) -> tuple[Estimate, list[str]]:
         """The algorithm of one frame. Returns the estimate and events."""
         camera, config, has_map = self._camera, self._config, self._camera.submaps.any
-        # 1. Rectify the images and build their pyramids.
+        # 1. Build the images' pyramids.
         first = config.pyramid.first if has_map and self._loss.failed_searches == 0 else 0
         images = frame_images(frame, self._rectifier, config.pyramid, first, self.map.offset_px)
         self._count_images(frame)

@@ -25,6 +25,7 @@ FAR = se3.exp(np.array([1.3, -0.6, 0.1, 0.0, 0.0, 0.4]))
 def corrections() -> Corrections:
     camera, config = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4)), AgentConfig()
     local_map = LocalMap(camera, config.local_map, config.depth_filter)
+    local_map.activate(FIRST)
     cache = MapCache(camera, config.map_cache, config.matching, config.ransac, None)
     return Corrections(local_map, cache, config.smoothing)
 
@@ -46,7 +47,7 @@ def test_a_withdrawn_placement_recognises_nothing(corrections: Corrections) -> N
     corrections.take([SubmapPlacement(SECOND, FAR, recognised=True)], [])
     corrections.take([], [Key(SubmapPlacement.KIND, int(SECOND), 0)])
     assert not corrections.is_recognised(SECOND)
-    assert corrections.in_world(SECOND, np.eye(4), np.eye(4), 0) is None
+    assert corrections.in_world(SECOND, np.eye(4), np.eye(4), 0, metric=True) is None
 
 
 TILTED = GravityAlignment(FIRST, se3.exp(np.array([0.2, 0.1, 0.0, 0.4, -0.2, 0.0])))
@@ -54,7 +55,7 @@ TILTED = GravityAlignment(FIRST, se3.exp(np.array([0.2, 0.1, 0.0, 0.4, -0.2, 0.0
 
 def in_world(corrections: Corrections) -> NDArray[np.float64]:
     """T_w_b of a body at the origin of the first submap, nothing of which was reported before."""
-    placed = copy.deepcopy(corrections).in_world(FIRST, np.eye(4), np.eye(4), 0)
+    placed = copy.deepcopy(corrections).in_world(FIRST, np.eye(4), np.eye(4), 0, metric=True)
     assert placed is not None
     return placed
 
@@ -80,3 +81,27 @@ def test_a_merge_stands_even_if_the_other_world_is_not_level(corrections: Correc
     other = FAR @ se3.exp(np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
     corrections.take([SubmapPlacement(FIRST, other, recognised=True)], [])
     assert np.allclose(in_world(corrections), other)
+
+
+def test_a_new_submap_continues_where_odometry_puts_it(corrections: Corrections) -> None:
+    """Until the base has placed it; one without a scale in metres waits."""
+    corrections.take([SubmapPlacement(FIRST, FAR)], [])
+    T_o_b = se3.exp(np.array([0.4, 0.1, -0.2, 0.1, 0.0, 0.3]))
+    before = corrections.in_world(FIRST, T_o_b, np.eye(4), 0, metric=True)
+    entered = corrections.in_world(SECOND, np.eye(4), T_o_b, 50_000_000, metric=True)
+    assert before is not None and entered is not None
+    assert np.allclose(entered, before)
+    assert corrections.in_world(SECOND, np.eye(4), T_o_b, 50_000_000, metric=False) is None
+
+
+def test_a_merge_is_taken_over_at_once_and_later_corrections_slowly(corrections: Corrections) -> None:
+    corrections.take([SubmapPlacement(FIRST, np.eye(4))], [])
+    near = se3.from_rt(np.eye(3), np.array([0.3, 0.0, 0.0]))
+    for t_ns in (0, 50_000_000):
+        corrections.in_world(FIRST, np.eye(4), np.eye(4), t_ns, metric=True)
+    corrections.take([SubmapPlacement(FIRST, near, recognised=True)], [])
+    merged = corrections.in_world(FIRST, np.eye(4), np.eye(4), 100_000_000, metric=True)
+    corrections.take([SubmapPlacement(FIRST, np.eye(4), recognised=True)], [])
+    later = corrections.in_world(FIRST, np.eye(4), np.eye(4), 150_000_000, metric=True)
+    assert merged is not None and np.allclose(merged, near)
+    assert later is not None and 0.29 < later[0, 3] < 0.3

@@ -27,13 +27,13 @@ def test_a_place_with_a_scale_stretches_the_way_but_not_the_arm(pace: float) -> 
     base = Corrections(local_map, window, SmoothingConfig(max_m_s=pace, max_rad_s=pace, snap_m=0.3))
     T_m_c = se3.exp(np.array([2.0, 1.0, 0.3, 0.1, 0.4, -0.2]))
     T_m_b, T_o_m = T_m_c @ se3.inverse(T_B_C), se3.exp(np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.7]))
-    assert base.in_world(SUBMAP, T_m_b, T_o_m, 0) is None
+    assert base.in_world(SUBMAP, T_m_b, T_o_m, 0, metric=False) is None
     S_w_m = sim3.of(2.7, se3.exp(np.array([1.0, -4.0, 0.2, 0.02, 0.0, 1.3])))
     assert not base.take([SubmapPlacement(SUBMAP, S_w_m)], [])[0]  # the local map, and with it odometry, stays
-    told = base.in_world(SUBMAP, T_m_b, T_o_m, 50_000_000)
+    told = base.in_world(SUBMAP, T_m_b, T_o_m, 50_000_000, metric=False)
     assert told is not None
     assert np.allclose(told, sim3.place(S_w_m, T_m_c) @ se3.inverse(T_B_C), atol=1e-9)
     eye, body = (told @ T_B_C)[:3, 3], told[:3, 3]
     assert np.isclose(np.linalg.norm(eye - body), np.linalg.norm(T_B_C[:3, 3]))
     base.take([], [Key(SubmapPlacement.KIND, int(SUBMAP), 0)])
-    assert base.in_world(SUBMAP, T_m_b, T_o_m, 100_000_000) is None
+    assert base.in_world(SUBMAP, T_m_b, T_o_m, 100_000_000, metric=False) is None

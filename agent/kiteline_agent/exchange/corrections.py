@@ -84,6 +84,8 @@ class Corrections:
             return False  # sent before the base knew of gravity; the upright placement follows
         self._S_w_m[record.submap] = record.S_w_m
         if record.recognised:
+            if record.submap not in self._recognised and record.submap == self._map.active:
+                self._smoothing.snap()  # a merge: until now the submap lay where odometry put it
             self._recognised.add(record.submap)
         else:
             self._recognised.discard(record.submap)

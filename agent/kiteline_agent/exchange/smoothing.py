@@ -30,6 +30,10 @@ class Smoothing:
         """T_w_o (4,4) as last reported; None before the first correction."""
         return self._T_w_o
 
+    def snap(self) -> None:
+        """Report the next corrected pose at once."""
+        self._goal = None
+
     def follow(self, T_w_o: F64, here_o: F64, t_ns: int) -> F64:
         """The pose (4,4) to report for the corrected T_w_o (4,4). here_o: (3,) m, vehicle in o.
 
