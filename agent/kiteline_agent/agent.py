@@ -118,7 +118,7 @@ class Agent:
                 self.work.inertial_samples = 0 if imu is None else len(imu.t_ns)
                 estimate, more = self._process(step_input.frame, imu)
                 events += more
-            else:
+            elif self._full_config.governor.cpu_percent >= self._full_config.prediction.least_cpu_percent:
                 predicted = self.predict(step_input.frame.t_ns)
         else:
             if step_input.imu is not None:

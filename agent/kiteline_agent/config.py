@@ -294,6 +294,7 @@ class PredictionConfig:
     """Poses of frames that the governor skips, and between frames."""
 
     rate_hz: float = 30.0  # 1/s: poses to a flight controller, predicted to the time of sending; 0: frames only
+    least_cpu_percent: float = 10.0  # of a core: with less, predictions of skipped frames would take half of the budget
     max_s: float = 1.0  # s after the last processed frame: later no pose is predicted
 
 
