@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from kiteline_agent.imaging.features import DetectorConfig
+from kiteline_agent.imaging.row_alignment import RowConfig
 from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial_start_config import InertialStartConfig
@@ -87,21 +88,6 @@ class StereoConfig:
     iterations: int = 6  # Gauss-Newton steps; it converges in 3
     points: int = 240  # disparities measured in a frame, spread over the landmarks found; 0: none
     sigma_px: float = 0.25  # px at octave 0: standard deviation of a disparity
-
-
-@dataclass(frozen=True, slots=True)
-class RowConfig:
-    """Estimation of how far the right image lies off the rows of the left one, from the points of keyframes."""
-
-    on: bool = True
-    min_points: int = 40  # points of a keyframe with a measured offset; five numbers are estimated from them
-    sigma_px: float = 0.5  # px at octave 0; of a measured offset, with what points of a keyframe have in common
-    prior_px: float = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's
-    max_px: float = 3.5  # px of the level; offset beyond which the patch is another one
-    iterations: int = 10  # Gauss-Newton steps; it converges in 4 from 1 px
-    min_ncc: float = 0.9  # correlation of the two patches; lower at occlusions
-    min_px: float = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
-    min_significance: float = 4.0  # standard deviations of a change that is applied
 
 
 @dataclass(frozen=True, slots=True)

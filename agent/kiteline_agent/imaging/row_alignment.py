@@ -8,10 +8,11 @@ a pixel.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import RowConfig
 from kiteline_agent.imaging import row_kernels
 from kiteline_core.geometry.cameras import GRID_STEP, Rectifier
 
@@ -19,6 +20,21 @@ F64 = NDArray[np.float64]
 
 TERMS = 5
 _ROUNDS = 4  # of robust weighting
+
+
+@dataclass(frozen=True, slots=True)
+class RowConfig:
+    """Estimation of how far the right image lies off the rows of the left one, from the points of keyframes."""
+
+    on: bool = True
+    min_points: int = 40  # points of a keyframe with a measured offset; five numbers are estimated from them
+    sigma_px: float = 0.5  # px at octave 0; of a measured offset, with what points of a keyframe have in common
+    prior_px: float = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's
+    max_px: float = 3.5  # px of the level; offset beyond which the patch is another one
+    iterations: int = 10  # Gauss-Newton steps; it converges in 4 from 1 px
+    min_ncc: float = 0.9  # correlation of the two patches; lower at occlusions
+    min_px: float = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
+    min_significance: float = 4.0  # standard deviations of a change that is applied
 
 
 def terms(xy: F64) -> F64:
