@@ -105,8 +105,12 @@ class InertialBundle:
 
     def landmarks_of(self, state: WindowState) -> tuple[F64, I64]:
         """Landmarks (P,3) in w, and the keyframe (P,) that saw each one first."""
-        ray = (self._axes @ np.append(state.m, np.ones((self._landmarks, 1)), axis=1)[..., None])[..., 0]
-        return self._origin + ray / state.rho[:, None], np.argmax(self._obs.seen, axis=0)
+        return self._origin + self._rays(state) / state.rho[:, None], np.argmax(self._obs.seen, axis=0)
+
+    def _rays(self, state: WindowState) -> F64:
+        """(P,3) from the landmarks' origins to the landmarks, in w, times rho."""
+        m = np.append(state.m, np.ones((self._landmarks, 1)), axis=1)
+        return np.asarray((self._axes @ m[..., None])[..., 0])
 
     # stages
 
@@ -213,8 +217,7 @@ class InertialBundle:
             [last + np.arange(9), _STATE * n + np.arange(3), last + np.arange(9, 12), _STATE * n + 3 + np.arange(2)]
         )
         camera = state.p[-1] + state.R[-1] @ self._t_bc
-        ray = (self._axes @ np.append(state.m, np.ones((self._landmarks, 1)), axis=1)[..., None])[..., 0]
-        scaled = (ray + state.rho[:, None] * (self._origin - camera)) @ (state.R[-1] @ self._r_bc)
+        scaled = (self._rays(state) + state.rho[:, None] * (self._origin - camera)) @ (state.R[-1] @ self._r_bc)
         fits = self._error[self._obs.seen]
         fits = fits[fits < 3.0]
         return WindowSolution(
@@ -246,9 +249,8 @@ class InertialBundle:
 
     def _project(self, state: WindowState) -> tuple[F64, F64, F64, F64]:
         """Landmarks in the body (K,P,3) times rho, depth times rho (K,P), pixels over focal (K,P,2), error there."""
-        ray = (self._axes @ np.append(state.m, np.ones((self._landmarks, 1)), axis=1)[..., None])[..., 0]
         to = self._origin[None] - state.p[:, None]
-        y = (ray[None] + state.rho[None, :, None] * to) @ state.R
+        y = (self._rays(state)[None] + state.rho[None, :, None] * to) @ state.R
         q = (y - state.rho[None, :, None] * self._t_bc) @ self._r_bc
         z = np.maximum(q[..., 2], 1e-3)
         xy = q[..., :2] / z[..., None]
@@ -279,8 +281,6 @@ class InertialBundle:
     def _cost(self, state: WindowState, *, inertial: bool) -> float:
         cost = self._visual_cost(self._project(state)[3])[0]
         errors = self._inertial_errors(state)
-        if not inertial:
-            errors[:, 3:] = 0.0
         cost += 0.5 * sum(float(e @ i @ e) for e, i in zip(errors, self._used_info(inertial=inertial), strict=True))
         return cost + self._prior_cost(state)
 

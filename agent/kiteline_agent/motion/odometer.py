@@ -247,11 +247,6 @@ class Odometer:
         self._scale_windows = []
         self._reset_image_loss()
 
-    @property
-    def measures_scale(self) -> bool:
-        """True if most windows so far agree with a monocular map, so that its scale will be known soon."""
-        return 0 < len(self._scale_windows) <= 2 * sum(agrees for _, agrees in self._scale_windows)
-
     def metres_per_unit(self) -> tuple[float, float] | None:
         """Metres per unit of the map and its standard deviation; None while unknown."""
         c = self._config

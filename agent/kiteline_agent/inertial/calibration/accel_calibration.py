@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.robust_update import robust_update, significance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.geometry import se3
 
@@ -13,7 +14,6 @@ F64 = NDArray[np.float64]
 _AXES, _BIAS, _TILT, _SCALE = slice(0, 9), slice(9, 12), slice(12, 15), 15
 _BIAS_M_S2, _TILT_RAD = 0.1, 0.03  # standard deviations at the start
 _TILT_WALK_RAD = 2e-4  # per sqrt(s): the map bends while it grows
-_OUTLIER = 9.0  # squared error over its variance from which a pair of windows weighs less
 
 
 class AccelCalibration:
@@ -54,8 +54,7 @@ class AccelCalibration:
 
     def significance(self) -> float:
         """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
-        axes = self._x[_AXES]
-        return float(axes @ np.linalg.solve(self.axes_cov, axes)) / max(self.excess, 1.0)
+        return significance(self._x[_AXES], self.axes_cov, self.excess)
 
     def set_vertical(self, gravity: F64 | None) -> None:
         """Begin in a map in which gravity points along (3,); None: unknown as yet."""
@@ -96,16 +95,11 @@ class AccelCalibration:
         j = np.empty((3, 16))  # of the negative error
         j[:, _AXES], j[:, _BIAS], j[:, _TILT], j[:, _SCALE] = force, -time, -se3.skew(fallen), -moved
         self._cov[np.diag_indices(16)] += self._walk * dt[1]
-        predicted = j @ self._cov @ j.T
-        s = predicted + variance * np.eye(3)
-        square = float(error @ np.linalg.solve(s, error)) / 3.0
-        self.excess += 0.05 * (min(square, 25.0) - self.excess)
-        if square > _OUTLIER:
-            s = predicted + variance * square / _OUTLIER * np.eye(3)
-        gain = np.linalg.solve(s, j @ self._cov).T
-        change = gain @ error
+        update = robust_update(j, self._cov, error, variance)
+        self.excess += 0.05 * (min(update.square, 25.0) - self.excess)
+        change = update.gain @ error
         self._gravity = se3.so3_exp(change[_TILT]) @ self._gravity
         change[_TILT] = 0.0
         self._x = x + change
-        self._cov -= gain @ s @ gain.T
+        self._cov -= update.gain @ update.s @ update.gain.T
         self._cov = 0.5 * (self._cov + self._cov.T)

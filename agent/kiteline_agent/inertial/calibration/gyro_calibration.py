@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.robust_update import robust_update, significance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.geometry import se3
 
@@ -12,7 +13,6 @@ F64 = NDArray[np.float64]
 
 _AXES, _OFFSET, _BIAS = slice(0, 9), 9, slice(10, 13)
 _BIAS_RAD_S = 0.1  # standard deviation of an unknown bias
-_OUTLIER = 9.0  # squared error over its variance from which a window weighs less
 
 
 class GyroCalibration:
@@ -58,8 +58,7 @@ class GyroCalibration:
 
     def significance(self) -> float:
         """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
-        axes = self._x[_AXES]
-        return float(axes @ np.linalg.solve(self.axes_cov, axes)) / max(self.excess, 1.0)
+        return significance(self._x[_AXES], self.axes_cov, self.excess)
 
     def add(self, window: Window, R_b0_b1: F64, turn_variance: float) -> float:
         """Add a window over which the images rotated by R_b0_b1 (3,3).
@@ -74,14 +73,9 @@ class GyroCalibration:
         j[:, _BIAS] = -back @ window.time[0]
         error = se3.so3_log(back @ R_b0_b1)
         self._cov[np.diag_indices(13)] += self._walk * window.duration_s
-        predicted = j @ self._cov @ j.T
-        s = predicted + turn_variance * np.eye(3)
-        square = float(error @ np.linalg.solve(s, error)) / 3.0
-        self.excess += 0.05 * (min(square, 25.0) - self.excess)
-        if square > _OUTLIER:
-            s = predicted + turn_variance * square / _OUTLIER * np.eye(3)
-        gain = np.linalg.solve(s, j @ self._cov).T
-        self._x += gain @ error
-        self._cov -= gain @ s @ gain.T
+        update = robust_update(j, self._cov, error, turn_variance)
+        self.excess += 0.05 * (min(update.square, 25.0) - self.excess)
+        self._x += update.gain @ error
+        self._cov -= update.gain @ update.s @ update.gain.T
         self._cov = 0.5 * (self._cov + self._cov.T)
-        return float(np.trace(predicted)) / 3.0
+        return float(np.trace(update.predicted)) / 3.0
