@@ -156,7 +156,7 @@ class GraphConfig:
     iterations: int = 8  # of Gauss-Newton
     scale_iterations: int = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther
     stop: float = 1e-4  # relative decrease of the error below which the solver stops
-    first_full: int = 12  # keyframes of a map at its first full bundle
+    first_full: int = 3  # keyframes of a map at its first full bundle: a worn rig is seen in it
     full_share: float = 0.03  # of the worker's time for scheduled full bundles: one of 100 keyframes every 3 s
     max_full: int = 800  # keyframes of a full bundle, which takes 0.4 s; of a larger map, those around the loop
     robust_trials: int = 6  # trial steps of a full bundle before the outlier test
@@ -174,6 +174,11 @@ class DisparityConfig:
     prior_rad: float = 3e-4  # rad; of the right camera's rotation (times the focal length: px where x or y is 1)
     tail: float = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
     determined: float = 0.7  # share of the prior's deviation; a term yields that data alone determine better
+    worn: float = 15.0  # factor on both deviations for a rig that has changed since its calibration: one or two pixels
+    contradicts: float = (
+        6.0  # squared distance of the data from a good calibration, inflated; of true rigs it is below 1
+    )
+    min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
     inflation: float = (
         3.0  # factor on the estimated standard deviations: lens distortion biases depths from motion, too
     )

@@ -14,7 +14,9 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.refinement.disparity_calibration import sideways_share
 from kiteline_codec.schema import CameraIntrinsics, DisparityCalibration, NewLandmarks, Observations, Record
+from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 
@@ -95,3 +97,26 @@ def test_the_next_flight_begins_with_the_offset_unless_the_rig_was_calibrated_ag
     assert told(after, flight.camera.fx) == []
     assert [r.disparity_px.tolist() for r in told(after, flight.camera.fx + 1.0)] == [NONE.tolist()]
     assert AgentId(0) not in after.map.disparity_calibrated
+
+
+def test_an_offset_of_a_worn_rig_is_found_early(make_flight: MakeFlight, words: Any) -> None:
+    worn = np.array([1.2, 0.1, -0.2, 0.6, 0.2])
+    flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    flight.records[8:] = []
+    mapper = Mapper(BaseConfig(), words)
+    fly(mapper, flight, worn)
+    corners = terms(np.array([[x, y] for x in (-0.7, 0.0, 0.7) for y in (-0.45, 0.0, 0.45)]))
+    left = corners @ (worn - mapper.map.disparity_offset_px.get(AgentId(0), NONE))
+    assert np.sqrt(np.mean(left**2)) < 0.25 * np.sqrt(np.mean((corners @ worn) ** 2))
+
+
+def test_motion_across_the_axis_is_that_of_the_cameras_own_axes() -> None:
+    """A camera that looks along its path moves along its axis, whichever way the path bends."""
+    turn = se3.so3_exp(np.array([0.0, 0.3, 0.0]))
+    step = {"ahead": np.array([0.0, 0.0, 0.5]), "sideways": np.array([0.5, 0.0, 0.0]), "both": np.array([0.3, 0, 0.4])}
+    for name, share in (("ahead", 0.0), ("sideways", 1.0), ("both", 0.36)):
+        T_m_c = [np.eye(4)]
+        for _ in range(6):
+            T_m_c.append(T_m_c[-1] @ se3.from_rt(np.eye(3), step[name]) @ se3.from_rt(turn, np.zeros(3)))
+        assert sideways_share(np.stack([se3.inverse(T) for T in T_m_c])) == pytest.approx(share, abs=1e-9)
+    assert sideways_share(np.tile(np.eye(4), (3, 1, 1))) == 0.0

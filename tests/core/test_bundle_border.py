@@ -122,6 +122,30 @@ def test_a_prior_yields_to_data_that_determine_a_large_offset() -> None:
     assert np.array_equal(bundle(holds, EASY).offset, normal.offset)  # the data determine too little
 
 
+def test_a_prior_widens_where_the_data_contradict_it() -> None:
+    problem = passage(0.02)
+    assert problem.border is not None
+    narrow = bundle(problem, EASY)
+    worn = replace(problem, border=replace(problem.border, worn=100.0, contradicts=30.0))
+    sure = replace(problem, border=replace(problem.border, worn=100.0, contradicts=1e6))
+    wide = bundle(worn, EASY)
+    free = bundle(passage(2.0), EASY)
+    assert np.allclose(wide.offset, free.offset, atol=1e-6)
+    assert np.abs(wide.offset - TRUE).max() < 0.15 < np.abs(narrow.offset - TRUE).max()
+    assert np.array_equal(bundle(sure, EASY).offset, narrow.offset)
+
+
+def test_a_prior_stays_where_the_data_agree_with_it() -> None:
+    problem = passage(0.02)
+    assert problem.border is not None
+    off = np.sum(problem.border.terms * TRUE[problem.border.group], axis=1)
+    good = problem.measured.copy()
+    good[:, 2] -= np.where(problem.border.group >= 0, off, 0.0)
+    true_rig = replace(problem, measured=good)
+    may = replace(true_rig, border=replace(problem.border, worn=100.0, contradicts=30.0))
+    assert np.array_equal(bundle(may, EASY).offset, bundle(true_rig, EASY).offset)
+
+
 def test_the_cost_of_a_yielding_prior_is_minimal() -> None:
     problem = passage(0.02)
     assert problem.border is not None

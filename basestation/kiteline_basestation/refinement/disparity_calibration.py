@@ -58,10 +58,24 @@ def with_border(
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
     sigma = np.array([config.prior_px, *[config.prior_rad * focal] * (TERMS - 1)])
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
+    tells = sideways_share(problem.T_c_m) >= config.min_sideways
     border = Border(
-        group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined
-    )
+        group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined,
+        config.worn, config.inflation**2 * config.contradicts if tells else np.inf,
+    )  # fmt: skip
     return replace(problem, measured=measured, border=border), agents
+
+
+def sideways_share(T_c_m: F64) -> float:
+    """Share of the squared motion between cameras (k,4,4) that is across the optical axis."""
+    moved = np.einsum("kij,kj->ki", T_c_m[:-1, :3, :3], _centres(T_c_m[1:])) + T_c_m[:-1, :3, 3]
+    squared = np.sum(np.square(moved), 0)
+    return float(squared[:2].sum() / max(float(squared.sum()), 1e-12))
+
+
+def _centres(T_c_m: F64) -> F64:
+    """Positions (k,3) of cameras (k,4,4) in m."""
+    return np.asarray(-np.einsum("kji,kj->ki", T_c_m[:, :3, :3], T_c_m[:, :3, 3]))
 
 
 def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:

@@ -45,7 +45,9 @@ class Border:
     group: (m,) int32 group of each observation, -1 for no offset. terms: (m,t): the offset to subtract from the
     disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) px, standard deviation of c about 0. tail: standard
     deviations beyond which the prior flattens (a t distribution), so that it yields to data that show a large offset;
-    only for terms whose standard deviation by the data alone is below this share `determined` of sigma.
+    only for terms whose standard deviation by the data alone is below this share `determined` of sigma. worn: factor on
+    sigma where the data contradict it: where their own estimate of a group is beyond `contradicts` (a squared
+    Mahalanobis distance) of what they and sigma allow.
     """
 
     group: I32
@@ -54,6 +56,8 @@ class Border:
     sigma: F64
     tail: float = np.inf
     determined: float = 0.7
+    worn: float = 1.0
+    contradicts: float = np.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,14 +280,33 @@ class _BorderSolver(_Solver):
         return self._c, inverse @ inverse.T
 
     def let_priors_yield(self, active: U8) -> None:
-        """Let the priors of terms flatten that the data determine, each beside all other unknowns."""
-        if np.isinf(self._border.tail):
+        """Widen the priors of groups that the data contradict, and let those of terms flatten that the data determine,
+        each beside all other unknowns.
+        """
+        if np.isinf(self._border.tail) and np.isinf(self._border.contradicts):
             return
-        variance = np.diag(self.border_estimate(active)[1])
+        cov = self.border_estimate(active)[1]
+        variance = np.diag(cov)
         if not np.isfinite(variance).all():
+            return
+        self._widen_priors(cov)
+        if np.isinf(self._border.tail):
             return
         by_data = 1.0 / np.maximum(1.0 / variance - 1.0 / np.square(self._sigma), 1e-12)
         self._yields = by_data < np.square(self._border.determined * self._sigma)
+
+    def _widen_priors(self, cov: F64) -> None:
+        """Compare the data's own estimate of each group's offsets with its prior. cov: (b,b) with the prior."""
+        total = np.linalg.inv(cov)
+        own = total - np.diag(np.square(1.0 / self._sigma)) + 1e-9 * np.eye(len(cov))
+        estimate = np.linalg.solve(own, total @ (self._c.ravel() + self._rhs[6 * self._n_free :]))
+        spread = np.linalg.inv(own) + np.diag(np.square(self._sigma))
+        terms = self._c.shape[1]
+        for first in range(0, len(cov), terms):
+            part = slice(first, first + terms)
+            distance = float(estimate[part] @ np.linalg.solve(spread[part, part], estimate[part]))
+            if distance > self._border.contradicts:
+                self._sigma[part] *= self._border.worn
 
     def _correct(self, c: F64) -> None:
         border_kernels.correct(self._raw, self._border.group, self._border.terms, c, self._measured)
