@@ -74,10 +74,8 @@ class KeyframeMaker:
         track: None for a keyframe without observations of older landmarks.
         """
         rows, seen = (np.zeros(0, np.int64), np.zeros((0, 3))) if track is None else self._inliers(track)
-        # New landmarks first, in the order of image rows: neighbours code shortest.
-        band = points.uv[:, 1] // ctx.config.detector.cell_px
         profile = self._channel.profile
-        order = np.lexsort((points.uv[:, 0], band, np.arange(len(band)) >= profile.landmarks))
+        order = _in_order_of_rows(points, ctx.config.detector.cell_px, profile.landmarks)
         landmarks, strength = self._new_landmarks(keyframe, points, order)
         shared = self._map.is_shared(rows)
         observations = self._observations(keyframe, rows[shared], seen[shared], min(len(order), profile.landmarks))
@@ -93,12 +91,26 @@ class KeyframeMaker:
             uv[decoded.index], rho[decoded.index] = decoded.uv, decoded.inv_depth
         for section in sections[1]:
             self._channel.put(section)
-        rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         T_m_k = self._pose_of(header)
         seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
         self._store(ctx, header, T_m_k, uv, seen_uv, rho, landmarks)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         return T_m_k
+
+    def make_unshared(
+        self, ctx: FrameContext, points: NewPoints, keyframe: KeyframeId, parent: KeyframeId, T_p_k: F64
+    ) -> None:  # fmt: skip
+        """Store a keyframe for the tracker alone. parent: a keyframe that is shared; T_p_k: (4,4)."""
+        order = _in_order_of_rows(points, ctx.config.detector.cell_px, len(points.uv))
+        landmarks, _ = self._new_landmarks(keyframe, points, order)
+        self._count(ctx, len(order), 0)
+        uv = landmarks.uv.astype(np.float64)
+        header = KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, 0)
+        seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
+        self._store(
+            ctx, header, self._pose_of(header), uv, seen_uv, landmarks.inv_depth.astype(np.float64), landmarks
+        )  # fmt: skip
+        self._map.share(keyframe, 0)
 
     def _inliers(self, track: Track) -> tuple[NDArray[np.int64], F64]:
         """Rows (n,) and observations (n,3) of the inliers, by landmark id."""
@@ -155,7 +167,11 @@ class KeyframeMaker:
         self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, seen_uv: F64, rho: F64,
         landmarks: NewLandmarks,
     ) -> None:  # fmt: skip
-        """Cut the templates at seen_uv (n,2), where the image shows them, and add the keyframe to the local map."""
+        """Cut the templates at seen_uv (n,2), where the image shows them, and add the keyframe to the local map.
+
+        rho: (n,) 1/m as measured, with the stereo offset.
+        """
+        rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         octave, config = landmarks.octave, ctx.config
         side = alignment_kernels.TEMPLATE
         templates = np.empty((len(uv), alignment_kernels.TEMPLATE_LEVELS, side, side), np.uint8)
@@ -167,3 +183,9 @@ class KeyframeMaker:
             header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number
         )  # fmt: skip
         self._map.rolled[slot] = ctx.shutter is None
+
+
+def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> NDArray[np.int64]:
+    """Order of the strongest `first` points, then of the others, by image rows: neighbours code shortest."""
+    band = points.uv[:, 1] // cell_px
+    return np.lexsort((points.uv[:, 0], band, np.arange(len(band)) >= first))

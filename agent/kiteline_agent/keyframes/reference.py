@@ -1,6 +1,11 @@
-"""The reference keyframe: the newest one, or the one at which the camera was relocalised."""
+"""The reference keyframe: the newest one that is shared, or the one at which the camera was relocalised.
+
+Beside it the newest of all is known: where a link carries fewer keyframes than tracking needs, some are not shared.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +15,21 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id
+from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id
 
 F64 = NDArray[np.float64]
+
+_UNSHARED = 1024  # sequence numbers of keyframes that are not shared, used in turn: many times those in a local map
+
+
+@dataclass(slots=True)
+class _Made:
+    """When a keyframe was made. inliers: of the first frame that was tracked after it."""
+
+    keyframe: KeyframeId = NO_KEYFRAME
+    t_ns: int = 0
+    frame_number: int = 0
+    inliers: int = 0
 
 
 class ReferenceKeyframe:
@@ -20,17 +37,20 @@ class ReferenceKeyframe:
 
     def __init__(self, local_map: LocalMap) -> None:
         self._map = local_map
-        self._last_sequence: dict[SubmapId, int] = {}  # of the newest keyframe in each submap
-        self._inliers = 0  # of the first frame that was tracked after the newest keyframe
-        self._t_ns = 0  # of the newest keyframe
-        self._frame_number = 0
+        self._last_sequence: dict[SubmapId, int] = {}  # of the newest keyframe that is shared in each submap
+        self._shared = _Made()  # the newest keyframe that is shared; its inliers are those of shared landmarks
+        self._newest = _Made()  # the newest one, shared or not
+        self._unshared = 0  # number of keyframes that were not shared
         self.keyframe: KeyframeId = NO_KEYFRAME
         self.T_k_c: F64 = np.eye(4)
 
     @property
     def T_m_k(self) -> F64 | None:
         """(4,4) in the local map; None if the keyframe was evicted."""
-        slot = self._map.slot_of(self.keyframe)
+        return self._pose_of(self.keyframe)
+
+    def _pose_of(self, keyframe: KeyframeId) -> F64 | None:
+        slot = self._map.slot_of(keyframe)
         return self._map.T_m_k[slot] if slot >= 0 else None
 
     def set_camera(self, T_m_c: F64) -> None:
@@ -40,18 +60,34 @@ class ReferenceKeyframe:
             self.T_k_c = se3.inverse(T_m_k) @ T_m_c
 
     def keyframe_need(self, ctx: FrameContext, track: Track) -> KeyframeNeed | None:
-        """Why a tracked frame should become a keyframe; None if it need not."""
-        frames = ctx.number - self._frame_number
+        """Why a tracked frame should become a keyframe; None if it need not.
+
+        After a keyframe that was not shared, another such one serves the tracker: what presses is that the base's
+        landmarks leave the view.
+        """
+        unshared = self._newest.keyframe != self._shared.keyframe
+        frames, of_base = ctx.number - self._newest.frame_number, self._of_base(track)
         if frames == 1:
-            self._inliers = track.inliers
-        T_m_k = self.T_m_k
+            self._newest.inliers = track.inliers
+        if ctx.number - self._shared.frame_number == 1:
+            self._shared.inliers = of_base
+        T_m_k = self._pose_of(self._newest.keyframe) if unshared else self.T_m_k
+        T_m_k = self.T_m_k if T_m_k is None else T_m_k
         assert T_m_k is not None
-        now = situation(track, self._map.camera, T_m_k, frames, self.age_ns(ctx.t_ns) * 1e-9, self._inliers)
-        return keyframe_need(now, ctx.config.keyframe)
+        age_s = (ctx.t_ns - self._newest.t_ns) * 1e-9
+        now = situation(track, self._map.camera, T_m_k, frames, age_s, self._newest.inliers)
+        need = keyframe_need(now, ctx.config.keyframe)
+        if need is None or not unshared:
+            return need
+        return replace(need, pressing=of_base < ctx.config.keyframe.min_share * self._shared.inliers)
+
+    def _of_base(self, track: Track) -> int:
+        """Number of tracked landmarks that the base knows."""
+        return int(np.count_nonzero(self._map.is_shared(track.rows[track.inlier])))
 
     def age_ns(self, t_ns: int) -> int:
-        """Time since the newest keyframe."""
-        return t_ns - self._t_ns
+        """Time since the newest keyframe that is shared."""
+        return t_ns - self._shared.t_ns
 
     def next_keyframe(self, submap: SubmapId, T_m_c: F64) -> tuple[KeyframeId, KeyframeId, F64]:
         """Id, parent and T_p_k (4,4) of the next keyframe; a submap's first one has no parent, its pose is T_m_c."""
@@ -59,22 +95,34 @@ class ReferenceKeyframe:
             return keyframe_id(submap, 0), NO_KEYFRAME, T_m_c
         return keyframe_id(submap, self._last_sequence[submap] + 1), self.keyframe, self.T_k_c
 
+    def next_unshared(self, submap: SubmapId) -> KeyframeId:
+        """Id of the next keyframe that is not shared: from the end of the sequence numbers, where no other ones are."""
+        return keyframe_id(submap, MAX_KEYFRAMES - 1 - self._unshared % _UNSHARED)
+
     def set_new(self, keyframe: KeyframeId, submap: SubmapId, T_k_c: F64, t_ns: int, frame_number: int) -> None:
         """A keyframe was made. T_k_c: (4,4), not exactly the identity, since the keyframe's pose is quantised."""
         self._last_sequence[submap] = self._last_sequence.get(submap, -1) + 1
         self.keyframe, self.T_k_c = keyframe, T_k_c
-        self._t_ns, self._frame_number = t_ns, frame_number
+        self._shared = _Made(keyframe, t_ns, frame_number, self._shared.inliers)
+        self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers)
+
+    def set_unshared(self, keyframe: KeyframeId, t_ns: int, frame_number: int) -> None:
+        """A keyframe was made that is not shared."""
+        self._unshared += 1
+        self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers)
 
     def is_of(self, frame_number: int) -> bool:
-        """True if the newest keyframe was made of this frame."""
-        return self._frame_number == frame_number
+        """True if the newest keyframe that is shared was made of this frame."""
+        return self._shared.frame_number == frame_number
 
     def return_to(self, keyframe: KeyframeId, inliers: int, frame_number: int) -> None:
         """Use an older keyframe after a relocalisation; `set_camera` follows."""
         self.keyframe = keyframe
-        self._inliers = inliers
+        self._newest = replace(self._shared, inliers=inliers)
+        self._shared.inliers = inliers
         self._map.last_seen[self._map.slot_of(keyframe)] = frame_number
 
     def scale_inliers(self, points_before: int, points_now: int) -> None:
         """Frames track another number of landmarks from now on: keep the reference comparable."""
-        self._inliers = self._inliers * points_now // points_before
+        for made in (self._shared, self._newest):
+            made.inliers = made.inliers * points_now // points_before

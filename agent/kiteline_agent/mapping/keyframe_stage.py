@@ -36,7 +36,7 @@ class KeyframeStage:
         self._without_right = 0  # frames since the last right image of a stereo camera
 
     def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
-        """Make a keyframe if the policy needs one, and link and CPU time allow it. Returns events."""
+        """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events."""
         self._without_right = self._without_right + 1 if self._maker.lacks_right_image(ctx) else 0
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
@@ -47,7 +47,8 @@ class KeyframeStage:
         if not urgent and 0 < self._without_right <= ctx.config.keyframe.wait_right_frames:
             return []  # its new landmarks would have no depth
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
-            return []
+            self._add_unshared(ctx, track)
+            return [f"keyframe, not shared: {need.rule}"]
         self.add(ctx, track)
         return [f"keyframe: {need.rule}"]
 
@@ -55,6 +56,15 @@ class KeyframeStage:
         """Make a keyframe of a tracked frame, with new landmarks where the image has room."""
         points = self._maker.points_beside(ctx, track)
         self.make(ctx, track, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
+
+    def _add_unshared(self, ctx: FrameContext, track: Track) -> None:
+        """Make a keyframe for the tracker alone."""
+        camera, reference = self._camera, self._camera.reference
+        keyframe = reference.next_unshared(camera.submaps.active)
+        points = self._maker.points_beside(ctx, track)
+        self._maker.make_unshared(ctx, points, keyframe, reference.keyframe, reference.T_k_c)
+        reference.set_unshared(keyframe, ctx.t_ns, ctx.number)
+        self._finish(ctx, keyframe, Extra.KEYFRAME)
 
     def extend_map_by_dead_reckoning(self, ctx: FrameContext) -> tuple[bool, list[str]]:
         """Make a keyframe without observations, where dead reckoning says that the camera is.
@@ -82,9 +92,12 @@ class KeyframeStage:
         keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
         T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k)
         reference.set_new(keyframe, submap, se3.inverse(T_m_k) @ T_m_c, ctx.t_ns, ctx.number)
-        self._governor.note(kind)
         self._relocaliser.add_keyframe(keyframe)
+        self._finish(ctx, keyframe, kind)
+        return keyframe
+
+    def _finish(self, ctx: FrameContext, keyframe: KeyframeId, kind: Extra) -> None:
+        self._governor.note(kind)
         self._camera.covariance.store(keyframe)
         if ctx.images.right is not None and ctx.images.right.needs_rectification:
             self._work.rectified_px += ctx.images.sampled[1].size
-        return keyframe

@@ -1,0 +1,91 @@
+"""Keyframes for the tracker alone: a link that carries few keyframes does not thin out the agent's own map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_bench.harness.recording import Recording, load
+from kiteline_bench.harness.run import FlyingAgent
+from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations, Record
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME
+
+FRAMES = 60
+GAP_NS = 2_000_000_000
+
+
+class ThinLink(NoBaseChannel):
+    """A link that carries a keyframe now and then."""
+
+    def __init__(self, gap_ns: int) -> None:
+        super().__init__()
+        self.gap_ns = gap_ns
+        self.records: list[Record] = []
+
+    def keyframe_gap_ns(self) -> int:
+        return self.gap_ns
+
+    def put(self, record: Record) -> Record:
+        self.records.append(record)
+        return super().put(record)
+
+    def headers(self) -> list[KeyframeHeader]:
+        return [r for r in self.records if isinstance(r, KeyframeHeader)]
+
+
+@pytest.fixture(scope="module")
+def room(data_dir: Path) -> Recording:
+    return load(str(data_dir / "room_flight.mcap"), frames=FRAMES).without_imu()
+
+
+def fly(room: Recording, gap_ns: int) -> tuple[FlyingAgent, ThinLink]:
+    channel = ThinLink(gap_ns)
+    agent = FlyingAgent(room.rig, room.imu, channel=channel)
+    for item in room.items:
+        agent.step(item)
+    return agent, channel
+
+
+def test_a_thin_link_does_not_thin_out_the_local_map(room: Recording) -> None:
+    wide, thin = fly(room, 0), fly(room, GAP_NS)
+    in_map = [int(np.count_nonzero(agent.box.map.keyframe != NO_KEYFRAME)) for agent, _ in (wide, thin)]
+    assert in_map[1] >= in_map[0] - 1  # as many keyframes to track by
+    assert len(wide[1].headers()) == in_map[0]
+    assert len(thin[1].headers()) < 0.7 * in_map[1]
+    assert thin[0].run.lost == 0
+
+
+def test_the_base_hears_of_shared_keyframes_alone(room: Recording) -> None:
+    agent, channel = fly(room, GAP_NS)
+    shared: set[int] = set()
+    for record in channel.records:
+        if isinstance(record, KeyframeHeader):
+            assert record.parent == NO_KEYFRAME or record.parent in shared
+            shared.add(int(record.keyframe))
+        elif isinstance(record, NewLandmarks):
+            assert int(record.keyframe) in shared
+        elif isinstance(record, Observations):
+            assert {int(point) >> KEYPOINT_BITS for point in record.point} <= shared
+        elif isinstance(record, LivePose):
+            assert int(record.keyframe) in shared
+    assert sorted(k & 0xFFFFF for k in shared) == list(range(len(shared)))  # their numbers have no gaps
+    assert {int(e.keyframe) for e in agent.run.found} <= shared
+    assert any("not shared" in event for events in agent.run.events for event in events)
+
+
+def test_an_unshared_keyframe_moves_with_its_parent(room: Recording) -> None:
+    agent, _ = fly(room, GAP_NS)
+    held = agent.box.map
+    unshared = [s for s in np.flatnonzero(held.keyframe != NO_KEYFRAME).tolist() if not held.shared[s]]
+    assert unshared
+    slot = unshared[-1]
+    parent = held.slot_of(int(held.parent[slot]))
+    assert held.shared[parent] > 0
+    relative = np.linalg.inv(held.T_m_k[parent]) @ held.T_m_k[slot]
+    held.T_m_k[parent][:3, 3] += [0.1, 0.0, -0.2]
+    held.from_base[parent] = True
+    held.compose_unplaced()
+    assert np.allclose(held.T_m_k[parent] @ relative, held.T_m_k[slot], atol=1e-9)
