@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_agent.imaging.rectification_kernels import ROOM, SIDE, _rectify_patch
+from kiteline_agent.imaging.rectification_kernels import _raw_at
 from kiteline_core.jit import njit
 
 PATCH_RADIUS = 4  # a patch is 9x9 px of the level at which it is compared
@@ -167,10 +167,9 @@ def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def
 
 
 @njit
-def _align_level(image, grid, is_raw, whole, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
+def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # type: ignore[no-untyped-def]
     """Gauss-Newton on (x, y) until the patch matches the template. Returns (x, y, ncc, inside).
 
-    grid: of raw pixels, used if the image is raw. whole: (SIDE, SIDE) uint8, for its rectified part around the patch.
     patches: (5, LANES) int16: the current patch (out), the template, its gradients (see template_gradients), and ones.
     The steps use gradients made orthogonal to the template and to a constant; their sums follow from the exact sums
     over the plain ones.
@@ -195,22 +194,10 @@ def _align_level(image, grid, is_raw, whole, patches, raw, across, x, y, iterati
     start_y = y
     ncc = 0.0
     converged = False
-    left = -SIDE  # of `whole` in the image
-    top = -SIDE
     for k in range(iterations + 1):
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             return x, y, 0.0, False
-        if is_raw:
-            dx = int(x) - PATCH_RADIUS - left
-            dy = int(y) - PATCH_RADIUS - top
-            if dx < 0 or dy < 0 or dx > 2 * ROOM or dy > 2 * ROOM:
-                left = int(x) - PATCH_RADIUS - ROOM
-                top = int(y) - PATCH_RADIUS - ROOM
-                if not _rectify_patch(image, grid, left, top, whole):
-                    return x, y, 0.0, False
-            sample_patch(whole, x - left, y - top, raw, across, seen)
-        else:
-            sample_patch(image, x, y, raw, across, seen)
+        sample_patch(image, x, y, raw, across, seen)
         total = float(dot(seen, ones))
         st = dot(seen, t) - mean * total
         gain = st / tt
@@ -239,6 +226,18 @@ def _align_level(image, grid, is_raw, whole, patches, raw, across, x, y, iterati
 
 
 @njit
+def _raw_slopes(grid, x, y):  # type: ignore[no-untyped-def]
+    """Raw pixel of the rectified pixel (x, y), and its derivatives by x and by y, over the width of a patch."""
+    u, v = _raw_at(grid, x, y)
+    u1, v1 = _raw_at(grid, x + PATCH_RADIUS, y)
+    u0, v0 = _raw_at(grid, x - PATCH_RADIUS, y)
+    u3, v3 = _raw_at(grid, x, y + PATCH_RADIUS)
+    u2, v2 = _raw_at(grid, x, y - PATCH_RADIUS)
+    s = 0.5 / PATCH_RADIUS
+    return u, v, (u1 - u0) * s, (v1 - v0) * s, (u3 - u2) * s, (v3 - v2) * s
+
+
+@njit
 def align(  # type: ignore[no-untyped-def]
     pyramid, grid, templates, rows, octave, warp, uv, first, last, iterations, max_step_px, min_ncc, found, ncc
 ):
@@ -256,7 +255,6 @@ def align(  # type: ignore[no-untyped-def]
     raw = np.zeros(LANES + STRIDE, np.uint8)
     across = np.zeros(LANES + STRIDE, np.int16)
     patches = np.zeros((5, LANES), np.int16)
-    whole = np.empty((SIDE, SIDE), np.uint8)
     for r in range(PATCH):
         for c in range(PATCH):
             patches[4, r * STRIDE + c] = 1
@@ -276,22 +274,39 @@ def align(  # type: ignore[no-untyped-def]
             cut = min(octave[i] + j, levels - 1)
             level = min(max(cut + shift, 0), levels - 1)
             ratio = float(1 << level) / float(1 << cut) / det
-            inside = warp_template(
-                templates[rows[i], j],
-                warp[i, 1, 1] * ratio,
-                -warp[i, 0, 1] * ratio,
-                -warp[i, 1, 0] * ratio,
-                warp[i, 0, 0] * ratio,
-                reference,
-            )
-            if not inside:
+            m00 = warp[i, 1, 1] * ratio
+            m01 = -warp[i, 0, 1] * ratio
+            m10 = -warp[i, 1, 0] * ratio
+            m11 = warp[i, 0, 0] * ratio
+            s = float(1 << level)
+            begin_x = x / s
+            begin_y = y / s
+            is_raw = level == 0 and grid.shape[0] > 0
+            if is_raw:
+                h, w = pyramid[0].shape
+                if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
+                    ok = False
+                    continue
+                # The template is warped into the raw image: over a patch, distortion is affine to 0.02 px.
+                begin_x, begin_y, ux, vx, uy, vy = _raw_slopes(grid, x, y)
+                part = 1.0 / (ux * vy - uy * vx)
+                xu, xv, yu, yv = vy * part, -uy * part, -vx * part, ux * part
+                m00, m01, m10, m11 = m00 * xu + m01 * yu, m00 * xv + m01 * yv, m10 * xu + m11 * yu, m10 * xv + m11 * yv
+            if not warp_template(templates[rows[i], j], m00, m01, m10, m11, reference):
                 continue
             template_gradients(reference, patches)
-            s = float(1 << level)
             px, py, score, ok = _align_level(
-                pyramid[level], grid, level == 0 and grid.shape[0] > 0, whole, patches, raw, across, x / s, y / s,
-                iterations, max_step_px,
-            )  # fmt: skip
+                pyramid[level], patches, raw, across, begin_x, begin_y, iterations, max_step_px
+            )
+            if is_raw and ok:
+                u, v = begin_x, begin_y
+                at_x, at_y = x, y
+                for _ in range(2):  # Newton steps from the raw pixel back to the rectified one
+                    at_x += xu * (px - u) + xv * (py - v)
+                    at_y += yu * (px - u) + yv * (py - v)
+                    u, v = _raw_at(grid, at_x, at_y)
+                px = at_x
+                py = at_y
             if ok and (score >= min_ncc or j > last):
                 if score > 0.5:
                     x = px * s

@@ -90,7 +90,7 @@ def search_segments(  # type: ignore[no-untyped-def]
                 if abs(x0 - left - PATCH_RADIUS - ROOM) > ROOM or abs(y0 - top - PATCH_RADIUS - ROOM) > ROOM:
                     left = x0 - PATCH_RADIUS - ROOM
                     top = y0 - PATCH_RADIUS - ROOM
-                    if not _rectify_patch(pyramid[0], grid, left, top, whole):
+                    if not _rectify_patch(pyramid[0], grid, 1.0, float(left), float(top), SIDE, SIDE, 14, whole.T):
                         left = -SIDE
                         continue
                 x0 -= left

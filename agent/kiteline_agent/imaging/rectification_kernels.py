@@ -7,7 +7,7 @@ import numpy as np
 from kiteline_core.geometry.cameras import GRID_STEP
 from kiteline_core.jit import njit
 
-SIDE = 14  # px of a rectified patch: 10 px for a bilinear 9x9 patch, and room to move by 2 px each way
+SIDE = 14  # px of a patch in which another is moved: 10 px for a bilinear 9x9 patch, and 2 px each way
 ROOM = 2
 FIXED = 4294967296.0  # steps per px of a position
 HALF = 1 << 24  # half of 1/128 px: positions are rounded
@@ -32,43 +32,81 @@ def _raw_at(grid, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _rectify_patch(image, grid, left, top, patch):  # type: ignore[no-untyped-def]
-    """Fill patch (SIDE, SIDE) uint8 with the rectified pixels from (left, top) on; False outside of the raw image.
+def _differences(a, b, c, part):  # type: ignore[no-untyped-def]
+    """A parabola in steps of `part` of its length: first value, first and second difference. a, b, c: its values at
+    begin, middle and end.
+    """
+    bend = 4.0 * (a - 2.0 * b + c) * part * part
+    return np.int64(a), np.int64((4.0 * b - 3.0 * a - c) * part + 0.5 * bend), np.int64(bend)
 
-    Distortion is a parabola in each direction, through three by three pixels.
+
+@njit
+def _rectify_patch(image, grid, scale, left, top, rows, columns, bits, out):  # type: ignore[no-untyped-def]
+    """Fill out[:columns, :rows] with the rectified pixels from (left, top) on; False outside of the raw image.
+
+    image: raw, of the pyramid's level whose pixels are `scale` px wide; left, top: px of it. bits: of 14, by which grey
+    levels are shortened. Distortion is a parabola in each direction, through three by three pixels.
     """
     h, w = image.shape
-    last = SIDE - 1.0
     one = np.uint64(1)
-    for r in range(SIDE):
-        row = float(top + r)
-        u0, v0 = _raw_at(grid, float(left), row)
-        u1, v1 = _raw_at(grid, left + 0.5 * last, row)
-        u2, v2 = _raw_at(grid, left + last, row)
-        if min(u0, u1, u2) < 0.5 or max(u0, u1, u2) >= w - 2.0 or min(v0, v1, v2) < 0.5 or max(v0, v1, v2) >= h - 2.0:
-            return False
-        # Positions by second differences, in 2^-32 px; pixels in 1/128 of the way to the next.
-        cu = 2.0 * (u0 - 2.0 * u1 + u2) / (last * last)
-        cv = 2.0 * (v0 - 2.0 * v1 + v2) / (last * last)
-        x = np.int64(u0 * FIXED) + HALF
-        y = np.int64(v0 * FIXED) + HALF
-        step_x = np.int64(((4.0 * u1 - 3.0 * u0 - u2) / last + cu) * FIXED)
-        step_y = np.int64(((4.0 * v1 - 3.0 * v0 - v2) / last + cv) * FIXED)
-        bend_x = np.int64(2.0 * cu * FIXED)
-        bend_y = np.int64(2.0 * cv * FIXED)
-        out = patch[r]
-        for k in range(SIDE):
-            x0 = np.uint64(x >> 32)
-            y0 = np.uint64(y >> 32)
+    last = columns - 1.0
+    inverse = 1.0 / scale
+    half_x = 0.5 * last * scale
+    half_y = 0.5 * (rows - 1.0) * scale
+    x0 = left * scale
+    y0 = top * scale
+    u00, v00 = _raw_at(grid, x0, y0)
+    u01, v01 = _raw_at(grid, x0 + half_x, y0)
+    u02, v02 = _raw_at(grid, x0 + 2.0 * half_x, y0)
+    u10, v10 = _raw_at(grid, x0, y0 + half_y)
+    u11, v11 = _raw_at(grid, x0 + half_x, y0 + half_y)
+    u12, v12 = _raw_at(grid, x0 + 2.0 * half_x, y0 + half_y)
+    u20, v20 = _raw_at(grid, x0, y0 + 2.0 * half_y)
+    u21, v21 = _raw_at(grid, x0 + half_x, y0 + 2.0 * half_y)
+    u22, v22 = _raw_at(grid, x0 + 2.0 * half_x, y0 + 2.0 * half_y)
+    if min(u00, u10, u20) * inverse < 0.5 or max(u02, u12, u22) * inverse >= w - 2.0:
+        return False
+    if min(v00, v01, v02) * inverse < 0.5 or max(v20, v21, v22) * inverse >= h - 2.0:
+        return False
+    # Positions by differences along rows, and those by differences from row to row, in 2^-32 px; pixels in 1/128 of the
+    # way to the next.
+    fixed = inverse * FIXED
+    part = 1.0 / last
+    down = 1.0 / (rows - 1.0)
+    x_row, dx_row, ddx_row = _differences(u00 * fixed, u10 * fixed, u20 * fixed, down)
+    y_row, dy_row, ddy_row = _differences(v00 * fixed, v10 * fixed, v20 * fixed, down)
+    _, step0, _ = _differences(u00 * fixed, u01 * fixed, u02 * fixed, part)
+    _, step1, bend_x = _differences(u10 * fixed, u11 * fixed, u12 * fixed, part)
+    _, step2, _ = _differences(u20 * fixed, u21 * fixed, u22 * fixed, part)
+    step_x_row, dstep_x, ddstep_x = _differences(float(step0), float(step1), float(step2), down)
+    _, step0, _ = _differences(v00 * fixed, v01 * fixed, v02 * fixed, part)
+    _, step1, bend_y = _differences(v10 * fixed, v11 * fixed, v12 * fixed, part)
+    _, step2, _ = _differences(v20 * fixed, v21 * fixed, v22 * fixed, part)
+    step_y_row, dstep_y, ddstep_y = _differences(float(step0), float(step1), float(step2), down)
+    rounding = np.int64(1) << (bits - 1)
+    for r in range(rows):
+        x, y, step_x, step_y = x_row + HALF, y_row + HALF, step_x_row, step_y_row
+        to = np.uint64(r)
+        for k in range(columns):
+            column = np.uint64(x >> 32)
+            row = np.uint64(y >> 32)
             fx = (x >> 25) & 127
             fy = (y >> 25) & 127
-            a = np.int64(image[y0, x0])
-            b = np.int64(image[y0 + one, x0])
-            above = (a << 7) + fx * (np.int64(image[y0, x0 + one]) - a)
-            below = (b << 7) + fx * (np.int64(image[y0 + one, x0 + one]) - b)
-            out[np.uint64(k)] = np.uint8(((above << 7) + fy * (below - above) + 8192) >> 14)
+            a = np.int64(image[row, column])
+            b = np.int64(image[row + one, column])
+            above = (a << 7) + fx * (np.int64(image[row, column + one]) - a)
+            below = (b << 7) + fx * (np.int64(image[row + one, column + one]) - b)
+            out[np.uint64(k), to] = ((above << 7) + fy * (below - above) + rounding) >> bits
             x += step_x
             y += step_y
             step_x += bend_x
             step_y += bend_y
+        x_row += dx_row
+        y_row += dy_row
+        dx_row += ddx_row
+        dy_row += ddy_row
+        step_x_row += dstep_x
+        step_y_row += dstep_y
+        dstep_x += ddstep_x
+        dstep_y += ddstep_y
     return True

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_agent.imaging.rectification_kernels import SIDE as PATCH_SIDE
-from kiteline_agent.imaging.rectification_kernels import _raw_at, _rectify_patch
+from kiteline_agent.imaging.alignment_kernels import GREY, LANES, STRIDE, dot
+from kiteline_agent.imaging.rectification_kernels import _rectify_patch
 from kiteline_core.jit import njit
 
 RADIUS = 4
 SIDE = 2 * RADIUS + 1
+LEAST_SLOPES = 30.0  # sum of squared slopes in grey levels a px, made orthogonal to gain and offset; less is flat
 FINE_STEP_PX = 2.0  # px of the finer level: error left by the coarser one, or by a good prediction
 
 
@@ -94,127 +95,83 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
 
 
 @njit
-def _cut(image, x, y, patch, gradient):  # type: ignore[no-untyped-def]
-    """Patch around (x, y) of a level, zero-mean, and its gradient along the row made orthogonal to gain and offset.
+def _sample_columns(image, left, top, columns, out):  # type: ignore[no-untyped-def]
+    """Fill out[:columns, :SIDE] with the image from (left, top) on, in 1/GREY grey levels."""
+    x0 = int(left)
+    y0 = int(top)
+    fx = np.int32((left - x0) * 128.0 + 0.5)
+    fy = np.int32((top - y0) * 128.0 + 0.5)
+    for r in range(SIDE):
+        upper = image[y0 + r, x0 : x0 + columns + 1]
+        lower = image[y0 + r + 1, x0 : x0 + columns + 1]
+        to = np.uint64(r)
+        a = np.int32(upper[0])
+        before = (a << 7) + fy * (np.int32(lower[0]) - a)
+        for k in range(columns):
+            a = np.int32(upper[np.uint64(k + 1)])
+            here = (a << 7) + fy * (np.int32(lower[np.uint64(k + 1)]) - a)
+            out[np.uint64(k), to] = ((before << 7) + fx * (here - before) + 512) >> 10
+            before = here
 
-    Returns the sums of squares of both. The caller keeps RADIUS + 2 px from the border.
+
+@njit
+def _put_template(wide, patches):  # type: ignore[no-untyped-def]
+    """Write the template (row 0 of patches) and twice its gradient along the row (1), by wide (SIDE + 2, STRIDE)."""
+    grey = wide.reshape(-1)
+    for k in range(LANES):
+        j = np.uint64(k)
+        patches[0, j] = grey[np.uint64(k + STRIDE)]
+        patches[1, j] = grey[np.uint64(k + 2 * STRIDE)] - grey[j]
+
+
+@njit
+def _slide(strip, first, patches, begin, width, iterations, max_step_px):  # type: ignore[no-untyped-def]
+    """Align the template along a strip. Returns the column (px of the level) and the correlation, -1 on failure.
+
+    strip: (columns * STRIDE,) int16, columns of SIDE pixels, the first at column `first`. patches: (3, LANES) int16:
+    the template, twice its gradient, and ones, in columns as well. Gain and offset drop out as in `alignment_kernels`.
+    The patch between two columns is interpolated: so are its sums.
     """
-    y0 = int(y)
-    fy = y - y0
-    x0 = int(x)
-    fx = x - x0
-    line = np.empty(SIDE + 3)
-    mean = 0.0
-    mg = 0.0
-    for r in range(SIDE):
-        row = y0 + r - RADIUS
-        for c in range(SIDE + 3):
-            col = x0 + c - RADIUS - 1
-            line[c] = (1.0 - fy) * image[row, col] + fy * image[row + 1, col]
-        for c in range(SIDE):
-            v = (1.0 - fx) * line[c + 1] + fx * line[c + 2]
-            gv = 0.5 * ((1.0 - fx) * (line[c + 2] - line[c]) + fx * (line[c + 3] - line[c + 1]))
-            patch[r, c] = v
-            gradient[r, c] = gv
-            mean += v
-            mg += gv
-    mean /= SIDE * SIDE
-    mg /= SIDE * SIDE
-    tt = 1e-9
-    tg = 0.0
-    for r in range(SIDE):
-        for c in range(SIDE):
-            patch[r, c] -= mean
-            gradient[r, c] -= mg
-            tt += patch[r, c] * patch[r, c]
-            tg += patch[r, c] * gradient[r, c]
-    hess = 0.0
-    for r in range(SIDE):
-        for c in range(SIDE):
-            gradient[r, c] -= tg / tt * patch[r, c]
-            hess += gradient[r, c] * gradient[r, c]
-    return tt, hess
-
-
-@njit
-def _strip_of(image, first, columns, y, strip):  # type: ignore[no-untyped-def]
-    """Fill strip (SIDE, >= columns) with the rows around y of a level, from column `first` on."""
-    y0 = int(y)
-    fy = y - y0
-    for r in range(SIDE):
-        row = y0 + r - RADIUS
-        for c in range(columns):
-            strip[r, c] = (1.0 - fy) * image[row, first + c] + fy * image[row + 1, first + c]
-
-
-@njit
-def _raw_strip_of(image, grid, scale, first, columns, y, strip):  # type: ignore[no-untyped-def]
-    """Fill the strip by rectifying the raw image; False outside of it.
-
-    Distortion along a row is a parabola through three pixels: accurate to 0.02 px over the coarsest level.
-    """
-    h, w = image.shape
-    last = columns - 1.0
-    inverse = 1.0 / scale
-    for r in range(SIDE):
-        row = (y + r - RADIUS) * scale
-        u0, v0 = _raw_at(grid, first * scale, row)
-        u1, v1 = _raw_at(grid, (first + 0.5 * last) * scale, row)
-        u2, v2 = _raw_at(grid, (first + last) * scale, row)
-        u0, v0, u1, v1, u2, v2 = u0 * inverse, v0 * inverse, u1 * inverse, v1 * inverse, u2 * inverse, v2 * inverse
-        if min(u0, u2) < 0.0 or max(u0, u2) >= w - 1.5 or min(v0, v1, v2) < 0.5 or max(v0, v1, v2) >= h - 1.5:
-            return False
-        bu, bv = (4.0 * u1 - 3.0 * u0 - u2) / last, (4.0 * v1 - 3.0 * v0 - v2) / last
-        cu, cv = 2.0 * (u0 - 2.0 * u1 + u2) / (last * last), 2.0 * (v0 - 2.0 * v1 + v2) / (last * last)
-        for c in range(columns):
-            px = u0 + c * (bu + c * cu)
-            py = v0 + c * (bv + c * cv)
-            x0 = int(px)
-            y0 = int(py)
-            fx = px - x0
-            fy = py - y0
-            a = float(image[y0, x0])
-            b = float(image[y0 + 1, x0])
-            top = a + fx * (float(image[y0, x0 + 1]) - a)
-            bottom = b + fx * (float(image[y0 + 1, x0 + 1]) - b)
-            strip[r, c] = top + fy * (bottom - top)
-    return True
-
-
-@njit
-def _slide(strip, first, patch, gradient, tt, hess, begin, width, iterations, max_step_px):  # type: ignore[no-untyped-def]
-    """Align the patch along a strip. Returns the column (px of the level) and the correlation, -1 on failure."""
+    t, g, ones = patches[0], patches[1], patches[2]
+    count = float(SIDE * SIDE)
+    mean = dot(t, ones) / count
+    mean_g = dot(g, ones) / count
+    tt = dot(t, t) - count * mean * mean + 1e-9
+    share = (dot(t, g) - count * mean * mean_g) / tt
+    hess = dot(g, g) - count * mean_g * mean_g - share * share * tt
+    if hess < LEAST_SLOPES * 4.0 * GREY * GREY:
+        return begin, -1.0
     xr = begin
-    ncc = 0.0
     converged = False
+    at = -1
+    a = b = strip[:LANES]
+    t0, g0, n0, t1, g1, n1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(iterations + 1):
         if xr < RADIUS or xr >= width - RADIUS - 1 or abs(xr - begin) > max_step_px:
             return xr, -1.0
         c0 = int(xr)
-        fr = xr - c0
-        base = c0 - RADIUS - first
-        si = 0.0
-        sii = 0.0
-        st = 0.0
-        sg = 0.0
-        for r in range(SIDE):
-            for c in range(SIDE):
-                v1 = strip[r, base + c]
-                v = v1 + fr * (strip[r, base + c + 1] - v1)
-                si += v
-                sii += v * v
-                st += v * patch[r, c]
-                sg += v * gradient[r, c]
-        ncc = st / np.sqrt(tt * max(sii - si * si / (SIDE * SIDE), 1e-9))
+        f = xr - c0
+        if c0 != at:
+            at = c0
+            from_ = (c0 - RADIUS - first) * STRIDE
+            a = strip[from_ : from_ + LANES]
+            b = strip[from_ + STRIDE : from_ + STRIDE + LANES]
+            t0, g0, n0 = float(dot(a, t)), float(dot(a, g)), float(dot(a, ones))
+            t1, g1, n1 = float(dot(b, t)), float(dot(b, g)), float(dot(b, ones))
+        total = n0 + f * (n1 - n0)
+        st = t0 + f * (t1 - t0) - mean * total
         gain = st / tt
         if gain < 0.1:
             return xr, -1.0
         if converged or k == iterations:
-            break
-        move = min(max(-sg / (hess * gain), -1.5), 1.5)
+            e = 1.0 - f
+            square = e * e * dot(a, a) + 2.0 * e * f * dot(a, b) + f * f * dot(b, b)
+            return xr, st / np.sqrt(tt * max(square - total * total / count, 1e-9))
+        sg = g0 + f * (g1 - g0) - mean_g * total - share * st
+        move = min(max(-2.0 * sg / (hess * gain), -1.5), 1.5)
         xr += move
         converged = abs(move) < 0.01
-    return xr, ncc
+    return xr, -1.0
 
 
 @njit
@@ -231,12 +188,14 @@ def refine_rows(  # type: ignore[no-untyped-def]
     max_step_px: largest distance of the match from the prediction, in px of the level.
     """
     levels = len(left)
-    patch = np.empty((SIDE, SIDE))
-    gradient = np.empty((SIDE, SIDE))
-    strip = np.empty((SIDE, SIDE + 2 * int(np.ceil(max(max_step_px, FINE_STEP_PX))) + 4))
+    patches = np.zeros((3, LANES), np.int16)
+    for r in range(SIDE):
+        for c in range(SIDE):
+            patches[2, c * STRIDE + r] = 1
+    wide = np.zeros((SIDE + 2, STRIDE), np.int16)  # columns, padded to full vectors
+    strip = np.zeros((SIDE + 1 + 2 * int(np.ceil(max(max_step_px, FINE_STEP_PX))), STRIDE), np.int16)
     raw = grid.shape[0] > 0
     raw_left = left_grid.shape[0] > 0
-    whole = np.empty((PATCH_SIDE, PATCH_SIDE), np.uint8)
     for i in range(uv.shape[0]):
         found[i] = False
         if disparity[i] < 0.0:
@@ -245,7 +204,7 @@ def refine_rows(  # type: ignore[no-untyped-def]
         ok = False
         for step in range(1 if sure[i] else 0, 2):
             reach_px = max_step_px if step == 0 else min(max_step_px, FINE_STEP_PX)
-            reach = int(np.ceil(reach_px)) + 1
+            reach = int(np.ceil(reach_px))
             level = min(int(octave[i]) + 1 - step, levels - 1)
             h, w = left[level].shape
             s = float(1 << level)
@@ -258,23 +217,19 @@ def refine_rows(  # type: ignore[no-untyped-def]
             if begin < RADIUS or begin >= w - RADIUS - 1:
                 continue
             if raw_left and level == 0:
-                x0 = int(x) - RADIUS - 1
-                y0 = int(y) - RADIUS
-                if not _rectify_patch(left[0], left_grid, x0, y0, whole):
+                if not _rectify_patch(left[0], left_grid, 1.0, x - RADIUS - 1, y - RADIUS, SIDE, SIDE + 2, 10, wide):
                     continue
-                tt, hess = _cut(whole, x - x0, y - y0, patch, gradient)
             else:
-                tt, hess = _cut(left[level], x, y, patch, gradient)
-            if hess < 30.0:
-                continue
+                _sample_columns(left[level], x - RADIUS - 1, y - RADIUS, SIDE + 2, wide)
+            _put_template(wide, patches)
             first = max(int(begin) - RADIUS - reach, 0)
-            columns = min(int(begin) + RADIUS + reach + 2, w) - first
+            columns = min(int(begin) + RADIUS + reach + 2, w - 1) - first
             if raw:
-                if not _raw_strip_of(right[level], grid, s, first, columns, y, strip):
+                if not _rectify_patch(right[level], grid, s, float(first), y - RADIUS, SIDE, columns, 10, strip):
                     continue
             else:
-                _strip_of(right[level], first, columns, y, strip)
-            xr, ncc = _slide(strip, first, patch, gradient, tt, hess, begin, w, iterations, reach_px)
+                _sample_columns(right[level], float(first), y - RADIUS, columns, strip)
+            xr, ncc = _slide(strip.reshape(-1), first, patches, begin, w, iterations, reach_px)
             if ncc >= min_ncc or (step == 0 and ncc > 0.6):
                 d = (x - xr) * s
                 ok = step == 1

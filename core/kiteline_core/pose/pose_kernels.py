@@ -85,57 +85,113 @@ def optimise_pose(  # type: ignore[no-untyped-def]
     h = np.zeros((6, 6))
     g = np.zeros(6)
     step = np.zeros(6)
-    jac = np.zeros((3, 6))
-    res = np.zeros(3)
-    v = np.zeros(3)
-    jv = np.zeros(6)
     dr = np.zeros((3, 3))
     dt = np.zeros(3)
     count = 0
     total = 0.0
-    for _round in range(rounds):
-        for _iteration in range(iterations):
+    for turn in range(rounds + 1):
+        final = turn == rounds
+        for iteration in range(1 if final else iterations):
+            # The first step of a round chooses the inliers anew; after the last round nothing else is left to do.
+            judge = iteration == 0 and turn > 0
+            if judge:
+                count = 0
+                total = 0.0
             for a in range(6):
                 g[a] = 0.0
                 for b in range(6):
                     h[a, b] = 0.0
+            t00, t01, t02, t03 = T_c_m[0, 0], T_c_m[0, 1], T_c_m[0, 2], T_c_m[0, 3]
+            t10, t11, t12, t13 = T_c_m[1, 0], T_c_m[1, 1], T_c_m[1, 2], T_c_m[1, 3]
+            t20, t21, t22, t23 = T_c_m[2, 0], T_c_m[2, 1], T_c_m[2, 2], T_c_m[2, 3]
             for i in range(n):
-                if not inlier[i]:
+                if not (judge or inlier[i]):
                     continue
-                ok = _point_terms(
-                    T_c_m, points[i], depth_ray[i], observed[i], sigma_px[i], fx, fy, cx, cy, bf, jac, res, v
-                )
-                if not ok:
+                px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+                x = t00 * px + t01 * py + t02 * pz + t03
+                y = t10 * px + t11 * py + t12 * pz + t13
+                z = t20 * px + t21 * py + t22 * pz + t23
+                if z < 0.05:
+                    inlier[i] = inlier[i] and not judge
                     continue
-                rows = 3 if observed[i, 2] >= 0.0 else 2
+                stereo = observed[i, 2] >= 0.0
                 s2 = sigma_px[i] * sigma_px[i]
-                vv = s2
-                rv = 0.0
-                rr = 0.0
-                for k in range(rows):
-                    vv += v[k] * v[k]
-                    rv += res[k] * v[k]
-                    rr += res[k] * res[k]
-                e2 = (rr - rv * rv / vv) / s2
-                limit = chi2 if rows == 2 else chi2 * 1.3
+                inverse = 1.0 / z
+                u = x * inverse
+                w = y * inverse
+                r0 = fx * u + cx - observed[i, 0]
+                r1 = fy * w + cy - observed[i, 1]
+                r2 = bf * inverse - observed[i, 2] if stereo else 0.0
+                # d(u, v, disparity)/d(x, y, z) = a0 0 a2 | 0 b1 b2 | 0 0 c2, and the shift (v0, v1, v2) by the ray
+                a0, a2 = fx * inverse, -fx * u * inverse
+                b1, b2 = fy * inverse, -fy * w * inverse
+                c2 = -bf * inverse * inverse if stereo else 0.0
+                px, py, pz = depth_ray[i, 0], depth_ray[i, 1], depth_ray[i, 2]
+                along = t20 * px + t21 * py + t22 * pz
+                v0 = a0 * (t00 * px + t01 * py + t02 * pz) + a2 * along
+                v1 = b1 * (t10 * px + t11 * py + t12 * pz) + b2 * along
+                v2 = c2 * along
+                spread = 1.0 / (s2 + v0 * v0 + v1 * v1 + v2 * v2)
+                rv = r0 * v0 + r1 * v1 + r2 * v2
                 weight = 1.0 / s2
+                e2 = (r0 * r0 + r1 * r1 + r2 * r2 - rv * rv * spread) * weight
+                limit = chi2 * 1.3 if stereo else chi2
+                if judge:
+                    inlier[i] = e2 <= limit
+                    if not inlier[i]:
+                        continue
+                    count += 1
+                    total += e2 / (3.0 if stereo else 2.0)
+                    if final:
+                        continue
                 if e2 > limit * 0.5:
                     weight *= np.sqrt(limit * 0.5 / e2)
-                for a in range(6):
-                    s = 0.0
-                    for k in range(rows):
-                        s += jac[k, a] * v[k]
-                    jv[a] = s
-                for a in range(6):
-                    s = 0.0
-                    for k in range(rows):
-                        s += jac[k, a] * res[k]
-                    g[a] -= weight * (s - jv[a] * rv / vv)
-                    for b in range(a + 1):
-                        s = 0.0
-                        for k in range(rows):
-                            s += jac[k, a] * jac[k, b]
-                        h[a, b] += weight * (s - jv[a] * jv[b] / vv)
+                # by (x, y, z): m = weight (J^T J - j j^T spread) with j = J^T v, and q = weight J^T (r - v rv spread)
+                j0, j1, j2 = a0 * v0, b1 * v1, a2 * v0 + b2 * v1 + c2 * v2
+                spread *= weight
+                rv *= spread
+                q0 = weight * a0 * r0 - rv * j0
+                q1 = weight * b1 * r1 - rv * j1
+                q2 = weight * (a2 * r0 + b2 * r1 + c2 * r2) - rv * j2
+                m00 = weight * a0 * a0 - spread * j0 * j0
+                m01 = -spread * j0 * j1
+                m02 = weight * a0 * a2 - spread * j0 * j2
+                m11 = weight * b1 * b1 - spread * j1 * j1
+                m12 = weight * b1 * b2 - spread * j1 * j2
+                m22 = weight * (a2 * a2 + b2 * b2 + c2 * c2) - spread * j2 * j2
+                # a rotation w moves the point by w x p: its slopes are those by (x, y, z) times -[p]x
+                n00, n01, n02 = m02 * y - m01 * z, m00 * z - m02 * x, m01 * x - m00 * y
+                n10, n11, n12 = m12 * y - m11 * z, m01 * z - m12 * x, m11 * x - m01 * y
+                n20, n21, n22 = m22 * y - m12 * z, m02 * z - m22 * x, m12 * x - m02 * y
+                g[0] -= q0
+                g[1] -= q1
+                g[2] -= q2
+                g[3] -= y * q2 - z * q1
+                g[4] -= z * q0 - x * q2
+                g[5] -= x * q1 - y * q0
+                h[0, 0] += m00
+                h[1, 0] += m01
+                h[1, 1] += m11
+                h[2, 0] += m02
+                h[2, 1] += m12
+                h[2, 2] += m22
+                h[3, 0] += n00
+                h[3, 1] += n10
+                h[3, 2] += n20
+                h[4, 0] += n01
+                h[4, 1] += n11
+                h[4, 2] += n21
+                h[5, 0] += n02
+                h[5, 1] += n12
+                h[5, 2] += n22
+                h[3, 3] += y * n20 - z * n10
+                h[4, 3] += z * n00 - x * n20
+                h[4, 4] += z * n01 - x * n21
+                h[5, 3] += x * n10 - y * n00
+                h[5, 4] += x * n11 - y * n01
+                h[5, 5] += x * n12 - y * n02
+            if final:
+                break
             # prior on the pose: error of T_c_m * prior^-1, first order
             if prior_weight[0] > 0.0 or prior_weight[3] > 0.0:
                 for a in range(3):
@@ -171,27 +227,6 @@ def optimise_pose(  # type: ignore[no-untyped-def]
                 norm += step[a] * step[a]
             if norm < _STILL:
                 break
-        count = 0
-        total = 0.0
-        for i in range(n):
-            ok = _point_terms(T_c_m, points[i], depth_ray[i], observed[i], sigma_px[i], fx, fy, cx, cy, bf, jac, res, v)
-            if not ok:
-                inlier[i] = False
-                continue
-            rows = 3 if observed[i, 2] >= 0.0 else 2
-            s2 = sigma_px[i] * sigma_px[i]
-            vv = s2
-            rv = 0.0
-            rr = 0.0
-            for k in range(rows):
-                vv += v[k] * v[k]
-                rv += res[k] * v[k]
-                rr += res[k] * res[k]
-            e2 = (rr - rv * rv / vv) / s2
-            inlier[i] = e2 <= (chi2 if rows == 2 else chi2 * 1.3)
-            if inlier[i]:
-                count += 1
-                total += e2 / rows
     return count, np.sqrt(total / max(count, 1))
 
 
@@ -204,39 +239,3 @@ def _apply_left(dr, dt, T):  # type: ignore[no-untyped-def]
             T[a, c] = dr[a, 0] * x + dr[a, 1] * y + dr[a, 2] * z
     for a in range(3):
         T[a, 3] += dt[a]
-
-
-@njit
-def _point_terms(T, p, ray, obs, sigma, fx, fy, cx, cy, bf, jac, res, v):  # type: ignore[no-untyped-def]
-    """Residual (predicted - observed), its Jacobian by a left perturbation of T, and its shift by `ray`."""
-    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-    z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-    if z < 0.05:
-        return False
-    iz = 1.0 / z
-    u = x * iz
-    w = y * iz
-    res[0] = fx * u + cx - obs[0]
-    res[1] = fy * w + cy - obs[1]
-    res[2] = bf * iz - obs[2]
-    # d(u, v, disparity)/d(x, y, z)
-    a0, a2 = fx * iz, -fx * u * iz
-    b1, b2 = fy * iz, -fy * w * iz
-    c2 = -bf * iz * iz
-    jac[0, 0], jac[0, 1], jac[0, 2] = a0, 0.0, a2
-    jac[1, 0], jac[1, 1], jac[1, 2] = 0.0, b1, b2
-    jac[2, 0], jac[2, 1], jac[2, 2] = 0.0, 0.0, c2
-    # left perturbation: dp = dt + w x p  ->  d/dw = -[p]x
-    for k in range(3):
-        j0, j1, j2 = jac[k, 0], jac[k, 1], jac[k, 2]
-        jac[k, 3] = -j1 * z + j2 * y
-        jac[k, 4] = j0 * z - j2 * x
-        jac[k, 5] = -j0 * y + j1 * x
-    rx = T[0, 0] * ray[0] + T[0, 1] * ray[1] + T[0, 2] * ray[2]
-    ry = T[1, 0] * ray[0] + T[1, 1] * ray[1] + T[1, 2] * ray[2]
-    rz = T[2, 0] * ray[0] + T[2, 1] * ray[1] + T[2, 2] * ray[2]
-    v[0] = a0 * rx + a2 * rz
-    v[1] = b1 * ry + b2 * rz
-    v[2] = c2 * rz
-    return True
