@@ -18,6 +18,7 @@ from kiteline_codec.schema import (
     NewLandmarks,
     Observations,
     Record,
+    StereoAlignment,
     SubmapScale,
 )
 from kiteline_core.ids import (
@@ -85,6 +86,8 @@ class Intake:
                 self._take_header(record, now_ns)
             elif isinstance(record, GravityAlignment):
                 self.gravity[record.submap] = record
+            elif isinstance(record, StereoAlignment):
+                self._map.set_stereo_alignment(record.agent, record.rows_px, record.disparity_px)
             elif isinstance(record, SubmapScale):
                 self.metres_per_unit[record.submap] = record.metres
                 if record.metres == 1.0:

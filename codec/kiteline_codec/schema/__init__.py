@@ -10,6 +10,7 @@ from kiteline_codec.schema.agent.keyframe_header import KeyframeHeader as Keyfra
 from kiteline_codec.schema.agent.live_pose import LivePose as LivePose
 from kiteline_codec.schema.agent.new_landmarks import NewLandmarks as NewLandmarks
 from kiteline_codec.schema.agent.observations import Observations as Observations
+from kiteline_codec.schema.agent.stereo_alignment import StereoAlignment as StereoAlignment
 from kiteline_codec.schema.agent.submap_scale import SubmapScale as SubmapScale
 from kiteline_codec.schema.base.cached_keyframe import CachedKeyframe as CachedKeyframe
 from kiteline_codec.schema.base.cached_landmarks import CachedLandmarks as CachedLandmarks

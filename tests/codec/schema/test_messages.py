@@ -34,6 +34,7 @@ from kiteline_codec.schema import (
     Record,
     RefinedLandmarks,
     RemovedObservations,
+    StereoAlignment,
     SubmapPlacement,
     SubmapScale,
     WireError,
@@ -72,6 +73,10 @@ def some_records(seed: int, n: int) -> list[Record]:
         Observations(keyframe, 2, rng.permutation(index), uv, inv_depth, octave, point),
         GravityAlignment(submap, pose),
         SubmapScale(submap, 0.73),
+        StereoAlignment(
+            AgentId(5), np.array([700.0, -88.0, 0.0, 1100.0, -420.0]) / 1024.0,
+            np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0,
+        ),
         KeyframePose(keyframe, pose),
         RefinedLandmarks(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
         FusedLandmarks(keyframe, index, point),

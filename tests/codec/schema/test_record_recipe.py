@@ -28,7 +28,7 @@ from kiteline_core.ids import AgentId
 class Battery(Record):
     """Charge of an agent's battery in percent."""
 
-    KIND = 8
+    KIND = 9
     ID = IdOf.AGENT
     PRIORITY = Priority.CORRECTION
 
