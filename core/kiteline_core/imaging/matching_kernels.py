@@ -21,15 +21,20 @@ _FAR = 1 << 20  # more bits than any two descriptors differ in
 
 
 @njit
+def count_bits(x: np.uint64) -> int:
+    """Number of bits that are set."""
+    x = x - ((x >> _S1) & _M1)
+    x = (x & _M2) + ((x >> _S2) & _M2)
+    x = (x + (x >> _S4)) & _M4
+    return int((x * _H) >> _S56)
+
+
+@njit
 def hamming(a: U64, i: int, b: U64, j: int) -> int:
     """Number of bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
     total = 0
     for k in range(4):
-        x = a[i, k] ^ b[j, k]
-        x = x - ((x >> _S1) & _M1)
-        x = (x & _M2) + ((x >> _S2) & _M2)
-        x = (x + (x >> _S4)) & _M4
-        total += int((x * _H) >> _S56)
+        total += count_bits(a[i, k] ^ b[j, k])
     return total
 
 
