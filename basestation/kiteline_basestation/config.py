@@ -207,6 +207,8 @@ class PublishConfig:
     pose_m: float = 0.0005  # m
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
+    batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
+    batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
     grid_every: int = 3  # keyframes between two grids
     grid_share: int = 40  # a grid is built after 1 in so many of the map's keyframes: it reads the whole map
 
