@@ -102,5 +102,5 @@ def _gaps(index: I64) -> I64:
 def _measured_depths(landmarks: I32, parts: Iterable[int], index: I64) -> I64:
     """Codes (n,) of inverse depths as the agent measured them, 0 where none of the parts has the keypoint."""
     measured: I64 = np.zeros((4, len(index)), np.int64)
-    kernels.select(landmarks, index, sum(1 << part for part in parts), measured)
+    kernels.select(landmarks, index, sum(1 << part for part in parts), 0, measured)
     return np.asarray(measured[2])

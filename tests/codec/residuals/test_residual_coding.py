@@ -201,7 +201,7 @@ def test_landmarks_are_selected_by_keypoint_and_part() -> None:
     landmarks[4] = rng.integers(-1, 4, 1200)
     keypoint, mask = rng.integers(0, 2048, 300), 0b101
     out = np.full((4, 300), -7, np.int64)
-    prediction_kernels.select(landmarks, keypoint, mask, out)
+    prediction_kernels.select(landmarks, keypoint, mask, 0, out)
     whole = np.pad(landmarks, ((0, 0), (0, 2048 - 1200)), constant_values=-1)
     named = np.isin(whole[4, keypoint], (0, 2))
     assert np.array_equal(out, np.where(named, whole[:4, keypoint], -7))
