@@ -97,8 +97,8 @@ class LoopConfig:
     min_gap: int = 12  # keyframes of one submap between two that are matched
     loop_gap: int = 30  # keyframes; landmarks observed again after so many count as a loop
     max_shared: int = 15  # landmarks that a candidate may share with the keyframe already
-    min_likeness: float = 0.005  # similarity of places, 0..1: of unrelated images on average 0.01, of a revisit more
-    min_neighbour_ratio: float = 0.03  # of the similarity to the previous keyframe, whose descriptors hardly differ
+    min_likeness: float = 0.02  # similarity of bags of words, 0..1: unrelated places stay below it
+    min_neighbour_ratio: float = 0.1  # of the similarity to the previous keyframe
     match: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
     sigma_disparity_px: float = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
@@ -187,6 +187,24 @@ class DisparityConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class InertialScaleConfig:
+    """Scale of a monocular map in metres by the agents' inertial steps."""
+
+    least_s: float = 8.0  # time of all steps below which the agent's scale stands: it rests on as much
+    iterations: int = 5  # of Gauss-Newton
+    gravity_m_s2: float = 9.81
+    noise_inflation: float = 3.0  # of the accelerometer's noise: vibration
+    floor_m_s: float = 2e-4  # m/s; of a step by the IMU: the code's quanta
+    floor_m: float = 3e-5  # m; the same
+    image_rad: float = 5e-4  # error of a step by images, over the distance of what they see
+    image_m: float = 5e-4  # m; the same of near scenes
+    huber: float = 2.5  # deviations; steps by images with larger errors weigh less
+    bias_sigma: float = 0.3  # m/s^2; of the accelerometer's bias where a chain begins
+    bias_walk: float = 0.04  # m/s^2 per sqrt(s); its slow errors: axes, vibration, temperature
+    agent_sigma: float = 0.03  # of the agent's scale
+
+
+@dataclass(frozen=True, slots=True)
 class CullConfig:
     """Culling of landmarks, observations and keyframes."""
 
@@ -207,8 +225,6 @@ class PublishConfig:
     pose_m: float = 0.0005  # m
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
-    batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
-    batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
     grid_every: int = 3  # keyframes between two grids
     grid_share: int = 40  # a grid is built after 1 in so many of the map's keyframes: it reads the whole map
 
@@ -279,6 +295,7 @@ class BaseConfig:
     bundle: BundleConfig = field(default_factory=BundleConfig)
     landmark_matching: LandmarkMatchingConfig = field(default_factory=LandmarkMatchingConfig)
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
+    inertial_scale: InertialScaleConfig = field(default_factory=InertialScaleConfig)
     cull: CullConfig = field(default_factory=CullConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)

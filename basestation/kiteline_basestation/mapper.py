@@ -40,15 +40,11 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class MapperInput:
-    """Inputs since the last step: records by agent, in order of agent id, finished jobs, and commands of users.
-
-    room_bytes: for corrections of an agent's map, by agent; 0: none now. Without an entry there is no limit.
-    """
+    """Inputs since the last step: records by agent, in order of agent id, finished jobs, and commands of users."""
 
     arrivals: tuple[tuple[AgentId, tuple[Record, ...]], ...]
     done: tuple[JobDone, ...] = ()
     commands: tuple[Command, ...] = ()
-    room_bytes: tuple[tuple[AgentId, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +113,8 @@ class Mapper:
         jobs = self._local_bundles.jobs() + self._grid.jobs()
         if self.merger is not None:
             jobs += self.merger.jobs(now_ns)
-        # 6. Publish the values that changed and for which there is room.
-        return MapperOutput(self._publisher.collect(dict(given.room_bytes)), tuple(jobs), tuple(answers), withdrawn)
+        # 6. Publish all values that changed.
+        return MapperOutput(self._publisher.collect(), tuple(jobs), tuple(answers), withdrawn)
 
     def adopt(self, record: Record) -> None:
         """Replace a published value by its quantised code, as the agent will hold it."""
@@ -143,10 +139,9 @@ class Mapper:
 
     @property
     def idle(self) -> bool:
-        """True if no job is due or pending, all keyframes that arrived are used, and no change waits to be sent."""
+        """True if no job is due or pending and all keyframes that arrived are used."""
         merged = self.merger is None or self.merger.idle
-        waiting = self._intake.backlog or self._grid.pending or self._publisher.waiting
-        return merged and self._local_bundles.idle and not waiting
+        return merged and self._local_bundles.idle and not (self._intake.backlog or self._grid.pending)
 
     def live(self, agent: AgentId) -> LivePose | None:
         """The newest live pose of an agent."""
@@ -274,6 +269,7 @@ class Mapper:
             keyframes: Sequence[KeyframeId] = self.map.submaps.get(submap, [])
             for keyframe in keyframes:
                 slots = self.map.slots_of(keyframe)
+                self.map.inertial_steps.pop(keyframe, None)
                 self.map.set_flags(slots[self.map.keypoints.kind[slots] == LANDMARK], CULLED)
                 self.map.cull_keyframe(keyframe)
                 self._publisher.mark_changed(CulledLandmarks.KIND, keyframe)

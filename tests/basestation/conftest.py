@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -179,6 +179,17 @@ def words() -> Vocabulary:
 def make_flight() -> Callable[..., Flight]:
     """The maker of synthetic flights."""
     return fly
+
+
+@pytest.fixture(scope="session")
+def lively_room() -> Scene:
+    """A room of 8 x 7 x 3 m, flown with accelerations in all directions."""
+
+    def path(turns: float) -> F64:
+        there = circle(turns)
+        return look((1.0 + 0.1 * np.sin(2 * np.pi * 3.1 * turns)) * there[:3, 3], there[:3, 2])
+
+    return replace(room(np.random.default_rng(21), 700), path=path)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
-from kiteline_agent.exchange.correction_batches import CorrectionBatches
 from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
@@ -35,6 +34,8 @@ F64 = NDArray[np.float64]
 
 _SAME_TILT = 0.9999  # cosine of the angle, 0.8 degrees, between verticals that agree: gravity is known to half a degree
 
+_METRES = 0.2  # difference of two scales in metres that IMU and base estimate: more is another unit
+
 
 class Corrections:
     """Applies the base's records, one handler for each kind, and holds where submaps lie in the world."""
@@ -43,7 +44,6 @@ class Corrections:
         self._map = local_map
         self._cache = cache
         self._smoothing = Smoothing(smoothing)
-        self._batches = CorrectionBatches()
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self._upright: GravityAlignment | None = None  # of the submap that began in motion
@@ -67,7 +67,7 @@ class Corrections:
         """Apply records, and drop what the base removed. Returns whether the local map moved, and events."""
         self._events = []
         moved = False
-        for record in self._batches.take(records, removed):
+        for record in records:
             handler = self._handlers.get(type(record))
             if handler is not None:
                 moved |= handler(record)
@@ -134,7 +134,8 @@ class Corrections:
         S_w_m = self._S_w_m.get(submap)
         if S_w_m is None:
             held = self._smoothing.held
-            return None if held is None or not metric or sim3.scale_of(held) != 1.0 else held @ T_o_m @ T_m_b
+            near = held is not None and abs(sim3.scale_of(held) - 1.0) < _METRES
+            return self._body_in_world(held, T_o_m @ T_m_b) if held is not None and near and metric else None
         if not self._smoothing.on:
             return self._body_in_world(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b

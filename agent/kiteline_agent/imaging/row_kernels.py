@@ -15,37 +15,6 @@ LEAST_PIVOT = 100.0  # sum of squared gradients across the weaker direction: les
 
 
 @njit
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    """Sum of the products of two patches."""
-    total = 0.0
-    for r in range(SIDE):
-        for c in range(SIDE):
-            total += a[r, c] * b[r, c]
-    return total
-
-
-@njit
-def _centre(a):  # type: ignore[no-untyped-def]
-    """Take the mean off a patch."""
-    total = 0.0
-    for r in range(SIDE):
-        for c in range(SIDE):
-            total += a[r, c]
-    mean = total / (SIDE * SIDE)
-    for r in range(SIDE):
-        for c in range(SIDE):
-            a[r, c] -= mean
-
-
-@njit
-def _take_off(a, share, b):  # type: ignore[no-untyped-def]
-    """a -= share * b for patches."""
-    for r in range(SIDE):
-        for c in range(SIDE):
-            a[r, c] -= share * b[r, c]
-
-
-@njit
 def _cut(image, x, y, patch, gu, gv):  # type: ignore[no-untyped-def]
     """Patch around (x, y), zero-mean, and its gradients made orthogonal to gain and offset; its sum of squares."""
     x0, y0 = int(x), int(y)
@@ -64,12 +33,12 @@ def _cut(image, x, y, patch, gu, gv):  # type: ignore[no-untyped-def]
             patch[r, c] = wide[r + 1, c + 1]
             gu[r, c] = 0.5 * (wide[r + 1, c + 2] - wide[r + 1, c])
             gv[r, c] = 0.5 * (wide[r + 2, c + 1] - wide[r, c + 1])
-    _centre(patch)
-    _centre(gu)
-    _centre(gv)
-    tt = _dot(patch, patch) + 1e-9
-    _take_off(gu, _dot(patch, gu) / tt, patch)
-    _take_off(gv, _dot(patch, gv) / tt, patch)
+    patch -= patch.mean()
+    gu -= gu.mean()
+    gv -= gv.mean()
+    tt = (patch * patch).sum() + 1e-9
+    gu -= (patch * gu).sum() / tt * patch
+    gv -= (patch * gv).sum() / tt * patch
     return tt
 
 
@@ -125,7 +94,7 @@ def measure_rows(  # type: ignore[no-untyped-def]
         if x < RADIUS + 1 or y < RADIUS + 1 or x >= w - RADIUS - 3 or y >= h - RADIUS - 3:
             continue
         tt = _cut(left[level], x, y, patch, gu, gv)
-        huu, huv, hvv = _dot(gu, gu), _dot(gu, gv), _dot(gv, gv)
+        huu, huv, hvv = (gu * gu).sum(), (gu * gv).sum(), (gv * gv).sum()
         pivot = hvv - huv * huv / max(huu, 1e-9)
         if pivot < LEAST_PIVOT or huu < LEAST_PIVOT:
             continue
@@ -133,12 +102,12 @@ def measure_rows(  # type: ignore[no-untyped-def]
         for _ in range(iterations):
             if not _sample(right[level], grid, s, xr, yr, other):
                 break
-            _centre(other)
-            gain = _dot(other, patch) / tt
-            ncc = gain * np.sqrt(tt / max(_dot(other, other), 1e-9))
+            other -= other.mean()
+            gain = (other * patch).sum() / tt
+            ncc = gain * np.sqrt(tt / max((other * other).sum(), 1e-9))
             if gain < 0.1:
                 break
-            bu, bv = -_dot(other, gu) / gain, -_dot(other, gv) / gain
+            bu, bv = -(other * gu).sum() / gain, -(other * gv).sum() / gain
             dv = (bv - huv / huu * bu) / pivot
             du = (bu - huv * dv) / huu
             if abs(du) < CONVERGED_PX and abs(dv) < CONVERGED_PX:

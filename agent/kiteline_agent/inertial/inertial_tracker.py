@@ -163,8 +163,10 @@ class InertialTracker:
             return events
         self._reported_s = self._self_calibration.offset_s
         offset_s, sigma_s = self.time_offset_s
-        offset = f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)"
-        return [*events, offset]
+        return [
+            *events,
+            f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)",
+        ]
 
     # per frame
 
@@ -178,8 +180,7 @@ class InertialTracker:
         if self._smoother.running:
             T_m_b, velocity = self._smoother.predict(samples)
             return Prediction(T_m_b, velocity, last_T_m_b[:3, :3].T @ T_m_b[:3, :3])
-        motion = preintegrate(samples, self._bias, self._calibration)
-        velocity = self._initialiser.velocity()
+        motion, velocity = preintegrate(samples, self._bias, self._calibration), self._initialiser.velocity()
         T = last_T_m_b.copy()
         T[:3, 3] += velocity * (t_ns - last_ns) * 1e-9
         T[:3, :3] = T[:3, :3] @ motion.turn
@@ -192,14 +193,12 @@ class InertialTracker:
         """
         if self._last is None or not self._smoother.running:
             return None
-        begin_ns, end_ns = self._interval_end_ns, t_ns + self._offset_ns
-        samples = self._buffer.extended(imu).between(begin_ns, end_ns)
+        samples = self._buffer.extended(imu).between(self._interval_end_ns, t_ns + self._offset_ns)
         if samples is None:
             return None
-        state, gravity = self._smoother.state, self._smoother.gravity
-        samples = self._self_calibration.correct(samples)
+        state, samples = self._smoother.state, self._self_calibration.correct(samples)
         motion = preintegrate(samples, state.bias, self._calibration, self._config.smoother.imu_inflation)
-        T_m_b, velocity = motion.propagate(state.T_m_b, state.velocity, state.bias, gravity)
+        T_m_b, velocity = motion.propagate(state.T_m_b, state.velocity, state.bias, self._smoother.gravity)
         T_m_b, rate = se3.orthonormalise(T_m_b), samples.gyro[-1] - state.bias[:3]
         return InertialMotion(T_m_b, velocity, rate, self._growth(state, motion))
 
@@ -335,6 +334,10 @@ class InertialTracker:
         begin = self._interval_end_ns if self._interval_end_ns else self._last[0] + self._offset_ns
         return self._between(begin, t_ns + self._offset_ns)
 
+    def samples_between(self, from_ns: int, to_ns: int) -> Samples | None:
+        """Corrected samples between two camera stamps; None with a gap."""
+        return self._between(from_ns + self._offset_ns, to_ns + self._offset_ns)
+
     def _between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples; the prediction and the update of a frame ask for the same ones."""
         key = (from_ns, to_ns, self._buffer.newest_t_ns)
@@ -375,7 +378,7 @@ class InertialTracker:
             self._scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
         elif (t_ns - self._scale_from[0]) * 1e-9 >= self._config.scale_filter.interval_s:
-            samples = self._between(self._scale_from[0] + self._offset_ns, t_ns + self._offset_ns)
+            samples = self.samples_between(self._scale_from[0], t_ns)
             seen = points.xyz[points.inlier]
             if samples is not None and len(seen):
                 depth_m = float(np.median(np.linalg.norm(seen - T_m_b[:3, 3], axis=1)))

@@ -91,6 +91,9 @@ class KeyframeStage:
         reference, submap = self._camera.reference, self._camera.submaps.active
         keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
         T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k)
+        steps = self._camera.motion.take_steps(keyframe, ctx.t_ns)
+        if steps is not None and self._channel.profile.inertial_steps:
+            self._channel.put(steps)
         reference.set_new(keyframe, submap, se3.inverse(T_m_k) @ T_m_c, ctx.t_ns, ctx.number)
         self._relocaliser.add_keyframe(keyframe)
         self._finish(ctx, keyframe, kind)

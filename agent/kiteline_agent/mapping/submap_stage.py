@@ -186,4 +186,4 @@ class SubmapStage:
         keyframe = self._keyframes.make(ctx, None, metric.points, camera.pose.T_m_c, Extra.SUBMAP)
         metric.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))
-        camera.motion.set_scale(unit_m, T_new_old)
+        camera.motion.set_scale(ctx.t_ns, unit_m, T_new_old)

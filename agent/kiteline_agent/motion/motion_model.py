@@ -16,11 +16,14 @@ from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialStartState, InertialTracker
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer import Odometer
+from kiteline_agent.motion.step_recorder import StepRecorder
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
+from kiteline_codec.schema import InertialSteps
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[float64]
 
@@ -51,6 +54,7 @@ class MotionModel:
         self._pose = pose
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
+        self._steps = None if imu is None or metric else StepRecorder(imu, config.scale_filter.interval_s)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
         self._watch = ImuWatch(config.silent_s)
         self._events: list[str] = []
@@ -117,11 +121,18 @@ class MotionModel:
         if self.tracker is not None:
             points = VisualPoints(track.xyz, track.ray, track.observed, track.sigma_px, track.inlier)
             velocity = self.odometer.velocity(t_ns)
-            state = self.tracker.update(t_ns, se3.inverse(track.T_c_m) @ self._T_c_b, points, velocity)
+            T_m_b = se3.inverse(track.T_c_m) @ self._T_c_b
+            state = self.tracker.update(t_ns, T_m_b, points, velocity)
+            if self._steps is not None and self.tracker.metric and state is not None:
+                self._steps.see(t_ns, T_m_b, self.tracker)
         if state is not None:
             track = replace(track, T_c_m=se3.inverse(state.T_m_b @ self._T_b_c))
         self.odometer.update(se3.inverse(track.T_c_m), t_ns)
         return track
+
+    def take_steps(self, keyframe: KeyframeId, t_ns: int) -> InertialSteps | None:
+        """The steps from the keyframe before to a new one of this frame; None if the base cannot use them."""
+        return None if self._steps is None or self.tracker is None else self._steps.take(keyframe, t_ns, self.tracker)
 
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""
@@ -134,6 +145,8 @@ class MotionModel:
 
     def dead_reckon(self, predicted: F64, t_ns: int) -> DeadReckoning:
         """Process a frame without a pose from images, predicted at T_m_c (4,4)."""
+        if self._steps is not None:
+            self._steps.clear()
         state = None if self.tracker is None else self.tracker.dead_reckon(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
             cov = self.odometer.dead_reckon(predicted, t_ns)
@@ -147,17 +160,22 @@ class MotionModel:
         """Move the inertial state to the current pose after a relocalisation or in a new map."""
         if self.tracker is not None:
             self.tracker.begin_map(t_ns, self._pose.T_m_c @ self._T_c_b)
+        self._restart_steps(t_ns)
         self.odometer.restart(self._pose.T_m_c, t_ns)
 
     def move_map(self, T_new_old: F64) -> None:
         """Transform the state after the submap frame moved by T_new_old (4,4)."""
         if self.tracker is not None:
             self.tracker.move_map(T_new_old)
+        if self._steps is not None:
+            self._steps.move_map(T_new_old)
         self.odometer.move_map(T_new_old)
 
     def begin_unscaled_map(self) -> None:
         """Begin a map of unknown scale."""
         self.odometer.set_metric(False)
+        if self._steps is not None:
+            self._steps.clear()
         if self.tracker is not None:
             self.tracker.reset()
             self.tracker.metric = False
@@ -166,6 +184,7 @@ class MotionModel:
         """Begin a map in metres at the present pose, in a known inertial state."""
         assert self.tracker is not None
         self.tracker.start(t_ns, self._pose.T_m_c @ self._T_c_b, state)
+        self._restart_steps(t_ns)
         self.odometer.set_metric(True)
         self.odometer.restart(self._pose.T_m_c, t_ns)
 
@@ -183,9 +202,14 @@ class MotionModel:
         """Factor by which the map in metres is to be scaled, and its deviation; None if nothing says so."""
         return None if self._metric or self.tracker is None else self.tracker.scale_correction()
 
-    def set_scale(self, metres_per_unit: float, T_new_old: F64) -> None:
-        """Scale the state to metres, in a submap in which the old one lies at T_new_old (4,4)."""
+    def set_scale(self, t_ns: int, metres_per_unit: float, T_new_old: F64) -> None:
+        """Scale the state to metres, in a submap that begins at this frame; the old one lies at T_new_old (4,4)."""
         if self.tracker is not None:
             self.tracker.rescale(metres_per_unit)
             self.tracker.move_map(T_new_old)
         self.odometer.set_metric(True)
+        self._restart_steps(t_ns)
+
+    def _restart_steps(self, t_ns: int) -> None:
+        if self._steps is not None:
+            self._steps.restart(t_ns, self._pose.T_m_c @ self._T_c_b)

@@ -13,12 +13,12 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import (
     CameraIntrinsics,
     GravityAlignment,
+    InertialSteps,
     KeyframeHeader,
     LivePose,
     NewLandmarks,
     Observations,
     Record,
-    StereoAlignment,
     SubmapScale,
 )
 from kiteline_core.ids import (
@@ -86,12 +86,12 @@ class Intake:
                 self._take_header(record, now_ns)
             elif isinstance(record, GravityAlignment):
                 self.gravity[record.submap] = record
-            elif isinstance(record, StereoAlignment):
-                self._map.set_stereo_alignment(record.agent, record.rows_px, record.disparity_px)
             elif isinstance(record, SubmapScale):
                 self.metres_per_unit[record.submap] = record.metres
                 if record.metres == 1.0:
                     self._map.metric_submaps.add(record.submap)
+            elif isinstance(record, InertialSteps):
+                self._map.inertial_steps[record.keyframe] = record
             elif isinstance(record, NewLandmarks | Observations):
                 if record.keyframe in self._map:
                     self._take_section(record)
@@ -192,6 +192,6 @@ def _order(live: LivePose) -> tuple[int, int]:
 
 
 def _submap_of(record: Record) -> SubmapId | None:
-    if isinstance(record, KeyframeHeader | NewLandmarks | Observations | LivePose):
+    if isinstance(record, KeyframeHeader | NewLandmarks | Observations | InertialSteps | LivePose):
         return submap_of_keyframe(record.keyframe)
     return record.submap if isinstance(record, GravityAlignment | SubmapScale) else None

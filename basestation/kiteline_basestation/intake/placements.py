@@ -174,8 +174,9 @@ class SubmapPlacements:
                 self._set(submap, self._moved(submap, S_new_old, S_w_m))
 
     def _moved(self, submap: SubmapId, S_new_old: F64, S_w_m: F64) -> F64:
-        """Placement of a submap in a moved world; one in metres moves rigidly with its first keyframe."""
+        """Placement of a submap in a moved world; one in metres moves rigidly, with its first keyframe."""
         if sim3.scale_of(S_new_old) == 1.0 or self._map.is_up_to_scale(submap):
             return sim3.normalise(S_new_old @ S_w_m)
         first = self._map.first_pose(submap)
-        return se3.orthonormalise(sim3.place(S_new_old, sim3.place(S_w_m, first)) @ se3.inverse(first))
+        T_w_k = sim3.place(S_new_old, sim3.place(S_w_m, first))
+        return sim3.normalise(sim3.of(sim3.scale_of(S_w_m), T_w_k) @ se3.inverse(first))

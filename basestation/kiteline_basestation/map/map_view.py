@@ -18,6 +18,7 @@ from kiteline_basestation.map.map_tables import (
     empty_keyframes,
     empty_keypoints,
 )
+from kiteline_codec.schema import InertialSteps
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, AgentId, KeyframeId, SubmapId, agent_of_submap
 
@@ -42,10 +43,10 @@ class MapView:
         self.root_submaps: dict[SubmapId, SubmapId] = {}  # merged submaps -> root submap of their map
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.metric_submaps: set[SubmapId] = set()  # monocular submaps of known metric scale
+        self.inertial_steps: dict[KeyframeId, InertialSteps] = {}  # from the keyframe before to this one
         self.measures_depth: set[AgentId] = set()  # agents that measure depth in each observation (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # (5,) by agent, see disparity_calibration
         self.disparity_calibrated: set[AgentId] = set()  # agents with an accurate disparity offset
-        self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots whose landmark's keyframe is not received yet
 
@@ -198,10 +199,17 @@ class MapView:
 
     def is_up_to_scale(self, submap: SubmapId) -> bool:
         """True for a monocular submap of unknown metric scale."""
+        return not (self.is_ranged(submap) or submap in self.metric_submaps)
+
+    def is_ranged(self, submap: SubmapId) -> bool:
+        """True if images of a submap measure distances, or may."""
         agent = agent_of_submap(submap)
         camera = self.cameras.get(agent)
-        deep = camera is None or camera.stereo or agent in self.measures_depth
-        return not (deep or submap in self.metric_submaps)
+        return camera is None or camera.stereo or agent in self.measures_depth
+
+    def has_metric_scale_by_imu(self, submap: SubmapId) -> bool:
+        """True for a monocular submap in metres: its scale is as good as the agent's IMU knew it."""
+        return submap in self.metric_submaps and not self.is_ranged(submap)
 
     def map_id(self, submap: SubmapId) -> SubmapId:
         """The root submap of the map that a submap belongs to."""

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.inertial.chain import segments_of
+from kiteline_basestation.inertial.map_scale import tells_scale
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.correction import essential_graph_of, full_bundle_window, keyframes_of
@@ -26,6 +30,7 @@ class FullBundle:
     map_id: SubmapId
     window: BundleWindow
     calibrated: tuple[AgentId, ...]
+    inertial: bool = False  # whether inertial steps scale it
 
 
 class CorrectionJobs:
@@ -122,9 +127,9 @@ class CorrectionJobs:
             self._bundles_due.add(grown)
         out: list[Job] = []
         for map_id in sorted(self._graphs_due):
-            inputs = essential_graph_of(self._map, map_id, edges, self._config.graph)
-            if inputs is not None:
-                out.append(Job(next(self._job_ids), POSE_GRAPH.name, inputs))
+            graph = essential_graph_of(self._map, map_id, edges, self._config.graph)
+            if graph is not None:
+                out.append(Job(next(self._job_ids), POSE_GRAPH.name, graph))
                 self._graphs[out[-1].id] = map_id
         self._graphs_due.clear()
         for map_id in sorted(self._bundles_due - set(self._graphs.values())):
@@ -134,7 +139,12 @@ class CorrectionJobs:
                 problem = with_odometry_factors(self._map, bundle.window, self._config.odometry_factors)
                 trials = self._config.graph.robust_trials, self._config.graph.final_trials
                 solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
-                out.append(Job(next(self._job_ids), FULL_BUNDLE.name, BundleInputs(problem, solver)))
+                chain = segments_of(self._map, bundle.window) if self.fits(map_id) else ()
+                bundle = replace(bundle, inertial=tells_scale(chain, self._config.inertial_scale))
+                chain = chain if bundle.inertial else ()
+                held = int(np.flatnonzero(~bundle.window.problem.free)[0])
+                inputs = BundleInputs(problem, solver, chain, held, self._config.inertial_scale)
+                out.append(Job(next(self._job_ids), FULL_BUNDLE.name, inputs))
                 self._bundles[out[-1].id] = bundle
             self._bundles_due.discard(map_id)
             self._uncalibrated.discard(map_id)

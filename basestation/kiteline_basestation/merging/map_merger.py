@@ -19,7 +19,7 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.correction import apply_scales, keyframes_of, move_keyframes
-from kiteline_basestation.merging.correction_jobs import CorrectionJobs
+from kiteline_basestation.merging.correction_jobs import CorrectionJobs, FullBundle
 from kiteline_basestation.merging.essential_graph import GraphResult
 from kiteline_basestation.merging.loop_detector import (
     Contradiction,
@@ -165,7 +165,7 @@ class MapMerger:
         wrong = self._contradicted_merge(map_id, window, result)
         if wrong is not None:
             return self.undo(wrong)
-        changed = self._apply_full_bundle(map_id, window, result)
+        changed = self._apply_full_bundle(bundle, result)
         if agents:
             self._corrections.uncertain_at.pop(map_id, None)
             disparity.set_offsets(self._map, agents, window.problem, result, self._config.disparity)
@@ -370,11 +370,12 @@ class MapMerger:
             return None
         return None if float(np.mean(result.inlier[moved])) >= self._config.graph.min_kept else merge
 
-    def _apply_full_bundle(self, map_id: SubmapId, window: BundleWindow, result: BundleResult) -> MergeResult:
+    def _apply_full_bundle(self, bundle: FullBundle, result: BundleResult) -> MergeResult:
         """Move a map to the result of its full bundle; newer keyframes move along the spanning tree."""
+        map_id, window = bundle.map_id, bundle.window
         units: dict[SubmapId, float] = {}
         if self._corrections.fits(map_id):
-            result, units = keep_scales(self._map, map_id, window, result)
+            result, units = keep_scales(self._map, map_id, window, result, inertial=bundle.inertial)
         free = window.problem.free
         ids = self._map.keyframes.id[window.rows]
         poses = np.linalg.inv(result.T_c_m[free])

@@ -112,17 +112,19 @@ def _points(
 
 
 def keep_scales(
-    sparse_map: SparseMap, map_id: SubmapId, window: BundleWindow, result: BundleResult
+    sparse_map: SparseMap, map_id: SubmapId, window: BundleWindow, result: BundleResult, *, inertial: bool
 ) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
     """Move the change of scale that a full bundle found into the scale of monocular submaps.
 
-    It is measured at each submap's newest keyframes, so that the agent's lengths there do not change. In a map without
-    metric scale, lengths at the oldest keyframes do not change in w. Returns the result, and the factors by submap.
+    inertial: also of those in metres, because inertial steps tell their scale. It is measured at each submap's newest
+    keyframes, so that the agent's lengths there do not change. In a map without metric scale, lengths at the oldest
+    keyframes do not change in w. Returns the result, and the factors by submap.
     """
-    own = [submap for submap in sparse_map.submaps_of_map(map_id) if sparse_map.is_up_to_scale(submap)]
+    submaps = sparse_map.submaps_of_map(map_id)
+    own = [s for s in submaps if sparse_map.is_up_to_scale(s) or (inertial and sparse_map.has_metric_scale_by_imu(s))]
     factors = {s: _scale_change(sparse_map, sparse_map.submaps[s][-_ENDS:], window, result) for s in own}
     root = sparse_map.map_id(map_id)
-    if root in factors:
+    if sparse_map.is_up_to_scale(root):
         whole = _scale_change(sparse_map, sparse_map.submaps[root][:_ENDS], window, result)
         centre = sim3.place(sparse_map.submap_pose(root), sparse_map.first_pose(root))[:3, 3]
         poses = np.linalg.inv(result.T_c_m)
@@ -137,7 +139,7 @@ def keep_scales(
 def _scale_change(
     sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult
 ) -> float:
-    """Median factor by which a bundle changed depths in keyframes; 1 if too few landmarks are known."""
+    """Median factor by which a bundle changed depths in keyframes: of landmarks that began there, if enough did."""
     table = sparse_map.keyframes
     rows = [sparse_map.rows[k] for k in keyframes]
     anchors = sparse_map.keypoints.row[window.points]
@@ -145,12 +147,30 @@ def _scale_change(
     number[window.rows] = np.arange(len(window.rows))
     here = np.isin(anchors, rows) & (number[anchors] >= 0)
     if np.count_nonzero(here) < _MIN_LANDMARKS:
-        return 1.0
+        return _observed_change(sparse_map, keyframes, window, result)
     T = result.T_c_m[number[anchors[here]]]
     after = np.einsum("nj,nj->n", T[:, 2, :3], result.points[here]) + T[:, 2, 3]
     inverse = sparse_map.inverse_depths(window.points[here]) / table.scale[anchors[here]]
     good = (after > 0.0) & (inverse > 0.0)
     return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _MIN_LANDMARKS else 1.0
+
+
+def _observed_change(
+    sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult
+) -> float:
+    """Median factor by which a bundle changed depths of what keyframes observe; 1 if that is too little."""
+    problem = window.problem
+    rows = np.array([sparse_map.rows[k] for k in keyframes], np.int32)
+    camera = problem.camera[: len(window.slots)]
+    here = np.isin(window.rows[camera], rows) & result.inlier[: len(window.slots)]
+    camera = camera[here]
+    point = np.repeat(np.arange(len(window.points)), np.diff(problem.starts[: len(window.points) + 1]))[here]
+    before, after = (
+        np.einsum("nj,nj->n", T[camera, 2, :3], points[point]) + T[camera, 2, 3]
+        for T, points in ((problem.T_c_m, problem.points), (result.T_c_m, result.points))
+    )
+    good = (before > 0.0) & (after > 0.0)
+    return float(np.median(after[good] / before[good])) if np.count_nonzero(good) >= _MIN_LANDMARKS else 1.0
 
 
 def cull_landmarks(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:

@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
+from kiteline_basestation.config import InertialScaleConfig
+from kiteline_basestation.inertial.chain import Segment
+from kiteline_basestation.inertial.map_scale import in_metres
 from kiteline_basestation.jobs import JobKind
 from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, BundleResult, bundle
+
+_STEP_OPS = 120_000  # of an inertial step: 0.12 ms, as timed
 
 
 @dataclass(frozen=True, slots=True)
 class BundleInputs:
-    """A bundle adjustment problem and how to solve it."""
+    """A bundle adjustment problem and how to solve it. chain: scales the result, about camera `held`."""
 
     problem: BundleProblem
     config: BundleConfig
+    chain: tuple[Segment, ...] = ()
+    held: int = 0
+    inertial_scale: InertialScaleConfig = field(default_factory=InertialScaleConfig)
 
 
 def _run(inputs: BundleInputs) -> BundleResult:
-    return bundle(inputs.problem, inputs.config)
+    result = bundle(inputs.problem, inputs.config)
+    if not inputs.chain:
+        return result
+    steps = sum(len(segment.dt_s) for segment in inputs.chain)
+    result = replace(result, cost_ops=result.cost_ops + _STEP_OPS * steps)
+    return in_metres(result, inputs.chain, inputs.held, inputs.inertial_scale)
 
 
 def _cost_ops(inputs: BundleInputs, result: BundleResult) -> int:

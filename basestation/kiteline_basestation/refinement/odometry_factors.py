@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 
@@ -53,7 +53,8 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         if not (sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth):
             sets.append((_DEPTHS, config.scale_sigma_px))
         for depths, set_sigma in sets:
-            synthetic = _synthetic_points(sparse_map, problem, k, p, table.T_p_k[row], depths)
+            T_p_k = sim3.with_scaled_translation(table.T_p_k[row], sparse_map.scale(submap))
+            synthetic = _synthetic_points(sparse_map, problem, k, p, T_p_k, depths)
             if synthetic is None:
                 continue
             in_k, in_p, world = synthetic

@@ -67,17 +67,15 @@ def _rice_bits(values: I64, mode: int, shift: int, low: int, start: int) -> int:
 def _shape(values: I64, out: I64) -> None:
     """Mode, shift, first number and width or start of the shortest form of a column (n,), n >= 1, into out (4,)."""
     n = values.size
-    union, least, most = 0, int(values[0]), int(values[0])
+    union = 0
     for j in range(n):
-        v = int(values[j])
-        union |= v
-        least, most = min(least, v), max(most, v)
+        union |= int(values[j])
     shift = 0
     while shift < MAX_SHIFT and union and not union >> shift & 1:
         shift += 1
-    low = least >> shift
+    low = int(values.min()) >> shift
     first = int(values[0]) >> shift
-    span = (most >> shift) - low
+    span = (int(values.max()) >> shift) - low
     width = 0
     while span >> width:
         width += 1

@@ -36,6 +36,7 @@ class Profile:
     landmark_bytes: int = 39  # of a new landmark on the wire, headers included
     undescribed_bytes: int = 9  # the same without a descriptor, with one or two observations
     observations_room_bytes: int = 600  # of a keyframe's header and observations on the wire
+    inertial_steps: bool = True  # whether the IMU's steps between keyframes are shared: 110 bytes a second
     packet_bytes: int = 1200  # largest packet: fits an Ethernet frame inside any tunnel
     overhead_bytes: int = 28  # cost of a packet on the wire beyond its own bytes: IPv4 and UDP
     heartbeat_ns: int = 1_000_000_000  # longest silence
@@ -99,6 +100,7 @@ RADIO = Profile(
     live_gap_ns=245_000_000,  # 4 Hz, so that two lost poses still leave one a second
     keyframe_bytes=2_000,
     thin=True,
+    inertial_steps=False,
     landmark_bytes=25,
     undescribed_bytes=11,
     observations_room_bytes=220,

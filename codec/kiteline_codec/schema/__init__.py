@@ -6,15 +6,14 @@ In: dataclasses of numpy arrays. Out: a key and a code for each, and back. A new
 from kiteline_codec.coding.packing import WireError as WireError
 from kiteline_codec.schema.agent.camera_intrinsics import CameraIntrinsics as CameraIntrinsics
 from kiteline_codec.schema.agent.gravity_alignment import GravityAlignment as GravityAlignment
+from kiteline_codec.schema.agent.inertial_steps import InertialSteps as InertialSteps
 from kiteline_codec.schema.agent.keyframe_header import KeyframeHeader as KeyframeHeader
 from kiteline_codec.schema.agent.live_pose import LivePose as LivePose
 from kiteline_codec.schema.agent.new_landmarks import NewLandmarks as NewLandmarks
 from kiteline_codec.schema.agent.observations import Observations as Observations
-from kiteline_codec.schema.agent.stereo_alignment import StereoAlignment as StereoAlignment
 from kiteline_codec.schema.agent.submap_scale import SubmapScale as SubmapScale
 from kiteline_codec.schema.base.cached_keyframe import CachedKeyframe as CachedKeyframe
 from kiteline_codec.schema.base.cached_landmarks import CachedLandmarks as CachedLandmarks
-from kiteline_codec.schema.base.correction_batch import CorrectionBatch as CorrectionBatch
 from kiteline_codec.schema.base.culled_landmarks import CulledLandmarks as CulledLandmarks
 from kiteline_codec.schema.base.disparity_calibration import DisparityCalibration as DisparityCalibration
 from kiteline_codec.schema.base.fused_landmarks import FusedLandmarks as FusedLandmarks

@@ -28,7 +28,7 @@ from kiteline_core.ids import AgentId
 class Battery(Record):
     """Charge of an agent's battery in percent."""
 
-    KIND = 9
+    KIND = 15
     ID = IdOf.AGENT
     PRIORITY = Priority.CORRECTION
 

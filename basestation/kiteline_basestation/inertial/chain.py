@@ -1,0 +1,162 @@
+"""The agents' inertial steps along the keyframes of a map, and the path of the body that poses and steps give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_codec.schema import InertialSteps
+from kiteline_core.geometry import se3
+from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+
+F64 = NDArray[np.float64]
+
+_MAX_STEPS = 8000  # of a map, the newest: a quarter of an hour, 0.3 s of solving
+_LEAST_M = 0.05  # distance between keyframes from which the path's length follows theirs
+_FOLLOW = (0.7, 1.4)  # factors by which it may
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Steps (n,…) between keyframes `first` and `last` of a window, which number its poses; see InertialSteps.
+
+    T_c_b: (4,4). depth_m: median distance of what the camera sees. unit: metres that the agent told in one of w.
+    """
+
+    first: int
+    last: int
+    T_c_b: F64
+    depth_m: float
+    unit: float
+    noise: float
+    dt_s: F64
+    turn: F64
+    moved: F64
+    velocity: F64
+    position: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Steps (n,) of all segments between nodes: step i leads from node `begin[i]` to the next one.
+
+    R_w_b: (k,3,3) and camera: (k,3) m, at the nodes, lever: (k,3) m from body to camera, in w. fresh: (k,) True where
+    a chain begins. noise, depth_m, unit: (n,) of each step's segment.
+    """
+
+    begin: NDArray[np.int64]
+    R_w_b: F64
+    camera: F64
+    lever: F64
+    fresh: NDArray[np.bool_]
+    dt_s: F64
+    turn: F64
+    velocity: F64
+    position: F64
+    noise: F64
+    depth_m: F64
+    unit: F64
+
+
+def segments_of(sparse_map: SparseMap, window: BundleWindow) -> tuple[Segment, ...]:
+    """Segments of a window in order of time; steps over culled keyframes are joined."""
+    table = sparse_map.keyframes
+    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    depths = _depths(window)
+    out: list[Segment] = []
+    for keyframe, i in number.items():
+        agent = agent_of_keyframe(KeyframeId(keyframe))
+        if not sparse_map.has_metric_scale_by_imu(submap_of_keyframe(KeyframeId(keyframe))):
+            continue
+        records: list[InertialSteps] = []
+        at = KeyframeId(keyframe)
+        while (record := sparse_map.inertial_steps.get(at)) is not None and (not records or at not in number):
+            records.append(record)
+            at = record.since
+        if not records or at not in number:
+            continue
+        records.reverse()
+        fields = (np.concatenate([getattr(r, name) for r in records]) for name in _STEPS)
+        submap = submap_of_keyframe(KeyframeId(keyframe))
+        out.append(
+            Segment(
+                number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depths[i]),
+                1.0 / sparse_map.scale(submap), records[-1].noise, *fields,
+            )
+        )  # fmt: skip
+    out.sort(key=lambda s: int(table.t_ns[window.rows[s.last]]))
+    kept, n = len(out), 0
+    while kept > 0 and n + len(out[kept - 1].dt_s) <= _MAX_STEPS:
+        kept, n = kept - 1, n + len(out[kept - 1].dt_s)
+    return tuple(out[kept:])
+
+
+_STEPS = ("dt_s", "turn", "moved", "velocity", "position")
+
+
+def _depths(window: BundleWindow) -> F64:
+    """Median distance (k,) of the landmarks that each keyframe of a window observes; 1 without any."""
+    problem = window.problem
+    point = np.repeat(np.arange(len(problem.starts) - 1), np.diff(problem.starts))
+    T = problem.T_c_m[problem.camera]
+    distance = np.linalg.norm(np.einsum("mij,mj->mi", T[:, :3, :3], problem.points[point]) + T[:, :3, 3], axis=1)
+    order = np.argsort(problem.camera, kind="stable")
+    ends = np.searchsorted(problem.camera[order], np.arange(len(problem.T_c_m) + 1))
+    parts = [distance[order[a:b]] for a, b in pairwise(ends)]
+    return np.array([float(np.median(part)) if len(part) else 1.0 for part in parts])
+
+
+def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
+    """The path through keyframes at T_w_c (k,4,4).
+
+    Between them it has the shape that the agent saw, bent so that it ends where the keyframes are.
+    """
+    begin, fresh = list[NDArray[np.int64]](), list[NDArray[np.bool_]]()
+    R, camera, lever = list[F64](), list[F64](), list[F64]()
+    end = -1  # keyframe at which the path ends so far
+    for s in segments:
+        R_k, p_k = _shape(s, T_w_c[s.first], T_w_c[s.last])
+        R_w_b = R_k @ s.T_c_b[:3, :3]
+        joined = s.first == end
+        drop = 1 if joined else 0  # its first node is the last one of the segment before
+        begin.append(sum(map(len, R)) - drop + np.arange(len(s.dt_s)))
+        R.append(R_w_b[drop:])
+        camera.append(p_k[drop:])
+        lever.append(-(R_k @ s.T_c_b[:3, 3])[drop:])
+        fresh.append((np.arange(len(R_k)) == 0)[drop:])
+        end = s.last
+    sizes = [len(s.dt_s) for s in segments]
+    return Path(
+        np.concatenate(begin), np.concatenate(R), np.concatenate(camera), np.concatenate(lever),
+        np.concatenate(fresh), *(np.concatenate([getattr(s, name) for s in segments]) for name in _SHAPE),
+        *(np.repeat([getattr(s, name) for s in segments], sizes) for name in ("noise", "depth_m", "unit")),
+    )  # fmt: skip
+
+
+_SHAPE = ("dt_s", "turn", "velocity", "position")
+
+
+def _shape(s: Segment, T_w_first: F64, T_w_last: F64) -> tuple[F64, F64]:
+    """Rotations (n+1,3,3) and positions (n+1,3) of the camera in w."""
+    T_b_c = se3.inverse(s.T_c_b)
+    T = np.eye(4)
+    relative = [np.eye(4)]
+    for turn, moved in zip(s.turn, s.moved, strict=True):
+        T = T @ se3.from_rt(se3.so3_exp(turn), moved)
+        relative.append(s.T_c_b @ T @ T_b_c)
+    chain = np.array(relative)
+    target = se3.inverse(T_w_first) @ T_w_last
+    share = np.concatenate([[0.0], np.cumsum(s.dt_s)]) / float(np.sum(s.dt_s))
+    apart, seen = float(np.linalg.norm(target[:3, 3])), float(np.linalg.norm(chain[-1, :3, 3]))
+    ratio = apart / seen if min(apart, seen) > _LEAST_M else 1.0
+    ratio = ratio if _FOLLOW[0] < ratio < _FOLLOW[1] else 1.0
+    place = ratio * chain[:, :3, 3] + share[:, None] * (target[:3, 3] - ratio * chain[-1, :3, 3])
+    bend = se3.so3_log(chain[-1, :3, :3].T @ target[:3, :3])
+    rotation = np.array([C[:3, :3] @ se3.so3_exp(a * bend) for C, a in zip(chain, share, strict=True)])
+    R = T_w_first[:3, :3] @ rotation
+    return R, T_w_first[:3, 3] + place @ T_w_first[:3, :3].T

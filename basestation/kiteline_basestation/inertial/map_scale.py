@@ -1,0 +1,198 @@
+"""The scale of a map by the accelerations of the whole flight.
+
+Maximum a posteriori of position, velocity and accelerometer bias at the ends of short steps, of gravity's direction and
+of the scale, given rotations and the shape of the path by images. As in C. Campos et al., "Inertial-only optimization
+for visual-inertial initialization", 2020, but that positions are unknown too: images err by as much as a short step
+accelerates, and taken as exact they would make the scale too small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import InertialScaleConfig
+from kiteline_basestation.inertial import band_kernels
+from kiteline_basestation.inertial.chain import Path, Segment, path_along
+from kiteline_core.geometry import se3
+from kiteline_core.optimisation.bundle import BundleResult
+
+F64 = NDArray[np.float64]
+
+_NODE = 9  # unknowns of a node: position, velocity, accelerometer bias
+_SHARED = 3  # of the map: direction of gravity, units of w in a metre
+_ROWS = 12  # of a step: velocity and position by the IMU, displacement by images, change of the bias
+_WIDTH = 2 * _NODE
+
+
+@dataclass(frozen=True, slots=True)
+class MapScale:
+    """metres: in one unit of w. sigma: standard deviation of its logarithm. chi2: mean squared residual by images."""
+
+    metres: float
+    sigma: float
+    chi2: float
+
+
+@dataclass(slots=True)
+class _State:
+    """node: (k,9). gravity: (3,) m/s^2 in w. units: of w in a metre."""
+
+    node: F64
+    gravity: F64
+    units: float
+
+
+def in_metres(
+    result: BundleResult, segments: tuple[Segment, ...], held: int, config: InertialScaleConfig
+) -> BundleResult:  # fmt: skip
+    """The result of a bundle, scaled about the camera `held` by what the segments tell, if they tell anything."""
+    T_w_c: F64 = np.linalg.inv(result.T_c_m).astype(np.float64)
+    found = map_scale(segments, T_w_c, config)
+    if found is None:
+        return result
+    centre = T_w_c[held, :3, 3].copy()
+    T_w_c[:, :3, 3] = centre + found.metres * (T_w_c[:, :3, 3] - centre)
+    T_c_w: F64 = np.linalg.inv(T_w_c).astype(np.float64)
+    T_c_w[held] = result.T_c_m[held]
+    return replace(result, T_c_m=T_c_w, points=centre + found.metres * (result.points - centre))
+
+
+def tells_scale(segments: tuple[Segment, ...], config: InertialScaleConfig) -> bool:
+    """True if the segments are long enough."""
+    return sum(float(s.dt_s.sum()) for s in segments) >= config.least_s
+
+
+def map_scale(segments: tuple[Segment, ...], T_w_c: F64, config: InertialScaleConfig) -> MapScale | None:
+    """The scale of keyframes at T_w_c (k,4,4); None with too few steps, and if they do not fit."""
+    if not tells_scale(segments, config) or not np.isfinite(T_w_c).all():
+        return None
+    path = path_along(segments, T_w_c)
+    state, weight = _start(path, config), np.ones(len(path.begin))
+    agent_units = 1.0 / float(np.average(path.unit, weights=path.dt_s))
+    for _ in range(config.iterations):
+        J, e, chi2 = _linearised(path, state, weight, config)
+        solved = _solve(path, state, J, e, agent_units, config)
+        if solved is None:
+            return None
+        state, variance = solved
+        if not 0.5 < state.units < 2.0:
+            return None
+        weight = np.minimum(1.0, config.huber / np.sqrt(np.maximum(chi2, 1e-12)))
+    typical = max(1.0, float(np.median(chi2)) / _MEDIAN_3)
+    return MapScale(1.0 / state.units, float(np.sqrt(variance * typical)) / state.units, float(np.mean(chi2)) / 3.0)
+
+
+_MEDIAN_3 = 2.366  # of a chi-square with three degrees of freedom
+
+
+def _start(path: Path, config: InertialScaleConfig) -> _State:
+    a, dt = path.begin, path.dt_s
+    place = path.camera - path.lever
+    velocity = np.zeros_like(place)
+    velocity[a + 1] = (place[a + 1] - place[a]) / dt[:, None]
+    first = a[path.fresh[a]]
+    velocity[first] = velocity[first + 1]
+    force = np.einsum("nij,nj->i", path.R_w_b[a], path.velocity) - (velocity[a + 1] - velocity[a]).sum(axis=0)
+    gravity = -config.gravity_m_s2 * force / max(float(np.linalg.norm(force)), 1e-9)
+    return _State(np.concatenate([place, velocity, np.zeros_like(place)], axis=1), gravity, 1.0)
+
+
+def _tangent(gravity: F64) -> F64:
+    """Two directions (3,2) across gravity, as long as it."""
+    u = gravity / np.linalg.norm(gravity)
+    x = np.cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
+    x /= np.linalg.norm(x)
+    return np.asarray(np.column_stack([x, np.cross(u, x)]) * np.linalg.norm(gravity))
+
+
+def _linearised(path: Path, state: _State, weight: F64, config: InertialScaleConfig) -> tuple[F64, F64, F64]:
+    """Jacobians (n,12,21) of whitened errors by two nodes and the shared unknowns, errors (n,12), and the squared
+    errors (n,) of the images in deviations.
+    """
+    a, dt = path.begin, path.dt_s
+    n, x0, x1 = len(a), state.node[path.begin], state.node[path.begin + 1]
+    back = np.swapaxes(path.R_w_b[a], 1, 2)
+    # the accelerometer's bias turns with the body during a step
+    middle = np.array([se3.so3_exp(0.5 * w) for w in path.turn])
+    early = np.array([se3.so3_exp(w / 3.0) for w in path.turn])
+    J = np.zeros((n, _ROWS, _WIDTH + _SHARED))
+    e = np.zeros((n, _ROWS))
+    t = dt[:, None]
+    dv = np.einsum("nij,nj->ni", back, x1[:, 3:6] - x0[:, 3:6] - t * state.gravity)
+    dp = np.einsum("nij,nj->ni", back, x1[:, :3] - x0[:, :3] - t * x0[:, 3:6] - 0.5 * t * t * state.gravity)
+    by_bias_v, by_bias_p = dt[:, None, None] * middle, 0.5 * (dt * dt)[:, None, None] * early
+    e[:, :3] = dv - path.velocity + np.einsum("nij,nj->ni", by_bias_v, x0[:, 6:])
+    e[:, 3:6] = dp - path.position + np.einsum("nij,nj->ni", by_bias_p, x0[:, 6:])
+    tilt = back @ _tangent(state.gravity)
+    J[:, :3, 3:6], J[:, :3, 12:15], J[:, :3, 6:9] = -back, back, by_bias_v
+    J[:, :3, 18:20] = -dt[:, None, None] * tilt
+    J[:, 3:6, :3], J[:, 3:6, 9:12], J[:, 3:6, 3:6] = -back, back, -dt[:, None, None] * back
+    J[:, 3:6, 6:9], J[:, 3:6, 18:20] = by_bias_p, -0.5 * (dt * dt)[:, None, None] * tilt
+    moved = x1[:, :3] - x0[:, :3] + path.lever[a + 1] - path.lever[a]
+    e[:, 6:9] = path.camera[a + 1] - path.camera[a] - state.units * moved
+    J[:, 6:9, :3], J[:, 6:9, 9:12] = state.units * np.eye(3), -state.units * np.eye(3)
+    J[:, 6:9, 20] = -moved
+    e[:, 9:] = x1[:, 6:] - x0[:, 6:]
+    J[:, 9:, 6:9], J[:, 9:, 15:18] = -np.eye(3), np.eye(3)
+    # whitening: L L^T = inverse covariance of [velocity, position] by white noise
+    density = config.noise_inflation * path.noise
+    v, vp, p = density**2 * dt, 0.5 * density**2 * dt**2, density**2 * dt**3 / 3.0
+    v, p = v + config.floor_m_s**2, p + config.floor_m**2
+    by_p = 1.0 / np.sqrt(p - vp**2 / v)
+    position = by_p[:, None] * (e[:, 3:6] - (vp / v)[:, None] * e[:, :3])
+    e[:, :3], e[:, 3:6] = e[:, :3] / np.sqrt(v)[:, None], position
+    position_J = by_p[:, None, None] * (J[:, 3:6] - (vp / v)[:, None, None] * J[:, :3])
+    J[:, :3], J[:, 3:6] = J[:, :3] / np.sqrt(v)[:, None, None], position_J
+    image = 1.0 / np.hypot(config.image_rad * path.depth_m, config.image_m)
+    chi2 = np.square(image[:, None] * e[:, 6:9]).sum(axis=1)
+    walk = 1.0 / (config.bias_walk * np.sqrt(dt))
+    for rows, factor in ((slice(6, 9), image * np.sqrt(weight)), (slice(9, 12), walk)):
+        e[:, rows] *= factor[:, None]
+        J[:, rows] *= factor[:, None, None]
+    return J, e, chi2
+
+
+def _solve(
+    path: Path, state: _State, J: F64, e: F64, agent_units: float, config: InertialScaleConfig
+) -> tuple[_State, float] | None:
+    """A Gauss-Newton step, and the variance of the units; None if the system has no solution."""
+    k = len(path.fresh)
+    H, g = np.swapaxes(J, 1, 2) @ J, -np.einsum("nri,nr->ni", J, e)
+    diagonal, beside = np.zeros((k, _NODE, _NODE)), np.zeros((k, _NODE, _NODE))
+    border, rhs = np.zeros((k, _NODE, _SHARED)), np.zeros((k, _NODE))
+    a = path.begin
+    for node, at in ((a, slice(0, _NODE)), (a + 1, slice(_NODE, _WIDTH))):  # each node once: plain indexing adds
+        diagonal[node] += H[:, at, at]
+        border[node] += H[:, at, _WIDTH:]
+        rhs[node] += g[:, at]
+    beside[a] = H[:, :_NODE, _NODE:_WIDTH]
+    # where a chain begins: a place, and a first bias
+    first = np.flatnonzero(path.fresh)
+    diagonal[first, :3, :3] += np.eye(3) / config.image_m**2
+    diagonal[first, 6:, 6:] += np.eye(3) / config.bias_sigma**2
+    rhs[first, 6:] -= state.node[first, 6:] / config.bias_sigma**2
+    corner, corner_rhs = H[:, _WIDTH:, _WIDTH:].sum(axis=0), g[:, _WIDTH:].sum(axis=0)
+    corner[2, 2] += 1.0 / (config.agent_sigma * agent_units) ** 2
+    corner_rhs[2] += (agent_units - state.units) / (config.agent_sigma * agent_units) ** 2
+    band = np.zeros((k, _NODE, _WIDTH))
+    for r in range(_NODE):
+        band[:, r, : _NODE - r] = diagonal[:, r, r:]
+        band[:, r, _NODE - r : _WIDTH - r] = beside[:, r]
+    flat, flat_border, x = band.reshape(-1, _WIDTH), border.reshape(-1, _SHARED), rhs.reshape(-1)
+    if not band_kernels.factor(flat, flat_border, corner, x, corner_rhs):
+        return None
+    try:
+        cov = np.linalg.inv(corner)
+    except np.linalg.LinAlgError:
+        return None
+    shared = cov @ corner_rhs
+    band_kernels.substitute(flat, flat_border, x, shared)
+    if not (np.isfinite(x).all() and np.isfinite(cov).all() and cov[2, 2] > 0.0):
+        return None
+    gravity = state.gravity + _tangent(state.gravity) @ shared[:2]
+    gravity *= config.gravity_m_s2 / float(np.linalg.norm(gravity))
+    moved = _State(state.node + x.reshape(k, _NODE), gravity, state.units + float(shared[2]))
+    return moved, float(cov[2, 2])

@@ -1,0 +1,289 @@
+"""The scale of a map by inertial steps: the truth, an IMU that is silent about it, and chains with gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import BaseConfig, InertialScaleConfig
+from kiteline_basestation.inertial import band_kernels
+from kiteline_basestation.inertial.chain import Segment, path_along, segments_of
+from kiteline_basestation.inertial.map_scale import in_metres, map_scale
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_basestation.store.integrity import contradictions
+from kiteline_codec.schema import CameraIntrinsics, InertialSteps, Record, SubmapScale
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
+from kiteline_core.optimisation.bundle import BundleResult
+
+F64 = NDArray[np.float64]
+
+CONFIG = InertialScaleConfig()
+GRAVITY = np.array([0.0, 0.0, -9.81])
+T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.02, -0.05]))
+FINE = 1e-2  # s between two samples
+
+
+def body(t: float, lively: float) -> F64:
+    """T_w_b (4,4) of a flight with accelerations of about 0.5 m/s^2 times `lively`."""
+    p = np.array([0.3 * np.sin(1.9 * t), 0.35 * np.sin(1.3 * t + 1.0), 0.2 * np.sin(2.3 * t + 0.4)])
+    turn = np.array([0.08 * np.sin(1.1 * t), 0.1 * np.sin(1.6 * t + 0.3), 0.2 * np.sin(0.7 * t)])
+    return se3.from_rt(se3.so3_exp(turn), lively * p + np.array([0.3 * t, 0.1 * t, 0.0]))
+
+
+def steps(
+    from_s: float, to_s: float, n: int, lively: float, scale: float, rng: np.random.Generator, bias: F64
+) -> dict[str, Any]:
+    """The fields of steps: images see `scale` times the true lengths with 1 mm of noise, the IMU has noise and bias."""
+    edges = np.linspace(from_s, to_s, n + 1)
+    rows: dict[str, list[Any]] = {name: [] for name in ("dt_s", "turn", "moved", "velocity", "position")}
+    for a, b in pairwise(edges):
+        T0, T1 = body(a, lively), body(b, lively)
+        C = se3.inverse(T0 @ T_B_C) @ (T1 @ T_B_C)
+        C[:3, 3] = scale * C[:3, 3] + rng.normal(0.0, 1e-3, 3)
+        seen = T_B_C @ C @ se3.inverse(T_B_C)
+        v, p = np.zeros(3), np.zeros(3)
+        m = max(2, round((b - a) / FINE))
+        h = (b - a) / m
+        for k in range(m):
+            t = a + (k + 0.5) * h
+            second = (body(t + h, lively) - 2.0 * body(t, lively) + body(t - h, lively))[:3, 3] / h**2
+            noise = rng.normal(0.0, 2e-3 / np.sqrt(h), 3)
+            force = T0[:3, :3].T @ (second - GRAVITY) + T0[:3, :3].T @ body(t, lively)[:3, :3] @ (bias + noise)
+            p += v * h + 0.5 * force * h * h
+            v += force * h
+        turn = se3.so3_log(seen[:3, :3])
+        for name, value in zip(rows, (b - a, turn, seen[:3, 3], v, p), strict=True):
+            rows[name].append(value)
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+def a_map(scale: float, lively: float = 1.0, seed: int = 0, seconds: float = 20.0) -> tuple[tuple[Segment, ...], F64]:
+    """Segments between keyframes 0.9 s apart, and T_w_c (k,4,4) of a map `scale` times too large."""
+    rng, times = np.random.default_rng(seed), np.arange(0.0, seconds, 0.9)
+    T_w_c = np.array([body(t, lively) @ T_B_C for t in times])
+    T_w_c[:, :3, 3] *= scale
+    bias = np.array([0.05, -0.1, 0.08])
+    segments = tuple(
+        Segment(i, i + 1, se3.inverse(T_B_C), 3.0, 1.0, 2e-3, **steps(a, b, 6, lively, scale, rng, bias))
+        for i, (a, b) in enumerate(pairwise(times))
+    )
+    return segments, T_w_c
+
+
+@given(st.integers(0, 1 << 30), st.integers(2, 12), st.integers(1, 5), st.integers(1, 3))
+def test_the_band_is_solved_as_the_full_matrix(seed: int, n: int, w: int, b: int) -> None:
+    rng = np.random.default_rng(seed)
+    full = np.zeros((n + b, n + b))
+    for j in range(n):
+        full[j, j : min(j + w, n)] = rng.normal(0.0, 1.0, min(w, n - j))
+    full[:n, n:] = rng.normal(0.0, 1.0, (n, b))
+    full = full + full.T + 20.0 * np.eye(n + b)
+    rhs = rng.normal(0.0, 1.0, n + b)
+    band = np.zeros((n, w))
+    for j in range(n):
+        band[j, : min(w, n - j)] = full[j, j : min(j + w, n)]
+    border, corner = full[:n, n:].copy(), full[n:, n:].copy()
+    x, x_corner = rhs[:n].copy(), rhs[n:].copy()
+    assert band_kernels.factor(band, border, corner, x, x_corner)
+    expected = np.linalg.solve(full, rhs)
+    assert np.allclose(np.linalg.inv(corner), np.linalg.inv(full)[n:, n:], atol=1e-10)
+    x_corner = np.linalg.solve(corner, x_corner)
+    band_kernels.substitute(band, border, x, x_corner)
+    assert np.allclose(np.concatenate([x, x_corner]), expected, atol=1e-10)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
+    band = np.array([[1.0, 2.0], [1.0, 0.0]])
+    assert not band_kernels.factor(band, np.zeros((2, 1)), np.eye(1), np.zeros(2), np.zeros(1))
+
+
+@pytest.mark.parametrize("scale", [0.95, 1.0, 1.04])
+def test_the_scale_is_found_within_its_deviation(scale: float) -> None:
+    off = []
+    for seed in range(4):
+        segments, T_w_c = a_map(scale, seed=seed)
+        found = map_scale(segments, T_w_c, CONFIG)
+        assert found is not None
+        assert found.sigma < 0.02
+        off.append(np.log(found.metres * scale) / found.sigma)
+    assert np.abs(off).max() < 2.5
+    assert np.abs(np.mean(off)) < 1.0
+
+
+def test_a_flight_without_accelerations_keeps_the_agents_scale() -> None:
+    segments, T_w_c = a_map(0.95, lively=0.0)
+    found = map_scale(segments, T_w_c, CONFIG)
+    assert found is not None
+    assert found.sigma > 0.02
+    assert abs(found.metres - 1.0) < 0.02
+    told = tuple(
+        replace(s, unit=0.95) for s in segments
+    )  # w has been scaled before: the agent's unit is 1 / 0.95 of w's
+    found = map_scale(told, T_w_c, CONFIG)
+    assert found is not None
+    assert abs(found.metres - 0.95) < 0.02
+
+
+def test_the_path_ends_where_the_keyframes_are() -> None:
+    segments, T_w_c = a_map(1.0)
+    moved = T_w_c.copy()
+    moved[1:, :3, 3] += np.array([0.05, -0.02, 0.03])
+    moved[3] = moved[3] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, -0.02, 0.01]))
+    path = path_along(segments, moved)
+    ends = np.concatenate([[0], np.cumsum([len(s.dt_s) for s in segments])])
+    assert np.allclose(path.camera[ends], moved[:, :3, 3], atol=1e-9)
+    assert np.allclose(path.R_w_b[ends] @ T_B_C[:3, :3], moved[:, :3, :3], atol=1e-6)
+    assert path.fresh.sum() == 1
+    apart = path_along((*segments[:4], *segments[6:]), moved)
+    assert apart.fresh.sum() == 2
+    assert len(apart.camera) == len(apart.begin) + 2
+
+
+def test_a_gap_in_the_chain_costs_little() -> None:
+    segments, T_w_c = a_map(0.95)
+    found = map_scale((*segments[:10], *segments[13:]), T_w_c, CONFIG)
+    assert found is not None
+    assert abs(found.metres * 0.95 - 1.0) < 0.02
+
+
+def test_few_or_mad_steps_tell_nothing() -> None:
+    segments, T_w_c = a_map(0.95)
+    assert map_scale(segments[:2], T_w_c, CONFIG) is None
+    T_w_c[3, 0, 3] = np.nan
+    assert map_scale(segments, T_w_c, CONFIG) is None
+
+
+def test_a_bundle_is_scaled_about_the_camera_that_it_held() -> None:
+    segments, T_w_c = a_map(0.95)
+    points = np.random.default_rng(1).normal(0.0, 3.0, (20, 3))
+    result = BundleResult(np.linalg.inv(T_w_c), points, np.ones(0, np.bool_), 0.0, 0.0, 0, 0)
+    scaled = in_metres(result, segments, 2, CONFIG)
+    assert np.array_equal(scaled.T_c_m[2], result.T_c_m[2])
+    before = np.einsum("kij,nj->kni", result.T_c_m[:, :3, :3], points) + result.T_c_m[:, None, :3, 3]
+    after = np.einsum("kij,nj->kni", scaled.T_c_m[:, :3, :3], scaled.points) + scaled.T_c_m[:, None, :3, 3]
+    ratio = after / before  # no pixel moves
+    assert np.ptp(ratio) < 1e-6
+    assert ratio.mean() == pytest.approx(1.0 / 0.95, abs=0.02)
+
+
+def a_sparse_map(culled: set[int]) -> tuple[SparseMap, BundleWindow, list[KeyframeId]]:
+    sparse_map = SparseMap()
+    submap = submap_id(AgentId(0), 0, 0)
+    sparse_map.set_camera(AgentId(0), RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, False, T_B_C))
+    sparse_map.metric_submaps.add(submap)
+    keyframes = [keyframe_id(submap, i) for i in range(5)]
+    rng = np.random.default_rng(3)
+    for i, keyframe in enumerate(keyframes):
+        parent = keyframes[i - 1] if i else NO_KEYFRAME
+        sparse_map.add_keyframe(keyframe, i * 10**9, parent, np.eye(4), 0)
+        if i:
+            fields = steps(0.9 * i - 0.9, 0.9 * i, 3, 1.0, 1.0, rng, np.zeros(3))
+            sparse_map.inertial_steps[keyframe] = InertialSteps(keyframe, parent, 2e-3, **fields)
+    rows = np.array([sparse_map.rows[k] for i, k in enumerate(keyframes) if i not in culled], np.int32)
+    none = SimpleNamespace(
+        camera=np.zeros(0, np.int32), starts=np.zeros(1, np.int32), points=np.zeros((0, 3)),
+        T_c_m=np.tile(np.eye(4), (len(rows), 1, 1)),
+    )  # fmt: skip
+    return sparse_map, BundleWindow(rows, np.zeros(0, np.int32), np.zeros(0, np.int32), none), keyframes  # type: ignore[arg-type]
+
+
+def test_steps_over_culled_keyframes_are_joined() -> None:
+    sparse_map, window, _ = a_sparse_map({2})
+    found = segments_of(sparse_map, window)
+    assert [(s.first, s.last, len(s.dt_s)) for s in found] == [(0, 1, 3), (1, 2, 6), (2, 3, 3)]
+
+
+def test_a_lost_record_breaks_the_chain_and_another_unit_has_none() -> None:
+    sparse_map, window, keyframes = a_sparse_map(set())
+    del sparse_map.inertial_steps[keyframes[2]]
+    assert [(s.first, s.last) for s in segments_of(sparse_map, window)] == [(0, 1), (2, 3), (3, 4)]
+    sparse_map.metric_submaps.clear()
+    assert segments_of(sparse_map, window) == ()
+
+
+UNIT = 0.96
+
+
+def a_flight_in_wrong_metres(make_flight: Callable[..., Any], scene: Any, *, with_steps: bool) -> Any:
+    """One eye around a room in 10 s, whose agent calls 0.96 m a metre."""
+    turns, keyframes = 1.6, 40
+    flight = make_flight(keyframes=keyframes, turns=turns, stereo=False, drift_m=0.002, scene=scene)
+    submap = submap_of_keyframe(flight.keyframes[0])
+
+    def true(t: float) -> F64:
+        return np.asarray(scene.path(turns * t / (0.25 * keyframes)))
+
+    for n, records in enumerate(flight.records):
+        head = records[0]
+        records[0] = replace(head, T_p_k=sim3.with_scaled_translation(head.T_p_k, UNIT))
+        if n == 0:
+            records.append(SubmapScale(submap, 1.0))
+        elif with_steps:
+            fields = steps_along(true, 0.25 * (n - 1), 0.25 * n, 2)
+            records.append(InertialSteps(flight.keyframes[n], flight.keyframes[n - 1], 2e-3, **fields))
+    return flight
+
+
+def steps_along(true: Callable[[float], F64], from_s: float, to_s: float, n: int) -> dict[str, Any]:
+    """Steps of a camera that is the body, without noise."""
+    rows: dict[str, list[Any]] = {name: [] for name in ("dt_s", "turn", "moved", "velocity", "position")}
+    for a, b in pairwise(np.linspace(from_s, to_s, n + 1)):
+        T0, T1 = true(a), true(b)
+        moved, m = se3.inverse(T0) @ T1, round((b - a) / FINE)
+        h = (b - a) / m
+        v, p = np.zeros(3), np.zeros(3)
+        for k in range(m):
+            t = a + (k + 0.5) * h
+            second = (true(t + h) - 2.0 * true(t) + true(t - h))[:3, 3] / h**2
+            force = T0[:3, :3].T @ (second - GRAVITY)
+            p, v = p + v * h + 0.5 * force * h * h, v + force * h
+        for name, value in zip(rows, (b - a, se3.so3_log(moved[:3, :3]), UNIT * moved[:3, 3], v, p), strict=True):
+            rows[name].append(value)
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+def fed(flight: Any, words: Any) -> Mapper:
+    mapper = Mapper(BaseConfig(), words)
+    done: tuple[JobDone, ...] = ()
+    for n in range(len(flight.records) + 30):
+        records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
+        records += flight.records[n] if n < len(flight.records) else []
+        output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * 250_000_000)
+        done = tuple(run_job(job) for job in output.jobs)
+    assert mapper.idle
+    assert contradictions(mapper) == []
+    return mapper
+
+
+def length_ratio(places: F64, flight: Any) -> float:
+    true = np.array([T[:3, 3] for T in flight.true_T_w_k])
+    return float(np.linalg.norm(places - places.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0)))
+
+
+def test_the_world_is_in_metres_by_all_accelerations_and_the_agents_map_stays(
+    make_flight: Callable[..., Any], lively_room: Any, words: Any
+) -> None:
+    told, untold = (a_flight_in_wrong_metres(make_flight, lively_room, with_steps=known) for known in (True, False))
+    mapper, other = fed(told, words), fed(untold, words)
+    submap = submap_of_keyframe(told.keyframes[0])
+    S_w_m = mapper.placements[submap]
+    own = np.array([mapper.map.pose(k) for k in told.keyframes])
+    assert length_ratio(sim3.place(S_w_m, own)[:, :3, 3], told) == pytest.approx(1.0, abs=0.01)
+    assert length_ratio(own[:, :3, 3], told) == pytest.approx(UNIT, abs=0.01)
+    assert sim3.scale_of(other.placements[submap]) == 1.0
+    assert length_ratio(np.array([other.map.pose(k) for k in untold.keyframes])[:, :3, 3], untold) < 0.975
