@@ -22,17 +22,17 @@ class CornerTracksConfig:
 class InertialBundleConfig:
     """Error models of the window, and effort of the solver."""
 
-    sigma_px: float = 0.7  # px of an observation; corners that are followed from keyframe to keyframe drift by as much
-    huber: float = 1.5  # deviations beyond which an observation counts linearly
+    sigma_px: float = 1.0  # px of an observation; the drift of a corner is alike in all keyframes
+    huber: float = 0.5  # deviations beyond which an observation counts linearly: many corners drift
     imu_inflation: float = 3.0  # of the calibration's noise densities: vibration
     accel_walk: float = 0.015  # m/s^2 per sqrt(s), beside the calibration's: errors of scale and axes, vibration
     gyro_bias_rad_s: float = 0.1  # deviation of an unknown gyro bias
     accel_bias_m_s2: float = 0.2  # the same of the accelerometer
     first_depth_m: float = 3.0  # at which all landmarks start; only the sign matters
     structure_iterations: int = 25  # steps of the first stage: none of it is known
-    iterations: int = 15  # steps of the last stage
+    iterations: int = 20  # steps of the last stage
     structure_settled: float = 1e-3  # relative fall of the cost below which the first stage ends
-    settled: float = 0.02  # fall of the cost below which the last one ends: a deviation of the scale is worth 0.5
+    settled: float = 0.1  # fall of the cost below which the last one ends: a deviation of the scale is worth 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +40,17 @@ class InertialStartConfig:
     """When a monocular camera with an IMU knows its scale, and begins a map in metres."""
 
     min_span_s: float = 2.4  # before which a window tells no scale
-    max_span_s: float = 8.0  # longest window; older keyframes are dropped
+    max_span_s: float = 11.0  # longest window; older keyframes are dropped
     attempt_s: float = 0.45  # time between two solutions: each costs as much as some frames
-    landmarks: int = 70  # of the window, with the longest tracks, and
-    landmarks_each: int = 20  # in each keyframe: in fast turns no track is long
+    attempt_share: float = 0.09  # the same over the window's length: long windows cost more
+    landmarks: int = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
+    landmarks_each: int = 70  # in each keyframe: in fast turns no track is long
     min_flow: float = 0.02  # of the focal length, median: with less the camera has not moved
     scale_sigma: float = 0.02  # relative deviation of the scale below which it is metric
     sigma_inflation: float = 1.0  # of that deviation: errors of corners are correlated over keyframes
     agreement: float = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
     max_reprojection_px: float = 0.9  # rms of a solution's inliers
-    expected_imu_chi2: float = 0.15  # of those where the error model is right: velocities take up most of them
-    least_noise: float = 0.4  # smallest factor on that model: few windows tell
-    most_noise: float = 4.0  # largest one
+    noise_prior: float = 6.0  # degrees of freedom of the calibrated noise beside those of a window
     max_imu_chi2: float = 1.5  # mean squared error of its inertial factors, in deviations
     state_inflation: float = 2.0  # of the deviations of the state with which tracking begins
     depth_sigma: float = 0.25  # relative deviation above which a landmark has no depth yet

@@ -15,6 +15,7 @@ from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
+from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
@@ -95,12 +96,30 @@ def test_deviations_of_the_scale_are_honest() -> None:
 def test_a_noisier_model_of_the_imu_knows_the_scale_less_well() -> None:
     corners, samples, _ = window(1)
     found = [
-        InertialBundle(corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, noise).solve()
+        InertialBundle(
+            corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, WindowNoise(noise, noise, noise)
+        ).solve()
         for noise in (0.5, 1.0, 3.0)
     ]
     sigma = [s.scale_sigma for s in found if s is not None]
     assert len(sigma) == 3 and sigma[0] < sigma[1] < sigma[2]
     assert all(s is not None and s.converged for s in found)
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0, 12.0])
+def test_noise_of_the_accelerometer_is_found_from_more_than_there_is(factor: float) -> None:
+    """An IMU that shakes: its noise is `factor` times that of the error model."""
+    corners, samples, _ = window(2, keyframes=24)
+    rng = np.random.default_rng(3)
+    sigma = factor * CONFIG.imu_inflation * CALIBRATION.accel_noise * np.sqrt(CALIBRATION.rate_hz)
+    shaken = [replace(s, accel=s.accel + sigma * rng.standard_normal(s.accel.shape)) for s in samples]
+    noise, config = WindowNoise(accel=20.0), replace(CONFIG, sigma_px=0.5, huber=1.5)  # corners are as good as said
+    for _ in range(4):
+        found = InertialBundle(corners, shaken, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, config, noise).solve()
+        assert found is not None
+        noise = found.evidence.updated(noise, 6.0)
+    assert 0.5 * factor < noise.accel < 2.0 * factor
+    assert noise.gyro < 3.0
 
 
 def test_a_still_camera_tells_no_scale() -> None:

@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment
-from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.inertial_terms import SHARED, STATE, InertialTerms
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState, tangent
+from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, accelerometer bias
-_SHARED = 5  # unknowns of the window: gyro bias, direction of gravity
 _MAX_DAMPING = 1e4
 _PLACE_ITERATIONS = 4  # of landmarks alone
 
@@ -55,26 +55,19 @@ class InertialBundle:
         gravity_m_s2: float,
         prior: BiasPrior,
         config: InertialBundleConfig,
-        noise: float = 1.0,
+        noise: WindowNoise | None = None,
     ) -> None:
-        """intervals: K - 1, between the keyframes. noise: factor on the inertial error model."""
+        """intervals: K - 1, between the keyframes. noise: factors on the inertial error model."""
         self._obs = observations
-        # The measured noise is not used: it is vibration, which averages out over an interval, and fast motion.
-        self._intervals = [replace(s, density=None) for s in intervals]
-        self._calibration = calibration
+        self._terms = InertialTerms(intervals, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
         self._r_bc, self._t_bc = T_b_c[:3, :3], T_b_c[:3, 3]
         self._sigma = config.sigma_px / focal_px
         self._length = gravity_m_s2
         self._prior = prior
         self._config = config
-        self._inflation = noise * config.imu_inflation
-        self._walk = noise * float(np.hypot(calibration.accel_walk, config.accel_walk))
         self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
         self._origin, self._axes = np.zeros((self._landmarks, 3)), np.zeros((self._landmarks, 3, 3))
-        self._motions: list[Preintegrated] = []
-        self._info: list[F64] = []
-        self._imu_errors = np.zeros((0, 9))
         self._error = np.zeros((0, 0))  # (K,P) of observations in deviations
 
     def solve(self, warm: WarmStart | None = None) -> WindowSolution | None:
@@ -83,8 +76,8 @@ class InertialBundle:
             state = self._align(self._structure()) if warm is None else self._warm_state(warm)
             if state is None:
                 return None
-            self._integrate(state)
-            every = np.arange(6, _STATE * self._keyframes + _SHARED)
+            self._terms.integrate(state)
+            every = np.arange(6, STATE * self._keyframes + SHARED)
             state, system = self._iterate(state, every, self._config.iterations, inertial=True)
             return self._solution(state, system, every)
         except np.linalg.LinAlgError:
@@ -94,7 +87,7 @@ class InertialBundle:
         """The solution with these poses (rho of any length is replaced) and every landmark of the observations."""
         rho = np.full(self._landmarks, float(np.median(state.rho)))
         state = self._anchored(replace(state, rho=rho, m=np.zeros((self._landmarks, 2))))
-        self._integrate(state)
+        self._terms.integrate(state)
         system = self._linearise(state, inertial=True)
         still = np.zeros(len(system.b))
         for _ in range(_PLACE_ITERATIONS):
@@ -121,24 +114,24 @@ class InertialBundle:
             np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 3)), np.tile(self._prior.bias[3:], (n, 1)),
             self._prior.bias[:3].copy(), np.zeros(3), np.zeros((self._landmarks, 2)), np.zeros(self._landmarks),
         )  # fmt: skip
-        self._integrate(state)
+        self._terms.integrate(state)
         rotation = [np.eye(3)]
-        for motion in self._motions:
+        for motion in self._terms.motions:
             rotation.append(rotation[-1] @ motion.turn)
         R = np.array(rotation)
         rho = np.full(self._landmarks, 1.0 / self._config.first_depth_m)
         state = self._anchored(replace(state, R=R, p=self._t_bc - R @ self._t_bc, rho=rho))
-        unknown = (_STATE * np.arange(1, n)[:, None] + np.arange(6)).ravel()
-        unknown = np.concatenate([unknown, _STATE * n + np.arange(3)])
+        unknown = (STATE * np.arange(1, n)[:, None] + np.arange(6)).ravel()
+        unknown = np.concatenate([unknown, STATE * n + np.arange(3)])
         return self._iterate(state, unknown, self._config.structure_iterations, inertial=False)[0]
 
     def _warm_state(self, warm: WarmStart) -> WindowState:
         """The state of an earlier solution, carried to the newest keyframes by the IMU. NaN: unknown landmarks."""
         old = warm.state
         R, p, v, bias = (list(x) for x in (old.R, old.p, old.v, old.accel_bias))
-        for samples in self._intervals[len(R) - 1 :]:
+        for samples in self._terms.intervals[len(R) - 1 :]:
             both = np.concatenate([old.gyro_bias, bias[-1]])
-            motion = preintegrate(samples, both, self._calibration, self._inflation)
+            motion = self._terms.preintegrate(samples, both)
             T, velocity = motion.propagate(se3.from_rt(R[-1], p[-1]), v[-1], both, old.gravity)
             R, p, v, bias = [*R, T[:3, :3]], [*p, T[:3, 3]], [*v, velocity], [*bias, bias[-1]]
         state = replace(old, R=np.array(R), p=np.array(p), v=np.array(v), accel_bias=np.array(bias))
@@ -153,8 +146,8 @@ class InertialBundle:
         T_w_b = np.tile(np.eye(4), (self._keyframes, 1, 1))
         T_w_b[:, :3, :3], T_w_b[:, :3, 3] = state.R, state.p
         bias = np.concatenate([state.gyro_bias, self._prior.bias[3:]])
-        self._integrate(state)
-        found = initial_alignment.align(T_w_b, self._t_bc, self._motions, bias, self._length, with_scale=True)
+        self._terms.integrate(state)
+        found = initial_alignment.align(T_w_b, self._t_bc, self._terms.motions, bias, self._length, with_scale=True)
         if found is None:
             return None
         camera = state.p + state.R @ self._t_bc
@@ -190,8 +183,8 @@ class InertialBundle:
             enough = config.settled if inertial else config.structure_settled * system.cost
             settled = system.cost - cost < enough
             state, damping = moved, max(0.1 * damping, 1e-9)
-            if self._biases_moved(state):
-                self._integrate(state)
+            if self._terms.biases_moved(state):
+                self._terms.integrate(state)
             system = self._linearise(state, inertial=inertial)
             if settled:
                 self._converged = True
@@ -207,45 +200,29 @@ class InertialBundle:
             return None
         spread = state.p - state.p.mean(axis=0)
         along = np.zeros(len(cov))
-        rows = (_STATE * np.arange(n)[:, None] + np.arange(3, 6)).ravel()
+        rows = (STATE * np.arange(n)[:, None] + np.arange(3, 6)).ravel()
         along[rows] = (spread / max(float((spread**2).sum()), 1e-12)).ravel()
         variance = float(along @ cov @ along)
         if not (np.isfinite(cov).all() and variance > 0.0 and np.isfinite(state.p).all()):
             return None
-        last = _STATE * (n - 1)
+        last = STATE * (n - 1)
         order = np.concatenate(
-            [last + np.arange(9), _STATE * n + np.arange(3), last + np.arange(9, 12), _STATE * n + 3 + np.arange(2)]
+            [last + np.arange(9), STATE * n + np.arange(3), last + np.arange(9, 12), STATE * n + 3 + np.arange(2)]
         )
         camera = state.p[-1] + state.R[-1] @ self._t_bc
         scaled = (self._rays(state) + state.rho[:, None] * (self._origin - camera)) @ (state.R[-1] @ self._r_bc)
         fits = self._error[self._obs.seen]
         fits = fits[fits < 3.0]
+        reprojection_px = float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf
         return WindowSolution(
             state, se3.from_rt(state.R[-1], state.p[-1]), state.v[-1],
             np.concatenate([state.gyro_bias, state.accel_bias[-1]]), state.gravity, cov[np.ix_(order, order)],
             float(np.sqrt(variance)), system.cost, self._converged,
-            float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf,
-            float(np.mean([e @ i @ e for e, i in zip(self._imu_errors, self._info, strict=True)])) / 9.0,
+            reprojection_px, self._terms.mean_chi2(state), self._terms.evidence(state, cov),
             scaled[:, 2] / state.rho, np.sqrt(np.maximum(system.inv[:, 2, 2], 0.0)) / state.rho,
         )  # fmt: skip
 
     # errors
-
-    def _integrate(self, state: WindowState) -> None:
-        """Integrate the samples with the state's biases."""
-        self._motions = [
-            preintegrate(samples, np.concatenate([state.gyro_bias, bias]), self._calibration, self._inflation)
-            for samples, bias in zip(self._intervals, state.accel_bias, strict=False)
-        ]
-        floor = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)
-        self._info = [np.asarray(np.linalg.inv(m.cov + floor)) for m in self._motions]
-
-    def _biases_moved(self, state: WindowState) -> bool:
-        gyro = max(float(np.abs(m.bias[:3] - state.gyro_bias).max()) for m in self._motions)
-        accel = max(
-            float(np.abs(m.bias[3:] - bias).max()) for m, bias in zip(self._motions, state.accel_bias, strict=False)
-        )
-        return gyro > 0.01 or accel > 0.2
 
     def _project(self, state: WindowState) -> tuple[F64, F64, F64, F64]:
         """Landmarks in the body (K,P,3) times rho, depth times rho (K,P), pixels over focal (K,P,2), error there."""
@@ -265,45 +242,13 @@ class InertialBundle:
         weight = np.where(norm < k, 1.0, k / np.maximum(norm, 1e-9)) * self._obs.seen
         return float(np.where(norm < k, 0.5 * norm**2, k * (norm - 0.5 * k)).sum()), weight
 
-    def _inertial_errors(self, state: WindowState) -> F64:
-        """(K-1,9) errors of rotation, velocity and position."""
-        rows = []
-        for k, motion in enumerate(self._motions):
-            turn, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
-            back, dt = state.R[k].T, motion.dt_s
-            dv = state.v[k + 1] - state.v[k] - state.gravity * dt
-            dp = state.p[k + 1] - state.p[k] - state.v[k] * dt - 0.5 * dt * dt * state.gravity
-            rows.append(
-                np.concatenate([se3.so3_log(turn.T @ back @ state.R[k + 1]), back @ dv - vp[:3], back @ dp - vp[3:]])
-            )
-        return np.array(rows)
-
     def _cost(self, state: WindowState, *, inertial: bool) -> float:
-        cost = self._visual_cost(self._project(state)[3])[0]
-        errors = self._inertial_errors(state)
-        cost += 0.5 * sum(float(e @ i @ e) for e, i in zip(errors, self._used_info(inertial=inertial), strict=True))
-        return cost + self._prior_cost(state)
-
-    def _used_info(self, *, inertial: bool) -> list[F64]:
-        if inertial:
-            return self._info
-        used = [np.zeros((9, 9)) for _ in self._info]
-        for out, info in zip(used, self._info, strict=True):
-            out[:3, :3] = info[:3, :3]
-        return used
-
-    def _prior_cost(self, state: WindowState) -> float:
-        steps = np.diff(state.accel_bias, axis=0) / self._walk_sigma()[:, None]
-        off = (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias) / self._prior.sigma
-        return 0.5 * float((steps**2).sum() + off @ off)
-
-    def _walk_sigma(self) -> F64:
-        return np.array([self._walk * np.sqrt(m.dt_s) for m in self._motions])
+        return self._visual_cost(self._project(state)[3])[0] + self._terms.cost(state, inertial=inertial)
 
     # normal equations
 
     def _linearise(self, state: WindowState, *, inertial: bool) -> _System:
-        n, size = self._keyframes, _STATE * self._keyframes + _SHARED
+        n, size = self._keyframes, STATE * self._keyframes + SHARED
         y, z, xy, error = self._project(state)
         cost, weight = self._visual_cost(error)
         root = np.sqrt(weight) / self._sigma
@@ -335,66 +280,23 @@ class InertialBundle:
         for k in range(n):
             reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += diagonal[k]
         rest += np.einsum("kpri,kpr->ki", pose, error).ravel()
-        rows = (_STATE * np.arange(n)[:, None] + np.arange(6)).ravel()
+        rows = (STATE * np.arange(n)[:, None] + np.arange(6)).ravel()
         h[np.ix_(rows, rows)] += reduced
         b[rows] += rest
-        cost += self._add_inertial(state, h, b, inertial=inertial) + self._add_priors(state, h, b)
+        cost += self._terms.add(state, h, b, inertial=inertial)
         return _System(cost, h, b, inv, iw, bp)
-
-    def _add_inertial(self, state: WindowState, h: F64, b: F64, *, inertial: bool) -> float:
-        n, cost = self._keyframes, 0.0
-        errors = self._imu_errors = self._inertial_errors(state)
-        infos = self._used_info(inertial=inertial)
-        tilt = self._length * tangent(state.gravity)
-        shared = _STATE * n
-        for k, motion in enumerate(self._motions):
-            back, dt, o = state.R[k].T, motion.dt_s, _STATE * k
-            e, info = errors[k], infos[k]
-            _, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
-            columns = np.concatenate([np.arange(o, o + 2 * _STATE), np.arange(shared, shared + _SHARED)])
-            j = np.zeros((9, 2 * _STATE + _SHARED))
-            j[:3, :3], j[:3, 12:15] = -state.R[k + 1].T @ state.R[k], np.eye(3)
-            j[3:6, :3], j[3:6, 6:9], j[3:6, 18:21] = se3.skew(e[3:6] + vp[:3]), -back, back
-            j[6:, :3], j[6:, 3:6], j[6:, 15:18] = se3.skew(e[6:] + vp[3:]), -back, back
-            j[6:, 6:9] = -dt * back
-            j[3:, 9:12] = -motion.jac[3:, 3:]
-            j[:, 24:27] = -motion.jac[:, :3]
-            j[3:6, 27:], j[6:, 27:] = -dt * back @ tilt, -0.5 * dt * dt * back @ tilt
-            weighted = j.T @ info
-            h[np.ix_(columns, columns)] += weighted @ j
-            b[columns] += weighted @ e
-            cost += 0.5 * float(e @ info @ e)
-        return cost
-
-    def _add_priors(self, state: WindowState, h: F64, b: F64) -> float:
-        """Random walk of the accelerometer bias, and priors of the first biases."""
-        for k, sigma in enumerate(self._walk_sigma()):
-            rows = _STATE * k + 9 + np.arange(3)
-            change = (state.accel_bias[k + 1] - state.accel_bias[k]) / sigma**2
-            for r, g in zip(rows, change, strict=True):
-                h[r, r] += sigma**-2.0
-                h[r + _STATE, r + _STATE] += sigma**-2.0
-                h[r, r + _STATE] -= sigma**-2.0
-                h[r + _STATE, r] -= sigma**-2.0
-                b[r] -= g
-                b[r + _STATE] += g
-        info = self._prior.sigma**-2.0
-        rows = np.concatenate([_STATE * self._keyframes + np.arange(3), 9 + np.arange(3)])
-        h[rows, rows] += info
-        b[rows] += info * (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias)
-        return self._prior_cost(state)
 
     def _moved(self, state: WindowState, step: F64, system: _System) -> WindowState:
         n = self._keyframes
-        x = step[: _STATE * n].reshape(n, _STATE)
+        x = step[: STATE * n].reshape(n, STATE)
         R = np.array([r @ se3.so3_exp(phi) for r, phi in zip(state.R, x[:, :3], strict=True)])
         gravity = state.gravity
         if gravity.any():
-            gravity = gravity + self._length * tangent(gravity) @ step[_STATE * n + 3 :]
+            gravity = gravity + self._length * tangent(gravity) @ step[STATE * n + 3 :]
             gravity = self._length * gravity / np.linalg.norm(gravity)
         landmark = -(system.inv @ system.bp[..., None])[..., 0] - system.iw @ x[:, :6].ravel()
         return WindowState(
             R, state.p + x[:, 3:6], state.v + x[:, 6:9], state.accel_bias + x[:, 9:],
-            state.gyro_bias + step[_STATE * n : _STATE * n + 3], gravity,
+            state.gyro_bias + step[STATE * n : STATE * n + 3], gravity,
             state.m + landmark[:, :2], np.maximum(state.rho + landmark[:, 2], 1e-4),
         )  # fmt: skip

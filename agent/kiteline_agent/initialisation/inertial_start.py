@@ -17,6 +17,7 @@ from kiteline_agent.initialisation.inertial_bundle import InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
+from kiteline_agent.initialisation.window_noise import MOST, WindowNoise
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -49,6 +50,15 @@ class _Window:
     solution: WindowSolution
 
 
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """A solution, its landmarks (P,3) m and the keyframe (P,) that saw each first."""
+
+    solution: WindowSolution
+    xyz: F64
+    first: NDArray[np.int64]
+
+
 class InertialStart:
     """Follows corners and solves their window about twice a second. Call `add` with every frame that has no map."""
 
@@ -64,7 +74,7 @@ class InertialStart:
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
         self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
         self._before: _Window | None = None
-        self._noise = 1.0  # factor on the inertial error model, as the windows so far show it
+        self._noise: WindowNoise | None = None  # as the windows so far show it
         self._tried_ns: int | None = None
         self._heard_ns: int | None = None  # frame with the last samples
 
@@ -79,7 +89,7 @@ class InertialStart:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
         self._before = self._tried_ns = None
-        self._noise = 1.0
+        self._noise = None
 
     def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
@@ -93,7 +103,8 @@ class InertialStart:
         self._tracks.drop_before(ctx.t_ns - round(config.max_span_s * 1e9))
         keyframes = self._tracks.keyframes
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
-        waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= config.attempt_s
+        wait_s = max(config.attempt_s, config.attempt_share * span_s)
+        waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= wait_s
         if span_s < config.min_span_s or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
         self._tried_ns = ctx.t_ns
@@ -112,22 +123,34 @@ class InertialStart:
             return None
         observations = all_corners.part(_covering(all_corners, config.landmarks, config.landmarks_each))
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
-        found = self._solve(
-            observations, intervals, prior, None if before is None else _warm(before, stamps, observations)
-        )
+        if self._noise is None:
+            self._noise = self._measured_noise()
+        warm = None if before is None else _warm(before, stamps, observations)
+        found = None if warm is None else self._solve(observations, intervals, prior, warm)
+        if found is None or not self._fits(found.solution):
+            warm, found = None, self._solve(observations, intervals, prior, None)
         if found is None:
             self._before = None
             return None
-        solution, xyz, first = found
-        if self._sigma(solution) < 1.2 * config.scale_sigma:
-            aligned = realigned(keyframes, observations, solution.state, xyz, first, self._camera, self._config.align)
+        solution, modelled = found.solution, self._noise
+        noise, sigma = self._seen_noise(solution)
+        if sigma < 1.3 * config.scale_sigma:
+            self._noise = noise
+            aligned = realigned(
+                keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
+            )
             keep = aligned.seen.sum(axis=0) >= 3
             again = self._bundle(aligned.part(keep), intervals, prior)
-            solution = again.solve(WarmStart(solution.state, xyz[keep])) or solution
-        self._before = _Window(stamps, observations.ids, xyz, solution)
-        known = self._is_known(solution)
-        self._noise = self._found_noise(solution)
-        if not known or before is None or not self._agrees(before, self._before):
+            solution = again.solve(WarmStart(solution.state, found.xyz[keep])) or solution
+            noise, sigma = self._seen_noise(solution)
+        self._before = _Window(stamps, observations.ids, found.xyz, solution)
+        known = solution.converged and self._fits(solution) and sigma < config.scale_sigma
+        agrees = before is not None and self._agrees(before, self._before)
+        self._noise = modelled
+        if known and agrees and warm is not None and not self._is_lowest(found, observations, intervals, prior):
+            return None
+        self._noise = noise
+        if not known or not agrees:
             return None
         placed = self._bundle(all_corners, intervals, prior).place_landmarks(solution.state)
         points = None if placed is None else self._points(ctx, keyframes[-1], all_corners, placed)
@@ -138,36 +161,43 @@ class InertialStart:
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
-    ) -> tuple[WindowSolution, F64, NDArray[np.int64]] | None:
-        """The solution of the lowest cost, its landmarks (P,3) and the keyframe that saw each first.
+    ) -> _Solved | None:
+        bundle = self._bundle(corners, intervals, prior)
+        solution = bundle.solve(warm)
+        return None if solution is None else _Solved(solution, *bundle.landmarks_of(solution.state))
 
-        A warm start costs less than a cold one, but may stay in a wrong minimum: before a decision both are tried.
+    def _is_lowest(
+        self, found: _Solved, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior
+    ) -> bool:
+        """True if a solution from nothing has no lower cost: a warm start may stay in a wrong minimum.
+
+        Else that solution is the one to start from.
         """
-        best: tuple[WindowSolution, F64, NDArray[np.int64]] | None = None
-        for start in [None] if warm is None else [warm, None]:
-            if (
-                best is not None
-                and self._fits(best[0])
-                and self._sigma(best[0]) > 1.5 * self._config.inertial_start.scale_sigma
-            ):
-                break
-            bundle = self._bundle(corners, intervals, prior)
-            solution = bundle.solve(start)
-            if solution is not None and (best is None or solution.cost < best[0].cost):
-                best = (solution, *bundle.landmarks_of(solution.state))
-        return best
+        cold = self._solve(corners, intervals, prior, None)
+        if cold is None or cold.solution.cost > found.solution.cost - 1.0:
+            return True
+        assert self._before is not None
+        self._before = replace(self._before, xyz=cold.xyz, solution=cold.solution)
+        return False
 
-    def _found_noise(self, solution: WindowSolution) -> float:
-        """Factor on the inertial error model with which its errors are as expected."""
-        config = self._config.inertial_start
-        factor = self._noise * np.sqrt(solution.imu_chi2 / config.expected_imu_chi2)
-        return float(np.clip(factor, config.least_noise, config.most_noise))
+    def _seen_noise(self, solution: WindowSolution) -> tuple[WindowNoise, float]:
+        """The IMU's noise as a solution shows it, and the deviation of its scale if that is larger."""
+        before = self._noise
+        assert before is not None
+        now = solution.evidence.updated(before, self._config.inertial_start.noise_prior)
+        return now, self._sigma(solution) * max(now.accel / before.accel, now.walk / before.walk)
 
-    def _is_known(self, solution: WindowSolution) -> bool:
-        """True if the scale's deviation is small, and images and IMU agree."""
-        noise, before = self._found_noise(solution), self._noise
-        sigma = self._sigma(solution) * max(noise / before, 1.0)
-        return solution.converged and self._fits(solution) and sigma < self._config.inertial_start.scale_sigma
+    def _measured_noise(self) -> WindowNoise:
+        """The noise of single samples: more than that of intervals, since much of it is vibration and motion.
+
+        From too much noise its true size is found, which from too little is taken for motion.
+        """
+        bundle, calibration = self._config.inertial_start.bundle, self._calibration
+        gyro, accel = self._buffer.density / bundle.imu_inflation
+        return WindowNoise(
+            float(np.clip(gyro / calibration.gyro_noise, 1.0, MOST)),
+            float(np.clip(accel / calibration.accel_noise, 1.0, MOST)),
+        )
 
     def _fits(self, solution: WindowSolution) -> bool:
         """True if the errors of images and IMU are as expected: the solver has converged."""
@@ -203,7 +233,8 @@ class InertialStart:
         self._work.window_keyframes += len(intervals) + 1
         return InertialBundle(
             corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
-            self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle, self._noise,
+            self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
+            self._noise,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.initialisation.window_noise import NoiseEvidence
+
 F64 = NDArray[np.float64]
 
 
@@ -43,7 +45,7 @@ class WindowSolution:
     T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. cov: (17,17) as in
     InertialState, of that keyframe. scale_sigma: relative deviation of all lengths. reprojection_px: rms of inliers.
     cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared error of the
-    inertial factors in deviations. depth_m: (P,) in the newest camera, and
+    inertial factors in deviations. evidence: of the IMU's noise. depth_m: (P,) in the newest camera, and
     depth_sigma: (P,) its relative deviation with known poses.
     """
 
@@ -58,6 +60,7 @@ class WindowSolution:
     converged: bool
     reprojection_px: float
     imu_chi2: float
+    evidence: NoiseEvidence
     depth_m: F64
     depth_sigma: F64
 

@@ -1,0 +1,169 @@
+"""The inertial part of a window: errors of the IMU's samples and of priors, and how large these errors turn out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial_start_config import InertialBundleConfig
+from kiteline_agent.initialisation.inertial_window import WindowState, tangent
+from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+
+STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, accelerometer bias
+SHARED = 5  # unknowns of the window: gyro bias, direction of gravity
+_FLOOR = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)  # of an interval's covariance: rad, m/s, m
+
+
+class InertialTerms:
+    """Preintegrated intervals between K keyframes. Call `integrate` first, and again when biases have moved."""
+
+    def __init__(
+        self, intervals: list[Samples], calibration: ImuCalibration, gravity_m_s2: float, prior: BiasPrior,
+        config: InertialBundleConfig, noise: WindowNoise,
+    ) -> None:  # fmt: skip
+        """intervals: K - 1."""
+        # The measured noise is not used: much of it is fast motion, which averages out over an interval.
+        self.intervals = [replace(s, density=None) for s in intervals]
+        self._calibration = replace(
+            calibration,
+            gyro_noise=noise.gyro * config.imu_inflation * calibration.gyro_noise,
+            accel_noise=noise.accel * config.imu_inflation * calibration.accel_noise,
+        )
+        self._walk = noise.walk * float(np.hypot(calibration.accel_walk, config.accel_walk))
+        self._length = gravity_m_s2
+        self._prior = prior
+        self.motions: list[Preintegrated] = []
+        self._info: list[F64] = []
+
+    def preintegrate(self, samples: Samples, bias: F64) -> Preintegrated:
+        """One interval with a bias (6,)."""
+        return preintegrate(samples, bias, self._calibration)
+
+    def integrate(self, state: WindowState) -> None:
+        """Integrate the samples with the state's biases."""
+        self.motions = [
+            self.preintegrate(samples, np.concatenate([state.gyro_bias, bias]))
+            for samples, bias in zip(self.intervals, state.accel_bias, strict=False)
+        ]
+        self._info = [np.asarray(np.linalg.inv(m.cov + _FLOOR)) for m in self.motions]
+
+    def biases_moved(self, state: WindowState) -> bool:
+        """True if the state's biases are too far from the integrated ones for a linear correction."""
+        gyro = max(float(np.abs(m.bias[:3] - state.gyro_bias).max()) for m in self.motions)
+        accel = max(
+            float(np.abs(m.bias[3:] - bias).max()) for m, bias in zip(self.motions, state.accel_bias, strict=False)
+        )
+        return gyro > 0.01 or accel > 0.2
+
+    def cost(self, state: WindowState, *, inertial: bool) -> float:
+        """Half the squared errors. inertial: False counts rotations and priors alone."""
+        used = self._used_info(inertial=inertial)
+        cost = 0.5 * sum(float(e @ i @ e) for e, i in zip(self._errors(state), used, strict=True))
+        return cost + self._prior_cost(state)
+
+    def add(self, state: WindowState, h: F64, b: F64, *, inertial: bool) -> float:
+        """Add the normal equations of the errors; returns their cost."""
+        cost = 0.0
+        errors, infos = self._errors(state), self._used_info(inertial=inertial)
+        for k, e in enumerate(errors):
+            j, columns = self._jacobian(state, e, k)
+            weighted = j.T @ infos[k]
+            h[np.ix_(columns, columns)] += weighted @ j
+            b[columns] += weighted @ e
+            cost += 0.5 * float(e @ infos[k] @ e)
+        return cost + self._add_priors(state, h, b)
+
+    def mean_chi2(self, state: WindowState) -> float:
+        """Mean squared error in deviations."""
+        errors = self._errors(state)
+        return float(np.mean([e @ i @ e for e, i in zip(errors, self._info, strict=True)])) / 9.0
+
+    def evidence(self, state: WindowState, cov: F64) -> NoiseEvidence:
+        """How large the errors are, and would be by the error model. cov: of all unknowns but landmarks.
+
+        What the unknowns take up of an error is not expected (W. Förstner, variance components).
+        """
+        chi2, expected = np.zeros(3), np.zeros(3)
+        for k, (e, motion) in enumerate(zip(self._errors(state), self.motions, strict=True)):
+            j, columns = self._jacobian(state, e, k)
+            taken = j @ cov[np.ix_(columns, columns)] @ j.T
+            for part, rows in enumerate((slice(0, 3), slice(3, 9))):
+                info = np.linalg.inv(motion.cov[rows, rows] + _FLOOR[rows, rows])
+                chi2[part] += e[rows] @ info @ e[rows]
+                expected[part] += len(info) - np.trace(info @ taken[rows, rows])
+            rows_a = STATE * k + 9 + np.arange(3)
+            d = cov[rows_a, rows_a] + cov[rows_a + STATE, rows_a + STATE] - 2.0 * cov[rows_a, rows_a + STATE]
+            variance = self._walk**2 * motion.dt_s
+            chi2[2] += float(((state.accel_bias[k + 1] - state.accel_bias[k]) ** 2).sum()) / variance
+            expected[2] += 3.0 - float(d.sum()) / variance
+        return NoiseEvidence(chi2, np.maximum(expected, 0.0))
+
+    def _errors(self, state: WindowState) -> F64:
+        """(K-1,9) errors of rotation, velocity and position."""
+        rows = []
+        for k, motion in enumerate(self.motions):
+            turn, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
+            back, dt = state.R[k].T, motion.dt_s
+            dv = state.v[k + 1] - state.v[k] - state.gravity * dt
+            dp = state.p[k + 1] - state.p[k] - state.v[k] * dt - 0.5 * dt * dt * state.gravity
+            rows.append(
+                np.concatenate([se3.so3_log(turn.T @ back @ state.R[k + 1]), back @ dv - vp[:3], back @ dp - vp[3:]])
+            )
+        return np.array(rows)
+
+    def _jacobian(self, state: WindowState, e: F64, k: int) -> tuple[F64, NDArray[np.int64]]:
+        """(9,29) of interval k by its two keyframes and the shared unknowns, and their columns."""
+        motion, back, o, shared = self.motions[k], state.R[k].T, STATE * k, STATE * len(state.R)
+        dt, tilt = motion.dt_s, self._length * tangent(state.gravity)
+        _, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
+        columns = np.concatenate([np.arange(o, o + 2 * STATE), np.arange(shared, shared + SHARED)])
+        j = np.zeros((9, 2 * STATE + SHARED))
+        j[:3, :3], j[:3, 12:15] = -state.R[k + 1].T @ state.R[k], np.eye(3)
+        j[3:6, :3], j[3:6, 6:9], j[3:6, 18:21] = se3.skew(e[3:6] + vp[:3]), -back, back
+        j[6:, :3], j[6:, 3:6], j[6:, 15:18] = se3.skew(e[6:] + vp[3:]), -back, back
+        j[6:, 6:9] = -dt * back
+        j[3:, 9:12] = -motion.jac[3:, 3:]
+        j[:, 24:27] = -motion.jac[:, :3]
+        j[3:6, 27:], j[6:, 27:] = -dt * back @ tilt, -0.5 * dt * dt * back @ tilt
+        return j, columns
+
+    def _used_info(self, *, inertial: bool) -> list[F64]:
+        if inertial:
+            return self._info
+        used = [np.zeros((9, 9)) for _ in self._info]
+        for out, info in zip(used, self._info, strict=True):
+            out[:3, :3] = info[:3, :3]
+        return used
+
+    def _prior_cost(self, state: WindowState) -> float:
+        steps = np.diff(state.accel_bias, axis=0) / self._walk_sigma()[:, None]
+        off = (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias) / self._prior.sigma
+        return 0.5 * float((steps**2).sum() + off @ off)
+
+    def _walk_sigma(self) -> F64:
+        return np.array([self._walk * np.sqrt(m.dt_s) for m in self.motions])
+
+    def _add_priors(self, state: WindowState, h: F64, b: F64) -> float:
+        """Random walk of the accelerometer bias, and priors of the first biases."""
+        for k, sigma in enumerate(self._walk_sigma()):
+            rows = STATE * k + 9 + np.arange(3)
+            change = (state.accel_bias[k + 1] - state.accel_bias[k]) / sigma**2
+            for r, g in zip(rows, change, strict=True):
+                h[r, r] += sigma**-2.0
+                h[r + STATE, r + STATE] += sigma**-2.0
+                h[r, r + STATE] -= sigma**-2.0
+                h[r + STATE, r] -= sigma**-2.0
+                b[r] -= g
+                b[r + STATE] += g
+        info = self._prior.sigma**-2.0
+        rows = np.concatenate([STATE * len(state.R) + np.arange(3), 9 + np.arange(3)])
+        h[rows, rows] += info
+        b[rows] += info * (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias)
+        return self._prior_cost(state)

@@ -1,0 +1,40 @@
+"""How noisy the IMU is beside its calibration, as the errors of a window show it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+MOST = 25.0  # largest factor on a deviation
+_LEAST = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class WindowNoise:
+    """Factors on the deviations of the inertial error model.
+
+    gyro, accel: of white noise. walk: of the accelerometer bias's walk, with which errors of scale and axes come.
+    """
+
+    gyro: float = 1.0
+    accel: float = 1.0
+    walk: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseEvidence:
+    """Squared errors of gyro, accelerometer and bias walk (3,) in deviations, and their expectation (3,)."""
+
+    chi2: F64
+    expected: F64
+
+    def updated(self, noise: WindowNoise, prior: float) -> WindowNoise:
+        """The factors that explain these errors. prior: weight of 1, which is expected, in degrees of freedom."""
+        before = np.array([noise.gyro, noise.accel, noise.walk])
+        found = np.sqrt((before**2 * self.chi2 + prior) / (self.expected + prior))
+        gyro, accel, walk = (float(x) for x in np.clip(found, _LEAST, MOST))
+        return WindowNoise(gyro, accel, walk)
