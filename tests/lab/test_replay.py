@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -108,7 +109,7 @@ def test_another_estimate_in_the_log_is_found(flown: Path, tmp_path: Path, capsy
     with LogReader(flown / "agent0" / "log.mcap") as reader:
         fourth = list(reader.messages(["/estimate"]))[4].json()
     assert fourth["T_w_b"] is not None
-    log = rewritten(flown / "agent0" / "log.mcap", tmp_path / "log.mcap", "/estimate", 4, b'9.0],"initialising":false}')
+    log = rewritten(flown / "agent0" / "log.mcap", tmp_path / "log.mcap", "/estimate", 4, struct.pack("<d", 9.0))
     assert main([str(log), "--verify"]) == 1
     assert "T_w_b" in capsys.readouterr().out
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,8 @@ class SampleBuffer:
 
     def extended(self, imu: ImuBatch | None) -> SampleBuffer:
         """A copy with more samples; this buffer stays as it is."""
-        other = deepcopy(self)
+        other = copy(self)
+        other._largest, other._variance = self._largest.copy(), self._variance.copy()  # `push` replaces the others
         other.push(imu)
         return other
 

@@ -1,6 +1,6 @@
 """Writes the steps of an agent to its log: inputs, then outputs. Pure: the log is handed in.
 
-Each step begins with a /step message that counts the messages after it. Numbers pass through JSON bit for bit.
+Each step begins with a /step message that counts the messages after it. Numbers are logged bit for bit.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ class StepLog(Protocol):
     def odometer(self, topic: str, t_ns: int, batch: OdometryBatch) -> None: ...
     def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
     def json(self, topic: str, t_ns: int, value: object) -> None: ...
+    def fields(self, topic: str, t_ns: int, values: Mapping[str, object]) -> None: ...
     def pose(self, topic: str, t_ns: int, frame_id: str, pose: NDArray[np.float64]) -> None: ...
 
 
@@ -62,14 +63,14 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
         log.blob(PACKETS_IN, log_ns, packet)
     estimate = output.estimate
     if estimate is not None:
-        log.json(ESTIMATE, log_ns, estimate_to_json(estimate))
+        log.fields(ESTIMATE, log_ns, {name: getattr(estimate, name) for name in _ESTIMATE})
         if not estimate.initialising:
             log.pose("/odometry", log_ns, "odometry", estimate.T_o_b)
         pose = estimate.T_m_b if estimate.T_w_b is None else estimate.T_w_b
         if estimate.tracked and pose is not None:
             log.pose("/pose", log_ns, "submap" if estimate.T_w_b is None else "world", pose)
     if output.predicted is not None:
-        log.json(PREDICTED, log_ns, predicted_to_json(output.predicted))
+        log.fields(PREDICTED, log_ns, {name: getattr(output.predicted, name) for name in _PREDICTED})
     if output.events:
         log.json(EVENTS, log_ns, {"events": list(output.events)})
     for packet in output.packets:

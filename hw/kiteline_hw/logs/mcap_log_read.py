@@ -40,11 +40,25 @@ class LogMessage:
         return data
 
     def json(self) -> Any:
-        """The logged value."""
+        """The logged value; of named fields an object, with arrays as lists."""
         try:
-            return json.loads(self.data)
+            return self._fields() if self.schema == "kiteline.Fields" else json.loads(self.data)
         except ValueError as error:
             raise SourceError(f"{self.topic} at {self.t_ns} ns holds no JSON") from error
+
+    def _fields(self) -> dict[str, Any]:
+        """Raises ValueError."""
+        message = self._parse(schemas.Fields)
+        named, numbers, at = json.loads(message.text), list(message.numbers), 0
+        if not isinstance(named, dict) or not all(isinstance(named.get(key), dict) for key in ("fields", "arrays")):
+            raise ValueError("no named fields")
+        values: dict[str, Any] = dict(named["fields"])
+        for name, size in named["arrays"].items():
+            if not isinstance(size, int) or not 0 <= size <= len(numbers) - at:
+                raise ValueError(f"{name} is cut short")
+            values[name] = numbers[at : at + size]
+            at += size
+        return values
 
     def image(self) -> EncodedImage:
         """The encoded image; the format of a depth image includes its scale."""

@@ -1,8 +1,10 @@
 """The message types of our logs: Foxglove's protobuf schemas where one fits, and small ones of our own.
 
-`kiteline.Blob` {bytes data}: opaque bytes. `kiteline.Imu` {sfixed64 t_ns[], double gyro[], double accel[]}: a batch of
-samples. `kiteline.Odometry` {sfixed64 t_ns[], double velocity[], rate[], velocity_cov[], rate_cov[]}: a batch of
-odometer samples in the body frame. All are protobuf, so that viewers that do not know them can still open the log.
+`kiteline.Blob` {bytes data}: opaque bytes. `kiteline.Fields` {string text, double numbers[]}: named values; text is a
+JSON object {fields: plain values by name, arrays: lengths by name}, and the arrays stand in numbers, in that order.
+`kiteline.Imu` {sfixed64 t_ns[], double gyro[], double accel[]}: a batch of samples. `kiteline.Odometry` {sfixed64
+t_ns[], double velocity[], rate[], velocity_cov[], rate_cov[]}: a batch of odometer samples in the body frame. All are
+protobuf, so that viewers that do not know them can still open the log.
 """
 
 from __future__ import annotations
@@ -34,13 +36,16 @@ Grid = Grid_pb2.Grid
 Log = Log_pb2.Log
 
 _F = FieldDescriptorProto
-_OWN = ("Blob", "Imu", "Odometry")
+_OWN = ("Blob", "Fields", "Imu", "Odometry")
 
 
 def _own_messages() -> tuple[Any, ...]:
     file = FileDescriptorProto(name="kiteline.proto", package="kiteline", syntax="proto3")
     blob = file.message_type.add(name="Blob")
     blob.field.add(name="data", number=1, type=_F.TYPE_BYTES, label=_F.LABEL_OPTIONAL)
+    fields = file.message_type.add(name="Fields")
+    fields.field.add(name="text", number=1, type=_F.TYPE_STRING, label=_F.LABEL_OPTIONAL)
+    fields.field.add(name="numbers", number=2, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
     imu = file.message_type.add(name="Imu")
     imu.field.add(name="t_ns", number=1, type=_F.TYPE_SFIXED64, label=_F.LABEL_REPEATED)
     imu.field.add(name="gyro", number=2, type=_F.TYPE_DOUBLE, label=_F.LABEL_REPEATED)
@@ -54,7 +59,7 @@ def _own_messages() -> tuple[Any, ...]:
     return tuple(GetMessageClass(pool.FindMessageTypeByName(f"kiteline.{name}")) for name in _OWN)
 
 
-Blob, Imu, Odometry = _own_messages()
+Blob, Fields, Imu, Odometry = _own_messages()
 
 
 _schema_data: dict[str, bytes] = {}
@@ -70,7 +75,7 @@ def schema_data(message_class: Any) -> bytes:
 
 
 def bytes_field(message_class: Any, name: str, data: bytes) -> tuple[bytes, bytes]:
-    """A bytes field in protobuf's wire format, in two pieces to be appended to a serialised message.
+    """A field of bytes, text or packed numbers in protobuf's wire format, in two pieces to be appended to a message.
 
     The result equals setting the field, without the copies of a large image that setting and serialising would make.
     """

@@ -273,3 +273,20 @@ def test_the_ground_truth_topic_is_found_by_a_source(tmp_path: Path) -> None:
         log.frame(flight(1)[0][1])
         log.pose("/pose", T0, "world", np.eye(4))  # an estimate is no truth
     assert GROUND_TRUTH == "/ground_truth" and open_source(str(tmp_path / "log.mcap")).ground_truth is None
+
+
+def test_named_fields_come_back_bit_for_bit(tmp_path: Path) -> None:
+    pose = np.random.default_rng(3).normal(size=(4, 4))
+    values = {"t_ns": 7, "tracked": True, "T": pose, "place": None, "velocity": np.array([1 / 3, -0.0, np.inf])}
+    path = tmp_path / "log.mcap"
+    with LogWriter(path, {}) as log:
+        log.fields("/estimate", T0, values)
+        log.fields("/estimate", T0, {"t_ns": 8})
+    with LogReader(path) as log:
+        first, second = (message.json() for message in log.messages(["/estimate"]))
+        assert first == {**values, "T": pose.ravel().tolist(), "velocity": [1 / 3, 0.0, np.inf]}
+        assert np.signbit(first["velocity"][1]) and second == {"t_ns": 8}
+        message = next(iter(log.messages(["/estimate"])))
+        for data in (message.data[:-8], b"", b"\xff", b"\x0a\x02{}", message.data.replace(b'"arrays"', b'"errors"')):
+            with pytest.raises(SourceError):
+                replace(message, data=data).json()
