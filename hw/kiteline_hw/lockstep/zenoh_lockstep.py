@@ -1,13 +1,12 @@
-"""The barrier of a lock-step flight over Zenoh queries: each agent sends one message a tick and waits for the answer.
+"""The barrier of a lock-step flight over Zenoh: each agent sends one message a tick and waits for the answer.
 
-Reliable and ordered. The agent's query carries its message; the base collects the queries of all agents and replies to
-each. Queries are numbered, so that a repeated one gets the same reply. Liveliness tokens tell each side at once when
-the other's process ends.
+Reliable and ordered. Messages are published to each other, which costs half of a query. They are numbered: an agent
+repeats one that nobody may have received yet, and a repeated one gets the same answer. Liveliness tokens tell each side
+at once when the other's process ends.
 """
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import struct
 import threading
@@ -22,8 +21,10 @@ from kiteline_hw.ports import LinkError
 from kiteline_hw.system.closing import Closing
 
 _LEASE_MS = 10_000  # ms; a dead process is noticed by its socket at once, and a busy one must not count as dead
-_RETRY_S = 0.05  # s between two queries while the base is not there yet
-_HEADER = struct.Struct("<I")  # number of the query
+_RETRY_S = 0.05  # s between two looks for a base that is not there yet
+_REPEAT_S = (0.1, 2.0)  # s after which a message is repeated: before the first answer, and later
+_HEADER = struct.Struct("<IB")  # number of the message, and of an answer its kind
+_ANSWER, _REFUSAL = 0, 1
 
 
 def _prefix(group: str) -> str:
@@ -44,7 +45,9 @@ class LockstepClient(Closing):
         try:
             prefix = _prefix(group)
             session_id = self._session.zid()
-            self._key = f"{prefix}/tick/{agent}/{session_id}"
+            down, up = f"{prefix}/down/{agent}/{session_id}", f"{prefix}/up/{agent}/{session_id}"
+            self._subscriber = self._session.declare_subscriber(down, direct(self._on_answer))
+            self._publisher = _publisher(self._session, up)
             liveliness = self._session.liveliness()
             self._token = liveliness.declare_token(f"{prefix}/agent/{agent}/{session_id}")
             self._watch = liveliness.declare_subscriber(f"{prefix}/base", direct(self._on_base), history=True)
@@ -59,23 +62,11 @@ class LockstepClient(Closing):
             self._base_alive.clear()
             self._events.put(("gone", 0, b""))
 
-    def _query(self, number: int, message: bytes, timeout_s: float) -> None:
-        def on_reply(reply: Any) -> None:
-            if reply.ok is not None:
-                self._events.put(("answer", number, reply.ok.payload.to_bytes()))
-            elif reply.err is not None:
-                self._events.put(("refused", number, reply.err.payload.to_bytes()))
-
-        self._session.get(
-            self._key,
-            direct(on_reply, lambda: self._events.put(("end", number, b""))),
-            payload=_HEADER.pack(number) + message,
-            timeout=timeout_s + 1.0,
-            target=zenoh.QueryTarget.BEST_MATCHING,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            express=True,
-        )
+    def _on_answer(self, sample: Any) -> None:
+        raw = sample.payload.to_bytes()
+        if len(raw) >= _HEADER.size:
+            number, kind = _HEADER.unpack_from(raw)
+            self._events.put(("refused" if kind == _REFUSAL else "answer", number, raw[_HEADER.size :]))
 
     def exchange(self, message: bytes, timeout_s: float) -> bytes:
         """Send this tick's message and wait for the base's answer.
@@ -84,22 +75,23 @@ class LockstepClient(Closing):
         """
         deadline_s = time.monotonic() + timeout_s
         self._number += 1
-        waiting = False
+        repeat_s = 0.0  # when the message is due to be sent
         while (left_s := deadline_s - time.monotonic()) > 0.0:
-            if not waiting:
+            if time.monotonic() >= repeat_s:
                 if self._answered_once and not self._base_alive.is_set():
                     raise LinkError(self._lost_base_text())
                 if not self._base_alive.wait(min(left_s, _RETRY_S)):
                     continue
                 try:
-                    self._query(self._number, message, left_s)
+                    self._publisher.put(_HEADER.pack(self._number, _ANSWER) + message)
                 except zenoh.ZError as error:
                     raise LinkError(f"the link to the base station at {self._endpoint} broke: {error}") from error
-                waiting = True
+                repeat_s = time.monotonic() + _REPEAT_S[self._answered_once]
             try:
-                kind, number, body = self._events.get(timeout=left_s)
+                wait_s = min(deadline_s, repeat_s) - time.monotonic()
+                kind, number, body = self._events.get(timeout=max(wait_s, 0.0))
             except queue.Empty:
-                break
+                continue
             if kind == "gone" and not self._base_alive.is_set():
                 raise LinkError(self._lost_base_text())
             if number != self._number:
@@ -109,9 +101,6 @@ class LockstepClient(Closing):
                 return body
             if kind == "refused":
                 raise LinkError(f"the base station at {self._endpoint} refused: {body.decode(errors='replace')}")
-            if kind == "end":  # nobody received the query: the base is starting or ending
-                waiting = False
-                time.sleep(min(_RETRY_S, max(0.0, deadline_s - time.monotonic())))
         raise LinkError(
             f"the base station at {self._endpoint} did not answer message {self._number} of agent {self._agent} within "
             f"{timeout_s:g} s"
@@ -129,11 +118,10 @@ class LockstepClient(Closing):
 
 
 @dataclass(slots=True)
-class _Query:
+class _Message:
     session: str
     number: int
-    message: bytes
-    query: Any
+    body: bytes
     collected: bool = False
 
 
@@ -145,17 +133,17 @@ class LockstepServer(Closing):
         self._changed = threading.Condition()
         self._alive: dict[int, set[str]] = {}
         self._lost: set[int] = set()
-        self._open: dict[int, _Query] = {}
+        self._open: dict[int, _Message] = {}
         self._answered: dict[int, tuple[str, int, bytes]] = {}
+        self._publishers: dict[int, tuple[str, zenoh.Publisher]] = {}  # and the session that each sends to
+        self._sending = threading.Lock()
         self.callback_errors = 0
         self._session = open_session(endpoint, "base", lease_ms=_LEASE_MS)
         try:
-            prefix = _prefix(group)
+            prefix = self._prefix = _prefix(group)
             liveliness = self._session.liveliness()
             self._watch = liveliness.declare_subscriber(f"{prefix}/agent/*/*", direct(self._on_agent), history=True)
-            self._queryable = self._session.declare_queryable(
-                f"{prefix}/tick/*/*", direct(self._on_query), complete=True
-            )
+            self._subscriber = self._session.declare_subscriber(f"{prefix}/up/*/*", direct(self._on_message))
             self._token = liveliness.declare_token(f"{prefix}/base")
         except zenoh.ZError as error:
             close_session(self._session)
@@ -178,30 +166,40 @@ class LockstepServer(Closing):
         except Exception:
             self.callback_errors += 1
 
-    def _on_query(self, query: Any) -> None:
+    def _on_message(self, sample: Any) -> None:
         try:
-            agent, session = _parse_key(query.key_expr)
-            raw = query.payload.to_bytes() if query.payload is not None else b""
+            agent, session = _parse_key(sample.key_expr)
+            raw = sample.payload.to_bytes()
             if len(raw) < _HEADER.size:
-                _refuse(query, "an empty question")
                 return
-            (number,) = _HEADER.unpack_from(raw)
+            number = _HEADER.unpack_from(raw)[0]
+            answer: bytes | None = None
             with self._changed:
                 others = self._alive.get(agent, set()) - {session}
                 answered = self._answered.get(agent)
+                before = self._open.get(agent)
                 if others:
-                    _refuse(query, f"agent number {agent} is flown by another process; give each agent its own --agent")
+                    text = f"agent number {agent} is flown by another process; give each agent its own --agent"
+                    answer = _HEADER.pack(number, _REFUSAL) + text.encode()
                 elif answered is not None and answered[:2] == (session, number):
-                    _reply(query, answered[2])
-                else:
-                    before = self._open.get(agent)
-                    repeated = before is not None and (before.session, before.number) == (session, number)
-                    collected = before is not None and repeated and before.collected
-                    self._open[agent] = _Query(session, number, raw[_HEADER.size :], query, collected)
+                    answer = _HEADER.pack(number, _ANSWER) + answered[2]
+                elif before is None or (before.session, before.number) != (session, number):
+                    self._open[agent] = _Message(session, number, raw[_HEADER.size :])
                     self._lost.discard(agent)
                     self._changed.notify_all()
+            if answer is not None:
+                self._send(agent, session, answer)
         except Exception:
             self.callback_errors += 1
+
+    def _send(self, agent: int, session: str, message: bytes) -> None:
+        """Send to an agent's process, also from Zenoh's own thread."""
+        with self._sending:
+            kept = self._publishers.get(agent)
+            if kept is None or kept[0] != session:
+                key = f"{self._prefix}/down/{agent}/{session}"
+                kept = self._publishers[agent] = session, _publisher(self._session, key)
+            kept[1].put(message)
 
     def collect(self, expected: set[int], timeout_s: float) -> dict[int, bytes]:
         """Wait for a new message of every expected agent; the messages by agent, in order of agent.
@@ -215,7 +213,7 @@ class LockstepServer(Closing):
                 if expected <= ready:
                     for agent in expected:
                         self._open[agent].collected = True
-                    return {agent: self._open[agent].message for agent in sorted(expected)}
+                    return {agent: self._open[agent].body for agent in sorted(expected)}
                 lost = sorted(expected & self._lost)
                 if lost:
                     raise LinkError(f"agent {_names(lost)} ended, or the link broke, in the middle of a flight")
@@ -235,7 +233,7 @@ class LockstepServer(Closing):
             del self._open[agent]
             self._answered[agent] = (opened.session, opened.number, message)
         try:
-            _reply(opened.query, message)
+            self._send(agent, opened.session, _HEADER.pack(opened.number, _ANSWER) + message)
         except zenoh.ZError as error:
             raise LinkError(f"the answer to agent {agent} could not be sent: {error}") from error
 
@@ -255,14 +253,8 @@ def _parse_key(key: Any) -> tuple[int, str]:
     return int(parts[-2]), parts[-1]
 
 
-def _reply(query: Any, message: bytes) -> None:
-    with query:
-        query.reply(query.key_expr, message, express=True)
-
-
-def _refuse(query: Any, reason: str) -> None:
-    with contextlib.suppress(zenoh.ZError), query:
-        query.reply_err(reason.encode())
+def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    return session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
 
 
 def _names(agents: list[int]) -> str:
