@@ -32,7 +32,10 @@ class RecordChannel(Protocol):
         ...
 
     def put(self, record: Record) -> Record:
-        """Share a record. Returns it as the other side will hold it: compute on with that."""
+        """Share a record. Returns it as the other side will hold it: compute on with that.
+
+        A live pose, with which nobody computes, is returned as it is.
+        """
         ...
 
     def remove(self, key: Key) -> None:
@@ -164,7 +167,9 @@ class CodedChannel:
         self.endpoint.put(key, code)
         if isinstance(record, KeyframeHeader):
             self._pacer.keyframe(record.t_ns)
-        if self.noting and not isinstance(record, LivePose):
+        if isinstance(record, LivePose):
+            return record
+        if self.noting:
             self._noted[key] = code
         return messages.decode(key, code)
 

@@ -46,6 +46,8 @@ class Smoothing:
         if self._T_w_o is None or before is None or not self.on or dt_s <= 0.0:
             self._T_w_o = T_w_o
             return T_w_o
+        if np.array_equal(self._T_w_o, T_w_o):
+            return T_w_o
         if float(np.linalg.norm(_shift(before, T_w_o, here_o))) > limits.snap_m:
             self._T_w_o = T_w_o
             return T_w_o

@@ -212,7 +212,7 @@ class LocalMap:
         good = rows[inlier]
         self.hits[good] += 1
         self.last_hit[good] = frame_number
-        self.last_seen[np.unique(good // self.slot_size)] = frame_number
+        self.last_seen[good // self.slot_size] = frame_number
         hopeless = rows[(self.tried[rows] >= 12) & (self.hits[rows] * 5 < self.tried[rows])]
         self.usable.reshape(-1)[hopeless] = False
 
