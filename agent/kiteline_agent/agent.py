@@ -74,7 +74,7 @@ class Agent:
         self._camera = CameraState(rig, imu, config, identity, self.map)
         self._corrections = Corrections(self.map, self.map_cache, config.smoothing)
         self._tracker = Tracker(self.map, self.work)
-        self._image_shift = ImageShift(camera)
+        self._image_shift = ImageShift(self._rectifier)
         self._stuck_camera = StuckCamera(camera)
         self._relocaliser = Relocaliser(
             self.map, self._tracker, config, vocabulary, self.map_cache, self._is_consistent_place, self.work

@@ -112,7 +112,7 @@ def test_a_raw_image_is_searched_as_the_rectified_one() -> None:
     octaves, warps = np.zeros(n, np.uint8), np.tile(np.eye(2), (n, 1, 1))
     templates = np.empty((n, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
     alignment_kernels.cut_templates(whole, uv, octaves, templates)
-    for pyramid, raw_grid in ((whole, NO_GRID), ((raw, *whole[1:]), rectifier.left_grid)):
+    for pyramid, raw_grid in ((whole, NO_GRID), (build_pyramid(raw, len(whole)), rectifier.left_grid)):
         out, found = np.zeros((n, 2)), np.zeros(n, np.int8)
         search_segments(
             pyramid, raw_grid, templates, np.arange(n), octaves, warps, uv - 9.0, uv + 11.0, 0.7, 40, 0.8, 0.9, out,

@@ -118,7 +118,7 @@ def test_a_raw_left_image_says_what_the_rectified_one_says() -> None:
     raw_left, raw_right = pair(9, 12.4)
     whole, right = (build_pyramid(i, 3) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
     octave, results = np.zeros(len(UV), np.uint8), []
-    for left, grid in ((whole, RECTIFIED), ((raw_left, *whole[1:]), rectifier.left_grid)):
+    for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, 3), rectifier.left_grid)):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
         stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))

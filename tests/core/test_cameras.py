@@ -176,3 +176,17 @@ def test_unusable_calibrations_say_why() -> None:
         Rectifier(CameraRig(eye, eye, np.eye(4), apart))
     with pytest.raises(CalibrationError, match="image is 100x50"):
         Rectifier(CameraRig(eye, None, np.eye(4), None)).left(np.zeros((50, 100), np.uint8))
+
+
+@pytest.mark.parametrize("level", [1, 3])
+def test_a_coarse_level_is_rectified_as_the_whole_image(level: int) -> None:
+    rectifier = Rectifier(CameraRig(camera(Lens.RADTAN, EUROC), None, np.eye(4), None))
+    v, u = np.mgrid[0:H, 0:W]
+    raw = np.round(120.0 + 60.0 * np.sin(u / 40.0) + 50.0 * np.cos(v / 30.0)).astype(np.uint8)
+    step = 1 << level
+    small = rectifier.left_level(np.ascontiguousarray(raw[::step, ::step]), level)
+    whole = rectifier.left(raw)[::step, ::step]
+    inner = (slice(3, -3), slice(3, -3))
+    assert small.shape == whole.shape and np.abs(small[inner].astype(int) - whole[inner]).max() <= 4
+    plain = Rectifier(CameraRig(camera(Lens.NONE, ()), None, np.eye(4), None))
+    assert plain.left_level(small, level) is small

@@ -22,6 +22,7 @@ TEMPLATE = 2 * TEMPLATE_RADIUS + 1
 STRIDE = 16  # of a patch's rows: 9 pixels, padded to full vectors
 LANES = PATCH * STRIDE
 GREY = 16  # steps per grey level of integer patches
+CURVED = (PATCH_RADIUS + 1) / (6.0 * PATCH_RADIUS)  # mean of c^2 / 2 over a patch, over the square of its radius
 TEMPLATE_LEVELS = 3  # octave of the corner, and two coarser ones for convergence
 
 
@@ -226,15 +227,19 @@ def _align_level(image, patches, raw, across, x, y, iterations, max_step):  # ty
 
 
 @njit
-def _raw_slopes(grid, x, y):  # type: ignore[no-untyped-def]
-    """Raw pixel of the rectified pixel (x, y), and its derivatives by x and by y, over the width of a patch."""
+def _raw_slopes(grid, x, y, reach):  # type: ignore[no-untyped-def]
+    """Raw pixel of the rectified pixel (x, y), its derivatives by x and by y over a patch that reaches so far, and by
+    how much the patch's mean position is off the pixel, since distortion is curved.
+    """
     u, v = _raw_at(grid, x, y)
-    u1, v1 = _raw_at(grid, x + PATCH_RADIUS, y)
-    u0, v0 = _raw_at(grid, x - PATCH_RADIUS, y)
-    u3, v3 = _raw_at(grid, x, y + PATCH_RADIUS)
-    u2, v2 = _raw_at(grid, x, y - PATCH_RADIUS)
-    s = 0.5 / PATCH_RADIUS
-    return u, v, (u1 - u0) * s, (v1 - v0) * s, (u3 - u2) * s, (v3 - v2) * s
+    u1, v1 = _raw_at(grid, x + reach, y)
+    u0, v0 = _raw_at(grid, x - reach, y)
+    u3, v3 = _raw_at(grid, x, y + reach)
+    u2, v2 = _raw_at(grid, x, y - reach)
+    s = 0.5 / reach
+    off_u = CURVED * (u0 + u1 + u2 + u3 - 4.0 * u)
+    off_v = CURVED * (v0 + v1 + v2 + v3 - 4.0 * v)
+    return u, v, (u1 - u0) * s, (v1 - v0) * s, (u3 - u2) * s, (v3 - v2) * s, off_u, off_v
 
 
 @njit
@@ -243,14 +248,16 @@ def align(  # type: ignore[no-untyped-def]
 ):
     """Align templates[rows] in `pyramid`, coarse (template level `first`) to fine (`last`).
 
-    pyramid: tuple of uint8 images, each half the size of the one before; they are rectified, but for level 0 where
-    `grid` is its grid of raw pixels (gh,gw,2) float32 and not (0,0,2). templates: (N,3,21,21) uint8.
+    pyramid: tuple of uint8 images, each half the size of the one before. grid: (0,0,2), or the grid of raw pixels
+    (gh,gw,2) float32 if the images are raw. templates: (N,3,21,21) uint8.
     rows: (n,) int64 into templates. octave: (n,) uint8, level at which each template was cut.
     warp: (n,2,2) float64, d(pixel here) / d(pixel in the template's image), both at level 0.
     uv: (n,2) float64 px at level 0: prediction in, result out (unchanged where not found).
     max_step_px: how far a level may move the patch, in px of that level. found: (n,) bool out. ncc: (n,) float64 out.
     """
     levels = len(pyramid)
+    height, width = pyramid[0].shape
+    is_raw = grid.shape[0] > 0
     reference = np.zeros((PATCH + 2, STRIDE), np.int16)
     raw = np.zeros(LANES + STRIDE, np.uint8)
     across = np.zeros(LANES + STRIDE, np.int16)
@@ -281,14 +288,15 @@ def align(  # type: ignore[no-untyped-def]
             s = float(1 << level)
             begin_x = x / s
             begin_y = y / s
-            is_raw = level == 0 and grid.shape[0] > 0
             if is_raw:
-                h, w = pyramid[0].shape
-                if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
+                reach = PATCH_RADIUS * s
+                if x < reach or y < reach or x >= width - reach - s or y >= height - reach - s:
                     ok = False
                     continue
                 # The template is warped into the raw image: over a patch, distortion is affine to 0.02 px.
-                begin_x, begin_y, ux, vx, uy, vy = _raw_slopes(grid, x, y)
+                u, v, ux, vx, uy, vy, off_u, off_v = _raw_slopes(grid, x, y, reach)
+                begin_x = (u + off_u) / s
+                begin_y = (v + off_v) / s
                 part = 1.0 / (ux * vy - uy * vx)
                 xu, xv, yu, yv = vy * part, -uy * part, -vx * part, ux * part
                 m00, m01, m10, m11 = m00 * xu + m01 * yu, m00 * xv + m01 * yv, m10 * xu + m11 * yu, m10 * xv + m11 * yv
@@ -299,14 +307,14 @@ def align(  # type: ignore[no-untyped-def]
                 pyramid[level], patches, raw, across, begin_x, begin_y, iterations, max_step_px
             )
             if is_raw and ok:
-                u, v = begin_x, begin_y
                 at_x, at_y = x, y
                 for _ in range(2):  # Newton steps from the raw pixel back to the rectified one
-                    at_x += xu * (px - u) + xv * (py - v)
-                    at_y += yu * (px - u) + yv * (py - v)
+                    du, dv = px * s - off_u - u, py * s - off_v - v
+                    at_x += xu * du + xv * dv
+                    at_y += yu * du + yv * dv
                     u, v = _raw_at(grid, at_x, at_y)
-                px = at_x
-                py = at_y
+                px = at_x / s
+                py = at_y / s
             if ok and (score >= min_ncc or j > last):
                 if score > 0.5:
                     x = px * s

@@ -72,7 +72,7 @@ def search_segments(  # type: ignore[no-untyped-def]
         best = -1.0
         best_k = -1
         seen = 0
-        raw = grid.shape[0] > 0 and level == 0
+        raw = grid.shape[0] > 0
         left = -SIDE  # of `whole` in the image
         top = -SIDE
         for k in range(steps + 1):
@@ -90,7 +90,7 @@ def search_segments(  # type: ignore[no-untyped-def]
                 if abs(x0 - left - PATCH_RADIUS - ROOM) > ROOM or abs(y0 - top - PATCH_RADIUS - ROOM) > ROOM:
                     left = x0 - PATCH_RADIUS - ROOM
                     top = y0 - PATCH_RADIUS - ROOM
-                    if not _rectify_patch(pyramid[0], grid, 1.0, float(left), float(top), SIDE, SIDE, 14, whole.T):
+                    if not _rectify_patch(pyramid[level], grid, s, float(left), float(top), SIDE, SIDE, 14, whole.T):
                         left = -SIDE
                         continue
                 x0 -= left

@@ -180,9 +180,8 @@ def refine_rows(  # type: ignore[no-untyped-def]
 ):
     """Sub-pixel disparity by 1-D Lucas-Kanade, invariant to gain and offset, at level `octave` (and one coarser first).
 
-    left_grid: (0,0,2), or the grid of level 0 of `left`, which is then raw; its coarser levels are rectified.
-    grid: (0,0,2) if `right` is rectified; else `right` is the raw image's pyramid, and grid (gh,gw,2) float32 the raw
-    pixel of every GRID_STEP-th rectified one, so that only the strips are rectified.
+    left_grid, grid: (0,0,2) if `left` or `right` is rectified; else that is the raw image's pyramid, and the grid
+    (gh,gw,2) float32 the raw pixel of every GRID_STEP-th rectified one, so that only patches and strips are rectified.
     sure: (n,) bool, the prediction is good to a pixel of its octave: the coarser level is skipped.
     disparity: (n,) float64 px at level 0: prediction in (negative: skip), result out. found: (n,) bool out.
     max_step_px: largest distance of the match from the prediction, in px of the level.
@@ -216,8 +215,8 @@ def refine_rows(  # type: ignore[no-untyped-def]
             begin = x - d / s
             if begin < RADIUS or begin >= w - RADIUS - 1:
                 continue
-            if raw_left and level == 0:
-                if not _rectify_patch(left[0], left_grid, 1.0, x - RADIUS - 1, y - RADIUS, SIDE, SIDE + 2, 10, wide):
+            if raw_left:
+                if not _rectify_patch(left[level], left_grid, s, x - RADIUS - 1, y - RADIUS, SIDE, SIDE + 2, 10, wide):
                     continue
             else:
                 _sample_columns(left[level], x - RADIUS - 1, y - RADIUS, SIDE + 2, wide)

@@ -75,9 +75,10 @@ class RightImage:
 
 @dataclass(slots=True)
 class FrameImages:
-    """Images of one frame. sampled: pyramid of the left one, rectified, but for level 0 where `grid` is its grid of raw
-    pixels and not (0,0,2). depth_m: (h,w) float32 aligned with left, or None. first: finest level not blank.
-    rectify: makes the whole level 0; None if `sampled` has it.
+    """Images of one frame.
+
+    sampled: pyramid of the left one: rectified, or raw where `grid` is its grid of raw pixels and not (0,0,2).
+    depth_m: (h,w) float32 aligned with left, or None. first: finest level in use. rectifier: of raw images.
     """
 
     sampled: Pyramid
@@ -85,50 +86,61 @@ class FrameImages:
     depth_m: NDArray[np.float32] | None
     first: int = 0
     grid: F32 = field(default_factory=lambda: NO_GRID)
-    rectify: Callable[[], U8] | None = None
+    rectifier: Rectifier | None = None
     _left: Pyramid | None = field(default=None, init=False)
+    _coarse: Pyramid | None = field(default=None, init=False)
 
     @property
     def left(self) -> Pyramid:
         """Pyramid of the whole rectified left image, for corners and descriptors; made on demand: most frames are read
-        at few places.
+        at few places. Level 0 is blank if it is not in use.
         """
         if self._left is None:
-            levels = len(self.sampled)
-            self._left = self.sampled if self.rectify is None else build_pyramid(self.rectify(), levels)
+            if self.rectifier is None:
+                self._left = self.sampled
+            elif self.first:
+                self._left = (self.rectifier.blank, *self._halves(self.rectifier))
+            else:
+                self._left = build_pyramid(self.rectifier.rectify(0, self.sampled[0]), len(self.sampled))
         return self._left
 
     @property
     def aligned(self) -> Pyramid:
-        """The whole level 0, and the coarser levels as other frames have them: for templates and disparities."""
-        return (self.left[0], *self.sampled[1:])
+        """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates and
+        disparities.
+        """
+        return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
+
+    def _halves(self, rectifier: Rectifier) -> Pyramid:
+        """Level 1 of the raw pyramid, rectified, and its coarser levels."""
+        if self._coarse is None:
+            self._coarse = build_pyramid(rectifier.halved(0, self.sampled[1]), len(self.sampled) - 1)
+        return self._coarse
 
     @property
     def rectified_px(self) -> int:
         """Pixels that were rectified, but for single patches."""
-        if self.rectify is None and self.first == 0:
+        if self.rectifier is None:
             return 0
-        return self.sampled[1].size + (0 if self._left is None or self.first else self.sampled[0].size)
+        whole = 0 if self._left is None or self.first else self.sampled[0].size
+        return whole + (0 if self._coarse is None else self.sampled[1].size)
 
 
 def frame_images(
     frame: Frame, rectifier: Rectifier, config: PyramidConfig, first: int, offset_px: Callable[[F64], F64]
 ) -> FrameImages:
-    """Images of a frame. first: finest level wanted, 0 or 1; with 1, level 0 is blank.
+    """Images of a frame. first: finest level wanted, 0 or 1. offset_px: see RightImage.
 
-    Where images need rectification, the coarser levels are rectified at half size.
-    offset_px: see RightImage. Raises CalibrationError for an image of the wrong size.
+    Raises CalibrationError for an image of the wrong size.
     """
     right = None if frame.right is None else RightImage(frame.right, rectifier, config.levels, offset_px)
     depth_m = None if frame.depth_m is None else rectifier.depth(frame.depth_m)
-    if not rectifier.remaps:
-        return FrameImages(build_pyramid(rectifier.rectify(0, frame.left), config.levels), right, depth_m)
-    coarse = build_pyramid(rectifier.half(0, frame.left), config.levels - 1)
-    grid = rectifier.left_grid
-    if first or grid is None:
-        return FrameImages((rectifier.blank, *coarse), right, depth_m, 1)
+    rectifier.check_size(frame.left)
     image = np.require(frame.left, np.uint8, ("C", "W"))
-    return FrameImages((image, *coarse), right, depth_m, 0, grid, lambda: rectifier.rectify(0, image))
+    pyramid, grid = build_pyramid(image, config.levels), rectifier.left_grid
+    if grid is None:
+        return FrameImages(pyramid, right, depth_m)
+    return FrameImages(pyramid, right, depth_m, first, grid, rectifier)
 
 
 def depth_at(depth_m: NDArray[np.float32], uv: F64) -> F64:

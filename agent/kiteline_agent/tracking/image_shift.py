@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.imaging.features import Pyramid
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import Rectifier
 
 F64 = NDArray[np.float64]
 
@@ -23,14 +23,14 @@ _MIN_RESPONSE = 0.05  # height of the correlation peak; below it the two images 
 class ImageShift:
     """The small image of the last tracked frame, with its pose."""
 
-    def __init__(self, camera: RectifiedCamera) -> None:
-        self._camera = camera
+    def __init__(self, rectifier: Rectifier) -> None:
+        self._rectifier, self._camera = rectifier, rectifier.camera
         self._image: NDArray[np.uint8] | None = None
         self._T_c_m = np.eye(4)
         self._hanning: NDArray[np.float32] | None = None
 
     def remember(self, left: Pyramid, T_c_m: F64) -> None:
-        """Keep the image of a frame that was tracked at T_c_m (4,4)."""
+        """Keep the image of a frame that was tracked at T_c_m (4,4). left: its pyramid as it came."""
         self._image, self._T_c_m = left[min(_LEVEL, len(left) - 1)], T_c_m
 
     def rotated_pose(self, left: Pyramid) -> F64 | None:
@@ -41,7 +41,7 @@ class ImageShift:
         if self._hanning is None:
             h, w = self._image.shape
             self._hanning = np.asarray(cv2.createHanningWindow((w, h), cv2.CV_32F), np.float32)
-        before, now = self._image.astype(np.float32), left[level].astype(np.float32)
+        before, now = (self._rectifier.left_level(i, level).astype(np.float32) for i in (self._image, left[level]))
         (dx, dy), response = cv2.phaseCorrelate(before - before.mean(), now - now.mean(), self._hanning)
         if response < _MIN_RESPONSE:
             return None

@@ -179,11 +179,15 @@ class Rectifier:
         lower = np.gradient(told, float(GRID_STEP), axis=0) * offset_px[:, :, None]
         self.right_grid = np.ascontiguousarray(told + lower, np.float32)
         if self.remaps:
-            height, width = (self._size[1] + 1) // 2, (self._size[0] + 1) // 2
-            x, y = np.meshgrid(np.arange(width) * (2.0 / GRID_STEP), np.arange(height) * (2.0 / GRID_STEP))
-            raw = cv2.remap(self.right_grid, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
-            fixed = cv2.convertMaps(0.5 * raw[:, :, 0], 0.5 * raw[:, :, 1], cv2.CV_16SC2)
+            fixed = cv2.convertMaps(*_level_maps(self.right_grid, self._size, 1), cv2.CV_16SC2)
             self._halves[1] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
+
+    def left_level(self, image: U8, level: int) -> U8:
+        """Rectify a coarse level of a raw left image's pyramid; for few images: its maps are not kept."""
+        if self.left_grid is None:
+            return image
+        maps = _level_maps(self.left_grid, (image.shape[1] << level, image.shape[0] << level), level)
+        return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
 
     def rectify(self, side: int, image: U8) -> U8:
         """Rectify an image (h, w) of a side (0 left, 1 right). Raises CalibrationError for a wrong size."""
@@ -278,6 +282,17 @@ def _grid(camera: CameraModel, rotation: F64, new: F64) -> NDArray[np.float32]:
     undistort = cv2.fisheye.initUndistortRectifyMap if camera.lens is Lens.EQUIDISTANT else cv2.initUndistortRectifyMap
     x, y = undistort(camera.matrix(), d, rotation, new, size, cv2.CV_32FC1)
     return np.ascontiguousarray(np.stack([x, y], axis=-1)[::GRID_STEP, ::GRID_STEP], np.float32)
+
+
+def _level_maps(
+    grid: NDArray[np.float32], size: tuple[int, int], level: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Raw pixels of a pyramid's level, x and y, by a grid. size: of level 0, (w, h)."""
+    step = 1 << level
+    width, height = (-(-side // step) for side in size)
+    x, y = np.meshgrid(np.arange(width) * (step / GRID_STEP), np.arange(height) * (step / GRID_STEP))
+    raw = cv2.remap(grid, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR) / step
+    return np.ascontiguousarray(raw[:, :, 0], np.float32), np.ascontiguousarray(raw[:, :, 1], np.float32)
 
 
 def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:
