@@ -19,6 +19,7 @@ from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
@@ -80,6 +81,8 @@ class Agent:
             self.map, self._tracker, config, vocabulary, self.map_cache, self._is_consistent_place, self.work
         )
         self._rows = None if rig.right is None else RowAlignment(self._rectifier, config.rows)
+        estimates = rig.right is not None and config.disparities.on
+        self._disparities = DisparityAlignment(self.map, config.disparities) if estimates else None
         maker = KeyframeMaker(self.map, channel, self._rows, self.work)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
@@ -193,6 +196,12 @@ class Agent:
                 self._inertial_start.clear()
             self._depth.update_landmarks(ctx, track)
             self._depth.search_seeds(ctx, track)
+            if self._disparities is not None:
+                change = self._disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
+                camera.covariance.set_disparity_error(self._disparities.expected_cov, self._disparities.worn)
+                if change is not None:
+                    camera.correct_disparities(change)
+                    events += self._disparities.take_events()
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
             # 8. Join an older submap, or continue a monocular one in metres.

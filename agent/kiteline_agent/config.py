@@ -193,6 +193,28 @@ class DepthFromMotionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DisparityConfig:
+    """Estimation of a worn stereo rig's disparity offset on board."""
+
+    on: bool = True
+    every: int = 4  # frames between two pairs: each costs a quarter of a millisecond
+    min_points: int = 30  # landmarks of a pair; eleven numbers are estimated from them
+    points: int = 120  # most of them that are used
+    sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
+    inflation: float = 2.0  # of variance: templates and lens errors are common to neighbouring points
+    iterations: int = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
+    growth: float = 1.2  # of the parallax between two pairs of the same keyframe
+    prior_px: float = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
+    prior_slope_px: float = 0.5  # px where x or y is 1; of the other terms
+    good_px: float = 0.1  # px; standard deviation of all terms of a good calibration
+    worn_share: float = 0.4  # probability of a worn rig before the flight
+    sure: float = 0.95  # the same, above which the offset is applied
+    least_px: float = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
+    least_change_px: float = 0.04  # px, rms over the image; of a later change that is applied
+    min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
+
+
+@dataclass(frozen=True, slots=True)
 class RelocalisationConfig:
     """Relocalisation in the local map, and how the map goes on without it."""
 
@@ -325,6 +347,7 @@ class AgentConfig:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     rows: RowConfig = field(default_factory=RowConfig)
+    disparities: DisparityConfig = field(default_factory=DisparityConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

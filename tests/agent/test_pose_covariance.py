@@ -88,6 +88,36 @@ def test_what_an_error_of_calibration_does_to_a_pose_is_foreseen(shape: int) -> 
     assert np.abs(moved).max() > 1e-5
 
 
+def test_a_disparity_offset_that_was_found_moves_the_camera_to_where_it_is() -> None:
+    X, T_c_m = scene(), se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+    offset = np.array([0.3, -0.1, 0.2, 0.15, 0.1])
+    error, edge = np.zeros(SHAPES), 376.0 / CAMERA.fx
+    error[:5] = offset * [1.0, edge, edge, edge**2, edge**2]
+    local_map = map_of(seen_with(error, X, np.eye(4)))
+    track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance.update(track)
+    T_m_c = se3.exp(covariance.correct_disparities(offset)) @ track.T_m_c
+    before, after = (np.linalg.norm(se3.log(T_c_m @ T)) for T in (track.T_m_c, T_m_c))
+    assert after < 0.1 * before
+    np.testing.assert_allclose(local_map.T_m_k[0], np.eye(4), atol=1e-12)  # the first keyframe has no error
+
+
+def test_a_rig_that_may_be_worn_is_less_certain_until_it_is_known() -> None:
+    X, pose = scene(), PoseState()
+    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
+    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
+    good = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    covariance.set_disparity_error(0.2 * np.eye(5), 0.5)
+    doubtful = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    covariance.set_disparity_error(np.zeros((5, 5)), 0.0)
+    assert np.trace(doubtful[:3, :3]) > 4.0 * np.trace(good[:3, :3])
+    assert np.linalg.eigvalsh(doubtful - good)[0] > -1e-12
+    np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_c_m))[0], good)
+
+
 VIEWS = [np.array([0.3 * x, 0.2 * y, 0.4 * z, 0.05 * y, -0.1 * x, 0.08 * z])
          for x, y, z in np.random.default_rng(5).uniform(-1.0, 1.0, (12, 3))]  # fmt: skip
 

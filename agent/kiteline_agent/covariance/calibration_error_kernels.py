@@ -20,15 +20,15 @@ SHAPES = CALIBRATION + 1  # with the mean offset by the IMU as the last one
 def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
     """out (3,11): error of u, v and disparity for one pixel of each error term at the image's edge.
 
-    Disparity (difference of the cameras): constant, along x and y, with the squared distance from the centre,
-    distortion. Both cameras: focal length along x and y, principal point along x and y, distortion.
+    Disparity (difference of the cameras): the terms of `disparity_offset`. Both cameras: focal length along x and y,
+    principal point along x and y, distortion.
     """
     x, y = (u - camera[2]) / half_px, (v - camera[3]) / half_px
     r2 = x * x + y * y
     for a in range(3):
         for k in range(SHAPES):
             out[a, k] = 0.0
-    out[2, 0], out[2, 1], out[2, 2], out[2, 3], out[2, 4] = 1.0, x, y, r2, x * r2
+    out[2, 0], out[2, 1], out[2, 2], out[2, 3], out[2, 4] = 1.0, x, y, x * x, x * y
     out[0, 5], out[2, 5] = x, disparity / half_px
     out[1, 6] = y
     out[0, 7], out[1, 8] = 1.0, 1.0

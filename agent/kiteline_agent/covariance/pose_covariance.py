@@ -3,9 +3,9 @@
 - *Noise* accumulates from keyframe to keyframe: a pose has the noise of the keyframes whose landmarks it was measured
   against, plus that of its own measurement. A revisited place is as certain as its old keyframes.
 - *Calibration errors* are the same in every frame, so they bend and stretch the whole map instead of averaging out.
-  Their few parameters are not estimated; only their effect on each keyframe is tracked (S. F. Schmidt's consider
-  filter, 1966; for maps J. Civera et al., "Drift-free real-time sequential mosaicing"). Residuals tell whether they are
-  those of a good calibration or of a worn one.
+  Only their effect on each keyframe is tracked (S. F. Schmidt's consider filter, 1966; for maps J. Civera et al.,
+  "Drift-free real-time sequential mosaicing"). Residuals tell whether they are those of a good calibration or of a worn
+  one. A disparity offset that was found (`disparity_alignment`) moves the keyframes back by its effect.
 - *IMU bias on poses*: the mean offset between poses fused with the IMU and those from images alone.
 - *Dead reckoning* has the covariance of the IMU or odometer, or that of unknown accelerations.
 """
@@ -31,7 +31,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
-from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
 
@@ -39,6 +39,8 @@ _CACHE_PX = 1.0  # px, error of a corner at octave 0 that matched a landmark of 
 _CACHE_DEPTH_M = 4.0  # typical depth of such corners
 _EVERY = 4  # frames between two evaluations
 _MOUNT = 2.0  # growth of the error of the extrinsic rotation with that of the lenses: .15 degrees an axis if worn
+_WORN_LENS_PX = 0.8  # px at the image's edge: focal length and centre of a worn lens
+_WORN_MOUNT_RAD = 3e-3  # rad: rotation of the camera in the body about an axis, if worn
 _FEWER = 0.7  # share of the inliers of the last evaluation below which the next one is due at once
 
 
@@ -60,6 +62,11 @@ class PoseCovariance:
         self._calibration[CALIBRATION] = config.imu_offset_share**2
         self._calibration[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # a disparity has the errors of two cameras
         self._evidence = CalibrationEvidence(self._calibration[:CALIBRATION])
+        self._disparity_error: F64 | None = None  # as set last
+        self._worn = 0.0  # probability of a worn rig
+        self._worn_variance = np.zeros(CALIBRATION)  # beyond a good calibration
+        half = 0.5 * local_map.camera.width / local_map.camera.fx  # edge of the image, normalised
+        self._at_edge = np.array([1.0, half, half, half**2, half**2])  # px there for a pixel of each term of an offset
         self._good_calibration = self._calibration.copy()
         self._has_body = has_body
         self._camera_rotation_rad = 0.0  # found against the IMU
@@ -135,7 +142,7 @@ class PoseCovariance:
             return np.zeros((6, 6))
         # what wears the lenses wears their mount, too
         mount = self._config.extrinsic_rad * (1.0 + _MOUNT * (self._evidence.level - 1.0))
-        rotation = mount**2 + self._camera_rotation_rad**2 / 3.0
+        rotation = mount**2 + self._worn * _WORN_MOUNT_RAD**2 + self._camera_rotation_rad**2 / 3.0
         a = adjoint(self._T_b_c)
         return np.asarray(a @ np.diag(np.repeat([self._config.extrinsic_m**2, rotation], 3)) @ a.T)
 
@@ -147,8 +154,7 @@ class PoseCovariance:
             self._h, self._g, self._of_errors, self._side,
         )  # fmt: skip
         if self._evidence.add(self._h, self._g, self._of_errors, self._side):
-            self._calibration[:CALIBRATION] = self._good_calibration[:CALIBRATION] * self._evidence.level**2
-            self._extrinsic = self._extrinsic_cov()
+            self._set_calibration()
         inverse = np.linalg.inv(self._h + 1e-6 * np.eye(6))
         a = adjoint(se3.inverse(track.T_c_m))
         noise = max(track.rms, self._config.least_rms) ** 2 * self._config.inflation * inverse
@@ -255,6 +261,35 @@ class PoseCovariance:
         a = adjoint(pose.T_o_m)
         self._carried = self._carried + lost * a @ self._noise @ a.T
         self._noise = self._noise * self._config.refined_share
+
+    def correct_disparities(self, offset: F64) -> F64:
+        """Update after the disparity offset of the map changed: how the camera in m moves by it, on the left (6,).
+
+        offset: (5,) px, the change, as in `disparity_offset`. Keyframes move with it.
+        """
+        m = self._map
+        errors = np.zeros(SHAPES)
+        errors[:DISPARITY_SHAPES] = self._at_edge * offset
+        for slot in np.flatnonzero(m.keyframe >> SEQUENCE_BITS == m.active):
+            m.T_m_k[slot] = se3.orthonormalise(se3.exp(-self._shift_k[slot] @ errors) @ m.T_m_k[slot])
+        m.relate_to_parents()
+        self._evidence = CalibrationEvidence(self._good_calibration[:CALIBRATION])
+        self._set_calibration()
+        return np.asarray(-self._shift @ errors)
+
+    def set_disparity_error(self, cov: F64, worn: float) -> None:
+        """Set the covariance (5,5) px^2 of the map's disparity offset, and the probability that the rig is worn."""
+        if cov is not self._disparity_error:
+            self._disparity_error = cov
+            self._worn_variance[:DISPARITY_SHAPES] = self._at_edge**2 * np.diag(cov)
+            self._worn_variance[DISPARITY_SHAPES : CALIBRATION - 1] = worn * _WORN_LENS_PX**2
+            self._worn = worn
+            self._set_calibration()
+
+    def _set_calibration(self) -> None:
+        self._calibration[:CALIBRATION] = self._good_calibration[:CALIBRATION] * self._evidence.level**2
+        self._calibration[:CALIBRATION] += self._worn_variance
+        self._extrinsic = self._extrinsic_cov()
 
     # results
 

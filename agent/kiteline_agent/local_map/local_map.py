@@ -70,7 +70,8 @@ class LocalMap:
         self.usable = np.zeros((k, b), np.bool_)
         self.seed = np.zeros((k, b), np.bool_)  # a landmark that still has no depth
         self.measured = np.zeros((k, b), np.bool_)  # the depth is that of stereo, not of the base or of motion
-        self.disparity_offset = disparity_offset.none()  # of the stereo disparities, as the base estimates it
+        self.disparity_offset = disparity_offset.none()  # of the stereo disparities, as base or agent estimate it
+        self.disparity = np.zeros((k, b))  # px, in the keyframe itself, with the offset; 0: not measured
         self.bearing = np.zeros((k, b, 2))
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
@@ -138,6 +139,8 @@ class LocalMap:
         self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, sigma_rho[:n], 0.0)  # 0: not initialised
         self.measured[slot] = False
         self.measured[slot, :n] = rho[:n] > 0.0
+        self.disparity[slot] = 0.0
+        self.disparity[slot, :n] = np.where(rho[:n] > 0.0, rho[:n] * self.camera.bf + self.offset_px(uv[:n]), 0.0)
         self.seed[slot] = False
         self.seed[slot, :n] = rho[:n] <= 0.0
         self.octave[rows] = octave[:n]
@@ -309,6 +312,13 @@ class LocalMap:
         self.disparity_offset = np.array(offset)
         least = self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
         self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, least)
+
+    def relate_to_parents(self) -> None:
+        """Set the poses of keyframes relative to their parents from those in the submap."""
+        for slot in np.flatnonzero((self.keyframe != NO_KEYFRAME) & (self.parent != NO_KEYFRAME)):
+            parent = self.slot_of(int(self.parent[slot]))
+            if parent >= 0:
+                self.T_p_k[slot] = se3.inverse(self.T_m_k[parent]) @ self.T_m_k[slot]
 
     def fuse(self, record: FusedLandmarks) -> bool:
         """Stop searching for landmarks whose root landmark is stored here, too."""

@@ -126,6 +126,12 @@ class CameraState:
             return
         self.covariance.apply_refinement(self.pose)
 
+    def correct_disparities(self, change: F64) -> None:
+        """The disparity offset of the map changed by (5,) px: move keyframes and camera by its effect."""
+        self.leave_map()
+        shift = self.covariance.correct_disparities(change)
+        self.move_map(se3.orthonormalise(se3.exp(shift) @ self.pose.T_m_c))
+
     def return_to(self, found: Relocalisation, frame_number: int) -> None:
         """Continue in the submap in which the frame was relocalised."""
         self.leave_map()

@@ -12,6 +12,7 @@ from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
+from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_codec import warm as codec_warm
@@ -44,8 +45,16 @@ def warm(config: AgentConfig | None = None) -> None:
         shift = 0 if k < 13 else -80
         pair = [np.ascontiguousarray(np.roll(one, shift, axis=1)) for one in (image, right)]
         agent.step(StepInput(Frame(k * 50_000_000, pair[0], pair[1]), _resting(k)), k * 50_000_000)
+    _warm_disparities()
     _warm_relocalisation(vocabulary, pixels)
     _warm_monocular(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
+
+
+def _warm_disparities() -> None:
+    """A pair of frames without landmarks: the noise's frames have no parallax."""
+    none, rho, system, point = np.zeros((0, 3)), np.zeros(0), np.empty((11, 12)), np.empty((0, 12))
+    linearise_pair(np.zeros((0, 2)), rho, rho, none, np.eye(4), np.ones(5), np.zeros(5), rho, system, point)
+    move_points(point, np.zeros(11), 0.0, rho)
 
 
 def _warm_relocalisation(vocabulary: Vocabulary, noise: NDArray[np.uint8]) -> None:

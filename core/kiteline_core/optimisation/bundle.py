@@ -23,6 +23,7 @@ CHI2_2, CHI2_3 = (
     5.991,
     7.815,
 )  # 95 % of a chi-square with 2 (a pixel) and 3 (a pixel and a disparity) degrees of freedom
+_DAMPINGS = (0.0, 1e-6, 1e-4)  # of covariances, in order: a point far away may leave the system without a solution
 _MEDIAN_2, _MEDIAN_3 = 1.386, 2.366  # medians of the same
 
 
@@ -273,7 +274,7 @@ class _BorderSolver(_Solver):
         """Offsets (g,t), and their marginal covariance: infinite if the system has no solution."""
         self._linearise(active)
         b = self._c.size
-        if not self._solve(active, 0.0):
+        if not any(self._solve(active, damping) for damping in _DAMPINGS):
             return self._c, np.diag(np.full(b, np.inf))
         factor = np.triu(self._system[-b:, -b:])  # of the border, cameras and points eliminated
         inverse = np.linalg.inv(factor)

@@ -1,0 +1,174 @@
+"""Finds how far all disparities are off, from landmarks that two frames see from different places.
+
+The parallax between the frames tells depths up to one scale. A disparity offset is not a scale: disparities of near and
+far landmarks, and of different parts of the image, contradict it. Each keyframe counts once, with the later frame that
+tells most: disparities of one keyframe have the same errors in all frames.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.config import DisparityConfig
+from kiteline_agent.local_map import disparity_kernels as kernels
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.disparity_offset import TERMS, none, terms
+from kiteline_core.ids import NO_KEYFRAME
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_LEAST_RHO = 1e-4  # 1/m
+
+
+class DisparityAlignment:
+    """Information about the offset, by keyframe; and the offset that is applied."""
+
+    def __init__(self, local_map: LocalMap, config: DisparityConfig) -> None:
+        self._map, self._config = local_map, config
+        camera = local_map.camera
+        slots = len(local_map.keyframe)
+        self._keyframe = np.full(slots, NO_KEYFRAME, np.int64)  # whose pairs these are
+        self._parallax, self._told = np.zeros(slots), np.zeros(slots)
+        self._moved = np.zeros((slots, 3))  # m, translation of the best pair in the camera, squared
+        self._pair_h, self._pair_b = np.zeros((slots, TERMS, TERMS)), np.zeros((slots, TERMS))
+        self._old_h, self._old_b, self._old_moved = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(3)
+        self._prior = np.diag(np.array([config.prior_px, *[config.prior_slope_px] * (TERMS - 1)]) ** -2.0)
+        x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
+        self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
+        self._frames = 0
+        self._estimate, self.cov = none(), np.linalg.inv(self._prior)
+        self.worn = config.worn_share  # probability of it
+        self.applied = False  # the rig is worn: the map's offset is that found here
+        self.expected_cov = self._expected_cov()  # beside the error of a good calibration
+        self._events: list[str] = []
+
+    def add(self, T_c_m: F64, rows: I64, observed: F64) -> F64 | None:
+        """Add a frame at T_c_m (4,4) with landmarks in rows (n,) seen at observed (n,3) px.
+
+        Returns the change (5,) of the map's offset if there is one.
+        """
+        config, m = self._config, self._map
+        self._frames += 1
+        if self._frames % config.every:
+            return None
+        slots, counts = np.unique(rows // m.slot_size, return_counts=True)
+        for slot in slots[counts >= config.min_points].tolist():
+            if self._keyframe[slot] != m.keyframe[slot]:
+                self._begin(slot)
+        due = [s for s in slots[counts >= config.min_points].tolist() if self._grown(s, T_c_m) >= config.growth]
+        if not due:
+            return None
+        slot = max(due, key=lambda s: self._grown(s, T_c_m))
+        if self._add_pair(slot, T_c_m, rows, observed):
+            self._solve()
+            change = self._apply()
+            self.expected_cov = self._expected_cov()
+            return change
+        return None
+
+    def take_events(self) -> list[str]:
+        """Changes since the last call, for the log."""
+        events, self._events = self._events, []
+        return events
+
+    def _begin(self, slot: int) -> None:
+        """A keyframe took this slot: what the one before told stays."""
+        self._old_h += self._pair_h[slot]
+        self._old_b += self._pair_b[slot]
+        self._old_moved += self._moved[slot]
+        self._pair_h[slot], self._pair_b[slot], self._moved[slot] = 0.0, 0.0, 0.0
+        self._keyframe[slot], self._parallax[slot], self._told[slot] = self._map.keyframe[slot], 0.0, 0.0
+
+    def _parallax_of(self, slot: int, T_c_m: F64) -> float:
+        """Distance from a keyframe over the depth of its landmarks."""
+        T = T_c_m @ self._map.T_m_k[slot]
+        usable = self._map.usable[slot]
+        return float(np.linalg.norm(T[:3, 3]) * np.median(self._map.rho[slot, usable])) if usable.any() else 0.0
+
+    def _grown(self, slot: int, T_c_m: F64) -> float:
+        return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), 0.02)
+
+    def _add_pair(self, slot: int, T_c_m: F64, rows: I64, observed: F64) -> bool:
+        """Compare a frame with a keyframe. Returns True if it tells more than the pairs of that keyframe before."""
+        config, m = self._config, self._map
+        at = np.flatnonzero(rows // m.slot_size == slot)
+        index = rows[at] % m.slot_size
+        measured = m.disparity[slot, index] > 0.0
+        at, index = at[measured], index[measured]
+        if len(at) < config.min_points:
+            return False
+        if len(at) > config.points:
+            chosen = np.linspace(0, len(at) - 1, config.points).astype(np.int64)
+            at, index = at[chosen], index[chosen]
+        self._parallax[slot] = self._parallax_of(slot, T_c_m)
+        seen = observed[at].copy()
+        has = seen[:, 2] >= 0.0
+        seen[has, 2] += m.offset_px(seen[has, :2])
+        uv, disparity = m.uv[slot, index], m.disparity[slot, index]
+        sigma = config.sigma_px * (1 << m.octave[rows[at]]).astype(np.float64)
+        T, offset = T_c_m @ m.T_m_k[slot], self._estimate.copy()
+        rho = np.maximum((disparity - terms(m.bearing[slot, index]) @ offset) / m.camera.bf, _LEAST_RHO)
+        system, point = np.empty((kernels.UNKNOWNS, kernels.UNKNOWNS + 1)), np.empty((len(at), kernels.UNKNOWNS + 1))
+        for _ in range(config.iterations):
+            kernels.linearise_pair(uv, disparity, sigma, seen, T, m.intrinsics, offset, rho, system, point)
+            h, b = system[:, :-1].copy(), system[:, -1].copy()
+            h[6:, 6:] += self._prior
+            b[6:] -= self._prior @ offset
+            h[np.diag_indices(kernels.UNKNOWNS)] += 1e-9
+            step: F64 = np.asarray(np.linalg.solve(h, b), np.float64)
+            kernels.move_points(point, step, _LEAST_RHO, rho)
+            X = se3.exp(np.concatenate([np.zeros(3), step[3:6]]))
+            T = X @ T
+            T[:3, 3] += step[:3]
+            offset = offset + step[6:]
+        square = kernels.linearise_pair(uv, disparity, sigma, seen, T, m.intrinsics, offset, rho, system, point)
+        to_pose = np.linalg.solve(system[:6, :6] + 1e-6 * np.eye(6), system[:6, 6:]).T
+        scale = config.inflation * max(square, 1.0)
+        information = (system[6:, 6:-1] - to_pose[:TERMS] @ system[:6, 6:-1]) / scale
+        side = (system[6:, -1] - to_pose[:TERMS] @ system[:6, -1]) / scale + information @ offset
+        told = -float(np.trace(self._grid @ np.linalg.solve(information + self._prior, self._grid.T)))
+        if not np.isfinite(told) or (self._told[slot] != 0.0 and told <= self._told[slot]):
+            return False
+        self._told[slot], self._pair_h[slot], self._pair_b[slot] = told, information, side
+        self._moved[slot] = (T[:3, :3].T @ T[:3, 3]) ** 2
+        return True
+
+    def _solve(self) -> None:
+        """Estimate the offset, and the probability that the rig is worn, by the Bayes factor."""
+        h, b = self._old_h + self._pair_h.sum(0), self._old_b + self._pair_b.sum(0)
+        self.cov = np.linalg.inv(h + self._prior)
+        self._estimate = self.cov @ b
+        good = np.linalg.inv(h + np.eye(TERMS) / self._config.good_px**2)
+        log_odds = np.log(self._config.worn_share / (1.0 - self._config.worn_share))
+        log_odds += 0.5 * float(b @ (self.cov - good) @ b)
+        log_odds += 0.5 * float(np.linalg.slogdet(self.cov @ self._prior)[1])
+        log_odds -= 0.5 * float(np.linalg.slogdet(good)[1]) - TERMS * float(np.log(self._config.good_px))
+        self.worn = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+
+    def _expected_cov(self) -> F64:
+        """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
+        if self._map.disparity_offset.any():
+            left = none() if self._map.from_base.any() else self._estimate - self._map.disparity_offset
+            return np.asarray(self.cov + np.outer(left, left))
+        return np.asarray(self.worn * (self.cov + np.outer(self._estimate, self._estimate)))
+
+    def _apply(self) -> F64 | None:
+        """Change the offset of the map's disparities where the rig is worn. The base knows better, once it is there."""
+        if self._map.from_base.any():
+            return None
+        config, change = self._config, self._estimate - self._map.disparity_offset
+        moved = self._old_moved + self._moved.sum(0)
+        if moved[:2].sum() < config.min_sideways * moved.sum():
+            return None
+        if not self.applied and self.worn < config.sure:
+            return None
+        least = config.least_change_px if self.applied else config.least_px
+        if float(np.sqrt(np.mean((self._grid @ change) ** 2))) < least:
+            return None
+        self.applied = True
+        self._map.set_disparity_offset(self._estimate)
+        self._events.append(f"disparities in the middle are {self._estimate[0]:+.2f} px too large, by parallax")
+        return np.asarray(change)

@@ -1,0 +1,165 @@
+"""The offset of disparities is found on board, by the parallax of landmarks; kernels against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from kiteline_agent.config import DepthFilterConfig, DisparityConfig, LocalMapConfig
+from kiteline_agent.local_map import disparity_kernels as kernels
+from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_codec.schema import KeyframeHeader
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.disparity_offset import terms
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+
+F64 = NDArray[np.float64]
+CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
+WORN = np.array([-0.6, 0.1, -0.3, -0.5, 0.3])
+NOTHING = np.zeros(5)
+
+
+def intrinsics() -> F64:
+    return np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.bf])
+
+
+def normalised(uv: F64) -> F64:
+    return np.asarray((uv - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy])
+
+
+def residuals(uv: F64, disparity: F64, seen: F64, T: F64, offset: F64, rho: F64) -> F64:
+    """(n,4) px: of the first disparity, then of u, v and disparity in the second frame; 0 if not measured."""
+    q = np.column_stack([normalised(uv), np.ones(len(uv))]) @ T[:3, :3].T + rho[:, None] * T[:3, 3]
+    found = q[:, :2] / q[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+    far = CAMERA.bf * rho / q[:, 2] + terms(normalised(seen[:, :2])) @ offset - seen[:, 2]
+    return np.column_stack([
+        CAMERA.bf * rho + terms(normalised(uv)) @ offset - disparity, found - seen[:, :2],
+        np.where(seen[:, 2] >= 0.0, far, 0.0),
+    ])  # fmt: skip
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_normal_equations_are_those_of_numpy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 12
+    uv = rng.uniform([40, 40], [710, 440], (n, 2))
+    rho, offset = rng.uniform(0.1, 0.6, n), rng.normal(0, 0.3, 5)
+    T = se3.exp(rng.normal(0, 0.1, 6))
+    found = residuals(uv, np.zeros(n), np.zeros((n, 3)), T, offset, rho)
+    seen = np.column_stack([found[:, 1:3], CAMERA.bf * rho]) + rng.normal(0, 0.3, (n, 3))
+    seen[::5, 2] = -1.0
+    disparity, sigma = CAMERA.bf * rho + rng.normal(0, 0.3, n), rng.uniform(0.5, 1.0, n)
+
+    def all_residuals(x: F64) -> F64:
+        X = se3.exp(np.concatenate([np.zeros(3), x[3:6]])) @ T
+        X[:3, 3] += x[:3]
+        return (residuals(uv, disparity, seen, X, offset + x[6:11], rho + x[11:]) / sigma[:, None]).ravel()
+
+    step = 1e-6
+    jac = np.stack([(all_residuals(step * e) - all_residuals(-step * e)) / (2 * step) for e in np.eye(11 + n)], 1)
+    e = all_residuals(np.zeros(11 + n)).reshape(n, 4)
+    square = np.sum(e**2, 1)
+    root = np.repeat(np.sqrt(np.where(square > 9.0, 9.0 / np.maximum(square, 1e-9), 1.0)), 4)
+    jac, e_all = jac * root[:, None], e.ravel() * root
+    h, b = jac.T @ jac, -jac.T @ e_all
+    eliminate = np.linalg.solve(h[11:, 11:], h[11:, :11]).T
+    system, point = np.empty((11, 12)), np.empty((n, 12))
+    mean = kernels.linearise_pair(uv, disparity, sigma, seen, T, intrinsics(), offset, rho, system, point)
+    want = h[:11, :11] - eliminate @ h[11:, :11]
+    assert np.allclose(system[:, :11], want, rtol=1e-4, atol=1e-3 * np.abs(want).max())
+    side = b[:11] - eliminate @ b[11:]
+    assert np.allclose(system[:, 11], side, rtol=1e-4, atol=1e-3 * max(np.abs(side).max(), 1.0))
+    assert mean == pytest.approx(float(np.minimum(square, 9.0).mean()))
+    x = rng.normal(0, 1e-3, 11)
+    moved = rho.copy()
+    kernels.move_points(point, x, 1e-4, moved)
+    assert np.allclose(moved - rho, np.linalg.solve(h[11:, 11:], b[11:] - h[11:, :11] @ x), rtol=1e-3, atol=1e-6)
+
+
+class Flight:
+    """A camera that moves before a cloud; its disparities are off."""
+
+    def __init__(self, offset: F64, seed: int, step: F64) -> None:
+        self.rng, self.offset, self.step = np.random.default_rng(seed), offset, step
+        self.map = LocalMap(CAMERA, LocalMapConfig(keyframes=8), DepthFilterConfig())
+        self.alignment = DisparityAlignment(self.map, DisparityConfig())
+        uv = self.rng.uniform([40, 40], [710, 440], (160, 2))
+        self.depth = self.rng.uniform(2.0, 12.0, len(uv))
+        self.xyz = np.column_stack([normalised(uv), np.ones(len(uv))]) * self.depth[:, None]
+        disparity = CAMERA.bf / self.depth + terms(normalised(uv)) @ offset + self.rng.normal(0, 0.2, len(uv))
+        header = KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), len(uv))
+        templates = np.zeros((len(uv), 3, *self.map.templates.shape[2:]), np.uint8)
+        bytes_ = np.zeros(len(uv), np.uint8)
+        descriptors = np.zeros((len(uv), 32), np.uint8)
+        self.map.add(header, np.eye(4), uv, np.maximum(disparity, 0.1) / CAMERA.bf, np.full(len(uv), 0.01), bytes_,
+                     bytes_, descriptors, templates, 0)  # fmt: skip
+
+    def fly(self, frames: int) -> list[F64]:
+        """Changes of the map's offset."""
+        changes = []
+        for k in range(frames):
+            T = se3.inverse(se3.exp(np.concatenate([k * self.step, [0.0, 0.002 * k, 0.0]])))
+            q = se3.transform(T, self.xyz)
+            uv = q[:, :2] / q[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+            inside = (q[:, 2] > 0.3) & (uv > 10).all(1) & (uv < [740, 470]).all(1)
+            disparity = CAMERA.bf / q[:, 2] + terms(normalised(uv)) @ self.offset - self.map.offset_px(uv)
+            seen = np.column_stack([uv, disparity]) + self.rng.normal(0, 0.2, (len(uv), 3))
+            change = self.alignment.add(T, np.flatnonzero(inside), seen[inside])
+            changes += [] if change is None else [change]
+        return changes
+
+
+SIDEWAYS, AHEAD = np.array([0.03, 0.01, 0.02]), np.array([0.0, 0.0, 0.04])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> None:
+    flight = Flight(WORN, seed, SIDEWAYS)
+    before = flight.alignment.expected_cov
+    changes = flight.fly(80)
+    assert changes and flight.alignment.worn > 0.95
+    assert np.allclose(np.sum(changes, 0), flight.map.disparity_offset)
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
+    assert left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))
+    assert np.trace(flight.alignment.expected_cov) < 0.2 * np.trace(before)
+    off = flight.map.rho[0, :160] - 1.0 / flight.depth
+    assert abs(np.median(off * CAMERA.bf)) < 0.15
+    assert flight.alignment.take_events() and not flight.alignment.take_events()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_true_rig_is_left_alone(seed: int) -> None:
+    flight = Flight(NOTHING, seed, SIDEWAYS)
+    begin = np.trace(flight.alignment.expected_cov)
+    assert flight.fly(80) == []
+    assert flight.alignment.worn < 0.05
+    assert np.trace(flight.alignment.expected_cov) < 0.05 * begin
+
+
+def test_forward_motion_alone_changes_nothing() -> None:
+    flight = Flight(WORN, 1, AHEAD)
+    assert flight.fly(60) == []
+    assert flight.map.disparity_offset.tolist() == [0.0] * 5
+
+
+def test_the_base_s_map_is_left_to_the_base() -> None:
+    flight = Flight(WORN, 1, SIDEWAYS)
+    flight.map.from_base[0] = True
+    assert flight.fly(80) == []
+    assert flight.alignment.worn > 0.95  # the covariance knows
+
+
+def test_it_is_deterministic() -> None:
+    def found() -> bytes:
+        flight = Flight(WORN, 3, SIDEWAYS)
+        flight.fly(40)
+        return flight.map.disparity_offset.tobytes() + flight.alignment.expected_cov.tobytes()
+
+    assert found() == found()
