@@ -202,6 +202,7 @@ class InertialScaleConfig:
     bias_sigma: float = 0.3  # m/s^2; of the accelerometer's bias where a chain begins
     bias_walk: float = 0.04  # m/s^2 per sqrt(s); its slow errors: axes, vibration, temperature
     agent_sigma: float = 0.03  # of the agent's scale
+    hold: float = 0.5  # deviations; a smaller change would only move the world under the vehicle
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,6 +106,8 @@ class Mapper:
             changes += self._add_keyframe(keyframe)
         if self.merger is not None:
             changes += self.merger.requery()
+            while (tie := self._intake.ties.take()) is not None:
+                changes += self.merger.tie(tie)
         # 4. Apply what merges and corrections of whole maps changed.
         withdrawn = self._apply_merges(changes)
         # 5. Start jobs: local bundles, the grid, pose graphs, full bundles.

@@ -181,6 +181,17 @@ def test_a_bundle_is_scaled_about_the_camera_that_it_held() -> None:
     assert ratio.mean() == pytest.approx(1.0 / 0.95, abs=0.02)
 
 
+def test_a_change_that_does_not_matter_waits() -> None:
+    segments, T_w_c = a_map(0.999)
+    found = map_scale(segments, T_w_c, CONFIG)
+    assert found is not None
+    result = BundleResult(np.linalg.inv(T_w_c), np.zeros((0, 3)), np.ones(0, np.bool_), 0.0, 0.0, 0, 0)
+    patient = replace(CONFIG, hold=1.1 * abs(np.log(found.metres)) / found.sigma)
+    hasty = replace(CONFIG, hold=0.9 * abs(np.log(found.metres)) / found.sigma)
+    assert in_metres(result, segments, 0, patient) is result
+    assert in_metres(result, segments, 0, hasty) is not result
+
+
 def a_sparse_map(culled: set[int]) -> tuple[SparseMap, BundleWindow, list[KeyframeId]]:
     sparse_map = SparseMap()
     submap = submap_id(AgentId(0), 0, 0)

@@ -86,7 +86,7 @@ def segments_of(sparse_map: SparseMap, window: BundleWindow) -> tuple[Segment, .
         out.append(
             Segment(
                 number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depths[i]),
-                1.0 / sparse_map.scale(submap), records[-1].noise, *fields,
+                sparse_map.told_metres.get(submap, 1.0) / sparse_map.scale(submap), records[-1].noise, *fields,
             )
         )  # fmt: skip
     out.sort(key=lambda s: int(table.t_ns[window.rows[s.last]]))

@@ -48,10 +48,10 @@ class _State:
 def in_metres(
     result: BundleResult, segments: tuple[Segment, ...], held: int, config: InertialScaleConfig
 ) -> BundleResult:  # fmt: skip
-    """The result of a bundle, scaled about the camera `held` by what the segments tell, if they tell anything."""
+    """The result of a bundle, scaled about the camera `held` by what the segments tell, if that matters."""
     T_w_c: F64 = np.linalg.inv(result.T_c_m).astype(np.float64)
     found = map_scale(segments, T_w_c, config)
-    if found is None:
+    if found is None or abs(np.log(found.metres)) < config.hold * found.sigma:
         return result
     centre = T_w_c[held, :3, 3].copy()
     T_w_c[:, :3, 3] = centre + found.metres * (T_w_c[:, :3, 3] - centre)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
+from kiteline_basestation.inertial.ties import Ties
 from kiteline_basestation.map.map_tables import NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import (
@@ -64,6 +65,7 @@ class Intake:
         self.metres_per_unit: dict[SubmapId, float] = {}  # of submaps whose agent knows it
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
+        self.ties = Ties(sparse_map)
         self.refused = 0  # records that contradict the map
 
     def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int) -> None:
@@ -87,11 +89,12 @@ class Intake:
             elif isinstance(record, GravityAlignment):
                 self.gravity[record.submap] = record
             elif isinstance(record, SubmapScale):
-                self.metres_per_unit[record.submap] = record.metres
+                self.metres_per_unit[record.submap] = self._map.told_metres[record.submap] = record.metres
                 if record.metres == 1.0:
                     self._map.metric_submaps.add(record.submap)
             elif isinstance(record, InertialSteps):
                 self._map.inertial_steps[record.keyframe] = record
+                self.ties.add(record)
             elif isinstance(record, NewLandmarks | Observations):
                 if record.keyframe in self._map:
                     self._take_section(record)
@@ -141,6 +144,7 @@ class Intake:
         self.tracked_ns.update(state.tracked_ns)
         unused = set(state.unused)
         self._waiting = {k: t for k, t in self._waiting.items() if k in unused}
+        self.ties.clear()  # they were used, or undone
         self.deleted.update(state.deleted)
 
     def _is_usable(self, keyframe: KeyframeId) -> bool:

@@ -145,6 +145,20 @@ def apply_scales(
     return units, left
 
 
+def scale_map(sparse_map: SparseMap, map_id: SubmapId, factor: float) -> tuple[F64, dict[SubmapId, float]]:
+    """Multiply all lengths of a map in w, about its first keyframe.
+
+    Returns the similarity (4,4) by which it moved, and the factors of the units of submaps.
+    """
+    root = sparse_map.map_id(map_id)
+    centre = sim3.place(sparse_map.submap_pose(root), sparse_map.first_pose(root))[:3, 3]
+    S_new_old = sim3.of(factor, se3.from_rt(np.eye(3), centre - factor * centre))
+    submaps = sparse_map.submaps_of_map(map_id)
+    for submap in submaps:
+        sparse_map.move_submap(submap, sim3.normalise(S_new_old @ sparse_map.submap_pose(submap)))
+    return S_new_old, dict.fromkeys(submaps, factor)
+
+
 def _scale_depths(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, publisher: Publisher) -> None:
     """Multiply the depths of the landmarks anchored in a keyframe."""
     table, slots = sparse_map.keypoints, sparse_map.slots_of(keyframe)

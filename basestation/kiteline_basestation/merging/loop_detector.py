@@ -136,7 +136,7 @@ class LoopDetector:
                     continue
                 if sparse_map.is_up_to_scale(new) or sparse_map.is_up_to_scale(submap):
                     continue  # the scale between the submaps is unknown
-                if self._contradicted.get(_pair(new, submap), 0) or self._is_kept_apart(new, submap):
+                if self._contradicted.get(_pair(new, submap), 0) or self.is_kept_apart(new, submap):
                     continue
                 match = LoopMatch(keyframe, other, np.eye(4), self._config.min_inliers_loop, 1.0)
                 return self._closure(match, [match])
@@ -172,7 +172,7 @@ class LoopDetector:
                 key in taken
                 or left[same_map] == 0
                 or not self._sharing.allows(agent_of_keyframe(keyframe), agent_of_keyframe(old))
-                or self._is_kept_apart(submap_of_keyframe(keyframe), submap_of_keyframe(old))
+                or self.is_kept_apart(submap_of_keyframe(keyframe), submap_of_keyframe(old))
             ):
                 continue
             out.append(old)
@@ -181,7 +181,7 @@ class LoopDetector:
             taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > config.max_shared)].tolist())
         return out
 
-    def _is_kept_apart(self, a: SubmapId, b: SubmapId) -> bool:
+    def is_kept_apart(self, a: SubmapId, b: SubmapId) -> bool:
         return any((a in x and b in y) or (b in x and a in y) for x, y in self.kept_apart)
 
     # -- acceptance --------------------------------------------------------------------------------------------------

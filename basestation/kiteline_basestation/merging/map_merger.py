@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Publisher
+from kiteline_basestation.inertial.ties import Tie
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.correction import apply_scales, keyframes_of, move_keyframes
+from kiteline_basestation.merging.correction import apply_scales, keyframes_of, move_keyframes, scale_map
 from kiteline_basestation.merging.correction_jobs import CorrectionJobs, FullBundle
 from kiteline_basestation.merging.essential_graph import GraphResult
 from kiteline_basestation.merging.loop_detector import (
@@ -182,6 +183,14 @@ class MapMerger:
         self._corrections.cancel_pending(older)
         self._corrections.request_bundle(older)
         return result
+
+    def tie(self, tie: Tie) -> MergeResult:
+        """Merge two maps between which an agent flew without a break."""
+        if self.detector.is_kept_apart(tie.newer, tie.older):
+            return NOTHING
+        S_new_old, units = scale_map(self._map, tie.older, tie.metre)
+        S_older_newer = sim3.normalise(S_new_old @ tie.S_older_newer)
+        return replace(self.merge(tie.newer, tie.older, S_older_newer), rescaled=units)
 
     def split(self, submap: SubmapId) -> MergeResult | None:
         """Undo the merge that brought a submap into its map, for good; None if there was none (a user's command)."""

@@ -1,0 +1,83 @@
+"""Ties between submaps that one agent flew without a break: it opened the later one in the middle of its steps.
+
+That is how a monocular agent corrects its metre. The steps from the last keyframe of the one to the first of the other
+say how the two lie, and the agent says how long the old unit was; images need not recognise anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_codec.schema import InertialSteps
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import SubmapId, agent_of_keyframe, submap_of_keyframe
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """S_older_newer: (4,4) moves the newer map in w. metre: factor on the older map's lengths in w, before."""
+
+    newer: SubmapId
+    older: SubmapId
+    S_older_newer: F64
+    metre: float
+
+
+class Ties:
+    """Records that lead from one submap to another one, until both of their keyframes are in the map."""
+
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self._map = sparse_map
+        self._waiting: list[InertialSteps] = []
+
+    def add(self, record: InertialSteps) -> None:
+        """Let a record wait if it leads to another submap."""
+        if submap_of_keyframe(record.since) != submap_of_keyframe(record.keyframe):
+            self._waiting.append(record)
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
+
+    def take(self) -> Tie | None:
+        """The next tie between two maps; one that joins nothing is dropped."""
+        for record in list(self._waiting):
+            if record.keyframe in self._map and record.since in self._map:
+                self._waiting.remove(record)
+                tie = self._tie(record)
+                if tie is not None:
+                    return tie
+        return None
+
+    def _tie(self, record: InertialSteps) -> Tie | None:
+        sparse_map = self._map
+        before, after = submap_of_keyframe(record.since), submap_of_keyframe(record.keyframe)
+        T_w_a, T_w_k = sparse_map.world_pose(record.since), sparse_map.world_pose(record.keyframe)
+        older, newer = sparse_map.map_id(before), sparse_map.map_id(after)
+        known = all(sparse_map.has_metric_scale_by_imu(s) for s in (before, after, older, newer))
+        if T_w_a is None or T_w_k is None or not known or older == newer:
+            return None
+        # Where the older map was never scaled by the base, the agent's new metre replaces its old one.
+        unit = sparse_map.told_metres.get(before, 1.0)
+        held = sparse_map.scale(before)
+        metre = unit if held == 1.0 else 1.0
+        T_b_c = sparse_map.cameras[agent_of_keyframe(record.keyframe)].T_b_c
+        T_a_k = sim3.with_scaled_translation(se3.inverse(T_b_c) @ moved(record) @ T_b_c, held)
+        S_older_newer = sim3.of(held / unit / sparse_map.scale(after), T_w_a @ T_a_k) @ se3.inverse(T_w_k)
+        if newer < older:
+            return Tie(older, newer, sim3.inverse(S_older_newer), 1.0)
+        return Tie(newer, older, sim3.normalise(S_older_newer), metre)
+
+
+def moved(record: InertialSteps) -> F64:
+    """Motion (4,4) of the body along the steps, as the images saw it."""
+    T = np.eye(4)
+    for turn, step in zip(record.turn, record.moved, strict=True):
+        T = T @ se3.from_rt(se3.so3_exp(turn), step)
+    return se3.orthonormalise(T)
