@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
 from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
+from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.inertial_tracker import InertialStartState, InertialTracker
+from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.scale_filter import camera_scaled
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3

@@ -31,6 +31,22 @@ class TimedPose:
     samples: Samples | None
 
 
+@dataclass(frozen=True, slots=True)
+class InertialStartState:
+    """A known state at a frame, in any frame w.
+
+    T_w_b: (4,4). velocity: (3,) m/s. bias: (6,). gravity: (3,) m/s^2. cov: (17,17) as in InertialState, of full rank.
+    accel_noise: factor on the accelerometer's noise.
+    """
+
+    T_w_b: F64
+    velocity: F64
+    bias: F64
+    gravity: F64
+    cov: F64
+    accel_noise: float = 1.0
+
+
 class ImuInitialiser:
     """Window of poses by images, from which gravity, velocity, biases and scale are estimated."""
 

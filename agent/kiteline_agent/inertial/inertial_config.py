@@ -12,15 +12,15 @@ from kiteline_agent.inertial.fixed_lag import FixedLagConfig
 class ScaleFilterConfig:
     """How the scale of a monocular map is watched after its start."""
 
-    interval_s: float = 0.14  # between two poses that are compared
-    start_scale: float = 0.035  # relative deviations and deviations of the start: those of a short first window
+    interval_s: float = 0.39  # between two poses that are compared: acceleration moves much more than images err
+    start_scale: float = 0.022  # relative deviations and deviations of the start: those of a first window
     start_gravity_m_s2: float = 0.1
     start_velocity_m_s: float = 0.1
     start_bias_m_s2: float = 0.1
-    accel_walk: float = 0.04  # m/s^2 per sqrt(s): errors of scale and axes, vibration
-    scale_walk: float = 0.002  # per sqrt(s): the map's own scale drifts while it grows
-    image_rad: float = 5e-4  # error of a position by images, over the depth that they see
-    imu_inflation: float = 3.0  # of the calibration's noise densities: vibration
+    accel_walk: float = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
+    scale_walk: float = 0.006  # per sqrt(s): the map's own scale drifts while it grows
+    image_rad: float = 7e-4  # error of a position by images, over the depth that they see
+    imu_inflation: float = 3.0  # of the calibration's noise densities, beside the factor that the start found
     gravity_sigma_m_s2: float = 0.01  # of the length of gravity
     chi2: float = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
     known_sigma: float = 0.025  # deviation below which the scale may be corrected

@@ -17,7 +17,7 @@ from kiteline_agent.inertial.fixed_lag import (
     VisualPoints,
     tilt_of,
 )
-from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
+from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
@@ -52,20 +52,6 @@ class InertialMotion:
     velocity: F64
     rate: F64
     growth: F64
-
-
-@dataclass(frozen=True, slots=True)
-class InertialStartState:
-    """A known state at a frame, in any frame w.
-
-    T_w_b: (4,4). velocity: (3,) m/s. bias: (6,). gravity: (3,) m/s^2. cov: (17,17) as in InertialState, of full rank.
-    """
-
-    T_w_b: F64
-    velocity: F64
-    bias: F64
-    gravity: F64
-    cov: F64
 
 
 class InertialTracker:
@@ -294,7 +280,7 @@ class InertialTracker:
         self._smoother.start(start.T_w_b, start.velocity, start.bias, start.gravity, StartDeviations(), start.cov)
         self.begin_map(t_ns, T_m_b)
         state = self._smoother.state
-        self._scale.start(state.velocity, self._smoother.gravity, state.bias)
+        self._scale.start(state.velocity, self._smoother.gravity, state.bias, start.accel_noise)
 
     def reset(self) -> None:
         """Begin a new map at an unknown pose relative to the old one. Biases are kept."""

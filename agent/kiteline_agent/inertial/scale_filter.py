@@ -34,6 +34,7 @@ class ScaleFilter:
         self._p_b_c = p_b_c
         self._x = np.zeros(10)
         self._cov = np.eye(10)
+        self._inflation = config.imu_inflation
         self.running = False
         self.age_s = 0.0  # since the start or the last correction
 
@@ -55,9 +56,10 @@ class ScaleFilter:
         """Forget all."""
         self.running = False
 
-    def start(self, velocity: F64, gravity: F64, bias: F64) -> None:
-        """Start with unit scale. velocity, gravity: (3,) in m. bias: (6,)."""
+    def start(self, velocity: F64, gravity: F64, bias: F64, accel_noise: float) -> None:
+        """Start with unit scale. velocity, gravity: (3,) in m. bias: (6,). accel_noise: factor on the white noise."""
         c = self._config
+        self._inflation = c.imu_inflation * max(accel_noise, 1.0)
         self._x = np.concatenate([[1.0], gravity, velocity, bias[3:]])
         sigma = np.repeat([c.start_scale, c.start_gravity_m_s2, c.start_velocity_m_s, c.start_bias_m_s2], [1, 3, 3, 3])
         self._cov = np.diag(sigma**2)
@@ -74,7 +76,7 @@ class ScaleFilter:
         c, x = self._config, self._x
         samples = replace(samples, density=None)  # which is vibration, and averages out, and fast motion
         bias = np.concatenate([gyro_bias, x[_BIAS]])
-        motion = preintegrate(samples, bias, self._calibration, c.imu_inflation)
+        motion = preintegrate(samples, bias, self._calibration, self._inflation)
         r, dt = T_m_b0[:3, :3], motion.dt_s
         # predict the state, and behind it the displacement of the camera in metres
         f = np.zeros((13, 10))

@@ -30,7 +30,7 @@ class InertialMap:
     """The first keyframe of a map in metres, which is this frame, and the state there.
 
     points: new landmarks. solution: its window. cov: (17,17) of the state, as in InertialState. scale_sigma: relative
-    deviation of the scale. duration_s: length of the window.
+    deviation of the scale. duration_s: length of the window. accel_noise: factor on the accelerometer's noise.
     """
 
     points: MetricPoints
@@ -38,6 +38,7 @@ class InertialMap:
     cov: F64
     scale_sigma: float
     duration_s: float
+    accel_noise: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +158,8 @@ class InertialStart:
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
             return None
         cov = config.state_inflation**2 * solution.cov
-        return InertialMap(points, solution, cov, self._sigma(solution), (stamps[-1] - stamps[0]) * 1e-9)
+        duration_s = (stamps[-1] - stamps[0]) * 1e-9
+        return InertialMap(points, solution, cov, self._sigma(solution), duration_s, noise.accel)
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kiteline_agent.governor.governor import Extra, Governor
-from kiteline_agent.inertial.inertial_tracker import InertialStartState
+from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
@@ -98,7 +98,9 @@ class SubmapStage:
         keyframe = self._keyframes.make(ctx, None, found.points.points, camera.pose.T_m_c, Extra.SUBMAP)
         found.points.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))
-        state = InertialStartState(solution.T_w_b, solution.velocity, solution.bias, solution.gravity, found.cov)
+        state = InertialStartState(
+            solution.T_w_b, solution.velocity, solution.bias, solution.gravity, found.cov, found.accel_noise
+        )
         camera.motion.begin_metric_map(ctx.t_ns, state)
         start.clear()
         text = f"mono: metric within {100.0 * found.scale_sigma:.1f} %, from {found.duration_s:.1f} s of images and IMU"

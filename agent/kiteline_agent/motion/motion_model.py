@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.covariance.pose_covariance import adjoint
 from kiteline_agent.inertial.fixed_lag import VisualPoints
+from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
-from kiteline_agent.inertial.inertial_tracker import InertialStartState, InertialTracker
+from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.motion.step_recorder import StepRecorder
