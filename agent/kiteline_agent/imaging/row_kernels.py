@@ -15,8 +15,41 @@ LEAST_PIVOT = 100.0  # sum of squared gradients across the weaker direction: les
 
 
 @njit
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for r in range(SIDE):
+        for c in range(SIDE):
+            total += a[r, c] * b[r, c]
+    return total
+
+
+@njit
+def _centre(a):  # type: ignore[no-untyped-def]
+    """Subtract the mean."""
+    total = 0.0
+    for r in range(SIDE):
+        for c in range(SIDE):
+            total += a[r, c]
+    mean = total / (SIDE * SIDE)
+    for r in range(SIDE):
+        for c in range(SIDE):
+            a[r, c] -= mean
+
+
+@njit
+def _take_off(a, share, b):  # type: ignore[no-untyped-def]
+    """a -= share b."""
+    for r in range(SIDE):
+        for c in range(SIDE):
+            a[r, c] -= share * b[r, c]
+
+
+@njit
 def _cut(image, x, y, patch, gu, gv):  # type: ignore[no-untyped-def]
-    """Patch around (x, y), zero-mean, and its gradients made orthogonal to gain and offset; its sum of squares."""
+    """Patch around (x, y), zero-mean, and its gradients made orthogonal to gain and offset; its sum of squares.
+
+    Sums are written as loops: array expressions would allocate an array each.
+    """
     x0, y0 = int(x), int(y)
     fx, fy = x - x0, y - y0
     w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
@@ -33,12 +66,12 @@ def _cut(image, x, y, patch, gu, gv):  # type: ignore[no-untyped-def]
             patch[r, c] = wide[r + 1, c + 1]
             gu[r, c] = 0.5 * (wide[r + 1, c + 2] - wide[r + 1, c])
             gv[r, c] = 0.5 * (wide[r + 2, c + 1] - wide[r, c + 1])
-    patch -= patch.mean()
-    gu -= gu.mean()
-    gv -= gv.mean()
-    tt = (patch * patch).sum() + 1e-9
-    gu -= (patch * gu).sum() / tt * patch
-    gv -= (patch * gv).sum() / tt * patch
+    _centre(patch)
+    _centre(gu)
+    _centre(gv)
+    tt = _dot(patch, patch) + 1e-9
+    _take_off(gu, _dot(patch, gu) / tt, patch)
+    _take_off(gv, _dot(patch, gv) / tt, patch)
     return tt
 
 
@@ -94,7 +127,7 @@ def measure_rows(  # type: ignore[no-untyped-def]
         if x < RADIUS + 1 or y < RADIUS + 1 or x >= w - RADIUS - 3 or y >= h - RADIUS - 3:
             continue
         tt = _cut(left[level], x, y, patch, gu, gv)
-        huu, huv, hvv = (gu * gu).sum(), (gu * gv).sum(), (gv * gv).sum()
+        huu, huv, hvv = _dot(gu, gu), _dot(gu, gv), _dot(gv, gv)
         pivot = hvv - huv * huv / max(huu, 1e-9)
         if pivot < LEAST_PIVOT or huu < LEAST_PIVOT:
             continue
@@ -102,12 +135,12 @@ def measure_rows(  # type: ignore[no-untyped-def]
         for _ in range(iterations):
             if not _sample(right[level], grid, s, xr, yr, other):
                 break
-            other -= other.mean()
-            gain = (other * patch).sum() / tt
-            ncc = gain * np.sqrt(tt / max((other * other).sum(), 1e-9))
+            _centre(other)
+            gain = _dot(other, patch) / tt
+            ncc = gain * np.sqrt(tt / max(_dot(other, other), 1e-9))
             if gain < 0.1:
                 break
-            bu, bv = -(other * gu).sum() / gain, -(other * gv).sum() / gain
+            bu, bv = -_dot(other, gu) / gain, -_dot(other, gv) / gain
             dv = (bv - huv / huu * bu) / pivot
             du = (bu - huv * dv) / huu
             if abs(du) < CONVERGED_PX and abs(dv) < CONVERGED_PX:
