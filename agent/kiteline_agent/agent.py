@@ -203,6 +203,7 @@ class Agent:
                     camera.correct_disparities(change)
                     events += self._disparities.take_events()
             # 7. Make a keyframe if the policy needs one.
+            self._relocaliser.enter_keyframes()  # of earlier frames
             events += self._keyframes.add_if_needed(ctx, track)
             # 8. Join an older submap, or continue a monocular one in metres.
             events += self._submaps.join_older(ctx, track)

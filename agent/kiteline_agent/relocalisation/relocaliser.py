@@ -70,24 +70,36 @@ class Relocaliser:
             config.detector, cell_px=config.relocalisation.cell_px, max_corners=config.relocalisation.max_corners
         )
         self._index = None if vocabulary is None else PlaceIndex(vocabulary)
+        self._waiting: list[KeyframeId] = []  # keyframes that are not in the index yet
         self._join_until: int | None = None  # last frame of the search for an older submap
         self._unconfirmed: tuple[SubmapId, F64] | None = None  # the older submap as found once, T_old_new
         self.has_texture = True  # the last frame that was searched had enough corners
 
     def add_keyframe(self, keyframe: KeyframeId) -> None:
-        """Enter a keyframe of the local map into the place index; evicted ones leave it."""
-        if self._index is None:
+        """Note a keyframe of the local map. `enter_keyframes` enters it: the frame of a keyframe has enough to do."""
+        if self._index is not None:
+            self._waiting.append(keyframe)
+
+    def enter_keyframes(self) -> None:
+        """Enter the keyframes that wait into the place index; evicted ones leave it."""
+        waiting, self._waiting = self._waiting, []
+        if self._index is None or not waiting:
             return
         for key in self._index.keys:
             if self._map.slot_of(key) < 0:
                 self._index.remove(key)
+        for keyframe in waiting:
+            if self._map.slot_of(keyframe) >= 0:
+                self._enter(self._index, keyframe)
+
+    def _enter(self, index: PlaceIndex, keyframe: KeyframeId) -> None:
         slot = self._map.slot_of(keyframe)
         first = slot * self._map.slot_size
         own = np.arange(first, first + int(self._map.counts[slot]))
         in_view = self._map.candidates(
             se3.inverse(self._map.T_m_k[slot]), 0.0, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
         )
-        self._index.add(keyframe, self._map.descriptor[np.union1d(own, in_view.rows)])
+        index.add(keyframe, self._map.descriptor[np.union1d(own, in_view.rows)])
 
     def start_joining(self, frame_number: int) -> None:
         """A new submap was opened at this frame: search for older ones for a while."""
@@ -128,6 +140,7 @@ class Relocaliser:
         self.has_texture = seen is not None
         if seen is None:
             return None
+        self.enter_keyframes()
         # 2. Candidates, each verified by P3P, by the tracker and against the motion.
         for keyframe in self._candidates(seen, reference, exclude):
             fit = self._pose_from(keyframe, seen, ctx.number)
