@@ -19,6 +19,7 @@ from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
@@ -37,8 +38,9 @@ from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
+from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record, StereoAlignment
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
+from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import NO_KEYFRAME, SubmapId
 from kiteline_core.places.place_index import Vocabulary
@@ -105,6 +107,8 @@ class Agent:
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
+        self._began_with_px = np.zeros(disparity_offset.TERMS)  # error of disparities
+        self._begin_with(config.known_rig)
 
     def step(self, step_input: StepInput, now_ns: int) -> StepOutput:
         """Take in what arrived, track the frame if there is one, return what is to be sent. Never waits."""
@@ -211,6 +215,9 @@ class Agent:
             outcome = FrameOutcome(True, False, track.inliers, events)
         if self._rows is not None:
             outcome.events.extend(self._rows.take_events())
+            rows_px = self._rows.take_change()
+            if rows_px is not None:
+                self._channel.put(StereoAlignment(self._identity.agent, rows_px, self._began_with_px))
         self.work.rectified_px += images.rectified_px
         # 9. Report the pose.
         self._was_lost = not outcome.tracked or outcome.bridged
@@ -222,6 +229,15 @@ class Agent:
         return self._last_estimate, outcome.events
 
     # stages of a frame
+
+    def _begin_with(self, known: KnownRigConfig) -> None:
+        """Take over what earlier flights with this calibration found of the right camera."""
+        if self._rows is None or not known.is_of(self.map.camera):
+            return  # there is no right camera, or it was calibrated anew
+        self._rows.begin_with(known.rows)
+        self.map.set_disparity_offset(known.disparity)
+        self._began_with_px = known.disparity
+        self._channel.put(StereoAlignment(self._identity.agent, known.rows, known.disparity))
 
     def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
@@ -328,6 +344,12 @@ class Agent:
     def odometry_quality(self, estimate: Estimate) -> int:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""
         return min(estimate.quality, self._camera.covariance.quality(estimate.cov_o, None))
+
+    def known_rig(self) -> KnownRigConfig | None:
+        """What is known of the right camera now, for the next flight; None without one, and before it was measured."""
+        if self._rows is None or not self._rows.known:
+            return None
+        return known_rig(self.map.camera, self._rows.estimate_px, self.map.disparity_offset)
 
     def time_offset_report(self) -> dict[str, float] | None:
         """InertialTracker.offset_report; None without an IMU."""

@@ -9,6 +9,7 @@ from kiteline_agent.imaging.row_alignment import RowConfig
 from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial_start_config import InertialStartConfig
+from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 from kiteline_core.pose.pnp import RansacConfig
@@ -348,6 +349,7 @@ class AgentConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
     rows: RowConfig = field(default_factory=RowConfig)
     disparities: DisparityConfig = field(default_factory=DisparityConfig)
+    known_rig: KnownRigConfig = field(default_factory=KnownRigConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

@@ -97,8 +97,8 @@ class LoopConfig:
     min_gap: int = 12  # keyframes of one submap between two that are matched
     loop_gap: int = 30  # keyframes; landmarks observed again after so many count as a loop
     max_shared: int = 15  # landmarks that a candidate may share with the keyframe already
-    min_likeness: float = 0.02  # similarity of bags of words, 0..1: unrelated places stay below it
-    min_neighbour_ratio: float = 0.1  # of the similarity to the previous keyframe
+    min_likeness: float = 0.005  # similarity of places, 0..1: of unrelated images on average 0.01, of a revisit more
+    min_neighbour_ratio: float = 0.03  # of the similarity to the previous keyframe, whose descriptors hardly differ
     match: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
     sigma_disparity_px: float = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
@@ -226,6 +226,8 @@ class PublishConfig:
     pose_m: float = 0.0005  # m
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
+    batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
+    batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
     grid_every: int = 3  # keyframes between two grids
     grid_share: int = 40  # a grid is built after 1 in so many of the map's keyframes: it reads the whole map
 

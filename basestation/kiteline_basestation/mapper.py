@@ -40,11 +40,15 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class MapperInput:
-    """Inputs since the last step: records by agent, in order of agent id, finished jobs, and commands of users."""
+    """Inputs since the last step: records by agent, in order of agent id, finished jobs, and commands of users.
+
+    room_bytes: for corrections of an agent's map, by agent; 0: none now. Without an entry there is no limit.
+    """
 
     arrivals: tuple[tuple[AgentId, tuple[Record, ...]], ...]
     done: tuple[JobDone, ...] = ()
     commands: tuple[Command, ...] = ()
+    room_bytes: tuple[tuple[AgentId, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +119,8 @@ class Mapper:
         jobs = self._local_bundles.jobs() + self._grid.jobs()
         if self.merger is not None:
             jobs += self.merger.jobs(now_ns)
-        # 6. Publish all values that changed.
-        return MapperOutput(self._publisher.collect(), tuple(jobs), tuple(answers), withdrawn)
+        # 6. Publish the values that changed and for which there is room.
+        return MapperOutput(self._publisher.collect(dict(given.room_bytes)), tuple(jobs), tuple(answers), withdrawn)
 
     def adopt(self, record: Record) -> None:
         """Replace a published value by its quantised code, as the agent will hold it."""
@@ -141,9 +145,10 @@ class Mapper:
 
     @property
     def idle(self) -> bool:
-        """True if no job is due or pending and all keyframes that arrived are used."""
+        """True if no job is due or pending, all keyframes that arrived are used, and no change waits to be sent."""
         merged = self.merger is None or self.merger.idle
-        return merged and self._local_bundles.idle and not (self._intake.backlog or self._grid.pending)
+        waiting = self._intake.backlog or self._grid.pending or self._publisher.waiting
+        return merged and self._local_bundles.idle and not waiting
 
     def live(self, agent: AgentId) -> LivePose | None:
         """The newest live pose of an agent."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.exchange.correction_batches import CorrectionBatches
 from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
@@ -42,6 +43,8 @@ class Station:
         self.mapper = Mapper(config, vocabulary)
         self.map_cache_planner = MapCachePlanner(config.map_cache, config.loops, self.mapper.map)
         self.channels: dict[AgentId, RecordChannel] = {}
+        self._batches: dict[AgentId, CorrectionBatches] = {}  # of corrections, by agent
+        self._publish = config.publish
         self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
         self.unreadable = 0  # imported values whose code is no valid record
         self._open_channel = open_channel
@@ -50,6 +53,7 @@ class Station:
         """The channel to an agent; opened on first use."""
         if agent not in self.channels:
             self.channels[agent] = self._open_channel(agent)
+            self._batches[agent] = CorrectionBatches(agent, self._publish)
         return self.channels[agent]
 
     def track_changes(self) -> None:
@@ -77,20 +81,34 @@ class Station:
             self._track(agent, False, records)
         arrivals += [(order.agent, self._imported(order)) for order in orders if isinstance(order, Import)]
         commands = tuple(order for order in orders if isinstance(order, Command))
-        output = self.mapper.step(MapperInput(tuple(arrivals), tuple(done), commands), now_ns)
+        rooms = [(agent, self._batches[agent].room_bytes(end, now_ns)) for agent, end in sorted(self.channels.items())]
+        limits = tuple((agent, room) for agent, room in rooms if room is not None)
+        output = self.mapper.step(MapperInput(tuple(arrivals), tuple(done), commands, limits), now_ns)
         for agent, records in output.publish:
-            channel = self.join(agent)
-            for record in records:
-                self.mapper.adopt(channel.put(record))  # the base computes on with what the agent will hold
-            self._track(agent, True, records)
+            self.join(agent)
+            self._put(agent, self._batches[agent].numbered(records, now_ns))
         for agent, key in output.withdrawn:
             self.join(agent).remove(key)
             if self.changed is not None:
                 self.changed[agent, True, key] = None
+            replaced = self._batches[agent].without(key)
+            self._put(agent, [] if replaced is None else [replaced])
         for agent, channel in sorted(self.channels.items()):
             self.map_cache_planner.update(agent, self.mapper.live(agent), channel, now_ns)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))
         return StationOutput(sent, output.jobs, output.answers)
+
+    def _put(self, agent: AgentId, records: Sequence[Record]) -> None:
+        for record in records:
+            self.mapper.adopt(self.channels[agent].put(record))  # the base computes on with what the agent will hold
+        self._track(agent, True, records)
+
+    def restore(self, agent: AgentId, own: Sequence[Record], now_ns: int) -> None:
+        """Share again the values that an earlier process had written for an agent."""
+        channel = self.join(agent)
+        for record in own:
+            self._batches[agent].restore(record)
+        self.mapper.restore(agent, (), tuple(channel.put(record) for record in own), now_ns)
 
     def _track(self, agent: AgentId, own: bool, records: Sequence[Record]) -> None:
         if self.changed is not None:

@@ -27,6 +27,10 @@ class RecordChannel(Protocol):
         """How long to wait after a keyframe before one that is not urgent."""
         ...
 
+    def rate_bytes_s(self) -> int | None:
+        """What the link carries; None where nothing has to wait."""
+        ...
+
     def arrived(self, key: Key) -> bool:
         """True if the other side is known to hold the newest record of a key."""
         ...
@@ -68,6 +72,10 @@ class PlainChannel:
     def keyframe_gap_ns(self) -> int:
         """0: there is no link."""
         return 0
+
+    def rate_bytes_s(self) -> int | None:
+        """None: there is no link."""
+        return None
 
     def arrived(self, key: Key) -> bool:
         """Always true."""
@@ -132,6 +140,10 @@ class CodedChannel:
     def keyframe_gap_ns(self) -> int:
         """How long to wait after a keyframe before one that is not urgent."""
         return self._pacer.keyframe_gap_ns(self.endpoint.backlog_bytes, self.endpoint.throughput_bytes_s)
+
+    def rate_bytes_s(self) -> int | None:
+        """What the link carries; None where nothing has to wait."""
+        return self.endpoint.config.budget_bytes or self.endpoint.throughput_bytes_s
 
     def arrived(self, key: Key) -> bool:
         """True if the other side is known to hold the newest record of a key."""

@@ -54,11 +54,18 @@ _numba.core.event.register("numba:compile", _CollectorPause())
 def njit(function: F) -> F:
     """Compile a kernel: arrays in, caller's arrays out; no parallel, no fastmath, no objects.
 
-    A kernel whose name begins with an underscore is called by other kernels only. It gets no Python wrapper, which is
-    half of the compile time of a small kernel.
+    One whose name begins with an underscore is a `helper`.
     """
-    helper = function.__name__.startswith("_")
+    return _compiled(function, function.__name__.startswith("_"))
+
+
+def helper(function: F) -> F:
+    """Compile a function that only kernels call, into each of them; it cannot be called from Python."""
+    return _compiled(function, True)
+
+
+def _compiled(function: F, is_helper: bool) -> F:
     compiled: F = _numba.njit(
-        cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=helper, **_options
+        cache=True, nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=is_helper, **_options
     )(function)  # fmt: skip
     return compiled

@@ -1,15 +1,17 @@
-"""Shortcuts through numba's compiler: the same machine code, in four fifths of the time.
+"""Shortcuts through numba's compiler: kernels that compute the same, in two thirds of the time.
 
-They reach into numba, so a version that they were not tried with compiles without them. Their test compares the code.
+They reach into numba, so a version that they were not tried with compiles without them. Their tests compare results.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import llvmlite.binding as llvm
 import llvmlite.binding.ffi
 import numba
-from numba.core import typed_passes, untyped_passes
+from numba.core import ir, typed_passes, types, untyped_passes
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
 from numba.core.targetconfig import ConfigStack
@@ -36,7 +38,75 @@ class KernelCompiler(CompilerBase):
         return [passes]
 
 
+class KernelLibrary(JITCodeLibrary):
+    """Code of a function and of those that it calls.
+
+    A function that only compiled functions call is linked into each of them, which optimise and translate it together
+    with their own code: by itself it is only simplified. numba does all of it at every level.
+    """
+
+    is_linked_only = False
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        ll_module.data_layout = self._codegen._data_layout
+        if not self.is_linked_only:  # the passes over the whole module do what those over each function do
+            return
+        passes, builder = self._codegen._function_pass_manager()  # type: ignore[no-untyped-call]
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+    def _optimize_final_module(self) -> None:
+        if not self.is_linked_only:
+            passes, builder = self._codegen._module_pass_manager()  # type: ignore[no-untyped-call]
+            passes.run(self._final_module, builder)
+
+    def _finalize_final_module(self) -> None:
+        if self.is_linked_only:
+            self._finalized = True
+        else:
+            super()._finalize_final_module()  # type: ignore[no-untyped-call]
+
+    def serialize_using_object_code(self) -> Any:
+        """Return what the cache on disk keeps."""
+        if not self.is_linked_only:
+            return super().serialize_using_object_code()  # type: ignore[no-untyped-call]
+        self._ensure_finalized()  # type: ignore[no-untyped-call]
+        return self.name, "bitcode", self._get_module_for_linking().as_bitcode()  # type: ignore[no-untyped-call]
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+        name, kind, code = state
+        if kind != "bitcode":
+            return super()._unserialize(codegen, state)  # type: ignore[no-untyped-call]
+        self = codegen.create_library(name)
+        self.is_linked_only = self._finalized = True
+        self._final_module = self._shared_module = llvm.parse_bitcode(code)
+        return self
+
+
+_lower = typed_passes.NativeLowering.run_pass
+_set_env = JITCPUCodegen.set_env
+_call_type = types.Dispatcher.get_call_type
 _resolve = BaseFunction.get_call_type
+
+
+def lower(self: Any, state: Any) -> Any:
+    """Generate the code of a function; find out whether only compiled functions call it."""
+    if state.library is None:
+        state.library = state.targetctx.codegen().create_library(state.func_id.func_qualname)
+        state.library.enable_object_caching()
+    flags = state.flags
+    if flags.no_cpython_wrapper and (flags.no_cfunc_wrapper or state.func_id.modname.startswith("numba.")):
+        flags.no_cfunc_wrapper = True
+        state.library.is_linked_only = True
+    return _lower(self, state)  # type: ignore[no-untyped-call]
+
+
+def set_env(self: Any, env_name: str, env: Any) -> None:
+    """Tell a function its environment; one that is linked only has no address by itself."""
+    if self._engine.is_symbol_defined(env_name):
+        _set_env(self, env_name, env)  # type: ignore[no-untyped-call]
 
 
 def remembered_call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
@@ -57,10 +127,52 @@ def remembered_call_type(function: Any, context: Any, args: Any, kws: Any) -> An
     return known[key]
 
 
+def call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """Resolve a call of one kernel by another. Constants are numbers like others: no compilation for each of them."""
+    if self.dispatcher._compiler.pipeline_class is KernelCompiler:
+        args = tuple(types.unliteral(one) for one in args)  # type: ignore[no-untyped-call]
+    return _call_type(self, context, args, kws)
+
+
+_OTHER, _VARIABLE, _INSTRUCTION, _SEQUENCE, _MAPPING = range(5)
+_kinds: dict[type, int] = {}
+
+
+def _kind(cls: type) -> int:
+    _kinds[cls] = (
+        _VARIABLE if issubclass(cls, ir.Var) else _INSTRUCTION if issubclass(cls, ir.Inst)
+        else _SEQUENCE if issubclass(cls, (list, tuple)) else _MAPPING if issubclass(cls, dict) else _OTHER
+    )  # fmt: skip
+    return _kinds[cls]
+
+
+def variables_in(instruction: Any, value: Any) -> list[Any]:
+    """Variables in the fields of an instruction, in order; numba's own walk tests each value against five types."""
+    found: list[Any] = []
+    for part in value.values() if isinstance(value, dict) else value:
+        cls = type(part)
+        kind = _kinds[cls] if cls in _kinds else _kind(cls)
+        if kind == _VARIABLE:
+            found.append(part)
+        elif kind == _INSTRUCTION:
+            found.extend(part.list_vars())
+        elif kind != _OTHER:
+            found.extend(variables_in(instruction, part))
+    return found
+
+
 def install() -> dict[str, Any]:
     """Install the shortcuts if this version of numba was tried with them; the options of numba.njit that they need."""
     if not numba.__version__.startswith(TRIED):
         return {}
-    setattr(BaseFunction, "get_call_type", remembered_call_type)  # noqa: B010  mypy forbids the assignment
+    for owner, name, value in (
+        (BaseFunction, "get_call_type", remembered_call_type),
+        (types.Dispatcher, "get_call_type", call_type),
+        (typed_passes.NativeLowering, "run_pass", lower),
+        (JITCPUCodegen, "_library_class", KernelLibrary),
+        (JITCPUCodegen, "set_env", set_env),
+        (ir.Inst, "_rec_list_vars", variables_in),
+    ):
+        setattr(owner, name, value)
     llvmlite.binding.ffi.lib._lock._cblist.clear()  # events of each call of LLVM, to which nothing listens
     return {"pipeline_class": KernelCompiler}

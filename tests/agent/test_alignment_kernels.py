@@ -11,6 +11,7 @@ from kiteline_agent.imaging import alignment_kernels as kernels
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
+from tests.core.helpers_from_python import from_python
 
 
 def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> NDArray[np.float64]:
@@ -90,7 +91,7 @@ def test_flat_images_give_nothing() -> None:
 
 def test_sample_is_bilinear() -> None:
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    assert kernels.sample(image, 1.25, 0.5) == pytest.approx(1.25 + 2.0)
+    assert from_python(kernels.sample)(image, 1.25, 0.5) == pytest.approx(1.25 + 2.0)
 
 
 def test_templates_are_cut_as_one_would_by_hand() -> None:
@@ -127,18 +128,18 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     template = np.ascontiguousarray(image[100:121, 130:151])
     w = np.array([[1.1, -0.2], [0.15, 0.9]])
     reference = np.zeros((kernels.PATCH + 2, kernels.STRIDE), np.int16)
-    assert kernels.warp_template(template, *w.ravel(), reference)
+    assert from_python(kernels.warp_template)(template, *w.ravel(), reference)
     dx, dy = np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0))
     plain = bilinear(template, 10 + w[0, 0] * dx + w[0, 1] * dy, 10 + w[1, 0] * dx + w[1, 1] * dy)
     steepest = np.abs(np.diff(plain)).max()
     np.testing.assert_allclose(reference[:, : kernels.PATCH + 2] / kernels.GREY, plain, atol=0.04 + steepest / 128)
-    assert not kernels.warp_template(template, 1.5, 0.6, -0.6, 1.5, reference)
+    assert not from_python(kernels.warp_template)(template, 1.5, 0.6, -0.6, 1.5, reference)
 
     patches = np.zeros((5, kernels.LANES), np.int16)
     inside = np.zeros((kernels.PATCH, kernels.STRIDE), np.bool_)
     inside[:, : kernels.PATCH] = True
     patches[4] = inside.ravel()
-    kernels.template_gradients(reference, patches)
+    from_python(kernels.template_gradients)(reference, patches)
     grey = reference[:, : kernels.PATCH + 2].astype(np.int64)
     for row, wanted in (
         (1, grey[1:-1, 1:-1]),
@@ -147,11 +148,14 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     ):
         np.testing.assert_array_equal(patches[row].reshape(inside.shape)[:, : kernels.PATCH], wanted)
         assert not patches[row].reshape(inside.shape)[~inside].any()
-    assert kernels.dot(patches[2], patches[1]) == (grey[1:-1, 1:-1] * (grey[1:-1, 2:] - grey[1:-1, :-2])).sum()
+    assert (
+        from_python(kernels.dot)(patches[2], patches[1])
+        == (grey[1:-1, 1:-1] * (grey[1:-1, 2:] - grey[1:-1, :-2])).sum()
+    )
 
     raw, across = np.zeros(kernels.LANES + kernels.STRIDE, np.uint8), np.zeros(kernels.LANES + kernels.STRIDE, np.int16)
     for x, y in ((100.0, 90.0), (47.31, 60.78), (4.0, 4.99), (314.9, 234.9)):
-        kernels.sample_patch(image, x, y, raw, across, patches[0])
+        from_python(kernels.sample_patch)(image, x, y, raw, across, patches[0])
         dx, dy = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0))
         seen = patches[0].reshape(inside.shape)[:, : kernels.PATCH] / kernels.GREY
         np.testing.assert_allclose(seen, bilinear(image, x + dx, y + dy), atol=0.04 + 40.0 / 256)

@@ -25,6 +25,7 @@ from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
+from tests.core.helpers_from_python import from_python
 
 F64 = NDArray[np.float64]
 SEEDS = st.integers(0, 2**31)
@@ -175,7 +176,7 @@ def test_imu_jacobian_agrees_with_differences(seed: int) -> None:
         a, sa = moved_by(ri, si, x[:15])
         b, sb = moved_by(rj, sj, x[15:30])
         res, jac = np.empty(9), np.empty((9, 32))
-        inertial_kernels.imu_terms(
+        from_python(inertial_kernels.imu_terms)(
             a, sa, b, sb, tilt + x[30:], 9.81, motion.dt_s, motion.turn, motion.vp, motion.jac, motion.bias, res, jac
         )
         return res, jac
@@ -203,7 +204,7 @@ def test_velocity_terms_agree_with_a_plain_reference(seed: int) -> None:
     e = 1e-6
     jac = np.column_stack([(residual(e * d) - residual(-e * d)) / (2 * e) for d in np.eye(15)])
     h, b = np.zeros((20, 20)), np.zeros(20)
-    cost = inertial_kernels.velocity_terms(r, state[3:6].copy(), measured, info, h, b, 2)
+    cost = from_python(inertial_kernels.velocity_terms)(r, state[3:6].copy(), measured, info, h, b, 2)
     res = residual(np.zeros(15))
     np.testing.assert_allclose(h[2:17, 2:17], jac.T @ info @ jac, atol=1e-7)
     np.testing.assert_allclose(b[2:17], -jac.T @ info @ res, atol=1e-7)
@@ -247,7 +248,7 @@ def test_visual_terms_agree_with_a_plain_reference(seed: int) -> None:
         h += weight * jac.T @ info @ jac
         b -= weight * jac.T @ info @ res
     got_h, got_b = np.empty((6, 6)), np.empty(6)
-    inertial_kernels.visual_terms(
+    from_python(inertial_kernels.visual_terms)(
         r, p, np.ascontiguousarray(T_c_b[:3, :3]), T_c_b[:3, 3].copy(), np.array([c.fx, c.fy, c.cx, c.cy, c.bf]),
         len(points.xyz), points.xyz, points.ray, points.observed, points.sigma_px, points.inlier, 9.21,
         0.5, got_h, got_b,
@@ -263,12 +264,12 @@ def test_elimination_is_the_schur_complement(seed: int, keep: int) -> None:
     m = rng.normal(size=(12, 8))
     h, b = m.T @ m + 0.1 * np.eye(8), rng.normal(size=8)
     a = np.column_stack([h, b])
-    assert kernels.eliminate(a, keep, 8)
+    assert from_python(kernels.eliminate)(a, keep, 8)
     inner = np.linalg.inv(h[:keep, :keep])
     rest = h[keep:, keep:] - h[keep:, :keep] @ inner @ h[:keep, keep:]
     np.testing.assert_allclose(np.triu(a[keep:, keep:8]), np.triu(rest), atol=1e-8)
     np.testing.assert_allclose(a[keep:, 8], b[keep:] - h[keep:, :keep] @ inner @ b[:keep], atol=1e-8)
-    assert not kernels.eliminate(-np.column_stack([h, b]), keep, 8)
+    assert not from_python(kernels.eliminate)(-np.column_stack([h, b]), keep, 8)
 
 
 # the whole

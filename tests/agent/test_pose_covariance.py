@@ -20,6 +20,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.pose import pose_kernels
+from tests.core.helpers_from_python import from_python
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
@@ -34,7 +35,9 @@ def seen_with(error: F64, X: F64, T_c_m: F64) -> F64:
     out = uvd.copy()
     for i, (u, v, d) in enumerate(uvd):
         bias = np.empty((3, SHAPES))
-        certainty_kernels.bias_error(u, v, d, np.array([450.0, 450.0, 370.0, 240.0, CAMERA.bf]), 376.0, bias)
+        from_python(certainty_kernels.bias_error)(
+            u, v, d, np.array([450.0, 450.0, 370.0, 240.0, CAMERA.bf]), 376.0, bias
+        )
         out[i] += bias @ error
     return out
 

@@ -144,3 +144,31 @@ def test_terms_describe_small_rotations() -> None:
     rows = expected(rectifier, UV + [rectifier.camera.bf / DEPTH_M, 0.0], TURNED)
     left = rows - at @ np.linalg.lstsq(at, rows, rcond=None)[0]
     assert np.abs(left).max() < 0.01
+
+
+def test_the_next_flight_begins_with_the_rows_and_measures_on() -> None:
+    rectifier, left, right = flight(Lens.RADTAN, TURNED)
+    pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
+    octave, disparity = np.zeros(len(UV), np.uint8), np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    first = RowAlignment(rectifier, RowConfig())
+    assert not first.known
+    assert first.take_change() is None  # nothing was measured
+    first.add(*pyramids, UV, octave, disparity)
+    change = first.take_change()
+    assert change is not None
+    assert first.known
+    assert np.array_equal(change, first.estimate_px)
+    first.add(*pyramids, UV, octave, disparity)
+    assert first.take_change() is None  # it changed by less than matters
+
+    fresh, _, _ = flight(Lens.RADTAN, TURNED)
+    after = RowAlignment(fresh, RowConfig())
+    after.begin_with(first.estimate_px)
+    assert np.allclose(after.estimate_px, first.estimate_px)
+    offset, found = measured(fresh, left, right)
+    assert np.sqrt(np.median(offset[found] ** 2)) < 0.15
+    after.add(*pyramids, UV, octave, disparity)
+    assert after.take_change() is None
+    small = RowAlignment(flight(Lens.RADTAN, TURNED)[0], RowConfig())
+    small.begin_with(np.array([0.2, 0.0, 0.0, 0.0, 0.0]))
+    assert not small.applied_px.any()  # as in the flight that measured it

@@ -15,7 +15,14 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.refinement.disparity_calibration import sideways_share
-from kiteline_codec.schema import CameraIntrinsics, DisparityCalibration, NewLandmarks, Observations, Record
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    DisparityCalibration,
+    NewLandmarks,
+    Observations,
+    Record,
+    StereoAlignment,
+)
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
@@ -27,6 +34,9 @@ BF = FOCAL * 0.11
 TURNED = FOCAL * np.array([0.0, 0.0, 8e-4, 0.0, 0.0]) + [0.02, 0.0, 0.0, 0.0, 0.0]  # a right camera rolled by 0.8 mrad
 NONE = none()
 CONSTANT = np.array([0.12, 0.0, 0.0, 0.0, 0.0])
+WORN = FOCAL * np.array([1.2e-3, 0.0, 5e-4, 1e-3, 0.0])  # half a pixel: a mount that bent by a milliradian
+BENT_ROWS = FOCAL * np.array([1e-3, -8e-4, 0.0, 0.0, 0.0])  # the same mount, about the other axes
+CORNERS = np.array([[x, y] for x in (-0.7, 0.0, 0.7) for y in (-0.45, 0.0, 0.45)])
 
 
 def shifted(record: Record, offset: F64) -> Record:
@@ -37,12 +47,12 @@ def shifted(record: Record, offset: F64) -> Record:
     return record
 
 
-def fly(mapper: Mapper, flight: Any, offset: F64) -> list[Job]:
+def fly(mapper: Mapper, flight: Any, offset: F64, said: tuple[Record, ...] = ()) -> list[Job]:
     done: tuple[JobDone, ...] = ()
     jobs: list[Job] = []
     for n in range(len(flight.records) + 30):
         records = flight.records[n] if n < len(flight.records) else []
-        first = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
+        first = [CameraIntrinsics(flight.agent, flight.camera), *said] if n == 0 else []
         given = tuple(first) + tuple(shifted(r, offset) for r in records)
         output = mapper.step(MapperInput(((flight.agent, given),), done), n * 250_000_000)
         done = tuple(run_job(job) for job in output.jobs)
@@ -59,8 +69,7 @@ def test_an_offset_is_found(
     mapper = Mapper(replace(BaseConfig(), disparity=exact), words)
     fly(mapper, flight, offset)
     left = offset - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
-    corners = np.array([[x, y] for x in (-0.7, 0.0, 0.7) for y in (-0.45, 0.0, 0.45)])
-    assert np.sqrt(np.mean(np.square(terms(corners) @ left))) < 0.045
+    assert np.sqrt(np.mean(np.square(terms(CORNERS) @ left))) < 0.045
     error = [np.linalg.norm(mapper.map.pose(k)[:3, 3] - t[:3, 3]) for k, t in zip(flight.keyframes, flight.true_T_m_k)]
     assert np.sqrt(np.mean(np.square(error))) < 0.01
 
@@ -120,3 +129,19 @@ def test_motion_across_the_axis_is_that_of_the_cameras_own_axes() -> None:
             T_m_c.append(T_m_c[-1] @ se3.from_rt(np.eye(3), step[name]) @ se3.from_rt(turn, np.zeros(3)))
         assert sideways_share(np.stack([se3.inverse(T) for T in T_m_c])) == pytest.approx(share, abs=1e-9)
     assert sideways_share(np.tile(np.eye(4), (3, 1, 1))) == 0.0
+
+
+def test_a_base_begins_with_what_the_agent_began_with_but_keeps_its_own(words: Any, make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=2)
+    mapper = Mapper(BaseConfig(), words)
+    said = StereoAlignment(flight.agent, BENT_ROWS, WORN)
+    first = (CameraIntrinsics(flight.agent, flight.camera), said)
+    mapper.step(MapperInput(((flight.agent, first),), ()), 0)
+    assert np.array_equal(mapper.map.disparity_offset_px[AgentId(0)], WORN)
+    mapper.map.disparity_offset_px[AgentId(0)] = CONSTANT  # estimated here
+    mapper.step(MapperInput(((flight.agent, (said,)),), ()), 10**9)
+    assert np.array_equal(mapper.map.disparity_offset_px[AgentId(0)], CONSTANT)
+    again = CameraIntrinsics(flight.agent, replace(flight.camera, fx=flight.camera.fx + 1.0))
+    mapper.step(MapperInput(((flight.agent, (again,)),), ()), 2 * 10**9)
+    assert AgentId(0) not in mapper.map.rows_px
+    assert not np.any(mapper.map.disparity_offset_px[AgentId(0)])

@@ -102,7 +102,7 @@ def test_predecessors_of_a_matched_keyframe_are_verified(
 ) -> None:
     first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
     second = make_flight(keyframes=24, turns=0.45, T_w_m=ELSEWHERE)
-    loops = replace(BaseConfig().loops, predecessors=predecessors, min_likeness=0.34)  # the index finds one keyframe
+    loops = replace(BaseConfig().loops, predecessors=predecessors, min_likeness=0.075)  # the index finds one keyframe
     mapper = Mapper(replace(BaseConfig(), loops=loops), words)
     feed(mapper, [first, second], [0, 24])
     assert mapper.summary()["merges"] == merges

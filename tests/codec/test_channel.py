@@ -55,7 +55,7 @@ def test_coded_records_arrive_as_the_writer_was_told() -> None:
 def test_values_of_another_schema_are_counted() -> None:
     a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
     a.endpoint.put(Key(50, 1), b"of the future")
-    a.endpoint.put(Key(KeyframePose.KIND, 1), b"damaged")
+    a.endpoint.put(Key(KeyframePose.KIND, 1), b"damaged too")
     a.put(POSE)
     records, _ = cross(a, b)
     assert len(records) == 1

@@ -49,6 +49,9 @@ class Source:
         z = self.varint()
         return -(z + 1) // 2 if z % 2 else z // 2
 
+    def batch(self) -> int:
+        return self.varint() if self.at < len(self.data) else 0
+
     def columns(self, c: int, n: int) -> list[list[int]]:
         if not n:
             return [[] for _ in range(c)]
@@ -110,6 +113,8 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
     elif kind in (6, 16):
         out[{6: "T_l_m", 16: "T_m_k"}[kind]] = s.pose()
+        if kind == 16:
+            out["batch"] = s.batch()
     elif kind == 7:
         out["metres"] = struct.unpack("<f", s.raw(4))[0]
     elif kind == 8:
@@ -118,17 +123,24 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["dt_s"], v = c[:, 0] / 10000, c[:, 7:10] / 4096
         out["turn"], out["moved"], out["velocity"] = c[:, 1:4] / 2**14, c[:, 4:7] / 2**13, v
         out["position"] = c[:, 10:] / 2**15 + v * out["dt_s"][:, None] / 2
+    elif kind == 9:
+        out["rows_px"], out["disparity_px"] = ([s.signed() / 1024 for _ in range(5)] for _ in range(2))
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())
         S[:3, :3] *= scale
         out["S_w_m"] = S
         out["recognised"] = s.at < len(data) and s.u8() == 1
+        out["batch"] = s.batch()
     elif kind == 23:
         out["submap"] = s.varint()
         out["T_m_k"] = s.pose()
     elif kind == 25:
         out["disparity_px"] = [s.signed() / 1024 for _ in range(5)]
+        out["batch"] = s.batch()
+    elif kind == 26:
+        out["number"], out["members"] = s.varint(), s.varint()
+        out["keys"] = int.from_bytes(s.raw(4), "little") if out["members"] else 0
     elif kind == 22:
         out["cell_m"] = struct.unpack("<f", s.raw(4))[0]
         inflated = zlib.decompress(s.raw(len(data) - 4), -15)
@@ -159,6 +171,8 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
             out["point"] = points(s, n)
         if kind == 20:
             out["keyframe_too"] = s.u8()
+        if kind == 17:
+            out["batch"] = s.batch()
     assert s.at == len(data)
     return out
 
@@ -192,10 +206,14 @@ def test_a_recognised_placement_has_one_byte_more() -> None:
     key = messages.key(recognised)
     assert_agree(read_code(key.kind, key.id, code), messages.decode(key, code))
     assert messages.encode(messages.decode(key, code)) == code
-    with pytest.raises(WireError, match="must be 1"):
+    with pytest.raises(WireError, match="is 0 or 1"):
         messages.decode(key, code[:-1] + b"\0")
+    with pytest.raises(WireError, match="is 0 or 1"):
+        messages.decode(key, code[:-1] + b"\2\1")
+    with pytest.raises(WireError, match="above 0"):
+        messages.decode(key, code + b"\0")
     with pytest.raises(WireError, match="too many"):
-        messages.decode(key, code + b"\1")
+        messages.decode(key, code + b"\1\1")
 
 
 def exchange() -> list[tuple[str, bytes]]:

@@ -1,15 +1,23 @@
 import operator
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from numba.core import ir
+from numba.core.compiler import run_frontend
 from numba.core.registry import cpu_target
 from numba.core.types.functions import BaseFunction
 
 from kiteline_core import kernel_compiler
+from kiteline_core.imaging.matching_kernels import fill_cells
 from kiteline_core.kernel_compiler import KernelCompiler, install, remembered_call_type
+from kiteline_core.pose.pnp_kernels import p3p
 
 
 @numba.njit
@@ -42,6 +50,82 @@ def _code(options: dict[str, Any]) -> str:
 
 def test_the_short_pipeline_makes_the_same_code() -> None:
     assert _code({"pipeline_class": KernelCompiler}) == _code({})
+
+
+@numba.njit(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True, pipeline_class=KernelCompiler)
+def _mean(line: Any, k: int) -> float:
+    total = 0.0
+    for i in range(k):
+        total += line[i]
+    return total // k + np.floor(line.sum())
+
+
+def _means(a: Any, k: int) -> tuple[float, float]:
+    return _mean(a[0], k), _mean(a[:, 0], k)
+
+
+def test_a_helper_is_translated_in_its_callers_only() -> None:
+    if not numba.__version__.startswith(kernel_compiler.TRIED):
+        pytest.skip("compiles as numba does")
+    compiled: Any = numba.njit(_means)
+    values = np.arange(12.0).reshape(3, 4)
+    assert compiled(values, 3) == (_mean.py_func(values[0], 3), _mean.py_func(values[:, 0], 3))
+    assert len(_mean.overloads) == 2
+    engine = cpu_target.target_context.codegen()._engine
+    for result in _mean.overloads.values():
+        assert result.library.is_linked_only
+        assert not engine.is_symbol_defined(result.fndesc.llvm_cpython_wrapper_name)
+    with pytest.raises(ZeroDivisionError):
+        compiled(values, 0)
+
+
+def test_helpers_are_read_from_the_cache(tmp_path: Path) -> None:
+    """A second process loads the caller; a third compiles another caller with the helper from the cache."""
+    (tmp_path / "cached.py").write_text(
+        "from kiteline_core.jit import njit\n\n"
+        "@njit\ndef _twice(a, i):\n    return 2.0 * a[i]\n\n"
+        "@njit\ndef first(a):\n    return _twice(a, 1) + 1.0\n\n"
+        "@njit\ndef second(a):\n    return _twice(a, 2) + a[0]\n"
+    )
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+    }
+    lines = []
+    for call in ("first", "first", "second"):
+        code = (
+            f"import numpy as np, cached\nprint(cached.{call}(np.arange(6.0)), "
+            f"len(cached.{call}.stats.cache_hits), len(cached._twice.stats.cache_hits), "
+            f"len(cached._twice.stats.cache_misses))"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True
+        )
+        lines.append(done.stdout.split())
+    assert lines == [["3.0", "0", "0", "1"], ["3.0", "1", "0", "0"], ["4.0", "0", "1", "0"]]
+
+
+def _listed(value: Any) -> list[Any]:
+    """Variables of an instruction, as numba lists them."""
+    if isinstance(value, ir.Var):
+        return [value]
+    if isinstance(value, ir.Inst):
+        return value.list_vars()  # type: ignore[no-untyped-call, no-any-return]
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    return [one for part in parts for one in _listed(part)]
+
+
+def test_variables_of_instructions_are_all_found() -> None:
+    functions = [_kernel, _means, fill_cells.py_func, p3p.py_func]  # type: ignore[attr-defined]
+    found = 0
+    for function in functions:
+        blocks = run_frontend(function).blocks  # type: ignore[no-untyped-call]
+        for block in blocks.values():
+            for instruction in block.body:
+                assert list(map(id, instruction.list_vars())) == list(map(id, _listed(vars(instruction))))
+                found += len(instruction.list_vars())
+    assert found > 1000
 
 
 def test_remembered_types_are_the_resolved_ones() -> None:

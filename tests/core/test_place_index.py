@@ -36,25 +36,50 @@ def plain_words(v: Vocabulary, d: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def plain_vector(v: Vocabulary, d: np.ndarray) -> np.ndarray:
-    x = np.bincount(plain_words(v, d), minlength=len(v.weight)) * v.weight.astype(np.float64)
-    return x / x.sum()
+def plain_score(v: Vocabulary, asked: np.ndarray, place: np.ndarray) -> float:
+    """Sum of weight^2 of the asked features, each by the likeness of its most similar feature of the same word."""
+    asked, place = (d[v.weight[plain_words(v, d)] >= 1.0] for d in (asked, place))
+    a, b = plain_words(v, asked), plain_words(v, place)
+    total = 0.0
+    for word, row in zip(a, asked):
+        bits = [int(np.unpackbits(row[:8] ^ other[:8]).sum()) for other in place[b == word]]
+        total += float(v.weight[word]) ** 2 * max((np.exp(-((n / 6.0) ** 2)) for n in bits), default=0.0)
+    norms = [np.sqrt((v.weight[words].astype(np.float64) ** 2).sum()) for words in (a, b)]
+    return float(total / (norms[0] * norms[1]))
 
 
-def test_words_and_likeness_are_the_reference() -> None:
+def flipped(rng: np.random.Generator, d: np.ndarray, share: float) -> np.ndarray:
+    """Descriptors with a share of their bits wrong, as another image of the same landmarks gives."""
+    return d ^ np.packbits(rng.random((len(d), 256)) < share, axis=1)
+
+
+def test_words_and_scores_are_the_reference() -> None:
     v, rng = tree(0), np.random.default_rng(1)
-    places = {k: descriptors(rng, 40) for k in (5, 900, 17)}
+    base = descriptors(rng, 60)
+    places = {k: np.concatenate([flipped(rng, base[:n], 0.04), descriptors(rng, 30)]) for k, n in
+              ((5, 40), (900, 10), (17, 25))}  # fmt: skip
     index = PlaceIndex(v)
     for key, d in places.items():
         assert np.array_equal(v.words_of(d), plain_words(v, d))
         index.add(key, d)
-    asked = descriptors(rng, 50)
-    found = index.query(asked)
-    expected = {k: 1 - 0.5 * np.abs(plain_vector(v, asked) - plain_vector(v, d)).sum() for k, d in places.items()}
-    assert found.keys.tolist() == sorted(expected, key=lambda k: -expected[k])
-    assert np.allclose(found.score, [expected[k] for k in found.keys.tolist()], atol=1e-6)
-    between = 1 - 0.5 * np.abs(plain_vector(v, places[5]) - plain_vector(v, places[17])).sum()
-    assert np.allclose(index.similarity(5, [17, 3]), [between, 0.0], atol=1e-6)
+    found = index.query(base)
+    expected = {k: plain_score(v, base, d) for k, d in places.items()}
+    assert found.keys.tolist() == sorted(expected, key=lambda k: -expected[k]) == [5, 17, 900]
+    assert np.allclose(found.score, [expected[k] for k in found.keys.tolist()], rtol=1e-6)
+    between = plain_score(v, places[5], places[17])
+    assert np.allclose(index.similarity(5, [5, 17, 3]), [1.0, between, 0.0], rtol=1e-6)
+
+
+def test_a_repeated_feature_counts_once_for_each_feature_asked() -> None:
+    v, rng = tree(6), np.random.default_rng(6)
+    once, other = descriptors(rng, 1), descriptors(rng, 1)
+    index = PlaceIndex(v)
+    index.add(1, once)
+    index.add(2, np.repeat(once, 50, axis=0))
+    index.add(3, other)
+    index.remove(1)
+    index.add(4, once)
+    assert index.similarity(4, [2])[0] == pytest.approx(1 / np.sqrt(50))
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 9)), max_size=40), st.integers(0, 1000))

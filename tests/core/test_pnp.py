@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from kiteline_core.geometry import se3
 from kiteline_core.pose import pnp, pnp_kernels, ransac_kernels
+from tests.core.helpers_from_python import from_python
 
 CAMERA = np.array([450.0, 455.0, 370.0, 245.0, 50.0])
 
@@ -30,7 +31,7 @@ def test_p3p_contains_the_true_pose_and_only_poses_that_fit(seed: int) -> None:
     area = np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0]))
     assume(area > 0.3)  # nearly on a line, no pose is certain
     found = np.empty((4, 4, 4))
-    n = pnp_kernels.p3p(ray, points, found)
+    n = from_python(pnp_kernels.p3p)(ray, points, found)
     for k in range(n):
         seen = se3.transform(found[k], points)
         cosine = np.einsum("ni,ni->n", seen, ray) / np.linalg.norm(seen, axis=1)
@@ -77,7 +78,7 @@ def test_the_same_seed_gives_the_same_bits_and_draws_end_early() -> None:
     T, inlier = np.eye(4), np.zeros(50, np.bool_)
     pnp_kernels.p3p_ransac(points, uv, np.full(50, 3.0), CAMERA, 1000, 0.99, state, T, inlier)
     for _ in range(12):  # fewer than four triples were drawn: all points are inliers of the first pose
-        ransac_kernels.draw(again, 50)
+        from_python(ransac_kernels.draw)(again, 50)
         if again[0] == state[0]:
             return
     pytest.fail("draws went on although all points agreed")

@@ -69,7 +69,10 @@ def test_profiles_and_overrides() -> None:
     assert options(["a.mcap", "--out", "o"]) == Options(("a.mcap",), Path("o"))
 
 
-@pytest.mark.parametrize("words", [["--link-loss", "1.0"], ["--cpu", "-1"], ["--mode", "none"], ["--link-bytes", "x"]])
+@pytest.mark.parametrize(
+    "words",
+    [["--link-loss", "1.0"], ["--cpu", "-1"], ["--mode", "none"], ["--link-bytes", "x"], ["b.mcap", "--rig", "r.toml"]],
+)
 def test_a_wrong_word_ends_with_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         options(["a.mcap", "--out", "o", *words])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from kiteline_agent.imaging import row_alignment
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.mapper_state import MapperState, MapState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
@@ -20,7 +21,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.geometry.disparity_offset import terms
 from kiteline_core.ids import AgentId
-from kiteline_lab.tools.rig import RigError, exported, found_rig, main, summary
+from kiteline_lab.tools.rig import KnownCameras, RigError, exported, found_rig, main, summary
 
 T_b_c = se3.from_rt(se3.so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.05, 0.01, -0.02]))
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 363.0, 254.0, 0.11, True, T_b_c)
@@ -36,7 +37,7 @@ def known(offset: bool = True) -> Mapper:
 
 
 def test_the_rig_that_is_found_has_these_disparities() -> None:
-    rig = found_rig(CAMERA, OFFSET)
+    rig = found_rig(CAMERA, OFFSET, None)
     assert rig.right is not None
     assert rig.T_c_r is not None
     rng = np.random.default_rng(2)
@@ -48,19 +49,19 @@ def test_the_rig_that_is_found_has_these_disparities() -> None:
 
 
 def test_without_an_offset_it_is_the_rectified_pair() -> None:
-    rig = found_rig(CAMERA, np.zeros(5))
+    rig = found_rig(CAMERA, np.zeros(5), np.zeros(5))
     assert rig.left == rig.right
     assert rig.T_c_r is not None
     assert np.array_equal(rig.T_c_r, se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0])))
 
 
 def test_both_forms_hold_the_same_rig() -> None:
-    mapper = known()
+    mapper = KnownCameras.of_base(known())
     chain = yaml.safe_load(exported(mapper, None, "kalibr")["camchain-imucam.yaml"])
     sensors = [yaml.safe_load(text) for _, text in sorted(exported(mapper, 0, "euroc").items())]
     T_b = [np.array(s["T_BS"]["data"]).reshape(4, 4) for s in sensors]
     assert np.allclose(T_b[0], T_b_c)
-    rig = found_rig(CAMERA, OFFSET)
+    rig = found_rig(CAMERA, OFFSET, None)
     assert rig.T_c_r is not None
     assert np.allclose(np.linalg.inv(T_b[0]) @ T_b[1], rig.T_c_r)
     for k, sensor in enumerate(sensors):
@@ -74,9 +75,9 @@ def test_both_forms_hold_the_same_rig() -> None:
 
 def test_unknown_agents_are_named() -> None:
     with pytest.raises(RigError, match="no agent 3: expected one of 0"):
-        exported(known(), 3, "euroc")
+        exported(KnownCameras.of_base(known()), 3, "euroc")
     with pytest.raises(RigError, match="0 agents"):
-        exported(Mapper(), None, "euroc")
+        exported(KnownCameras(), None, "euroc")
 
 
 def test_the_command_reads_a_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,9 +89,49 @@ def test_the_command_reads_a_store(tmp_path: Path, capsys: pytest.CaptureFixture
     store.close()
     assert main(["show", "--json", str(tmp_path)]) == 0
     shown = json.loads(capsys.readouterr().out)
-    assert shown == summary(known())
+    assert shown == summary(KnownCameras.of_base(known()))
     assert np.allclose(shown["0"]["disparity_offset_px"], OFFSET)
     assert main(["show", str(tmp_path)]) == 0
     assert "+0.500 -0.350 -0.100 +0.450 +0.600 px" in capsys.readouterr().out
     assert main(["export", str(tmp_path), "--format", "kalibr", "--out", str(tmp_path / "new")]) == 0
     assert (tmp_path / "new" / "camchain-imucam.yaml").exists()
+
+
+def test_rows_tell_the_pitch_and_roll_of_the_right_camera() -> None:
+    f, turn, shift = CAMERA.fx, np.array([9e-4, -6e-4, 7e-4]), np.array([0.4, -0.3])
+    x, y = np.meshgrid(np.linspace(-0.8, 0.8, 15), np.linspace(-0.5, 0.5, 11))
+    far = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
+    seen = far @ se3.so3_exp(turn)
+    moved = f * (seen[:, :2] / seen[:, 2:] - far[:, :2]) + shift
+    xy = far[:, :2]
+    offset = np.linalg.lstsq(terms(xy), -moved[:, 0], rcond=None)[0]
+    rows = np.linalg.lstsq(row_alignment.terms(xy), moved[:, 1], rcond=None)[0]
+    rig = found_rig(CAMERA, offset, rows)
+    assert rig.T_c_r is not None
+    assert rig.right is not None
+    assert np.allclose(se3.so3_log(rig.T_c_r[:3, :3]), turn, atol=4e-5)
+    assert np.allclose([rig.right.cx - CAMERA.cx, rig.right.cy - CAMERA.cy], shift, atol=0.02)
+
+
+def test_a_rig_file_is_shown_and_exported_and_made_of_a_store(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = KnownCameras.of_base(known_base := known_mapper())
+    (tmp_path / "rig.toml").write_text(exported(known, None, "kiteline")["rig.toml"])
+    assert main(["show", str(tmp_path / "rig.toml"), "--json"]) == 0
+    shown, wanted = json.loads(capsys.readouterr().out)["0"], summary(KnownCameras.of_base(known_base))["0"]
+    for name in ("size_px", "focal_px", "centre_px", "baseline_m"):
+        assert shown[name] == wanted[name]
+    for name in ("disparity_offset_px", "rows_px"):
+        assert np.allclose(shown[name], wanted[name], atol=1e-3)
+    assert main(["show", str(tmp_path / "rig.toml")]) == 0
+    assert "rows of the right image too low by +0.700" in capsys.readouterr().out
+    assert main(["export", str(tmp_path / "rig.toml"), "--format", "euroc", "--out", str(tmp_path / "new")]) == 0
+    sensor = yaml.safe_load((tmp_path / "new" / "cam0" / "sensor.yaml").read_text())
+    assert np.allclose(np.array(sensor["T_BS"]["data"]).reshape(4, 4), T_b_c, atol=1e-8)
+
+
+def known_mapper() -> Mapper:
+    mapper = known()
+    mapper.map.rows_px[AgentId(0)] = np.array([0.7, -0.1, 0.0, 0.3, 0.2])
+    return mapper

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -16,7 +16,7 @@ DISPARITY_SHAPES = 5
 SHAPES = CALIBRATION + 1  # with the mean offset by the IMU as the last one
 
 
-@njit
+@helper
 def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float, out: F64) -> None:
     """out (3,11): error of u, v and disparity for one pixel of each error term at the image's edge.
 
@@ -197,7 +197,7 @@ def adjoint_into(T: F64, a: F64) -> None:
     _cross_into(T[:3, 3], T, 1.0, a)
 
 
-@njit
+@helper
 def body_into(T: F64, j: F64) -> None:
     """j (6,6): of [translation in a, rotation about the body's axes] by a perturbation on the left of T = T_a_b."""
     for i in range(6):

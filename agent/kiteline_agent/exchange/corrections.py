@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
+from kiteline_agent.exchange.correction_batches import CorrectionBatches
 from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
@@ -44,6 +45,7 @@ class Corrections:
         self._map = local_map
         self._cache = cache
         self._smoothing = Smoothing(smoothing)
+        self._batches = CorrectionBatches()
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self._upright: GravityAlignment | None = None  # of the submap that began in motion
@@ -67,7 +69,7 @@ class Corrections:
         """Apply records, and drop what the base removed. Returns whether the local map moved, and events."""
         self._events = []
         moved = False
-        for record in records:
+        for record in self._batches.take(records, removed):
             handler = self._handlers.get(type(record))
             if handler is not None:
                 moved |= handler(record)

@@ -21,6 +21,10 @@ class NoBaseChannel:
         """0: there is no link."""
         return 0
 
+    def rate_bytes_s(self) -> int | None:
+        """None: there is no link."""
+        return None
+
     def arrived(self, key: Key) -> bool:
         """True: nothing waits for an acknowledgement."""
         return True

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_agent.imaging.rectification_kernels import _raw_at
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 PATCH_RADIUS = 4  # a patch is 9x9 px of the level at which it is compared
 PATCH = 2 * PATCH_RADIUS + 1
@@ -26,7 +26,7 @@ CURVED = (PATCH_RADIUS + 1) / (6.0 * PATCH_RADIUS)  # mean of c^2 / 2 over a pat
 TEMPLATE_LEVELS = 3  # octave of the corner, and two coarser ones for convergence
 
 
-@njit
+@helper
 def sample(image, x, y):  # type: ignore[no-untyped-def]
     """Bilinear value of `image` at (x, y), with 0 <= x < w-1 and 0 <= y < h-1."""
     x0 = int(x)
@@ -88,7 +88,7 @@ def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-de
                     templates[i, j, r, c] = np.uint8(sample(image, x, y) + 0.5)
 
 
-@njit
+@helper
 def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-untyped-def]
     """Sample the warped template. Returns False if the warp exceeds it.
 
@@ -120,7 +120,7 @@ def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-u
     return True
 
 
-@njit
+@helper
 def template_gradients(reference, patches):  # type: ignore[no-untyped-def]
     """Write the template (row 1 of patches) and twice its gradients along x (2) and y (3)."""
     grey = reference.reshape(-1)
@@ -132,7 +132,7 @@ def template_gradients(reference, patches):  # type: ignore[no-untyped-def]
         patches[3, j] = (grey[np.uint64(k + 2 * STRIDE + 1)] - grey[np.uint64(k + 1)]) * used
 
 
-@njit
+@helper
 def dot(a, b):  # type: ignore[no-untyped-def]
     """Sum of products of two rows (LANES,) int16; 81 products of 12 and 13 bits fit into 31."""
     total = np.int32(0)
@@ -142,7 +142,7 @@ def dot(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit
+@helper
 def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
     """Sample the patch around (x, y) in 1/GREY grey levels, with (x, y) rounded to 1/128 px.
 

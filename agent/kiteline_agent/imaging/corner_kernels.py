@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 
-@njit
+@helper
 def ring_scores(r0, r1, r2, r3, r4, r5, r6, score):  # type: ignore[no-untyped-def]
     """FAST score: difference from the centre of the weakest pixel of the best arc of nine.
 
@@ -54,7 +54,7 @@ def ring_scores(r0, r1, r2, r3, r4, r5, r6, score):  # type: ignore[no-untyped-d
         score[j] = max(np.uint8(max(high, c) - c), np.uint8(c - min(low, c)))
 
 
-@njit
+@helper
 def peaks(above, at, below, threshold, peak):  # type: ignore[no-untyped-def]
     """Mark scores above a threshold that exceed their eight neighbours.
 

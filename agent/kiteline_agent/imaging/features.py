@@ -72,7 +72,7 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
     h, w = pyramid[0].shape
     rows, columns = -(-h // config.cell_px), -(-w // config.cell_px)
     occupied = np.zeros((rows, columns), np.bool_)
-    kernels.occupy(taken, float(config.cell_px), occupied)
+    kernels.occupy(np.ascontiguousarray(taken), float(config.cell_px), occupied)
     best_score = np.zeros((rows, columns))
     best_xy = np.zeros((rows, columns, 2), np.int32)
     best_level = np.zeros((rows, columns), np.uint8)

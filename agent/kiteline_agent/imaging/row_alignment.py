@@ -35,6 +35,8 @@ class RowConfig:
     min_ncc: float = 0.9  # correlation of the two patches; lower at occlusions
     min_px: float = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
     min_significance: float = 4.0  # standard deviations of a change that is applied
+    known_px: float = 0.1  # px; standard deviation of each number where an earlier flight measured it
+    share_px: float = 0.1  # px; rms over points of a change that the base is told: a tenth of what a worn rig has
 
 
 def terms(xy: F64) -> F64:
@@ -54,6 +56,9 @@ class RowAlignment:
         self._information = np.diag(np.full(TERMS, config.prior_px**-2.0))
         self._vector = np.zeros(TERMS)
         self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
+        self._taken_px: F64 = np.zeros(TERMS)  # see take_change
+        self._measured = False  # since take_change
+        self.known = False  # something was measured, in this flight or an earlier one
         self._events: list[str] = []
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
 
@@ -82,10 +87,11 @@ class RowAlignment:
             residual = np.abs(total - at @ np.linalg.solve(information, vector)) / sigma
             weight = 1.0 / np.maximum(residual, 1.0) ** 2  # a point on an occluding edge counts little
         self._information, self._vector, self._at = information, vector, at
+        self._measured = self.known = True
 
     def apply(self) -> float:
         """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0."""
-        estimate = np.linalg.solve(self._information, self._vector)
+        estimate = self.estimate_px
         change = estimate - self.applied_px
         config = self._config
         at = self._at
@@ -93,18 +99,50 @@ class RowAlignment:
         sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
         if rms < config.min_px or rms < config.min_significance * sigma:
             return 0.0
-        self.applied_px = np.asarray(estimate, np.float64)
-        rows, columns = self._rectifier.grid_shape
-        pixels = np.stack(np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows)), -1)
-        offset = terms(self._normalised(pixels.reshape(-1, 2).astype(np.float64))) @ estimate
-        self._rectifier.set_right_rows(offset.reshape(rows, columns))
+        self._read_at(estimate)
         self._events.append(f"rows of the right image are {estimate[0]:+.2f} px off in the middle")
         return rms
+
+    @property
+    def estimate_px(self) -> F64:
+        """The offset (5,) as measured so far, applied or not."""
+        return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
+
+    def begin_with(self, rows_px: F64) -> None:
+        """Begin with the offset (5,) that an earlier flight measured. Read the right image there if that one did."""
+        self._information = np.diag(np.full(TERMS, self._config.known_px**-2.0))
+        self._vector = self._information @ rows_px
+        self._taken_px = rows_px
+        self.known = True
+        self._events.append("the right camera is taken as earlier flights found it")
+        if float(np.sqrt(np.mean(self._on_grid(rows_px) ** 2))) >= self._config.min_px:
+            self._read_at(rows_px)
+
+    def take_change(self) -> F64 | None:
+        """The estimate, if a new one differs from what was taken last, at first from zero."""
+        if not self._measured:
+            return None
+        self._measured, estimate = False, self.estimate_px
+        if float(np.sqrt(np.mean((self._at @ (estimate - self._taken_px)) ** 2))) < self._config.share_px:
+            return None
+        self._taken_px = estimate
+        return estimate
 
     def take_events(self) -> list[str]:
         """Changes since the last call, for the log."""
         events, self._events = self._events, []
         return events
+
+    def _read_at(self, rows_px: F64) -> None:
+        self.applied_px = rows_px
+        self._rectifier.set_right_rows(self._on_grid(rows_px))
+
+    def _on_grid(self, rows_px: F64) -> F64:
+        """An offset (5,) at the points of a rectification grid."""
+        rows, columns = self._rectifier.grid_shape
+        pixels = np.stack(np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows)), -1)
+        offset = terms(self._normalised(pixels.reshape(-1, 2).astype(np.float64))) @ rows_px
+        return np.asarray(offset.reshape(rows, columns))
 
     def _normalised(self, uv: F64) -> F64:
         camera = self._rectifier.camera

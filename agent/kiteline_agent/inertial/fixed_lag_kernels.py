@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial.imu_kernels import copy33, mul33, mul33_tn, so3_exp, so3_log
 from kiteline_agent.inertial.inertial_kernels import imu_terms, velocity_terms, visual_terms
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -105,7 +105,7 @@ def _prior_side(
         out[i] = t
 
 
-@njit
+@helper
 def eliminate(a: F64, keep: int, width: int) -> bool:
     """Cholesky elimination of the first `keep` rows of a symmetric system a (>= width, >= width + 1), in place.
 
@@ -176,7 +176,7 @@ def smooth(
                 blocks[f, i, _W] += out6[i]
                 for k in range(6):
                     blocks[f, i, k] += vis_h[f, i, k]
-            if vel_info[f].any():
+            if vel_info[f, 0, 0] > 0.0:
                 cost += velocity_terms(
                     rot[f], state[f, 3:6], vel[f], vel_info[f], blocks[f], blocks[f, :, _W], 0
                 )  # fmt: skip
@@ -292,7 +292,7 @@ def marginalise(
         a[i, _W] += out6[i]
         for k in range(6):
             a[i, k] += vis_h[i, k]
-    if vel_info.any():
+    if vel_info[0, 0] > 0.0:
         velocity_terms(rot[0], state[0, 3:6], vel, vel_info, a, a[:, _W], 0)
     if not eliminate(a, _D, _W):
         return False

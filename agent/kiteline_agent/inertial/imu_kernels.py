@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 F64 = NDArray[np.float64]
 
 
-@njit
+@helper
 def copy33(a: F64, out: F64) -> None:
     """out = a for (3,3) matrices."""
     for i in range(3):
@@ -22,7 +22,7 @@ def copy33(a: F64, out: F64) -> None:
             out[i, j] = a[i, j]
 
 
-@njit
+@helper
 def mul33(a: F64, b: F64, out: F64) -> None:
     """out = a @ b for (3,3) matrices; out may be neither a nor b."""
     for i in range(3):
@@ -30,7 +30,7 @@ def mul33(a: F64, b: F64, out: F64) -> None:
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@njit
+@helper
 def mul33_tn(a: F64, b: F64, out: F64) -> None:
     """out = a.T @ b for (3,3) matrices; out may be neither a nor b."""
     for i in range(3):
@@ -38,7 +38,7 @@ def mul33_tn(a: F64, b: F64, out: F64) -> None:
             out[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
 
 
-@njit
+@helper
 def mul33_skew(a: F64, v: F64, out: F64) -> None:
     """out = a @ skew(v)."""
     for i in range(3):
@@ -74,7 +74,7 @@ def so3_exp(w: F64, out: F64) -> None:
         _series(w, 1.0, np.sin(n) / n, (1.0 - np.cos(n)) / n2, out)
 
 
-@njit
+@helper
 def right_jacobian(w: F64, out: F64) -> None:
     """Exp(w + d) = Exp(w) Exp(out @ d) to first order."""
     n2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -85,7 +85,7 @@ def right_jacobian(w: F64, out: F64) -> None:
         _series(w, 1.0, -(1.0 - np.cos(n)) / n2, (n - np.sin(n)) / (n2 * n), out)
 
 
-@njit
+@helper
 def right_jacobian_inverse(w: F64, out: F64) -> None:
     """The inverse of right_jacobian(w), for angles below pi."""
     n2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -96,7 +96,7 @@ def right_jacobian_inverse(w: F64, out: F64) -> None:
         _series(w, 1.0, 0.5, 1.0 / n2 - (1.0 + np.cos(n)) / (2.0 * n * np.sin(n)), out)
 
 
-@njit
+@helper
 def so3_log(r: F64, out: F64) -> None:
     """Rotation vector (3,) of a rotation (3,3), for angles below pi."""
     out[0] = 0.5 * (r[2, 1] - r[1, 2])

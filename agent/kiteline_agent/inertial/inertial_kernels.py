@@ -18,7 +18,7 @@ from kiteline_agent.inertial.imu_kernels import (
     so3_exp,
     so3_log,
 )
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -45,7 +45,7 @@ def down_of_tilt(tilt: F64, down: F64, jac: F64) -> None:
     jac[2, 0], jac[2, 1] = -s * y, s * x
 
 
-@njit
+@helper
 def visual_terms(
     r: F64, p: F64, r_cb: F64, t_cb: F64, camera: F64, n: int, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
     use: Bools, chi2: float, scale: float, h: F64, b: F64,
@@ -153,7 +153,7 @@ def visual_terms(
     return cost
 
 
-@njit
+@helper
 def velocity_terms(r: F64, v: F64, measured: F64, info: F64, h: F64, b: F64, first: int) -> float:
     """Add a velocity measured in the body's axes to the system h (w,w), b (w,) of a state whose 15 degrees of freedom
     begin at row `first`. r (3,3): R_m_b. v: (3,) m/s in m. measured: (3,) m/s in b. info: (3,3). Returns the cost.
@@ -184,7 +184,7 @@ def velocity_terms(r: F64, v: F64, measured: F64, info: F64, h: F64, b: F64, fir
     return cost
 
 
-@njit
+@helper
 def imu_terms(
     ri: F64, si: F64, rj: F64, sj: F64, tilt: F64, gravity: float, dt: float, turn: F64, vp: F64, jac: F64, bias: F64,
     res: F64, j: F64,

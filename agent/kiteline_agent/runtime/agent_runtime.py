@@ -24,6 +24,7 @@ from kiteline_agent.runtime.options import (
     agent_config,
     channel_for,
 )
+from kiteline_agent.runtime.rig_file import RigFile
 from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
@@ -42,6 +43,7 @@ from kiteline_hw.system import kernel_cache
 from kiteline_hw.system.memory import release_memory, rss_mib
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
+SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
 
 
@@ -60,7 +62,8 @@ class AgentRuntime:
         self.counts = FrameCounts()
         self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
         self.rss_mib = 0.0
-        config = agent_config(options.config, options.cpu_percent)
+        config = agent_config(options.config, options.cpu_percent, options.rig)
+        self._rig_file = RigFile(options.rig) if options.rig else None
         if whole_process:
             kernel_cache.fill("kiteline_agent.runtime.warm")
         begin_ns = time.process_time_ns()
@@ -181,6 +184,8 @@ class AgentRuntime:
             self._last_cpu_ns = self._account.last_ns
         if frame is not None and len(self._account.ms) % PROGRESS_FRAMES == 1:
             self.rss_mib = max(self.rss_mib, rss_mib())
+        if frame is not None and len(self._account.ms) % SAVE_FRAMES == 0:
+            self._save_rig()  # a vehicle's power may be cut at any time
         return sent
 
     def report(self) -> dict[str, Any]:
@@ -210,8 +215,13 @@ class AgentRuntime:
             },
         }
 
+    def _save_rig(self) -> None:
+        if self._rig_file is not None:
+            self._rig_file.save(self.agent.known_rig())
+
     def close(self) -> None:
         """Finish the files."""
+        self._save_rig()
         self._files.close()
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.runtime import rig_file
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.transport.link_traits import LinkTraits
@@ -28,6 +29,7 @@ class AgentOptions:
     mono: bool = False
     imu: bool = True
     config: str = ""  # a TOML file
+    rig: str = ""  # a rig file; "": none
     start_ns: int = 0  # the stamp that is flight time 0
     seconds: float = 0.0  # s of flight time to fly; 0: all
     up_bytes_s: int = 0  # B/s that the link takes; 0: any number
@@ -51,20 +53,22 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
     """Options from the command line. folder: for the log. boot: number of this start."""
     return AgentOptions(
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
-        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, up_bytes_s=a.up_bytes, profile=a.profile,
-        key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
+        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, up_bytes_s=a.up_bytes,
+        profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu,
     )  # fmt: skip
 
 
-def agent_config(path: str, cpu_percent: float = 0.0) -> AgentConfig:
+def agent_config(path: str, cpu_percent: float = 0.0, rig: str = "") -> AgentConfig:
     """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError.
 
-    cpu_percent: of one core, overrides the governor's budget; 0: what the file says.
+    cpu_percent: of one core, overrides the governor's budget; 0: what the file says. rig: a rig file.
     """
     config = AgentConfig()
     if path:
         config = configuration.load(config, Path(path).read_text(encoding="utf-8"), "agent", path)
+    if rig:
+        config = replace(config, known_rig=rig_file.load(rig))
     if cpu_percent <= 0.0:
         return config
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
@@ -99,6 +103,10 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         "--agent", metavar="N", type=int, default=0, help="number of this agent, 0 to 63, its own in a group"
     )
     p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
+    p.add_argument(
+        "--rig", metavar="FILE", default="",
+        help="begin with what earlier flights found of the cameras, and write what this one finds",
+    )  # fmt: skip
     p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
     p.add_argument(
         "--odometry", metavar="WHAT", default="",

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.exchange.correction_batches import MEMBERS
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED, REFINED_POSE, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import (
     CulledLandmarks,
     FusedLandmarks,
+    Key,
     KeyframePose,
     Record,
     RefinedLandmarks,
     RemovedObservations,
     SubmapPlacement,
+    messages,
 )
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
+
+_MEMBER_KINDS = frozenset(record.KIND for record in MEMBERS)
+_POSE_BYTES = 24  # of a keyframe's pose on the wire, and of what else stands beside landmarks
+_LANDMARK_BYTES = 4  # of a refined landmark as a residual
 
 Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
 
@@ -29,12 +38,12 @@ class Publisher:
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
-        self._dirty: set[tuple[int, KeyframeId]] = set()
+        self._dirty: dict[tuple[int, KeyframeId], None] = {}  # what has waited longest comes first
         self._records: list[tuple[AgentId, Record]] = []
 
     def mark_changed(self, kind: int, keyframe: KeyframeId) -> None:
         """Mark a value of a keyframe as changed. kind: KIND of a record class."""
-        self._dirty.add((int(kind), keyframe))
+        self._dirty.setdefault((int(kind), keyframe))
 
     def mark_changed_slots(self, kind: int, slots: I32) -> None:
         """Mark a value of the keyframes that own slots (n,) as changed."""
@@ -55,18 +64,54 @@ class Publisher:
         """Send any other record."""
         self._records.append((agent, record))
 
-    def collect(self) -> Published:
-        """All changes since the last call, by agent, in order of kind and keyframe."""
-        out: dict[AgentId, list[Record]] = {}
-        for agent, record in self._records:
-            out.setdefault(agent, []).append(record)
-        for kind, keyframe in sorted(self._dirty):
+    @property
+    def waiting(self) -> bool:
+        """True if changes wait for room."""
+        return bool(self._dirty or self._records)
+
+    def collect(self, room_bytes: Mapping[AgentId, int] | None = None) -> Published:
+        """The changes since the last call for which there is room, by agent, in order of kind and keyframe.
+
+        room_bytes: for corrections that move the agent's map; no limit for agents that are not in it. What waits is
+        sent at its newest value later.
+        """
+        room = dict(room_bytes or {})
+        out: dict[AgentId, dict[Key, Record]] = {}
+        records, self._records = self._records, []
+        for agent, record in records:
+            if isinstance(record, MEMBERS) and room.get(agent) == 0:
+                self._records.append((agent, record))
+            else:
+                out.setdefault(agent, {})[messages.key(record)] = record
+        for kind, keyframe in sorted(self._in_turn(room)):
             made = self._record(kind, keyframe)
             if made is not None:
-                out.setdefault(agent_of_keyframe(keyframe), []).append(made)
-        self._records.clear()
-        self._dirty.clear()
-        return tuple((agent, tuple(records)) for agent, records in sorted(out.items()))
+                out.setdefault(agent_of_keyframe(keyframe), {})[messages.key(made)] = made
+        return tuple((agent, tuple(found.values())) for agent, found in sorted(out.items()))
+
+    def _in_turn(self, room: dict[AgentId, int]) -> list[tuple[int, KeyframeId]]:
+        """Take the changes for which there is room: all poses, then landmarks of the keyframe that has waited longest
+        and of the newest ones. In a room above 0 at least one change is taken.
+        """
+        limited = [mark for mark in self._dirty if agent_of_keyframe(mark[1]) in room and mark[0] in _MEMBER_KINDS]
+        waits = dict.fromkeys(limited)
+        poses = sorted((m for m in limited if m[0] == KeyframePose.KIND), key=lambda m: -m[1])
+        others = [m for m in limited if m[0] != KeyframePose.KIND]
+        for mark in poses + others[:1] + sorted(others[1:], key=lambda m: -m[1]):
+            agent = agent_of_keyframe(mark[1])
+            if room[agent] > 0:
+                room[agent] -= self._bytes(*mark)
+                del waits[mark]
+        taken = [mark for mark in self._dirty if mark not in waits]
+        self._dirty = waits
+        return taken
+
+    def _bytes(self, kind: int, keyframe: KeyframeId) -> int:
+        """About what a change takes on the wire."""
+        if kind == KeyframePose.KIND:
+            return _POSE_BYTES
+        slots = self._map.slots_of(keyframe)
+        return _POSE_BYTES + _LANDMARK_BYTES * int(np.count_nonzero(self._map.keypoints.flags[slots] & REFINED))
 
     def _record(self, kind: int, keyframe: KeyframeId) -> Record | None:
         sparse_map, table = self._map, self._map.keypoints

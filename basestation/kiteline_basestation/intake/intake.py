@@ -20,6 +20,7 @@ from kiteline_codec.schema import (
     NewLandmarks,
     Observations,
     Record,
+    StereoAlignment,
     SubmapScale,
 )
 from kiteline_core.ids import (
@@ -88,6 +89,8 @@ class Intake:
                 self._take_header(record, now_ns)
             elif isinstance(record, GravityAlignment):
                 self.gravity[record.submap] = record
+            elif isinstance(record, StereoAlignment):
+                self._map.set_stereo_alignment(record.agent, record.rows_px, record.disparity_px)
             elif isinstance(record, SubmapScale):
                 self.metres_per_unit[record.submap] = self._map.told_metres[record.submap] = record.metres
                 if record.metres == 1.0:

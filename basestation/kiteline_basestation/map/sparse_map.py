@@ -58,13 +58,24 @@ class SparseMap(MapView):
         Disparity offsets outlive the flight: the agent's next one begins with them. They end with the calibration told.
         """
         before = self.cameras.get(agent)
-        if before is not None and _parameters(before) != _parameters(camera) and agent in self.disparity_offset_px:
-            self.disparity_offset_px[agent] = disparity_offset.none()
-            self.disparity_calibrated.discard(agent)
+        if before is not None and _parameters(before) != _parameters(camera):
+            self.rows_px.pop(agent, None)
+            if agent in self.disparity_offset_px:
+                self.disparity_offset_px[agent] = disparity_offset.none()
+                self.disparity_calibrated.discard(agent)
         self.cameras[agent] = camera
         for keyframe, row in self.rows.items():
             if agent_of_keyframe(keyframe) == agent:
                 self.keyframes.camera[row] = _parameters(camera)
+
+    def set_stereo_alignment(self, agent: AgentId, rows_px: F64, disparity_px: F64) -> None:
+        """Set what an agent knows of its right camera: rows (5,), and the disparity offset (5,) that it began with.
+
+        An offset that was estimated here counts more.
+        """
+        self.rows_px[agent] = rows_px
+        if agent not in self.disparity_offset_px and np.any(disparity_px != 0.0):
+            self.disparity_offset_px[agent] = disparity_px
 
     def add_keyframe(self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64, keypoints: int) -> int:
         """Add a keyframe, or update its header. T_p_k: (4,4). Returns its row.

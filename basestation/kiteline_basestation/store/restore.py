@@ -45,9 +45,8 @@ def _restore(station: Station, checked: Checked, now_ns: int) -> Restored:
         received = tuple(messages.decode(key, values.received[key]) for key in sorted(values.received))
         mapper.restore(agent, received, (), now_ns)
     for agent, values in sorted(saved.agents.items()):  # after all received: fused landmarks may be of several agents
-        channel = station.join(agent)
         own = [key for key in sorted(values.own) if not is_cached_key(key)]  # the map cache is planned anew
-        mapper.restore(agent, (), tuple(channel.put(messages.decode(key, values.own[key])) for key in own), now_ns)
+        station.restore(agent, [messages.decode(key, values.own[key]) for key in own], now_ns)
     mapper.restore_state(state_of(saved.texts))
     wrong = contradictions(mapper)
     if wrong:

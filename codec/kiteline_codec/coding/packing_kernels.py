@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
@@ -25,7 +25,7 @@ def first_outside(values: I64, low: I64, high: I64) -> int:
     return -1
 
 
-@njit
+@helper
 def put_varint(out: U8, at: int, value: int) -> int:
     """Write an unsigned number in groups of seven bits. Returns the position after it."""
     while value >= 128:
@@ -52,7 +52,7 @@ def zigzag(value: int) -> int:
     return 2 * value if value >= 0 else -2 * value - 1
 
 
-@njit
+@helper
 def put_bits(out: U8, bit: int, value: int, width: int) -> int:
     """Or a number of `width` bits into zeroed bytes, lowest bit first. Returns the position after it."""
     left = width
@@ -66,7 +66,7 @@ def put_bits(out: U8, bit: int, value: int, width: int) -> int:
     return bit
 
 
-@njit
+@helper
 def get_bits(data: U8, bit: int, width: int) -> int:
     """The number of `width` bits at a position."""
     value = 0
@@ -145,7 +145,7 @@ def pack_columns(values: I64, out: U8) -> int:
     return (bit + 7) >> 3
 
 
-@njit
+@helper
 def get_varint(data: U8, at: int, max_shift: int) -> tuple[int, int]:
     """(value, position after it); position -1 when the bytes end or the number is too large or not in shortest form.
 

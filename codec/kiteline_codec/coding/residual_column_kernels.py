@@ -67,15 +67,17 @@ def _rice_bits(values: I64, mode: int, shift: int, low: int, start: int) -> int:
 def _shape(values: I64, out: I64) -> None:
     """Mode, shift, first number and width or start of the shortest form of a column (n,), n >= 1, into out (4,)."""
     n = values.size
-    union = 0
+    union, least, most = 0, int(values[0]), int(values[0])
     for j in range(n):
-        union |= int(values[j])
+        v = int(values[j])
+        union |= v
+        least, most = min(least, v), max(most, v)
     shift = 0
     while shift < MAX_SHIFT and union and not union >> shift & 1:
         shift += 1
-    low = int(values.min()) >> shift
+    low = least >> shift
     first = int(values[0]) >> shift
-    span = (int(values.max()) >> shift) - low
+    span = (most >> shift) - low
     width = 0
     while span >> width:
         width += 1

@@ -11,6 +11,7 @@ from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.residuals import prediction_kernels as kernels
 from kiteline_codec.residuals.predictors import Held, Predictors
 from kiteline_codec.schema import Key, NewLandmarks, RefinedLandmarks
+from kiteline_codec.schema.batches import MAX_BATCH, read_batch, write_batch
 from kiteline_core.ids import MAX_KEYPOINTS
 
 I32 = NDArray[np.int32]
@@ -18,6 +19,7 @@ I64 = NDArray[np.int64]
 
 _DESCRIPTOR_SIZES = (0, 16, 32)
 _MAX_MASK = (1 << 16) - 1
+CHECKSUM_BYTES = 4  # at the end of each residual code
 
 
 class NewLandmarkResiduals:
@@ -62,12 +64,14 @@ class RefinedLandmarkResiduals:
         """Append the residual code. Returns the versions used. Raises ValueError or WireError."""
         source = Reader(code)
         values = RefinedLandmarks.COLUMNS.read_codes(source)
+        batch = read_batch(source)
         source.end()
         versions, landmarks = self._predictors.landmarks(key.id, held)
         out.varint(values.shape[1])
         out.varint(sum(1 << part for part in versions))
         measured = _measured_depths(landmarks, versions, values[0])
         out.residual_columns(np.stack([_gaps(values[0]), values[1] - measured, values[2], values[3]]))
+        write_batch(out, batch)
         return [versions[part] for part in sorted(versions)]
 
     def expand(self, out: Writer, key: Key, source: Reader, held: Held) -> list[int]:
@@ -85,6 +89,8 @@ class RefinedLandmarkResiduals:
         values[1] += _measured_depths(landmarks, parts, values[0])
         out.varint(n)
         out.columns(values)
+        if source.left > CHECKSUM_BYTES:
+            out.varint(source.varint(MAX_BATCH))
         return [versions[part] for part in parts]
 
 
@@ -96,5 +102,5 @@ def _gaps(index: I64) -> I64:
 def _measured_depths(landmarks: I32, parts: Iterable[int], index: I64) -> I64:
     """Codes (n,) of inverse depths as the agent measured them, 0 where none of the parts has the keypoint."""
     measured: I64 = np.zeros((4, len(index)), np.int64)
-    kernels.select(landmarks, index, sum(1 << part for part in parts), measured)
+    kernels.select(landmarks, index, sum(1 << part for part in parts), 0, measured)
     return np.asarray(measured[2])

@@ -128,7 +128,7 @@ class ObservationResiduals:
             if any(part not in versions for part in parts):
                 raise WireError("a residual code is predicted from landmarks that are not held")
             used += [versions[part] for part in parts]
-            kernels.select(landmarks, observed.keypoint[begin:end], mask, codes[:, begin:end])
+            kernels.select(landmarks, observed.keypoint[begin:end], mask, begin, codes)
         octave = np.maximum(codes[3], 0)
         predicted = np.full((3, n), -1, np.int64)
         if not any(observed.masks):

@@ -58,10 +58,11 @@ def _inverse_depth(code: int) -> float:
 
 
 @njit
-def select(landmarks: I32, keypoint: I64, mask: int, out: I64) -> None:
-    """Codes (4, n) of the landmarks at keypoints (n,) whose part is in the mask; elsewhere `out` is left as it is.
+def select(landmarks: I32, keypoint: I64, mask: int, first: int, out: I64) -> None:
+    """Codes of the landmarks at keypoints (n,) whose part is in the mask into columns `first` on of `out` (4, m).
 
-    landmarks: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part, -1 where there is none.
+    Elsewhere `out` is left as it is. landmarks: (5, k) codes of u, v, inverse depth and octave by keypoint, and the
+    part, -1 where there is none.
     """
     for i in range(keypoint.size):
         at = keypoint[i]
@@ -70,7 +71,7 @@ def select(landmarks: I32, keypoint: I64, mask: int, out: I64) -> None:
         part = landmarks[4, at]
         if part >= 0 and (mask >> part) & 1 == 1:
             for k in range(4):
-                out[k, i] = landmarks[k, at]
+                out[k, first + i] = landmarks[k, at]
 
 
 @njit

@@ -12,14 +12,13 @@ from struct import pack
 from zlib import crc32
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
-from kiteline_codec.residuals.landmark_residuals import NewLandmarkResiduals, RefinedLandmarkResiduals
+from kiteline_codec.residuals.landmark_residuals import CHECKSUM_BYTES, NewLandmarkResiduals, RefinedLandmarkResiduals
 from kiteline_codec.residuals.observation_residuals import ObservationResiduals
 from kiteline_codec.residuals.predictors import Held, Predictors
 from kiteline_codec.schema import Key, NewLandmarks, Observations, RefinedLandmarks
 
 _Coder = NewLandmarkResiduals | ObservationResiduals | RefinedLandmarkResiduals
 
-_CRC_BYTES = 4
 _CACHED = 64  # residual codes kept of new landmarks, which are asked for again until they fit a packet
 
 
@@ -59,7 +58,7 @@ class ResidualCoder:
             raise WireError(f"kind {key.kind} has no residual code")
         source, out = Reader(data), Writer()
         versions = coder.expand(out, key, source, held)
-        checksum, code = source.raw(_CRC_BYTES), out.bytes()
+        checksum, code = source.raw(CHECKSUM_BYTES), out.bytes()
         source.end()
         if _checksum(code, versions) != checksum:
             raise WireError("a residual code was made with other values than are held")
@@ -77,4 +76,4 @@ def _compress(coder: _Coder, key: Key, code: bytes, held: Held, own: Held) -> by
 
 
 def _checksum(code: bytes, versions: Sequence[int]) -> bytes:
-    return crc32(pack(f"<{len(versions)}q", *versions), crc32(code)).to_bytes(_CRC_BYTES, "little")
+    return crc32(pack(f"<{len(versions)}q", *versions), crc32(code)).to_bytes(CHECKSUM_BYTES, "little")

@@ -11,9 +11,11 @@ from kiteline_codec.schema.agent.keyframe_header import KeyframeHeader as Keyfra
 from kiteline_codec.schema.agent.live_pose import LivePose as LivePose
 from kiteline_codec.schema.agent.new_landmarks import NewLandmarks as NewLandmarks
 from kiteline_codec.schema.agent.observations import Observations as Observations
+from kiteline_codec.schema.agent.stereo_alignment import StereoAlignment as StereoAlignment
 from kiteline_codec.schema.agent.submap_scale import SubmapScale as SubmapScale
 from kiteline_codec.schema.base.cached_keyframe import CachedKeyframe as CachedKeyframe
 from kiteline_codec.schema.base.cached_landmarks import CachedLandmarks as CachedLandmarks
+from kiteline_codec.schema.base.correction_batch import CorrectionBatch as CorrectionBatch
 from kiteline_codec.schema.base.culled_landmarks import CulledLandmarks as CulledLandmarks
 from kiteline_codec.schema.base.disparity_calibration import DisparityCalibration as DisparityCalibration
 from kiteline_codec.schema.base.fused_landmarks import FusedLandmarks as FusedLandmarks

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -20,20 +20,25 @@ _S1, _S2, _S4, _S56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
 _FAR = 1 << 20  # more bits than any two descriptors differ in
 
 
-@njit
+@helper
+def count_bits(x: np.uint64) -> int:
+    """Number of bits that are set."""
+    x = x - ((x >> _S1) & _M1)
+    x = (x & _M2) + ((x >> _S2) & _M2)
+    x = (x + (x >> _S4)) & _M4
+    return int((x * _H) >> _S56)
+
+
+@helper
 def hamming(a: U64, i: int, b: U64, j: int) -> int:
     """Number of bits that differ between a[i] and b[j]; descriptors are (n,4) uint64."""
     total = 0
     for k in range(4):
-        x = a[i, k] ^ b[j, k]
-        x = x - ((x >> _S1) & _M1)
-        x = (x & _M2) + ((x >> _S2) & _M2)
-        x = (x + (x >> _S4)) & _M4
-        total += int((x * _H) >> _S56)
+        total += count_bits(a[i, k] ^ b[j, k])
     return total
 
 
-@njit
+@helper
 def take(i: int, j: int, distance: int, owner: I32, owner_distance: I32, best: I32) -> bool:
     """Assign j to i if i is nearer than j's current match, which is then undone. Returns whether i got j."""
     if distance >= owner_distance[j]:
@@ -120,13 +125,13 @@ def match_cells(
         right = min(max(int(np.floor((uv[i, 0] + reach) / cell_px)), 0), columns - 1)
         for r in range(top, bottom + 1):
             for s in range(start[r, left], start[r, right + 1]):
-                j = item[s]
+                j = int(item[s])
                 du, dv = uv2[j, 0] - uv[i, 0], uv2[j, 1] - uv[i, 1]
                 if du * du + dv * dv > reach * reach or abs(octave2[j] - octave[i]) > octave_gap:
                     continue
                 d = hamming(a, i, b, j)
                 if d < first:
-                    first, second, chosen = d, first, int(j)
+                    first, second, chosen = d, first, j
                 elif d < second:
                     second = d
         if chosen < 0 or first > max_hamming or first > ratio * second:

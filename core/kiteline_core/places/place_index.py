@@ -1,6 +1,8 @@
 """Place recognition: a visual vocabulary (tree of binary words) and an inverted index from words to places.
 
-Source: D. Galvez-Lopez, J. Tardos, "Bags of binary words for fast place recognition in image sequences", 2012. The
+Sources: D. Galvez-Lopez, J. Tardos, "Bags of binary words for fast place recognition in image sequences", 2012 (the
+tree); H. Jegou, M. Douze, C. Schmid, "Hamming embedding and weak geometric consistency", 2008, and "On the burstiness
+of visual elements", 2009 (features of one word count by the likeness of their signatures, the nearest one only). The
 vocabulary is trained once; consistency of successive candidates is left to the caller.
 """
 
@@ -25,6 +27,9 @@ U64 = NDArray[np.uint64]
 
 _MAGIC = b"KLW1"
 _HEADER = struct.Struct("<4sBB")
+_SIGMA_BITS = 6.0  # of 64: signatures of one landmark in two images differ in about this many
+_LIKENESS = np.exp(-((np.arange(65) / _SIGMA_BITS) ** 2))
+_LEAST_WEIGHT = 1.0  # words of more than a third of all images tell nothing, and make most of the work
 _IDF_STEP = 1.0 / 24.0  # of the packed logarithm: 255 steps cover words in 1 of 40,000 images
 
 
@@ -74,10 +79,23 @@ def unpack(data: bytes) -> Vocabulary:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """keys: (n,) int64 of places, most similar first. score: (n,) similarity in [0, 1]."""
+    """keys: (n,) int64 of places, most similar first. score: (n,) similarity; 1 for the same descriptors."""
 
     keys: I64
     score: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """One place. word: (n,) of its features. signature: (n,) first 64 bits of their descriptors. norm: of weights."""
+
+    word: I32
+    signature: U64
+    norm: float
+
+    @classmethod
+    def none(cls) -> _Entry:
+        return cls(np.empty(0, np.int32), np.empty(0, np.uint64), 0.0)
 
 
 class PlaceIndex:
@@ -86,14 +104,14 @@ class PlaceIndex:
     def __init__(self, vocabulary: Vocabulary) -> None:
         self._vocabulary = vocabulary
         n = len(vocabulary.weight)
-        self._scratch = np.zeros(n)
-        # The postings of a word (place and value) are a run: start, size, and capacity.
+        # The postings of a word (place and signature) are a run: start, size, and capacity.
         self._start, self._size, self._capacity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
         self._top = np.zeros(1, np.int32)
-        self._owner, self._value = np.empty(0, np.int32), np.empty(0, np.float32)
+        self._owner, self._signature = np.empty(0, np.int32), np.empty(0, np.uint64)
         self._row: dict[int, int] = {}
         self._key = np.empty(0, np.int64)  # of each row; -1 unused
-        self._entries: list[tuple[I32, F64]] = []
+        self._norm = np.empty(0)  # of each row
+        self._entries: list[_Entry] = []
         self._unused: list[int] = []
 
     def __len__(self) -> int:
@@ -110,20 +128,22 @@ class PlaceIndex:
     def add(self, key: int, descriptors: U8) -> None:
         """Add or replace a place with its descriptors (n,32)."""
         self.remove(key)
-        word, value = self._vector(descriptors)
+        entry = self._entry(descriptors)
         row = self._unused.pop() if self._unused else len(self._entries)
         if row == len(self._entries):
-            self._entries.append((word, value))
+            self._entries.append(entry)
             if row == len(self._key):
                 self._key = np.concatenate([self._key, np.full(max(64, row), -1, np.int64)])
-        self._entries[row] = (word, value)
-        self._key[row], self._row[key] = key, row
+                self._norm = np.concatenate([self._norm, np.zeros(max(64, row))])
+        self._entries[row] = entry
+        self._key[row], self._norm[row], self._row[key] = key, entry.norm, row
         done = 0
         while True:
             done = kernels.insert(
-                word, value, done, row, self._top, self._start, self._size, self._capacity, self._owner, self._value
-            )
-            if done == len(word):
+                entry.word, entry.signature, done, row, self._top, self._start, self._size, self._capacity,
+                self._owner, self._signature,
+            )  # fmt: skip
+            if done == len(entry.word):
                 return
             self._grow()
 
@@ -132,9 +152,8 @@ class PlaceIndex:
         row = self._row.pop(key, None)
         if row is None:
             return
-        word, _ = self._entries[row]
-        kernels.remove(word, row, self._start, self._size, self._owner, self._value)
-        self._entries[row] = (np.empty(0, np.int32), np.empty(0))
+        kernels.remove(self._entries[row].word, row, self._start, self._size, self._owner, self._signature)
+        self._entries[row] = _Entry.none()
         self._key[row] = -1
         self._unused.append(row)
 
@@ -143,7 +162,7 @@ class PlaceIndex:
 
         Places without a common word are left out; ties are ordered by key.
         """
-        total = self._scores(self._vector(descriptors))
+        total = self._scores(self._entry(descriptors))
         for key in exclude:
             if (row := self._row.get(key)) is not None:
                 total[row] = 0.0
@@ -158,24 +177,27 @@ class PlaceIndex:
         total = self._scores(self._entries[self._row[key]])
         return np.array([total[self._row[k]] if k in self._row else 0.0 for k in others])
 
-    def _scores(self, vector: tuple[I32, F64]) -> F64:
+    def _scores(self, asked: _Entry) -> F64:
         total = np.zeros(len(self._entries))
-        kernels.score(vector[0], vector[1], self._start, self._size, self._owner, self._value, total)
-        return total
+        kernels.score(
+            asked.word, asked.signature, self._vocabulary.weight, _LIKENESS, self._start, self._size,
+            self._owner, self._signature, total,
+        )  # fmt: skip
+        return total / np.maximum(asked.norm * self._norm[: len(total)], 1e-12)
 
-    def _vector(self, descriptors: U8) -> tuple[I32, F64]:
+    def _entry(self, descriptors: U8) -> _Entry:
         word = self._vocabulary.words_of(descriptors)
-        out, value = np.empty(len(word), np.int32), np.empty(len(word))
-        n = kernels.histogram(word, self._vocabulary.weight, self._scratch, out, value)
-        return out[:n].copy(), value[:n].copy()
+        weight = self._vocabulary.weight[word]
+        told = weight >= _LEAST_WEIGHT
+        return _Entry(word[told], words(descriptors)[told, 0], float(np.linalg.norm(weight[told].astype(np.float64))))
 
     def _grow(self) -> None:
         wanted = np.where(self._size > 0, np.maximum(4, self._size + self._size // 2), 0)
         self._capacity = np.minimum(self._capacity, wanted).astype(np.int32)
         held, widest = int(self._capacity.sum()), int(self._capacity.max())
         capacity = held + max(held // 2, 2 * widest) + 4096  # any run fits at the top now
-        owner, worth = np.empty(capacity, np.int32), np.empty(capacity, np.float32)
+        owner, signature = np.empty(capacity, np.int32), np.empty(capacity, np.uint64)
         kernels.move_runs(
-            self._top, self._start, self._size, self._capacity, self._owner, self._value, owner, worth
+            self._top, self._start, self._size, self._capacity, self._owner, self._signature, owner, signature
         )  # fmt: skip
-        self._owner, self._value = owner, worth
+        self._owner, self._signature = owner, signature

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 from kiteline_core.pose.ransac_kernels import draws_needed, reprojection_cost, three
 
 Bools = NDArray[np.bool_]
@@ -81,7 +81,7 @@ def _frame(p: F64, q: F64, r: F64, out: F64) -> bool:
     return True
 
 
-@njit
+@helper
 def p3p(ray: F64, point: F64, T: F64) -> int:
     """Poses that project three points onto three rays (M. Persson, K. Nordberg, "Lambda Twist", 2018).
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 U64 = NDArray[np.uint64]
 
 
-@njit
+@helper
 def draw(state: U64, n: int) -> int:
     """The next number in [0, n) of a xorshift64* generator (S. Vigna, 2016). state: (1,) uint64, not 0, in and out."""
     x = state[0]
@@ -23,7 +23,7 @@ def draw(state: U64, n: int) -> int:
     return int(((x * np.uint64(0x2545F4914F6CDD1D)) >> np.uint64(33)) % np.uint64(n))
 
 
-@njit
+@helper
 def draws_needed(share: float, confidence: float, most: int) -> int:
     """Number of draws of three until one has no outlier with the given confidence. share: of inliers."""
     bad = 1.0 - share * share * share
@@ -48,7 +48,7 @@ def three(state: U64, n: int, pick: I64) -> None:
         pick[2] += 1
 
 
-@njit
+@helper
 def reprojection_cost(T: F64, point: F64, uv: F64, limit_px: F64, camera: F64, give_up: float) -> float:
     """Sum over points of squared error over squared limit, at most 1 each (MSAC). Stops above `give_up`."""
     total = 0.0

@@ -46,6 +46,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")
     p.add_argument("--realtime", action="store_true", help="real clocks, frames paced by their stamps")
     p.add_argument("--config", metavar="F", default="", help="a TOML file with [agent] and [base] sections")
+    p.add_argument("--rig", metavar="FILE", default="",
+                   help="begin with what earlier flights found of the rig, and write what this one finds")  # fmt: skip
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
     p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
@@ -66,12 +68,14 @@ def options(argv: list[str]) -> Options:
             p.error(str(error))
     if not 0.0 <= a.link_loss < 1.0:
         p.error(f"--link-loss {a.link_loss}: expected a probability from 0 to below 1")
+    if a.rig and len(a.sources) > 1:
+        p.error("--rig is the file of one rig: it goes with one SOURCE")
     if a.cpu < 0.0 or a.seconds < 0.0:
         p.error("--cpu and --seconds must not be negative")
     return Options(
         tuple(a.sources), a.out, a.mode, a.link, a.profile, a.link_delay, up, down, a.link_loss, a.cpu, a.mono,
         not a.no_imu, a.realtime,
-        a.config, a.seed, a.seconds, a.store, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
+        a.config, a.rig, a.seed, a.seconds, a.store, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
     )  # fmt: skip
 
 

@@ -32,6 +32,7 @@ class Options:
     imu: bool = True
     realtime: bool = False
     config: str = ""
+    rig: str = ""
     seed: int = 0
     seconds: float = 0.0
     store: str = ""
@@ -76,7 +77,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
         made.agents.append(
             AgentOptions(
                 source=text, folder=str(o.out / f"agent{k}"), agent=k, boot=boot, mono=o.mono, imu=o.imu,
-                config=o.config,
+                config=o.config, rig=o.rig,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,

@@ -1,7 +1,7 @@
-"""`kiteline rig show|export STORE`: what a base knows of the agents' cameras, also in the forms of other tools.
+"""`kiteline rig show|export STORE|FILE`: what a base or a rig file knows of cameras, also in the forms of other tools.
 
-The cameras are the rectified ones of the calibration that was told. The base's disparity offset is written as a right
-camera that is turned, and whose focal length and centre differ: its five numbers are those of such a camera.
+The cameras are the rectified ones of the calibration that was told. Errors of disparities and rows are written as a
+right camera that is turned, and whose focal length and centre differ.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.imaging import row_alignment
+from kiteline_agent.known_rig import KnownRigConfig, known_rig
+from kiteline_agent.runtime import rig_file
 from kiteline_basestation.mapper import Mapper
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
@@ -25,37 +28,101 @@ from kiteline_lab.tools.export import load
 
 F64 = NDArray[np.float64]
 
-FORMATS = ("kalibr", "euroc")
+FORMATS = ("kalibr", "euroc", "kiteline")
+_LIKELY = np.array([1.0, 1.0, 0.5, 1e-3, 1e-3, 1e-3])  # px, px, px, rad: what mounts and lenses change by
+_FIT_PX = 0.005  # rms misfit that is accepted for a likelier rig
 
 
 class RigError(KitelineError):
     """A rig that is not known or cannot be exported."""
 
 
-def found_rig(camera: RectifiedCamera, offset_px: F64) -> CameraRig:
-    """The rectified pair in which disparities are off by `offset_px` (5,): its right camera is not quite parallel."""
-    c0, c1, c2, c3, c4 = (float(c) for c in offset_px)
+def found_rig(camera: RectifiedCamera, offset_px: F64, rows_px: F64 | None) -> CameraRig:
+    """The rectified pair whose disparities are off by `offset_px` (5,), and the right image's rows by `rows_px` (5,).
+
+    rows_px: None if no agent told it. The right camera is turned, and its focal length and centre differ: the most
+    likely ones that explain both.
+    """
     f = camera.fx
     left = CameraModel(camera.width, camera.height, f, camera.fy, camera.cx, camera.cy)
-    right = CameraModel(camera.width, camera.height, f - c1, camera.fy, camera.cx + c3 - c0, camera.cy)
-    turned = se3.so3_exp(np.array([-c4 / f, c3 / f, -c2 / f]))
-    return CameraRig(left, right, camera.T_b_c, se3.from_rt(turned, np.array([camera.baseline_m, 0.0, 0.0])))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 9) * camera.width / f, np.linspace(-0.5, 0.5, 7) * camera.height / f)
+    xy = np.stack([x.ravel(), y.ravel()], 1)
+    # a point far away: the right image is left of where it should be by the excess disparity, and lower by the rows
+    across = -disparity_offset.terms(xy) @ offset_px
+    down = across if rows_px is None else row_alignment.terms(xy) @ rows_px
+    wanted = np.stack([across, down], 1)[:, : 1 + (rows_px is not None)]
+    x, y = xy.T
+    none = np.zeros_like(x)
+    # by the centre, the focal length, and the turn about x, y, z of the right camera
+    shift = np.stack([
+        np.stack([none + 1.0, none], 1), np.stack([none, none + 1.0], 1), np.stack([x, y], 1),
+        f * np.stack([x * y, 1.0 + y * y], 1), f * np.stack([-1.0 - x * x, -x * y], 1), f * np.stack([y, -x], 1),
+    ])  # fmt: skip
+    columns = shift[:, :, : wanted.shape[1]].reshape(6, -1).T * _LIKELY
+    normal = columns.T @ columns + len(columns) * _FIT_PX**2 * np.eye(6)
+    cx, cy, df, *turn = np.linalg.solve(normal, columns.T @ wanted.ravel()) * _LIKELY
+    right = CameraModel(camera.width, camera.height, f + df, camera.fy + df, camera.cx + cx, camera.cy + cy)
+    T_c_r = se3.from_rt(se3.so3_exp(np.array(turn)), np.array([camera.baseline_m, 0.0, 0.0]))
+    return CameraRig(left, right, camera.T_b_c, T_c_r)
 
 
-def summary(mapper: Mapper) -> dict[str, Any]:
-    """Camera and disparity offset of each agent, by its number."""
+class KnownCameras:
+    """What a store or a rig file knows of cameras, by agent."""
+
+    def __init__(self) -> None:
+        self.cameras: dict[AgentId, RectifiedCamera] = {}
+        self.disparity_px: dict[AgentId, F64] = {}
+        self.rows_px: dict[AgentId, F64] = {}
+        self.calibrated: set[AgentId] = set()
+
+    @classmethod
+    def of_base(cls, mapper: Mapper) -> KnownCameras:
+        """Of a base."""
+        out = cls()
+        out.cameras.update(mapper.map.cameras)
+        out.disparity_px.update(mapper.map.disparity_offset_px)
+        out.rows_px.update(mapper.map.rows_px)
+        out.calibrated.update(mapper.map.disparity_calibrated)
+        return out
+
+    @classmethod
+    def of_file(cls, known: KnownRigConfig) -> KnownCameras:
+        """Of a rig file, as agent 0; empty if it says nothing."""
+        out, agent = cls(), AgentId(0)
+        camera = known.rectified()
+        if camera is not None:
+            out.cameras[agent], out.rows_px[agent] = camera, known.rows
+            out.disparity_px[agent] = known.disparity
+        return out
+
+    def offset_px(self, agent: AgentId) -> F64:
+        """Disparity offset (5,) of an agent, zero if none is known."""
+        return self.disparity_px.get(agent, disparity_offset.none())
+
+    def rig(self, agent: AgentId) -> CameraRig:
+        """An agent's rectified pair as it was found."""
+        return found_rig(self.cameras[agent], self.offset_px(agent), self.rows_px.get(agent))
+
+
+def opened(path: Path) -> KnownCameras:
+    """What the store of a base (a folder) or a rig file knows. Raises KitelineError."""
+    return KnownCameras.of_file(rig_file.load(str(path))) if path.is_file() else KnownCameras.of_base(load(path))
+
+
+def summary(known: KnownCameras) -> dict[str, Any]:
+    """Camera, disparity offset and rows of each agent, by its number."""
     out: dict[str, Any] = {}
-    for agent, camera in sorted(mapper.map.cameras.items()):
-        offset = mapper.map.disparity_offset_px.get(agent, disparity_offset.none())
-        rig = found_rig(camera, offset)
+    for agent, camera in sorted(known.cameras.items()):
+        rig, rows = known.rig(agent), known.rows_px.get(agent)
         turned = np.zeros(3) if rig.T_c_r is None else se3.so3_log(rig.T_c_r[:3, :3])
         out[str(int(agent))] = {
             "size_px": [camera.width, camera.height],
             "focal_px": [camera.fx, camera.fy],
             "centre_px": [camera.cx, camera.cy],
             "baseline_m": camera.baseline_m if camera.stereo else None,
-            "disparity_offset_px": offset.tolist(),
-            "calibrated": agent in mapper.map.disparity_calibrated,
+            "disparity_offset_px": known.offset_px(agent).tolist(),
+            "rows_px": None if rows is None else rows.tolist(),
+            "calibrated": agent in known.calibrated,
             "right_camera_turned_deg": np.degrees(turned).tolist(),
         }
     return out
@@ -75,20 +142,29 @@ def table(rigs: dict[str, Any]) -> str:
         lines.append(f"  baseline {1000.0 * rig['baseline_m']:.2f} mm")
         lines.append(f"  disparities too large by {offset} px of 1, x, y, x^2, x y"
                      f"{'' if rig['calibrated'] else ' (uncertain)'}")  # fmt: skip
+        if rig["rows_px"] is not None:
+            rows = " ".join(f"{c:+.3f}" for c in rig["rows_px"])
+            lines.append(f"  rows of the right image too low by {rows} px of 1, x, y, x y, y^2")
         lines.append(f"  like a right camera turned by {turned} degrees about x, y, z")
     return "\n".join(lines)
 
 
-def exported(mapper: Mapper, agent: int | None, kind: str) -> dict[str, str]:
-    """Texts of the files of one format by name. kalibr: a camera chain; euroc: a sensor.yaml of each camera."""
-    cameras = mapper.map.cameras
+def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str]:
+    """Texts of the files of one format by name.
+
+    kalibr: a camera chain; euroc: a sensor.yaml of each camera; kiteline: a rig file for `kiteline agent --rig`.
+    """
+    cameras = known.cameras
     if agent is None and len(cameras) != 1:
         raise RigError(f"{len(cameras)} agents: choose one with --agent")
     chosen = AgentId(agent) if agent is not None else next(iter(cameras))
     camera = cameras.get(chosen)
     if camera is None:
         raise RigError(f"no agent {chosen}: expected one of {', '.join(str(int(a)) for a in sorted(cameras))}")
-    rig = found_rig(camera, mapper.map.disparity_offset_px.get(chosen, disparity_offset.none()))
+    if kind == "kiteline":
+        rows = known.rows_px.get(chosen, np.zeros(row_alignment.TERMS))
+        return {"rig.toml": rig_file.text_of(known_rig(camera, rows, known.offset_px(chosen)))}
+    rig = known.rig(chosen)
     pair = [(rig.left, rig.T_b_c)]
     if camera.stereo and rig.right is not None and rig.T_c_r is not None:
         pair.append((rig.right, rig.T_b_c @ rig.T_c_r))
@@ -124,23 +200,26 @@ def _euroc(model: CameraModel, T_b_c: F64) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Run `kiteline rig`; the exit status. Raises KitelineError."""
-    parser = argparse.ArgumentParser(prog="kiteline rig", description="What a base knows of the agents' cameras.")
+    parser = argparse.ArgumentParser(prog="kiteline rig", description="What flights found of cameras.")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    show = verbs.add_parser("show", help="cameras and what the base found of them")
+    show = verbs.add_parser("show", help="cameras and what was found of them")
     show.add_argument("--json", action="store_true", help="print JSON")
-    export = verbs.add_parser("export", help="write the rectified pair, as the base found it")
+    export = verbs.add_parser("export", help="write the rectified pair as it was found; kiteline: a rig file")
     export.add_argument("--format", choices=FORMATS, required=True)
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
     export.add_argument("--agent", type=int, help="whose rig; needed if there are several")
     for verb in (show, export):
-        verb.add_argument("store", type=Path, metavar="STORE", help="the folder given to `kiteline base --store`")
+        verb.add_argument(
+            "known", type=Path, metavar="STORE|FILE",
+            help="the folder given to `kiteline base --store`, or the file given to `kiteline agent --rig`",
+        )  # fmt: skip
     args = parser.parse_args(argv)
-    mapper = load(args.store)
+    known = opened(args.known)
     if args.verb == "show":
-        rigs = summary(mapper)
+        rigs = summary(known)
         sys.stdout.write((json.dumps(rigs, indent=2) if args.json else table(rigs)) + "\n")
         return 0
-    for name, text in exported(mapper, args.agent, args.format).items():
+    for name, text in exported(known, args.agent, args.format).items():
         path = args.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)

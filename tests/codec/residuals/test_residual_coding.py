@@ -168,7 +168,8 @@ def test_another_version_of_a_predictor_is_refused() -> None:
             assert refused == 2
 
 
-def test_refined_depths_are_predicted_from_measured_ones() -> None:
+@pytest.mark.parametrize("batch", [0, 5, 1 << 31])
+def test_refined_depths_are_predicted_from_measured_ones(batch: int) -> None:
     records = flight(5)
     values = coded(records)
     landmarks = next(r for r in records if isinstance(r, NewLandmarks))
@@ -176,7 +177,7 @@ def test_refined_depths_are_predicted_from_measured_ones() -> None:
     depths = RefinedLandmarks(
         landmarks.keyframe, landmarks.index,
         landmarks.inv_depth * rng.normal(1, 0.004, len(landmarks.index)).astype(np.float32),
-        rng.normal(0, 0.2, (len(landmarks.index), 2)).astype(np.float32),
+        rng.normal(0, 0.2, (len(landmarks.index), 2)).astype(np.float32), batch,
     )  # fmt: skip
     key, code = messages.key(depths), messages.encode(depths)
     form = ResidualCoder().compress(key, code, values.get, values.get)
@@ -200,7 +201,7 @@ def test_landmarks_are_selected_by_keypoint_and_part() -> None:
     landmarks[4] = rng.integers(-1, 4, 1200)
     keypoint, mask = rng.integers(0, 2048, 300), 0b101
     out = np.full((4, 300), -7, np.int64)
-    prediction_kernels.select(landmarks, keypoint, mask, out)
+    prediction_kernels.select(landmarks, keypoint, mask, 0, out)
     whole = np.pad(landmarks, ((0, 0), (0, 2048 - 1200)), constant_values=-1)
     named = np.isin(whole[4, keypoint], (0, 2))
     assert np.array_equal(out, np.where(named, whole[:4, keypoint], -7))

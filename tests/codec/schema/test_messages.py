@@ -20,6 +20,7 @@ from kiteline_codec.schema import (
     CachedKeyframe,
     CachedLandmarks,
     CameraIntrinsics,
+    CorrectionBatch,
     CulledLandmarks,
     DisparityCalibration,
     FusedLandmarks,
@@ -35,6 +36,7 @@ from kiteline_codec.schema import (
     Record,
     RefinedLandmarks,
     RemovedObservations,
+    StereoAlignment,
     SubmapPlacement,
     SubmapScale,
     WireError,
@@ -77,6 +79,10 @@ def some_records(seed: int, n: int) -> list[Record]:
             keyframe, KeyframeId(keyframe - 2), 2e-3, steps.uniform(0.02, 0.3, n + 1),
             *steps.normal(0.0, 0.5, (4, n + 1, 3)),
         ),
+        StereoAlignment(
+            AgentId(5), np.array([700.0, -88.0, 0.0, 1100.0, -420.0]) / 1024.0,
+            np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0,
+        ),
         KeyframePose(keyframe, pose),
         RefinedLandmarks(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
         FusedLandmarks(keyframe, index, point),
@@ -90,6 +96,16 @@ def some_records(seed: int, n: int) -> list[Record]:
             keyframe, 3, index, uv, inv_depth, octave, rng.integers(0, 256, n).astype(np.uint8),
             rng.integers(0, 256, (n, 32)).astype(np.uint8),
         ),
+        CorrectionBatch.of(
+            AgentId(3), int(rng.integers(1, 1 << 32)), [Key(16, keyframe), Key(17, keyframe)][: n % 3]
+        ),
+        KeyframePose(KeyframeId(keyframe - 1), pose, 5),
+        RefinedLandmarks(
+            KeyframeId(keyframe - 1), index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32), 200
+        ),
+        SubmapPlacement(SubmapId(submap ^ 1), sim3.of(1.0 + 0.37 * n, pose), False, 5),
+        SubmapPlacement(SubmapId(submap ^ 2), sim3.of(1.0, pose), True, 5),
+        DisparityCalibration(AgentId(4), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0, 5),
     ]  # fmt: skip
 
 
@@ -130,7 +146,8 @@ def test_decoding_gives_what_encodes_to_the_same_code(seed: int, n: int) -> None
         assert messages.key(decoded) == key
         assert messages.encode(decoded) == code
         assert_same(messages.decode(key, code), decoded)
-        for name in ("index", "octave", "angle", "descriptor", "point", "t_ns", "quality", "parent", "keypoints"):
+        exact = ("index", "octave", "angle", "descriptor", "point", "t_ns", "quality", "parent", "keypoints", "batch")
+        for name in exact:
             if hasattr(record, name):
                 assert np.array_equal(getattr(record, name), getattr(decoded, name)), name
         if isinstance(record, NewLandmarks | Observations):
@@ -163,13 +180,13 @@ def test_damaged_codes_are_a_record_or_an_error(seed: int, n: int, data: st.Data
 
 
 def test_errors_say_what_was_expected() -> None:
-    with pytest.raises(WireError, match="kind 9 is unknown"):
-        messages.decode(Key(9, 0), b"")
+    with pytest.raises(WireError, match="kind 15 is unknown"):
+        messages.decode(Key(15, 0), b"")
     with pytest.raises(WireError, match="out of range"):
         messages.decode(Key(LivePose.KIND, 64), b"")
     pose = messages.encode(KeyframePose(KeyframeId(1), np.eye(4)))
     with pytest.raises(WireError, match="1 bytes too many"):
-        messages.decode(Key(KeyframePose.KIND, 1), pose + b"\0")
+        messages.decode(Key(KeyframePose.KIND, 1), pose + b"\1\1")
     with pytest.raises(ValueError, match="indices must increase"):
         messages.encode(RemovedObservations(KeyframeId(1), np.array([2, 2], np.uint16)))
     with pytest.raises(ValueError, match="rigid motion"):

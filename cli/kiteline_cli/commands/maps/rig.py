@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-SUMMARY = "show and export what a base found of the agents' cameras"
+SUMMARY = "show and export what flights found of cameras"
 EXAMPLES = (
     "kiteline rig show maps",
+    "kiteline rig show rig.toml",
     "kiteline rig export maps --format kalibr --out calibration",
+    "kiteline rig export maps --format kiteline --out .",
 )
 
 

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_codec.schema.batches import Batch
 from kiteline_codec.schema.columns import Columns
 from kiteline_codec.schema.record import IdOf, Priority, Record, register
 from kiteline_core.ids import KeyframeId
@@ -17,16 +18,17 @@ from kiteline_core.ids import KeyframeId
 @dataclass(frozen=True, slots=True)
 class RefinedLandmarks(Record):
     """Positions of a keyframe's landmarks as the base refined them. index: (n,) keypoints. inv_depth: (n,) 1/m. offset:
-    (n,2) px added to the keypoint's pixel to give the bearing.
+    (n,2) px added to the keypoint's pixel to give the bearing. batch: see CorrectionBatch.
     """
 
     KIND = 17
     ID = IdOf.KEYFRAME
     PRIORITY = Priority.CORRECTION
     COLUMNS: ClassVar = Columns("index", "inv_depth", "offset")
-    CODE = (COLUMNS,)
+    CODE = (COLUMNS, Batch())
 
     keyframe: KeyframeId
     index: NDArray[np.uint16]
     inv_depth: NDArray[np.float32]
     offset: NDArray[np.float32]
+    batch: int = 0

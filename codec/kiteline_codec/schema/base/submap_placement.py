@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
+from kiteline_codec.schema.batches import read_batch, write_batch
 from kiteline_codec.schema.poses import read_pose, read_scale, write_pose, write_scale
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
 from kiteline_core.geometry import sim3
@@ -21,7 +22,7 @@ class SubmapPlacement(Record):
     """A submap's pose and unit of length in the world.
 
     S_w_m: (4,4) similarity, rigid if both units are the same. recognised: the submap's pose rests on a merge with
-    another submap, not on the odometry of its agent alone.
+    another submap, not on the odometry of its agent alone. batch: see CorrectionBatch.
     """
 
     KIND = 21
@@ -32,20 +33,24 @@ class SubmapPlacement(Record):
     submap: SubmapId
     S_w_m: NDArray[np.float64]
     recognised: bool = False
+    batch: int = 0
 
     def write(self, out: Writer) -> None:
-        """Append scale, pose and, if the submap was recognised, one byte more."""
+        """Append scale, pose and, if the submap was recognised or waits for a batch, one byte and its number."""
         write_scale(out, sim3.scale_of(self.S_w_m))
         write_pose(out, sim3.rigid(self.S_w_m))
-        if self.recognised:
-            out.u8(1)
+        if self.recognised or self.batch:
+            out.u8(self.recognised)
+            write_batch(out, self.batch)
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
         """The record of a key and a code."""
         scale = read_scale(source)
         S_w_m = sim3.of(scale, read_pose(source))
-        recognised = source.left > 0
-        if recognised and source.u8() != 1:
-            raise WireError("the last byte of a placement must be 1")
-        return cls(SubmapId(key.id), S_w_m, recognised)
+        more = source.left > 0
+        recognised = source.u8() if more else 0
+        batch = read_batch(source)
+        if recognised > 1 or (more and not (recognised or batch)):
+            raise WireError("whether a submap was recognised is 0 or 1, and 0 only where the number of a batch follows")
+        return cls(SubmapId(key.id), S_w_m, bool(recognised), batch)

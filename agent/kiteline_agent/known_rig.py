@@ -1,0 +1,73 @@
+"""What earlier flights found of a rig, as options of the agent: the next flight begins with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.imaging.row_alignment import TERMS as ROW_TERMS
+from kiteline_core.geometry import disparity_offset
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+F64 = NDArray[np.float64]
+
+_CAMERA_NUMBERS = 7
+_SAME = 1e-6  # relative; machines round differently
+_MAX_PX = 8.0  # of a number that the link can carry
+
+
+@dataclass(frozen=True, slots=True)
+class KnownRigConfig:
+    """What is known of a rig beyond its calibration, from `kiteline agent --rig FILE`. It holds for one calibration."""
+
+    # the rectified camera: width, height, fx, fy, cx, cy in px, baseline in m; (): nothing is known
+    camera: tuple[float, ...] = ()
+    T_b_c: tuple[float, ...] = ()  # row-major 4x4: rectified left camera in the body, m; for exports
+    rows_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x y, y^2 by which the right image is too low
+    disparity_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x^2, x y by which disparities are too large
+
+    def __post_init__(self) -> None:
+        sizes = {"camera": _CAMERA_NUMBERS, "T_b_c": 16, "rows_px": ROW_TERMS, "disparity_px": disparity_offset.TERMS}
+        for name, size in sizes.items():
+            values = getattr(self, name)
+            if values and (len(values) != size or not np.isfinite(values).all()):
+                raise ValueError(f"{name} has {len(values)} numbers: expected {size} finite ones, or none")
+        if any(abs(v) > _MAX_PX for v in (*self.rows_px, *self.disparity_px)):
+            raise ValueError(f"rows_px and disparity_px are px: expected at most {_MAX_PX:g}")
+
+    def is_of(self, camera: RectifiedCamera) -> bool:
+        """True if it was found with the calibration that gives this rectified camera."""
+        return bool(self.camera) and np.allclose(self.camera, numbers_of(camera), rtol=_SAME, atol=0.0)
+
+    def rectified(self) -> RectifiedCamera | None:
+        """The rectified camera; None if nothing is known."""
+        if not self.camera:
+            return None
+        width, height, fx, fy, cx, cy, baseline_m = self.camera
+        T_b_c = np.array(self.T_b_c).reshape(4, 4) if self.T_b_c else np.eye(4)
+        return RectifiedCamera(round(width), round(height), fx, fy, cx, cy, baseline_m, True, T_b_c)
+
+    @property
+    def rows(self) -> F64:
+        """rows_px (5,), zero where nothing is known."""
+        return np.array(self.rows_px or (0.0,) * ROW_TERMS)
+
+    @property
+    def disparity(self) -> F64:
+        """disparity_px (5,), zero where nothing is known."""
+        return np.array(self.disparity_px or (0.0,) * disparity_offset.TERMS)
+
+
+def numbers_of(camera: RectifiedCamera) -> tuple[float, ...]:
+    """The calibration for which a rig is known, as `KnownRigConfig.camera`."""
+    c = camera
+    return (float(c.width), float(c.height), c.fx, c.fy, c.cx, c.cy, c.baseline_m)
+
+
+def known_rig(camera: RectifiedCamera, rows_px: F64, disparity_px: F64) -> KnownRigConfig:
+    """What a flight found, rounded to what the next one can use."""
+    rows, disparity = (tuple(round(float(v), 3) for v in values) for values in (rows_px, disparity_px))
+    T_b_c = tuple(round(float(v), 9) for v in camera.T_b_c.ravel())
+    return KnownRigConfig(numbers_of(camera), T_b_c, rows, disparity)

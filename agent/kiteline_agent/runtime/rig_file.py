@@ -1,0 +1,61 @@
+"""The rig file: what flights found of a rig, as TOML. Read when an agent starts, written while and after it flies."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+
+from kiteline_agent.known_rig import KnownRigConfig
+from kiteline_core import config as configuration
+from kiteline_core.config import ConfigError
+
+_TABLE = "known_rig"
+_HEAD = """\
+# What kiteline found of a rig beyond its calibration; written by `kiteline agent --rig` and `kiteline rig export`.
+# rows_px: by how much the right image is too low; disparity_px: by how much disparities are too large. Delete this file
+# after repairs. It is not used with another calibration.
+"""
+
+
+def text_of(known: KnownRigConfig) -> str:
+    """The content of a rig file."""
+    return f"{_HEAD}[{_TABLE}]\n{configuration.describe(known)}"
+
+
+def load(path: str) -> KnownRigConfig:
+    """What a rig file says; nothing if there is no such file yet. Raises ConfigError for any other content."""
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return KnownRigConfig()
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: no readable rig file ({error})") from error
+    section = table.get(_TABLE)
+    if set(table) != {_TABLE} or not isinstance(section, dict):
+        raise ConfigError(f"{path}: no rig file: expected the table [{_TABLE}], found {sorted(table) or 'nothing'}")
+    try:
+        return configuration.apply(KnownRigConfig(), section, _TABLE)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+class RigFile:
+    """Keeps a rig file up to date. A cut write leaves the old file."""
+
+    def __init__(self, path: str) -> None:
+        self._path = Path(path)
+        self._written = ""
+
+    def save(self, known: KnownRigConfig | None) -> None:
+        """Write what is known, if that changed. Raises ConfigError if the file cannot be written."""
+        if known is None or (text := text_of(known)) == self._written:
+            return
+        part = self._path.with_name(f".{self._path.name}.part")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_text(text, encoding="utf-8")
+            os.replace(part, self._path)
+        except OSError as error:
+            raise ConfigError(f"{self._path}: cannot write the rig file ({error})") from error
+        self._written = text

@@ -1,0 +1,83 @@
+"""Corrections for one agent in batches: the next one is made when the one before has arrived.
+
+What changes meanwhile waits at the base, at its newest value. So a batch is never overtaken by the next one, and the
+agent can wait for all of it. On a thin link a batch is as large as the link carries in a few seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from kiteline_basestation.config import PublishConfig
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import (
+    CorrectionBatch,
+    DisparityCalibration,
+    Key,
+    KeyframePose,
+    Record,
+    RefinedLandmarks,
+    SubmapPlacement,
+    messages,
+)
+from kiteline_core.ids import AgentId
+
+Member = KeyframePose | RefinedLandmarks | SubmapPlacement | DisparityCalibration
+MEMBERS = (KeyframePose, RefinedLandmarks, SubmapPlacement, DisparityCalibration)  # what moves the agent's map
+
+
+class CorrectionBatches:
+    """Numbers the batches of one agent, and says when there is room for the next one."""
+
+    def __init__(self, agent: AgentId, config: PublishConfig) -> None:
+        self._agent = agent
+        self._config = config
+        self._number = 0
+        self._members: dict[Key, None] = {}  # of the newest batch
+        self._made_ns = 0
+        self._overdue = False  # the newest batch does not arrive: later values join it, and wait for no other ones
+
+    def room_bytes(self, channel: RecordChannel, now_ns: int) -> int | None:
+        """Bytes of corrections that may be shared now: 0 while a batch is on its way, None without a limit."""
+        arrived = channel.arrived(self._key) and all(channel.arrived(key) for key in self._members)
+        self._overdue = not arrived and now_ns - self._made_ns >= self._config.batch_wait_s * 1e9
+        if self._overdue:
+            return None  # nobody listens: the values are for the store, and for whoever comes back
+        if not arrived:
+            return 0
+        rate = channel.rate_bytes_s()
+        return None if rate is None else round(rate * self._config.batch_s)
+
+    def numbered(self, records: Sequence[Record], now_ns: int) -> list[Record]:
+        """Records with the number of their batch, and the record of the batch; as they are if none moves the map."""
+        keys = [messages.key(record) for record in records if isinstance(record, MEMBERS)]
+        if not keys:
+            return list(records)
+        if self._overdue and self._number:
+            self._members.update(dict.fromkeys(keys))
+            batch = CorrectionBatch.of(self._agent, self._number, [])
+        else:
+            self._number, self._made_ns = self._number + 1, now_ns
+            self._members = dict.fromkeys(keys)
+            batch = CorrectionBatch.of(self._agent, self._number, keys)
+        return [replace(r, batch=self._number) if isinstance(r, MEMBERS) else r for r in records] + [batch]
+
+    def without(self, key: Key) -> CorrectionBatch | None:
+        """The record that replaces that of the newest batch if a value of it is removed; None if none was."""
+        if key not in self._members:
+            return None
+        del self._members[key]
+        return CorrectionBatch.of(self._agent, self._number, [])
+
+    def restore(self, record: Record) -> None:
+        """Continue behind the batches of an earlier process. record: one that it had put."""
+        number = record.number if isinstance(record, CorrectionBatch) else getattr(record, "batch", 0)
+        if number > self._number:
+            self._number, self._members = number, {}
+        if isinstance(record, MEMBERS) and number and number == self._number:
+            self._members[messages.key(record)] = None
+
+    @property
+    def _key(self) -> Key:
+        return Key(CorrectionBatch.KIND, int(self._agent))

@@ -1,0 +1,121 @@
+"""What flights found of a rig is kept in a file, and the next flight begins with it."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.known_rig import KnownRigConfig, known_rig
+from kiteline_agent.runtime import rig_file
+from kiteline_agent.runtime.options import agent_config
+from kiteline_agent.runtime.rig_file import RigFile
+from kiteline_agent.step import Identity
+from kiteline_codec.schema import Record, StereoAlignment
+from kiteline_core import config as configuration
+from kiteline_core.config import ConfigError
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, RectifiedCamera, Rectifier
+from kiteline_core.ids import AgentId
+
+LEFT = CameraModel(640, 400, 420.0, 421.0, 318.0, 203.0, Lens.RADTAN, (-0.25, 0.06, 0.0, 0.0))
+RIG = CameraRig(LEFT, LEFT, np.eye(4), se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0])))
+CAMERA = Rectifier(RIG).camera
+ROWS = np.array([0.8, -0.3, 0.1, 0.4, -0.2])
+DISPARITY = np.array([-1.3, 0.1, 0.2, -1.2, 0.5])
+numbers = st.lists(st.floats(-8.0, 8.0), min_size=5, max_size=5).map(np.array)
+
+
+class Told(NoBaseChannel):
+    """Keeps what was put."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.records: list[Record] = []
+
+    def put(self, record: Record) -> Record:
+        self.records.append(record)
+        return super().put(record)
+
+
+def flown(known: KnownRigConfig, rig: CameraRig = RIG) -> tuple[Agent, Told]:
+    told = Told()
+    return Agent(rig, None, AgentConfig(known_rig=known), Identity(AgentId(2), 0), told), told
+
+
+@given(numbers, numbers)
+def test_a_file_holds_what_was_known(rows: np.ndarray, disparity: np.ndarray) -> None:
+    known = known_rig(CAMERA, rows, disparity)
+    table = tomllib.loads(rig_file.text_of(known))
+    assert configuration.apply(KnownRigConfig(), table["known_rig"]) == known
+    assert known.is_of(CAMERA)
+    assert np.allclose(known.rows, rows, atol=6e-4)
+    back = known.rectified()
+    assert back is not None
+    assert (back.width, back.fx, back.baseline_m) == (CAMERA.width, CAMERA.fx, CAMERA.baseline_m)
+
+
+def test_an_agent_begins_with_it_and_tells_the_base() -> None:
+    agent, told = flown(known_rig(CAMERA, ROWS, DISPARITY))
+    said = [r for r in told.records if isinstance(r, StereoAlignment)]
+    assert len(said) == 1
+    assert said[0].agent == 2
+    assert np.allclose(said[0].rows_px, ROWS)
+    assert np.allclose(said[0].disparity_px, DISPARITY)
+    assert np.allclose(agent.map.disparity_offset, DISPARITY)
+    assert agent.known_rig() == known_rig(CAMERA, ROWS, DISPARITY)
+
+
+def test_without_knowledge_or_with_another_calibration_nothing_changes() -> None:
+    other = RectifiedCamera(640, 400, CAMERA.fx + 0.01, CAMERA.fy, CAMERA.cx, CAMERA.cy, 0.11, True, np.eye(4))
+    for known in (KnownRigConfig(), known_rig(other, ROWS, DISPARITY)):
+        agent, told = flown(known)
+        assert not any(isinstance(r, StereoAlignment) for r in told.records)
+        assert not agent.map.disparity_offset.any()
+        assert agent.known_rig() is None  # nothing was measured yet
+    agent, _ = flown(known_rig(CAMERA, ROWS, DISPARITY), CameraRig(LEFT, None, np.eye(4), None))
+    assert agent.known_rig() is None
+
+
+def test_the_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "rig.toml"
+    assert agent_config("", rig=str(path)).known_rig == KnownRigConfig()  # the first flight
+    keeper = RigFile(str(path))
+    keeper.save(None)
+    assert not path.exists()
+    known = known_rig(CAMERA, ROWS, DISPARITY)
+    keeper.save(known)
+    assert agent_config("", rig=str(path)).known_rig == known
+    assert [p.name for p in path.parent.iterdir()] == ["rig.toml"]
+    path.unlink()
+    keeper.save(known)  # unchanged
+    assert not path.exists()
+    with pytest.raises(ConfigError, match="cannot write"):
+        RigFile(str(tmp_path)).save(known)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "expected the table"),
+        ("[agent]\n", "expected the table"),
+        ("[known_rig]\nspeed = 1\n", "unknown key 'speed'"),
+        ("[known_rig]\nrows_px = [1.0]\n", "rows_px has 1 numbers"),
+        ("[known_rig]\nrows_px = [nan, 0.0, 0.0, 0.0, 0.0]\n", "finite"),
+        ("[known_rig]\ndisparity_px = [0.0, 0.0, 0.0, 0.0, 9.5]\n", "at most 8"),
+        ("[known_rig\n", "no readable"),
+        ("\udcff", "no readable"),
+    ],
+)
+def test_another_file_is_refused(tmp_path: Path, text: str, why: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(ConfigError, match=why):
+        rig_file.load(str(path))

@@ -1,0 +1,175 @@
+"""The base's batches of corrections: one after another, sized by the link, nothing lost, nothing overtaken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_agent.exchange.correction_batches import CorrectionBatches as Holder
+from kiteline_basestation.config import BaseConfig, PublishConfig
+from kiteline_basestation.exchange.correction_batches import MEMBERS, CorrectionBatches
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel, PlainChannel
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    CorrectionBatch,
+    CulledLandmarks,
+    Key,
+    KeyframePose,
+    Record,
+    RefinedLandmarks,
+    messages,
+)
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_core.ids import AgentId, KeyframeId
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
+
+AGENT = AgentId(0)
+SECOND_NS = 1_000_000_000
+STEP_NS = 100_000_000
+
+
+class Link(PlainChannel):
+    """A channel of which the test says what has arrived."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.missing: set[Key] = set()
+        self.rate: int | None = None
+
+    def arrived(self, key: Key) -> bool:
+        return key not in self.missing
+
+    def rate_bytes_s(self) -> int | None:
+        return self.rate
+
+
+def pose(keyframe: int) -> KeyframePose:
+    return KeyframePose(KeyframeId(keyframe), np.eye(4))
+
+
+def numbers(records: list[Record]) -> list[int]:
+    out = [r.batch for r in records if isinstance(r, MEMBERS)]
+    return out + [r.number for r in records if isinstance(r, CorrectionBatch)]
+
+
+def test_the_next_batch_waits_until_the_last_value_of_this_one_has_arrived() -> None:
+    link, batches = Link(), CorrectionBatches(AGENT, PublishConfig())
+    first = batches.numbered([pose(1), pose(2)], 0)
+    assert numbers(first) == [1, 1, 1]
+    link.missing = {messages.key(first[1])}
+    assert batches.room_bytes(link, SECOND_NS) == 0
+    link.missing = {messages.key(first[2])}  # the record of the batch itself
+    assert batches.room_bytes(link, SECOND_NS) == 0
+    link.missing.clear()
+    assert batches.room_bytes(link, SECOND_NS) is None
+    assert numbers(batches.numbered([pose(2)], SECOND_NS)) == [2, 2]
+
+
+def test_what_moves_nothing_has_no_number() -> None:
+    batches = CorrectionBatches(AGENT, PublishConfig())
+    culled = CulledLandmarks(KeyframeId(1), np.zeros(0, np.uint16), 0)
+    assert batches.numbered([culled], 0) == [culled]
+    assert len(batches.numbered([culled, pose(1)], 0)) == 3
+
+
+def test_an_agent_that_does_not_listen_is_not_waited_for() -> None:
+    config = PublishConfig()
+    link, batches = Link(), CorrectionBatches(AGENT, config)
+    first = batches.numbered([pose(1)], 0)
+    link.missing = {messages.key(record) for record in first}
+    late_ns = round(config.batch_wait_s * 1e9)
+    assert batches.room_bytes(link, late_ns - 1) == 0
+    assert batches.room_bytes(link, late_ns) is None
+    joined = batches.numbered([pose(2)], late_ns)
+    assert numbers(joined) == [1, 1]
+    assert joined[-1] == CorrectionBatch.of(AGENT, 1, [])  # whoever comes back waits for none of them
+    link.missing.clear()
+    assert batches.room_bytes(link, late_ns + 1) is None
+    assert numbers(batches.numbered([pose(3)], late_ns + 1)) == [2, 2]
+
+
+def test_a_withdrawn_value_is_not_waited_for_by_the_agent() -> None:
+    batches = CorrectionBatches(AGENT, PublishConfig())
+    first = batches.numbered([pose(1), pose(2)], 0)
+    assert batches.without(Key(KeyframePose.KIND, 9)) is None
+    assert batches.without(messages.key(first[0])) == CorrectionBatch.of(AGENT, 1, [])
+
+
+def test_numbers_go_on_after_a_restart() -> None:
+    before, after, link = CorrectionBatches(AGENT, PublishConfig()), CorrectionBatches(AGENT, PublishConfig()), Link()
+    before.numbered([pose(1)], 0)
+    records = before.numbered([pose(1), pose(2)], 0)
+    for record in [replace_batch(pose(7), 1), *records]:
+        after.restore(record)
+    link.missing = {messages.key(records[0])}
+    assert after.room_bytes(link, 1) == 0  # the restored batch has to arrive first
+    link.missing = {messages.key(pose(7))}  # of an older one
+    assert after.room_bytes(link, 1) is None
+    assert numbers(after.numbered([pose(3)], 0)) == [3, 3]
+
+
+def replace_batch(record: KeyframePose, batch: int) -> KeyframePose:
+    return KeyframePose(record.keyframe, record.T_m_k, batch)
+
+
+def test_a_thin_link_gets_batches_of_its_size() -> None:
+    link, batches = Link(), CorrectionBatches(AGENT, PublishConfig())
+    link.rate = 500
+    assert batches.room_bytes(link, 0) == round(500 * PublishConfig().batch_s)
+
+
+@pytest.mark.parametrize(("budget_bytes", "loss"), [(None, 0.0), (None, 0.3), (800, 0.0), (800, 0.2)])
+def test_every_batch_is_applied_as_it_was_made(
+    make_flight: Callable[..., Any], budget_bytes: int | None, loss: float
+) -> None:
+    """Over any link: the agent applies the batches that the base made, whole and one after another, and ends equal."""
+    flight = make_flight(keyframes=12, turns=0.4)
+    config = SyncConfig(packet_bytes=220, overhead_bytes=7, budget_bytes=budget_bytes)
+    base_end, agent_end = CodedChannel(config, 1), CodedChannel(SyncConfig(), 1)
+    station, holder = Station(BaseConfig(), lambda agent: base_end), Holder()
+    up, down = (LinkModel(LinkModelConfig(loss=loss, delay_ns=30_000_000, duplicate=loss / 2), seed) for seed in (1, 2))
+    made: dict[int, dict[Key, bytes]] = {}
+    held: dict[Key, bytes] = {}
+    order: list[int] = []
+    put = base_end.put
+
+    def noted(record: Record) -> Record:
+        if isinstance(record, MEMBERS):
+            made.setdefault(record.batch, {})[messages.key(record)] = messages.encode(record)
+        return put(record)
+
+    base_end.put = noted  # type: ignore[method-assign]
+    agent_end.put(CameraIntrinsics(flight.agent, flight.camera))
+    done: list[Any] = []
+    for n in range(len(flight.records) + 600):
+        now_ns = n * STEP_NS
+        heard = agent_end.receive(down.deliver(now_ns), now_ns)
+        ready = [r for r in holder.take(heard, agent_end.take_removed()) if isinstance(r, MEMBERS)]
+        for number in sorted({r.batch for r in ready} - {0}):
+            part = {messages.key(r): messages.encode(r) for r in ready if r.batch == number}
+            assert part == made[number]
+            order.append(number)
+        held.update((messages.key(r), messages.encode(r)) for r in ready)
+        for record in flight.records[n] if n < len(flight.records) else ():
+            agent_end.put(record)
+        for packet in agent_end.poll(now_ns):
+            up.send(packet, now_ns)
+        output = station.step({flight.agent: up.deliver(now_ns)}, done, now_ns)
+        done = [run_job(job) for job in output.jobs]
+        for packet in dict(output.packets).get(flight.agent, ()):
+            down.send(packet, now_ns)
+        if n > len(flight.records) and station.mapper.idle and base_end.endpoint.digest_equal and not len(holder):
+            break
+    assert station.mapper.idle
+    assert base_end.endpoint.digest_equal
+    assert not len(holder)
+    assert order == list(range(1, len(made) + 1))
+    newest = {key: code for number in sorted(made) for key, code in made[number].items()}
+    assert held == newest
+    assert sum(key.kind == KeyframePose.KIND for key in held) == 11
+    assert any(key.kind == RefinedLandmarks.KIND for key in held)
