@@ -48,6 +48,19 @@ def test_files_that_are_named_exist(page: Path) -> None:
     assert not missing, f"{page.name} names what does not exist: {missing}"
 
 
+@pytest.mark.parametrize("page", ["ARCHITECTURE.md", "CONTRIBUTING.md"])
+def test_names_of_the_code_are_in_the_code(page: str) -> None:
+    """A table, class, function or field that a recipe names; for `Class.method` both in one file."""
+    files = [
+        set(re.findall(r"\w+", p.read_text(encoding="utf-8"))) for room in ROOMS for p in ROOT.glob(f"{room}/**/*.py")
+    ]
+    named = set(re.findall(r"`(_?[A-Za-z]\w*(?:\.[a-z_]\w*)*)(?:\([^`]*\))?`", text_of(ROOT / page)))
+    named -= {name for name in named if name.endswith((".md", ".py", ".toml", ".json", ".tum"))}
+    missing = [name for name in named if not any(set(name.split(".")) <= words for words in files)]
+    assert len(named) > 40
+    assert not missing, f"{page} names what no source holds: {missing}"
+
+
 def test_commands_that_are_named_exist() -> None:
     commands = {c.name for group in find_commands().values() for c in group}
     for page in PAGES:

@@ -33,11 +33,10 @@ _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """T_m_b: (4,4) predicted. velocity: (3,) m/s in m. R_b0_b1: (3,3) rotation since the last frame."""
+    """T_m_b: (4,4) predicted. velocity: (3,) m/s in m."""
 
     T_m_b: F64
     velocity: F64
-    R_b0_b1: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,12 +164,12 @@ class InertialTracker:
         last_ns, last_T_m_b = self._last
         if self._smoother.running:
             T_m_b, velocity = self._smoother.predict(samples)
-            return Prediction(T_m_b, velocity, last_T_m_b[:3, :3].T @ T_m_b[:3, :3])
+            return Prediction(T_m_b, velocity)
         motion, velocity = preintegrate(samples, self._bias, self._calibration), self._initialiser.velocity()
         T = last_T_m_b.copy()
         T[:3, 3] += velocity * (t_ns - last_ns) * 1e-9
         T[:3, :3] = T[:3, :3] @ motion.turn
-        return Prediction(T, velocity, motion.turn)
+        return Prediction(T, velocity)
 
     def extrapolate(self, imu: ImuBatch | None, t_ns: int) -> InertialMotion | None:
         """The body at t_ns, after the last frame, by the samples so far and `imu`. The state stays as it is.

@@ -26,7 +26,7 @@ Bool = NDArray[np.bool_]
 @dataclass(frozen=True, slots=True)
 class TwoView:
     """Result. T_b_a: (4,4), its translation has length 1. points: (n,3) in a. good: (n,) True if a point
-    has a depth. flat: the homography was chosen. ratio: R_H. parallax_rad: median over the good points.
+    has a depth. flat: the homography was chosen. ratio: R_H.
     """
 
     T_b_a: F64
@@ -34,7 +34,6 @@ class TwoView:
     good: Bool
     flat: bool
     ratio: float
-    parallax_rad: float
 
 
 def two_view(uv_a: F64, uv_b: F64, camera: F64, config: TwoViewConfig, seed: int) -> TwoView | None:
@@ -134,4 +133,4 @@ def _refined(
     if np.count_nonzero(good) < config.min_points:
         return None
     typical = float(np.median(angle[good]))
-    return None if typical < config.min_parallax_rad else TwoView(T, refined, good, flat, ratio, typical)
+    return None if typical < config.min_parallax_rad else TwoView(T, refined, good, flat, ratio)

@@ -9,7 +9,7 @@ Write::
     log.blob("/packets/in", t_ns, packet)                       # opaque bytes
     log.json("/events", t_ns, {"reset": 1});  log.fields("/estimate", t_ns, {"quality": 90, "T_o_b": T_o_b})
     log.transform("/tf", t_ns, "map", "body", T_map_body);  log.pose("/pose", t_ns, "world", T_w_b)
-    log.poses("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.scan(...);  log.text("/log", t_ns, "info", "…")
+    log.poses("/path", t_ns, "world", T_w_b_all);  log.grid(...);  log.text("/log", t_ns, "info", "…")
     log.close()                                                 # also a context manager
 
 Log times are handed in and nothing here reads a clock, so equal calls give equal bytes. Chunks are written at 64 KiB
@@ -177,15 +177,6 @@ class LogWriter(Closing):
         for pose in poses:
             item = message.poses.add()
             _fill_pose(item.position, item.orientation, pose)
-        self._add(topic, t_ns, message)
-
-    def scan(self, topic: str, t_ns: int, frame_id: str, angles_rad: tuple[float, float], ranges_m: F64) -> None:
-        """Ranges (n,) over equal steps between the first and the last angle."""
-        message = schemas.LaserScan(
-            frame_id=frame_id, start_angle=angles_rad[0], end_angle=angles_rad[1], ranges=ranges_m.tolist()
-        )
-        self._stamp(message, t_ns)
-        message.pose.orientation.w = 1.0
         self._add(topic, t_ns, message)
 
     def grid(

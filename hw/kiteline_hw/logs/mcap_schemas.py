@@ -16,7 +16,6 @@ from foxglove_schemas_protobuf import (
     CompressedImage_pb2,
     FrameTransform_pb2,
     Grid_pb2,
-    LaserScan_pb2,
     Log_pb2,
     PoseInFrame_pb2,
     PosesInFrame_pb2,
@@ -31,7 +30,6 @@ CameraCalibration = CameraCalibration_pb2.CameraCalibration
 FrameTransform = FrameTransform_pb2.FrameTransform
 PoseInFrame = PoseInFrame_pb2.PoseInFrame
 PosesInFrame = PosesInFrame_pb2.PosesInFrame
-LaserScan = LaserScan_pb2.LaserScan
 Grid = Grid_pb2.Grid
 Log = Log_pb2.Log
 

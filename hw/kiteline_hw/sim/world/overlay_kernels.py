@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, SKY, TILE, cast_ray, shade_hit
+from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, SKY, TILE, cast_ray, sample_ray, shade_hit
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -34,16 +34,8 @@ def overlay(
         for y in range(y0, min(y0 + TILE, height)):
             for x in range(x0, min(x0 + TILE, width)):
                 total, count, nearest, seen = 0.0, 0, np.inf, 0
-                c, cx, cy = rays[y + 1, x + 1], rays[y + 1, x + 2], rays[y + 2, x + 1]
                 for k in range(4):
-                    su = (-0.125, 0.375, -0.375, 0.125)[k]
-                    sv = (-0.375, -0.125, 0.125, 0.375)[k]
-                    r0 = c[0] + su * (cx[0] - c[0]) + sv * (cy[0] - c[0])
-                    r1 = c[1] + su * (cx[1] - c[1]) + sv * (cy[1] - c[1])
-                    r2 = c[2] + su * (cx[2] - c[2]) + sv * (cy[2] - c[2])
-                    dx = rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2
-                    dy = rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2
-                    dz = rot[2, 0] * r0 + rot[2, 1] * r1 + rot[2, 2] * r2
+                    dx, dy, dz = sample_ray(rays, rot, y, x, k)
                     t, hit = cast_ray(
                         boxes, NO_SHELL, field, frame, near, items, lists, tile, lengths[tile], o, dx, dy, dz, far
                     )
