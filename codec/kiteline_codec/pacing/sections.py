@@ -30,7 +30,7 @@ def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> l
     while start < len(best):
         chosen = best[start : start + rows]
         part = replace(take(record, chosen[np.argsort(record.index[chosen], kind="stable")]), part=len(parts))
-        size = len(messages.encode(part))
+        size = messages.length(part)
         if size > section_bytes:
             if len(chosen) == 1:
                 raise ValueError(f"one keypoint takes {size} bytes, expected at most {section_bytes}")

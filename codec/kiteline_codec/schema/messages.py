@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.record import RECORD_TYPES, Key, Record
+
+_KEPT = 32  # records: all sections of a keyframe, and those that were tried
+_measured: deque[tuple[Record, bytes]] = deque(
+    maxlen=_KEPT
+)  # records whose length was asked for last, with their codes
 
 
 def key(record: Record) -> Key:
@@ -13,9 +20,19 @@ def key(record: Record) -> Key:
 
 def encode(record: Record) -> bytes:
     """The code of a record: quantised, without its key. Raises ValueError for values that have no code."""
+    for known, code in tuple(_measured):
+        if known is record:
+            return code
     out = Writer()
     record.write(out)
     return out.bytes()
+
+
+def length(record: Record) -> int:
+    """Bytes of a record's code. `encode` of the very same record then returns that code; records are never changed."""
+    code = encode(record)
+    _measured.append((record, code))
+    return len(code)
 
 
 def decode(key: Key, code: bytes) -> Record:

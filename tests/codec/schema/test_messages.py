@@ -270,3 +270,11 @@ def test_a_keyframe_is_coded_quickly() -> None:
             messages.decode(messages.key(record), messages.encode(record))
         best = min(best, time.process_time() - start)
     assert best < 0.005  # typically 0.4 ms
+
+
+def test_a_measured_record_is_coded_as_any_other() -> None:
+    for record in some_records(5, 40):
+        code = messages.encode(record)
+        assert messages.length(record) == len(code)
+        assert messages.encode(record) is messages.encode(record) == code
+        assert messages.encode(replace(record)) == code
