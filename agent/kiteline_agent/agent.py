@@ -211,7 +211,10 @@ class Agent:
             events += self._keyframes.add_if_needed(ctx, track)
             # 8. Join an older submap, or continue a monocular one in metres.
             events += self._submaps.join_older(ctx, track)
-            events += self._submaps.restart_in_metres(ctx, track)
+            restarted = self._submaps.restart_in_metres(ctx, track)
+            if restarted:
+                self._corrections.note_continued(self.submap)
+            events += restarted
             outcome = FrameOutcome(True, False, track.inliers, events)
         if self._rows is not None:
             outcome.events.extend(self._rows.take_events())

@@ -105,3 +105,31 @@ def test_a_merge_is_taken_over_at_once_and_later_corrections_slowly(corrections:
     later = corrections.in_world(FIRST, np.eye(4), np.eye(4), 150_000_000, metric=True)
     assert merged is not None and np.allclose(merged, near)
     assert later is not None and 0.29 < later[0, 3] < 0.3
+
+
+def test_a_merge_of_a_submap_that_began_in_a_tracked_frame_is_smoothed(corrections: Corrections) -> None:
+    """Its map only changed its scale: odometry has placed it to some centimetres."""
+    corrections.take([SubmapPlacement(FIRST, np.eye(4))], [])
+    corrections.in_world(FIRST, np.eye(4), np.eye(4), 0, metric=True)
+    corrections.note_continued(FIRST)
+    moved = se3.from_rt(np.eye(3), np.array([0.04, 0.0, 0.0]))
+    path = []
+    for k in range(1, 60):
+        if k == 3:
+            corrections.take([SubmapPlacement(FIRST, moved, recognised=True)], [])
+        told = corrections.in_world(FIRST, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
+        assert told is not None
+        path.append(told[0, 3])
+    assert np.diff(path).max() < 0.003
+    assert path[-1] == pytest.approx(0.04)
+
+
+def test_time_without_a_placement_does_not_add_up_to_a_jump(corrections: Corrections) -> None:
+    corrections.take([SubmapPlacement(FIRST, np.eye(4))], [])
+    for k in range(2):
+        corrections.in_world(FIRST, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
+    for k in range(2, 12):  # a new submap, not placed yet
+        corrections.in_world(SECOND, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
+    corrections.take([SubmapPlacement(SECOND, se3.from_rt(np.eye(3), np.array([0.2, 0.0, 0.0])))], [])
+    told = corrections.in_world(SECOND, np.eye(4), np.eye(4), 600_000_000, metric=True)
+    assert told is not None and 0.0 < told[0, 3] < 0.003

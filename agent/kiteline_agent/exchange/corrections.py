@@ -48,6 +48,7 @@ class Corrections:
         self._batches = CorrectionBatches()
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
+        self._continued: SubmapId | None = None  # submap that began in a tracked frame
         self._upright: GravityAlignment | None = None  # of the submap that began in motion
         self.tiles: dict[tuple[int, int], GridTile] = {}
         # A handler returns whether the local map moved.
@@ -88,7 +89,8 @@ class Corrections:
             return False  # sent before the base knew of gravity; the upright placement follows
         self._S_w_m[record.submap] = record.S_w_m
         if record.recognised:
-            if record.submap not in self._recognised and record.submap == self._map.active:
+            lost_before = record.submap == self._map.active and record.submap != self._continued
+            if record.submap not in self._recognised and lost_before:
                 self._smoothing.snap()  # a merge: until now the submap lay where odometry put it
             self._recognised.add(record.submap)
         else:
@@ -104,6 +106,10 @@ class Corrections:
     def _add_tile(self, record: GridTile) -> bool:
         self.tiles[record.column, record.row] = record
         return False
+
+    def note_continued(self, submap: SubmapId) -> None:
+        """A submap began in a tracked frame: odometry places it well, and its merge is a correction like others."""
+        self._continued = submap
 
     def is_recognised(self, submap: SubmapId) -> bool:
         """True if the base merged a submap with another one: its pose there rests on more than odometry."""
@@ -136,6 +142,7 @@ class Corrections:
         S_w_m = self._S_w_m.get(submap)
         if S_w_m is None:
             held = self._smoothing.held
+            self._smoothing.hold(t_ns)
             near = held is not None and abs(sim3.scale_of(held) - 1.0) < _METRES
             return self._body_in_world(held, T_o_m @ T_m_b) if held is not None and near and metric else None
         if not self._smoothing.on:

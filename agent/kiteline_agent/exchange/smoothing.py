@@ -34,6 +34,10 @@ class Smoothing:
         """Report the next corrected pose at once."""
         self._goal = None
 
+    def hold(self, t_ns: int) -> None:
+        """The held pose is reported once more: nothing moved until this time."""
+        self._t_ns = t_ns
+
     def follow(self, T_w_o: F64, here_o: F64, t_ns: int) -> F64:
         """The pose (4,4) to report for the corrected T_w_o (4,4). here_o: (3,) m, vehicle in o.
 
