@@ -16,7 +16,7 @@ from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 
-_MAX_STEPS = 8000  # of a map, the newest: a quarter of an hour, 0.3 s of solving
+_MAX_STEPS = 8000  # of a map, the newest: twenty minutes
 _LEAST_M = 0.05  # distance between keyframes from which the path's length follows theirs
 _FOLLOW = (0.7, 1.4)  # factors by which it may
 
@@ -46,7 +46,8 @@ class Path:
     """Steps (n,) of all segments between nodes: step i leads from node `begin[i]` to the next one.
 
     R_w_b: (k,3,3) and camera: (k,3) m, at the nodes, lever: (k,3) m from body to camera, in w. fresh: (k,) True where
-    a chain begins. noise, depth_m, unit: (n,) of each step's segment.
+    a chain begins. by_bias: (n,2,3,3) what a bias of the accelerometer, which turns with the body, adds to velocity and
+    position. noise, depth_m, unit: (n,) of each step's segment.
     """
 
     begin: NDArray[np.int64]
@@ -55,9 +56,9 @@ class Path:
     lever: F64
     fresh: NDArray[np.bool_]
     dt_s: F64
-    turn: F64
     velocity: F64
     position: F64
+    by_bias: F64
     noise: F64
     depth_m: F64
     unit: F64
@@ -131,14 +132,27 @@ def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
         fresh.append((np.arange(len(R_k)) == 0)[drop:])
         end = s.last
     sizes = [len(s.dt_s) for s in segments]
+    dt_s, velocity, position = (np.concatenate([getattr(s, name) for s in segments]) for name in _BY_IMU)
+    noise, depth_m, unit = (np.repeat([getattr(s, name) for s in segments], sizes) for name in _OF_SEGMENT)
     return Path(
         np.concatenate(begin), np.concatenate(R), np.concatenate(camera), np.concatenate(lever),
-        np.concatenate(fresh), *(np.concatenate([getattr(s, name) for s in segments]) for name in _SHAPE),
-        *(np.repeat([getattr(s, name) for s in segments], sizes) for name in ("noise", "depth_m", "unit")),
+        np.concatenate(fresh), dt_s, velocity, position, np.concatenate([_by_bias(s) for s in segments]), noise,
+        depth_m, unit,
     )  # fmt: skip
 
 
-_SHAPE = ("dt_s", "turn", "velocity", "position")
+_BY_IMU = ("dt_s", "velocity", "position")
+_OF_SEGMENT = ("noise", "depth_m", "unit")
+
+
+def _by_bias(s: Segment) -> F64:
+    """(n,2,3,3), with the body's mean attitude during each step."""
+    return np.array(
+        [
+            [dt * se3.so3_exp(0.5 * turn), 0.5 * dt * dt * se3.so3_exp(turn / 3.0)]
+            for dt, turn in zip(s.dt_s.tolist(), s.turn, strict=True)
+        ]
+    )
 
 
 def _shape(s: Segment, T_w_first: F64, T_w_last: F64) -> tuple[F64, F64]:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
 from kiteline_basestation.inertial.chain import Path, Segment, path_along
-from kiteline_core.geometry import se3
 from kiteline_core.optimisation.bundle import BundleResult
 
 F64 = NDArray[np.float64]
@@ -115,15 +114,12 @@ def _linearised(path: Path, state: _State, weight: F64, config: InertialScaleCon
     a, dt = path.begin, path.dt_s
     n, x0, x1 = len(a), state.node[path.begin], state.node[path.begin + 1]
     back = np.swapaxes(path.R_w_b[a], 1, 2)
-    # the accelerometer's bias turns with the body during a step
-    middle = np.array([se3.so3_exp(0.5 * w) for w in path.turn])
-    early = np.array([se3.so3_exp(w / 3.0) for w in path.turn])
     J = np.zeros((n, _ROWS, _WIDTH + _SHARED))
     e = np.zeros((n, _ROWS))
     t = dt[:, None]
     dv = np.einsum("nij,nj->ni", back, x1[:, 3:6] - x0[:, 3:6] - t * state.gravity)
     dp = np.einsum("nij,nj->ni", back, x1[:, :3] - x0[:, :3] - t * x0[:, 3:6] - 0.5 * t * t * state.gravity)
-    by_bias_v, by_bias_p = dt[:, None, None] * middle, 0.5 * (dt * dt)[:, None, None] * early
+    by_bias_v, by_bias_p = path.by_bias[:, 0], path.by_bias[:, 1]
     e[:, :3] = dv - path.velocity + np.einsum("nij,nj->ni", by_bias_v, x0[:, 6:])
     e[:, 3:6] = dp - path.position + np.einsum("nij,nj->ni", by_bias_p, x0[:, 6:])
     tilt = back @ _tangent(state.gravity)
