@@ -228,8 +228,8 @@ def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     # the map is gravity-aligned from its first pose on: the camera's y axis points down
     up = np.array([e.T_o_b[2, :3] for e in estimates[first:]])
     assert np.degrees(np.arccos(np.clip((up * -true[:, 1, :3]).sum(axis=1), -1.0, 1.0))).max() < 2.0
-    births = [r for r in far.receive((), 0) if isinstance(r, NewLandmarks) and (r.inv_depth > 0).any()]
-    assert {submap_of_keyframe(r.keyframe) for r in births} == {e.submap for e in estimates[first:]}
+    new_landmarks = [r for r in far.receive((), 0) if isinstance(r, NewLandmarks) and (r.inv_depth > 0).any()]
+    assert {submap_of_keyframe(r.keyframe) for r in new_landmarks} == {e.submap for e in estimates[first:]}
 
 
 def test_a_still_camera_with_an_imu_has_no_pose() -> None:

@@ -30,8 +30,8 @@ class Flight:
     true_T_w_k: list[F64] = field(default_factory=list)
     agent_T_m_k: list[F64] = field(default_factory=list)
     records: list[list[Record]] = field(default_factory=list)
-    sightings: set[tuple[KeyframeId, int]] = field(default_factory=set)  # keyframe and keypoint
-    wild: set[tuple[KeyframeId, int]] = field(default_factory=set)  # sightings that are wrong by 12 px or more
+    observations: set[tuple[KeyframeId, int]] = field(default_factory=set)  # keyframe and keypoint
+    wild: set[tuple[KeyframeId, int]] = field(default_factory=set)  # observations that are wrong by 12 px or more
     point_of: dict[int, int] = field(default_factory=dict)  # point id -> row of world
 
     def all_records(self) -> list[Record]:
@@ -129,9 +129,9 @@ def fly(
             KeyframeHeader(keyframe, 10**9 + submap * 10**12 + n * 250_000_000, parent, T_p_k, len(rows))
         ]
         index = np.arange(len(rows), dtype=np.uint16)
-        for kind, mask in (("birth", ~known), ("sighting", known)):
+        for kind, mask in (("new landmark", ~known), ("observation", known)):
             for part, some in enumerate(np.array_split(np.flatnonzero(mask), 3)):
-                if kind == "birth":
+                if kind == "new landmark":
                     angle = ((direction[rows[some]] + rng.integers(-5, 6, len(some))) & 255).astype(np.uint8)
                     made.append(
                         NewLandmarks(
@@ -151,7 +151,7 @@ def fly(
                             keyframe, part, index[some], measured[some], inverse[some], octave[some], ids[some]
                         )
                     )
-        flight.sightings |= {(keyframe, int(i)) for i in np.flatnonzero(known)}
+        flight.observations |= {(keyframe, int(i)) for i in np.flatnonzero(known)}
         flight.wild |= {(keyframe, int(i)) for i in np.flatnonzero(wild & known)}
         for i, r in enumerate(rows.tolist()):
             if known[i]:

@@ -104,10 +104,10 @@ def test_outlier_observations_are_removed(make_flight: MakeFlight) -> None:
     keyframes = mapper.map.keyframes.id[table.row[slots]].tolist()
     removed = set(zip(keyframes, mapper.map.keypoint_of(slots).tolist()))
     assert removed == {(r.keyframe, int(i)) for r in published if isinstance(r, RemovedObservations) for i in r.index}
-    sightings = {(k, int(i)) for k, i in flight.sightings if k in flight.keyframes[2:-2]}
-    wild = flight.wild & sightings
+    observations = {(k, int(i)) for k, i in flight.observations if k in flight.keyframes[2:-2]}
+    wild = flight.wild & observations
     assert len(removed & wild) > 0.9 * len(wild) > 50
-    assert len(removed & (sightings - wild)) < 0.08 * len(sightings)  # a wild birth spoils its point
+    assert len(removed & (observations - wild)) < 0.08 * len(observations)  # a wild new landmark spoils its point
 
 
 def test_landmarks_without_later_observations_are_culled(make_flight: MakeFlight) -> None:
@@ -119,12 +119,12 @@ def test_landmarks_without_later_observations_are_culled(make_flight: MakeFlight
         head = next(r for r in part if isinstance(r, KeyframeHeader))
         index = np.arange(head.keypoints, head.keypoints + 15, dtype=np.uint16)
         ghosts |= {(head.keyframe, int(i)) for i in index}
-        births = NewLandmarks(
+        new_landmarks = NewLandmarks(
             head.keyframe, 9, index, rng.uniform(300, 450, (15, 2)).astype(np.float32),
             np.full(15, 0.4, np.float32), np.zeros(15, np.uint8), np.zeros(15, np.uint8),
             rng.integers(0, 256, (15, 32), dtype=np.uint8),
         )  # fmt: skip
-        records.append([replace(head, keypoints=head.keypoints + 15), *part[1:], births])
+        records.append([replace(head, keypoints=head.keypoints + 15), *part[1:], new_landmarks])
     mapper = Mapper()
     published = feed(mapper, flight, records)
     last = {r.keyframe: r for r in published if isinstance(r, CulledLandmarks)}
@@ -137,7 +137,7 @@ def test_landmarks_without_later_observations_are_culled(make_flight: MakeFlight
 @pytest.mark.parametrize("stereo", [True, False])
 def test_landmarks_without_depth_are_triangulated(make_flight: MakeFlight, stereo: bool) -> None:
     flight = make_flight(keyframes=14, turns=0.4, no_depth=0.4 if stereo else 0.0, stereo=True, drift_m=0.0005)
-    if not stereo:  # all births and sightings without depth: the poses alone place the points
+    if not stereo:  # all new landmarks and observations without depth: the poses alone place the points
         flight = make_flight(keyframes=14, turns=0.4, no_depth=1.0, drift_m=0.0005)
     mapper = Mapper()
     published = feed(mapper, flight, flight.records)
@@ -220,13 +220,13 @@ def test_published_values_match_the_map(make_flight: MakeFlight) -> None:
         assert np.allclose(T_m_k[:3, :3] @ T_m_k[:3, :3].T, np.eye(3), atol=1e-12)
     found = {r.keyframe: r for r in published if isinstance(r, FusedLandmarks)}
     for keyframe, same in found.items():
-        births = mapper.map.slots_of(keyframe)[same.index]
-        assert np.array_equal(mapper.map.landmark_ids(mapper.map.keypoints.root[births]), same.point)
+        new_landmarks = mapper.map.slots_of(keyframe)[same.index]
+        assert np.array_equal(mapper.map.landmark_ids(mapper.map.keypoints.root[new_landmarks]), same.point)
     for record in {r.keyframe: r for r in published if isinstance(r, RefinedLandmarks)}.values():
-        births = mapper.map.slots_of(record.keyframe)[record.index]
-        current = mapper.map.keypoints.root[births] == births
+        new_landmarks = mapper.map.slots_of(record.keyframe)[record.index]
+        current = mapper.map.keypoints.root[new_landmarks] == new_landmarks
         assert current.all()
-        assert np.array_equal(mapper.map.keypoints.refined[births], record.inv_depth)
+        assert np.array_equal(mapper.map.keypoints.refined[new_landmarks], record.inv_depth)
 
 
 def test_a_superseded_or_unknown_job_changes_nothing(make_flight: MakeFlight) -> None:

@@ -47,7 +47,7 @@ ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 
 
 def in_own_unit(flight: Any, unit: float, growth: float = 0.0) -> Any:
-    """The flight as one eye tells of it: lengths are unit times metres, and grow by a share with each keyframe."""
+    """The flight as one camera shows it: lengths are unit times metres, and grow by a share with each keyframe."""
     assert not flight.camera.stereo
     for n, records in enumerate(flight.records):
         head = records[0]

@@ -22,7 +22,7 @@ KEYFRAMES, BIRTHS = 6, 14
 
 
 def flight(noise_px: float) -> tuple[SparseMap, list[np.ndarray]]:
-    """Keyframes along x with few births each, seen again by the next; links are exact, pixels are not."""
+    """Keyframes along x with few new landmarks each, seen again by the next; links are exact, pixels are not."""
     rng = np.random.default_rng(1)
     sparse_map = SparseMap()
     sparse_map.set_camera(AgentId(0), CAMERA)

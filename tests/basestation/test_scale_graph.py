@@ -18,7 +18,7 @@ F64 = NDArray[np.float64]
 def drifting_ring(
     n: int, per_turn: int, loops: int, growth: float = 0.0005, seed: int = 0
 ) -> tuple[F64, F64, GraphInputs]:
-    """Poses around a circle, seen by one eye whose unit shrinks: lengths grow by a share with each. The loops know."""
+    """Poses around a circle, seen by one camera whose unit shrinks: lengths grow with each pose."""
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * np.arange(n) / per_turn
     true = np.array(

@@ -28,7 +28,7 @@ def slots(*numbers: int) -> Slots:
 
 
 class Writer:
-    """Writes keyframes of ten keypoints: births 0..5, sightings 6..9 of births 0..3 of the keyframe before."""
+    """Write keyframes of ten keypoints: new landmarks 0..5, observations 6..9 of 0..3 of the keyframe before."""
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self.map = sparse_map
@@ -37,7 +37,7 @@ class Writer:
         T = se3.exp(np.array([0.1, 0.01 * n, 0.0, 0.01, 0.0, 0.02]))
         self.map.add_keyframe(kf(n), n * 10, kf(n - 1) if n else NO_KEYFRAME, T, 10 if n else 6)
 
-    def births(self, n: int) -> None:
+    def new_landmarks(self, n: int) -> None:
         rng = np.random.default_rng(n)
         self.map.put_new_landmarks(
             kf(n), 0, np.arange(6, dtype=np.uint16), rng.uniform(50, 400, (6, 2)).astype(np.float32),
@@ -45,7 +45,7 @@ class Writer:
             rng.integers(0, 256, (6, 32), dtype=np.uint8),
         )  # fmt: skip
 
-    def sightings(self, n: int) -> None:
+    def observations(self, n: int) -> None:
         if n:
             points = np.array([point_id(kf(n - 1), i) for i in range(4)], np.int64)
             self.map.put_observations(
@@ -55,8 +55,8 @@ class Writer:
 
     def everything(self, n: int) -> None:
         self.head(n)
-        self.births(n)
-        self.sightings(n)
+        self.new_landmarks(n)
+        self.observations(n)
 
 
 def chain(length: int) -> SparseMap:
@@ -129,7 +129,7 @@ def test_bearing_is_the_inverse_of_position() -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.permutations([(n, what) for n in range(4) for what in ("births", "sightings")]), st.data())
+@given(st.permutations([(n, what) for n in range(4) for what in ("new_landmarks", "observations")]), st.data())
 def test_any_order_and_any_repetition_of_sections_gives_the_same_map(
     order: list[tuple[int, str]], data: st.DataObject
 ) -> None:
@@ -186,7 +186,7 @@ def test_fusing_moves_all_observations_and_late_observations_follow() -> None:
     assert sparse_map.keyframes.id[sparse_map.keypoints.row[seen]].tolist() == [kf(0), kf(2), kf(3)]
     assert new not in sparse_map.live_landmarks()
     (older,) = sparse_map.find_landmarks(np.array([point_id(kf(1), 5)], np.int64))
-    # An alias of an alias is flattened: both keyframes whose births now show another root are named.
+    # An alias of an alias is flattened: both keyframes whose new landmarks now show another root are named.
     third = int(sparse_map.find_landmarks(np.array([point_id(kf(1), 4)], np.int64))[0])
     assert sparse_map.fuse(third, int(older)) == [kf(1)]
     assert sparse_map.fuse(int(old), int(older)) == [kf(0), kf(2)]

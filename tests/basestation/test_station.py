@@ -49,9 +49,9 @@ def test_the_agent_holds_what_the_base_computes_with(make_flight: Callable[..., 
         assert held is not None
         assert np.array_equal(held, pose.T_m_k)
     for keyframe, record in depths.items():
-        births = sparse_map.slots_of(keyframe)[record.index]
-        assert np.array_equal(sparse_map.keypoints.refined[births], record.inv_depth)
-        assert np.array_equal(sparse_map.keypoints.offset[births], record.offset)
+        new_landmarks = sparse_map.slots_of(keyframe)[record.index]
+        assert np.array_equal(sparse_map.keypoints.refined[new_landmarks], record.inv_depth)
+        assert np.array_equal(sparse_map.keypoints.offset[new_landmarks], record.offset)
     assert base_end.endpoint.digest_equal
     assert station.mapper.idle
 

@@ -47,9 +47,9 @@ class Flight:
 
     @staticmethod
     def share(agent: CodedChannel, records: list[object], now_ns: int) -> None:
-        births = [r for r in records if isinstance(r, NewLandmarks)]
+        landmarks = [r for r in records if isinstance(r, NewLandmarks)]
         all_births = NewLandmarks(
-            births[0].keyframe, 0, *(np.concatenate([getattr(b, name) for b in births]) for name in
+            landmarks[0].keyframe, 0, *(np.concatenate([getattr(b, name) for b in landmarks]) for name in
             ("index", "uv", "inv_depth", "octave", "angle", "descriptor"))
         )  # fmt: skip
         order = np.argsort(all_births.index)
@@ -60,7 +60,7 @@ class Flight:
         seen = next(
             (r for r in records if isinstance(r, Observations)),
             Observations(
-                births[0].keyframe, 0, np.zeros(0, np.uint16), np.zeros((0, 2), np.float32), np.zeros(0, np.float32),
+                landmarks[0].keyframe, 0, np.zeros(0, np.uint16), np.zeros((0, 2), np.float32), np.zeros(0, np.float32),
                 np.zeros(0, np.uint8), np.zeros(0, np.int64),
             ),
         )  # fmt: skip

@@ -23,7 +23,7 @@ from kiteline_core.frame import Frame
 from kiteline_hw.sources.open import open_source
 
 RUNS = 5
-FLIGHTS = ("room_flight.mcap", "euroc_mh01_air", "kitti_straight")  # stereo and IMU, one eye and IMU, stereo
+FLIGHTS = ("room_flight.mcap", "euroc_mh01_air", "kitti_straight")  # stereo and IMU, monocular with IMU, stereo
 _CORNERS = 1000  # of the yardstick, cv2.ORB_create
 _EVERY = 4  # images of which one is measured
 _MEAN, _P95 = 0.95, 2.3  # over the yardstick

@@ -30,7 +30,7 @@ def run(bench: Bench) -> list[Bar]:
     columns = ("start s", "metric after s", f"scale off from {_SETTLED_S:g} s on, %", "largest of metric windows, %",
                "ATE odometry m", "ATE live m", "ATE base m", "lost after metric", "largest jump mm",
                "seconds")  # fmt: skip
-    table(bench, f"{FLIGHT}, one eye and IMU", columns, rows)
+    table(bench, f"{FLIGHT}, monocular with IMU", columns, rows)
     return [
         *spread(f"{FLIGHT}: metric after", [f.metric_after_s for f in flights], _METRIC_S, "s", 1),
         at_most(f"{FLIGHT}: frames lost afterwards, worst", max(f.lost_after_metric for f in flights), 0, "", 0),

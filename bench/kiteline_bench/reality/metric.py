@@ -1,4 +1,4 @@
-"""Whether the agent says "metric" only where lengths are right: one eye and IMU from a hundred starts."""
+"""Whether the agent says "metric" only where lengths are right: monocular with IMU from a hundred starts."""
 
 from __future__ import annotations
 

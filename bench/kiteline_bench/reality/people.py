@@ -11,7 +11,7 @@ from kiteline_bench.reality.flown import Flown, flown, spread, table
 
 _FLIGHTS = tuple(range(400, 420))  # numbers of random flights
 _STARTS_S = (0.0, 1.0, 2.0, 3.0, 4.0)
-_ONE_EYED = 2  # of the starts of each flight: one eye and IMU
+_MONOCULAR = 2  # of the starts of each flight: monocular with IMU
 _PEOPLE, _SECONDS = 4, 12.0
 _TIMES, _LEAST_M = 2.0, 0.01  # times the error in the empty scene, or m, whichever is larger
 _FALSE, _WRONG_M = 0.05, 0.3
@@ -20,7 +20,7 @@ _FALSE, _WRONG_M = 0.05, 0.3
 def run(bench: Bench) -> list[Bar]:
     """ATE over that in the empty scene, false scales and wrong merges."""
     rows: list[tuple[object, ...]] = []
-    figures: dict[str, list[tuple[float, ...]]] = {"two eyes": [], "one eye": []}
+    figures: dict[str, list[tuple[float, ...]]] = {"stereo": [], "monocular": []}
     folder = Path(bench.source("trajectories"))
     for number in bench.chosen(_FLIGHTS):
         crowd, empty = (
@@ -28,9 +28,9 @@ def run(bench: Bench) -> list[Bar]:
             for people in (_PEOPLE, 0)
         )
         for k, start_s in enumerate(_STARTS_S):
-            eyes = "one eye" if k >= len(_STARTS_S) - _ONE_EYED else "two eyes"
+            eyes = "monocular" if k >= len(_STARTS_S) - _MONOCULAR else "stereo"
             pair = [flown(bench, f"flight {number} from {start_s:g} s, {eyes}, {what}",
-                          _part(recording, start_s, eyes == "one eye"))
+                          _part(recording, start_s, eyes == "monocular"))
                     for what, recording in (("empty", empty), (f"{_PEOPLE} people", crowd))]  # fmt: skip
             found = _figures(*pair)
             figures[eyes].append(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from kiteline_bench.reality import base, cpu, difficult, euroc, metric, motion, nees, people, places, street, worn
 
 PARTS = {
-    "euroc": ("Reality: one eye and a real IMU", euroc.run),
+    "euroc": ("Reality: monocular with a real IMU", euroc.run),
     "room": ("Reality: a worn rig in a room", worn.room),
     "hall": ("Reality: a worn rig in a hall", worn.hall),
     "street": ("Reality: a street", street.run),
