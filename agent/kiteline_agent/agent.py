@@ -220,7 +220,7 @@ class Agent:
             outcome.events.extend(self._rows.take_events())
             rows_px = self._rows.take_change()
             if rows_px is not None:
-                self._channel.put(StereoAlignment(self._identity.agent, rows_px, self._began_with_px))
+                self._channel.put(StereoAlignment(self._identity.agent, rows_px, self._rows.read, self._began_with_px))
         self.work.rectified_px += images.rectified_px
         # 9. Report the pose.
         self._was_lost = not outcome.tracked or outcome.bridged
@@ -237,10 +237,12 @@ class Agent:
         """Take over what earlier flights with this calibration found of the right camera."""
         if self._rows is None or not known.is_of(self.map.camera):
             return  # there is no right camera, or it was calibrated anew
-        self._rows.begin_with(known.rows)
+        self._rows.begin_with(known.rows, read=known.rows_read)
         self.map.set_disparity_offset(known.disparity)
+        if self._disparities is not None:
+            self._disparities.begin_with(known.disparity)
         self._began_with_px = known.disparity
-        self._channel.put(StereoAlignment(self._identity.agent, known.rows, known.disparity))
+        self._channel.put(StereoAlignment(self._identity.agent, known.rows, known.rows_read, known.disparity))
 
     def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
@@ -352,7 +354,8 @@ class Agent:
         """What is known of the right camera now, for the next flight; None without one, and before it was measured."""
         if self._rows is None or not self._rows.known:
             return None
-        return known_rig(self.map.camera, self._rows.estimate_px, self.map.disparity_offset)
+        rows = self._rows
+        return known_rig(self.map.camera, rows.estimate_px, self.map.disparity_offset, rows_read=rows.read)
 
     def time_offset_report(self) -> dict[str, float] | None:
         """InertialTracker.offset_report; None without an IMU."""

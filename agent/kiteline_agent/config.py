@@ -205,6 +205,7 @@ class DisparityConfig:
     inflation: float = 2.0  # of variance: templates and lens errors are common to neighbouring points
     iterations: int = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
+    known_px: float = 0.1  # px; standard deviation of each number that an earlier flight found
     prior_px: float = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
     prior_slope_px: float = 0.5  # px where x or y is 1; of the other terms
     good_px: float = 0.1  # px; standard deviation of all terms of a good calibration

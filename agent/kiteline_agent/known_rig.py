@@ -26,6 +26,7 @@ class KnownRigConfig:
     camera: tuple[float, ...] = ()
     T_b_c: tuple[float, ...] = ()  # row-major 4x4: rectified left camera in the body, m; for exports
     rows_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x y, y^2 by which the right image is too low
+    rows_read: bool = False  # disparities were measured in a right image that was read there
     disparity_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x^2, x y by which disparities are too large
 
     def __post_init__(self) -> None:
@@ -66,8 +67,8 @@ def numbers_of(camera: RectifiedCamera) -> tuple[float, ...]:
     return (float(c.width), float(c.height), c.fx, c.fy, c.cx, c.cy, c.baseline_m)
 
 
-def known_rig(camera: RectifiedCamera, rows_px: F64, disparity_px: F64) -> KnownRigConfig:
+def known_rig(camera: RectifiedCamera, rows_px: F64, disparity_px: F64, *, rows_read: bool) -> KnownRigConfig:
     """What a flight found, rounded to what the next one can use."""
     rows, disparity = (tuple(round(float(v), 3) for v in values) for values in (rows_px, disparity_px))
     T_b_c = tuple(round(float(v), 9) for v in camera.T_b_c.ravel())
-    return KnownRigConfig(numbers_of(camera), T_b_c, rows, disparity)
+    return KnownRigConfig(numbers_of(camera), T_b_c, rows, rows_read, disparity)

@@ -179,6 +179,8 @@ class DisparityConfig:
         6.0  # squared distance of the data from a good calibration, inflated; of true rigs it is below 1
     )
     min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
+    known_from: float = 2.0  # prior deviations, rms; from which the offset of earlier flights is that of a worn rig
+    usual_rows_px: float = 0.25  # px; by which rows are off in good calibrations: more, and the motion does not matter
     inflation: float = (
         3.0  # factor on the estimated standard deviations: lens distortion biases depths from motion, too
     )

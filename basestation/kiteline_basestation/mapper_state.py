@@ -71,3 +71,4 @@ def restore_map(sparse_map: SparseMap, state: MapState) -> None:
         sparse_map.move_submap(submap, S_w_m)
     sparse_map.disparity_offset_px.update(state.disparity_offset_px)
     sparse_map.disparity_calibrated.update(state.disparity_calibrated)
+    sparse_map.known_offset_px.update(state.disparity_offset_px)

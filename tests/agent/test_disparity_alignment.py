@@ -156,6 +156,21 @@ def test_the_base_s_map_is_left_to_the_base() -> None:
     assert flight.alignment.worn > 0.95  # the covariance knows
 
 
+def test_what_earlier_flights_found_is_where_it_begins() -> None:
+    fresh, known = Flight(WORN, 2, SIDEWAYS), Flight(WORN, 2, SIDEWAYS)
+    known.map.set_disparity_offset(WORN)
+    known.alignment.begin_with(WORN)
+    assert np.trace(known.alignment.expected_cov) < 0.1 * np.trace(fresh.alignment.expected_cov)
+    known.fly(12)
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    assert np.sqrt(np.mean((grid @ (WORN - known.map.disparity_offset)) ** 2)) < 0.1
+    bent = Flight(0.3 * WORN, 2, SIDEWAYS)  # it was repaired since
+    bent.map.set_disparity_offset(WORN)
+    bent.alignment.begin_with(WORN)
+    bent.fly(80)
+    assert np.sqrt(np.mean((grid @ (0.3 * WORN - bent.map.disparity_offset)) ** 2)) < 0.35
+
+
 def test_it_is_deterministic() -> None:
     def found() -> bytes:
         flight = Flight(WORN, 3, SIDEWAYS)

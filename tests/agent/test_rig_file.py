@@ -52,7 +52,7 @@ def flown(known: KnownRigConfig, rig: CameraRig = RIG) -> tuple[Agent, Told]:
 
 @given(numbers, numbers)
 def test_a_file_holds_what_was_known(rows: np.ndarray, disparity: np.ndarray) -> None:
-    known = known_rig(CAMERA, rows, disparity)
+    known = known_rig(CAMERA, rows, disparity, rows_read=False)
     table = tomllib.loads(rig_file.text_of(known))
     assert configuration.apply(KnownRigConfig(), table["known_rig"]) == known
     assert known.is_of(CAMERA)
@@ -63,24 +63,26 @@ def test_a_file_holds_what_was_known(rows: np.ndarray, disparity: np.ndarray) ->
 
 
 def test_an_agent_begins_with_it_and_tells_the_base() -> None:
-    agent, told = flown(known_rig(CAMERA, ROWS, DISPARITY))
+    agent, told = flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True))
     said = [r for r in told.records if isinstance(r, StereoAlignment)]
     assert len(said) == 1
     assert said[0].agent == 2
     assert np.allclose(said[0].rows_px, ROWS)
     assert np.allclose(said[0].disparity_px, DISPARITY)
     assert np.allclose(agent.map.disparity_offset, DISPARITY)
-    assert agent.known_rig() == known_rig(CAMERA, ROWS, DISPARITY)
+    assert agent.known_rig() == known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
+    as_they_came, _ = flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=False))
+    assert as_they_came.known_rig() == known_rig(CAMERA, ROWS, DISPARITY, rows_read=False)
 
 
 def test_without_knowledge_or_with_another_calibration_nothing_changes() -> None:
     other = RectifiedCamera(640, 400, CAMERA.fx + 0.01, CAMERA.fy, CAMERA.cx, CAMERA.cy, 0.11, True, np.eye(4))
-    for known in (KnownRigConfig(), known_rig(other, ROWS, DISPARITY)):
+    for known in (KnownRigConfig(), known_rig(other, ROWS, DISPARITY, rows_read=True)):
         agent, told = flown(known)
         assert not any(isinstance(r, StereoAlignment) for r in told.records)
         assert not agent.map.disparity_offset.any()
         assert agent.known_rig() is None  # nothing was measured yet
-    agent, _ = flown(known_rig(CAMERA, ROWS, DISPARITY), CameraRig(LEFT, None, np.eye(4), None))
+    agent, _ = flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), CameraRig(LEFT, None, np.eye(4), None))
     assert agent.known_rig() is None
 
 
@@ -90,7 +92,7 @@ def test_the_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
     keeper = RigFile(str(path))
     keeper.save(None)
     assert not path.exists()
-    known = known_rig(CAMERA, ROWS, DISPARITY)
+    known = known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
     keeper.save(known)
     assert agent_config("", rig=str(path)).known_rig == known
     assert [p.name for p in path.parent.iterdir()] == ["rig.toml"]

@@ -14,7 +14,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.refinement.disparity_calibration import sideways_share
+from kiteline_basestation.refinement.disparity_calibration import has_bent, prior_mean, sideways_share
 from kiteline_codec.schema import (
     CameraIntrinsics,
     DisparityCalibration,
@@ -24,6 +24,7 @@ from kiteline_codec.schema import (
     StereoAlignment,
 )
 from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 
@@ -134,7 +135,7 @@ def test_motion_across_the_axis_is_that_of_the_cameras_own_axes() -> None:
 def test_a_base_begins_with_what_the_agent_began_with_but_keeps_its_own(words: Any, make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=2)
     mapper = Mapper(BaseConfig(), words)
-    said = StereoAlignment(flight.agent, BENT_ROWS, WORN)
+    said = StereoAlignment(flight.agent, BENT_ROWS, True, WORN)
     first = (CameraIntrinsics(flight.agent, flight.camera), said)
     mapper.step(MapperInput(((flight.agent, first),), ()), 0)
     assert np.array_equal(mapper.map.disparity_offset_px[AgentId(0)], WORN)
@@ -144,4 +145,44 @@ def test_a_base_begins_with_what_the_agent_began_with_but_keeps_its_own(words: A
     again = CameraIntrinsics(flight.agent, replace(flight.camera, fx=flight.camera.fx + 1.0))
     mapper.step(MapperInput(((flight.agent, (again,)),), ()), 2 * 10**9)
     assert AgentId(0) not in mapper.map.rows_px
+    assert AgentId(0) not in mapper.map.rows_read
+    assert AgentId(0) not in mapper.map.known_offset_px
     assert not np.any(mapper.map.disparity_offset_px[AgentId(0)])
+
+
+def test_a_worn_rig_is_held_about_what_earlier_flights_found(words: Any, make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=14, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    left = []
+    for told in (NONE, WORN):
+        config = replace(BaseConfig().disparity, min_sideways=2.0)  # no motion is believed
+        mapper = Mapper(replace(BaseConfig(), disparity=config), words)
+        fly(mapper, flight, WORN, (StereoAlignment(flight.agent, 0.1 * BENT_ROWS, False, told),))
+        assert not has_bent(mapper.map, flight.agent, config)
+        error = WORN - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
+        left.append(float(np.sqrt(np.mean(np.square(terms(CORNERS) @ error)))))
+    assert left[1] < 0.06
+    assert left[1] < 0.5 * left[0]
+
+
+def test_what_a_good_calibration_may_have_is_not_carried_from_flight_to_flight(words: Any) -> None:
+    mapper, config = Mapper(BaseConfig(), words), BaseConfig().disparity
+    assert not np.any(prior_mean(mapper.map, AgentId(0), config))
+    camera = RectifiedCamera(752, 480, FOCAL, FOCAL, CX, CY, 0.11, True, np.eye(4))
+    mapper.map.set_camera(AgentId(0), camera)
+    mapper.map.set_stereo_alignment(StereoAlignment(AgentId(0), NONE, False, CONSTANT))
+    assert np.array_equal(mapper.map.disparity_offset_px[AgentId(0)], CONSTANT)  # where it begins
+    assert not np.any(prior_mean(mapper.map, AgentId(0), config))
+    mapper.map.known_offset_px[AgentId(0)] = WORN
+    assert np.array_equal(prior_mean(mapper.map, AgentId(0), config), WORN)
+
+
+def test_bent_rows_let_a_large_offset_be_found_whatever_the_motion(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=14, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    left = []
+    for rows_px in (0.4 * BENT_ROWS, BENT_ROWS):  # as in a good calibration, and bent
+        mapper = Mapper(replace(BaseConfig(), disparity=replace(BaseConfig().disparity, min_sideways=2.0)), words)
+        fly(mapper, flight, WORN, (StereoAlignment(flight.agent, rows_px, True, NONE),))
+        error = WORN - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
+        left.append(float(np.sqrt(np.mean(np.square(terms(CORNERS) @ error)))))
+    assert left[1] < 0.1
+    assert left[1] < 0.6 * left[0]

@@ -124,6 +124,7 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["turn"], out["moved"], out["velocity"] = c[:, 1:4] / 2**14, c[:, 4:7] / 2**13, v
         out["position"] = c[:, 10:] / 2**15 + v * out["dt_s"][:, None] / 2
     elif kind == 9:
+        out["rows_read"] = s.u8() == 1
         out["rows_px"], out["disparity_px"] = ([s.signed() / 1024 for _ in range(5)] for _ in range(2))
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]

@@ -126,8 +126,8 @@ def test_a_prior_widens_where_the_data_contradict_it() -> None:
     problem = passage(0.02)
     assert problem.border is not None
     narrow = bundle(problem, EASY)
-    worn = replace(problem, border=replace(problem.border, worn=100.0, contradicts=30.0))
-    sure = replace(problem, border=replace(problem.border, worn=100.0, contradicts=1e6))
+    worn = replace(problem, border=replace(problem.border, worn=100.0, contradicts=np.full(2, 30.0)))
+    sure = replace(problem, border=replace(problem.border, worn=100.0, contradicts=np.full(2, 1e6)))
     wide = bundle(worn, EASY)
     free = bundle(passage(2.0), EASY)
     assert np.allclose(wide.offset, free.offset, atol=1e-6)
@@ -142,7 +142,7 @@ def test_a_prior_stays_where_the_data_agree_with_it() -> None:
     good = problem.measured.copy()
     good[:, 2] -= np.where(problem.border.group >= 0, off, 0.0)
     true_rig = replace(problem, measured=good)
-    may = replace(true_rig, border=replace(problem.border, worn=100.0, contradicts=30.0))
+    may = replace(true_rig, border=replace(problem.border, worn=100.0, contradicts=np.full(2, 30.0)))
     assert np.array_equal(bundle(may, EASY).offset, bundle(true_rig, EASY).offset)
 
 
@@ -159,3 +159,21 @@ def test_the_cost_of_a_yielding_prior_is_minimal() -> None:
     assert cost(ours.offset) == pytest.approx(ours.final_cost, rel=1e-6)
     for step in 1e-3 * np.concatenate([np.eye(4), -np.eye(4)]):
         assert cost(ours.offset + step.reshape(2, 2)) > ours.final_cost
+
+
+def test_a_prior_about_what_is_known_holds_there() -> None:
+    problem = passage(0.02)
+    assert problem.border is not None
+    off = np.abs(bundle(problem, EASY).offset - TRUE).max()
+    known = replace(problem, border=replace(problem.border, mean=TRUE))
+    assert np.abs(bundle(known, EASY).offset - TRUE).max() < 0.3 * off
+    moved = replace(known, border=replace(problem.border, mean=TRUE + 0.5, worn=100.0, contradicts=np.full(2, 30.0)))
+    held = replace(moved, border=replace(problem.border, mean=TRUE + 0.5))
+    assert np.abs(bundle(moved, EASY).offset - TRUE).max() < 0.4 * np.abs(bundle(held, EASY).offset - TRUE).max()
+    far = passage(1e6)
+    assert far.border is not None
+    assert np.allclose(  # without a weight its place does not matter
+        bundle(replace(far, border=replace(far.border, mean=TRUE + 0.5)), EASY).offset,
+        bundle(far, EASY).offset,
+        atol=1e-4,
+    )

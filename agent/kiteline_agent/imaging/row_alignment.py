@@ -57,6 +57,7 @@ class RowAlignment:
         self._vector = np.zeros(TERMS)
         self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
+        self._taken_read = False
         self._measured = False  # since take_change
         self.known = False  # something was measured, in this flight or an earlier one
         self._events: list[str] = []
@@ -104,26 +105,37 @@ class RowAlignment:
         return rms
 
     @property
+    def read(self) -> bool:
+        """True if the right image is read at its rows."""
+        return bool(self.applied_px.any())
+
+    @property
     def estimate_px(self) -> F64:
         """The offset (5,) as measured so far, applied or not."""
         return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
 
-    def begin_with(self, rows_px: F64) -> None:
-        """Begin with the offset (5,) that an earlier flight measured. Read the right image there if that one did."""
+    def begin_with(self, rows_px: F64, *, read: bool) -> None:
+        """Begin with the offset (5,) that an earlier flight measured. read: it read the right image there.
+
+        Disparities that were calibrated with the rows as they came would not fit others.
+        """
         self._information = np.diag(np.full(TERMS, self._config.known_px**-2.0))
         self._vector = self._information @ rows_px
         self._taken_px = rows_px
         self.known = True
         self._events.append("the right camera is taken as earlier flights found it")
-        if float(np.sqrt(np.mean(self._on_grid(rows_px) ** 2))) >= self._config.min_px:
+        self._taken_read = read
+        if read:
             self._read_at(rows_px)
 
     def take_change(self) -> F64 | None:
-        """The estimate, if a new one differs from what was taken last, at first from zero."""
+        """The estimate, if a new one differs from what was taken last, at first from zero, or is read from now on."""
         if not self._measured:
             return None
         self._measured, estimate = False, self.estimate_px
-        if float(np.sqrt(np.mean((self._at @ (estimate - self._taken_px)) ** 2))) < self._config.share_px:
+        before, self._taken_read = self._taken_read, self.read
+        change = float(np.sqrt(np.mean((self._at @ (estimate - self._taken_px)) ** 2)))
+        if before == self.read and change < self._config.share_px:
             return None
         self._taken_px = estimate
         return estimate

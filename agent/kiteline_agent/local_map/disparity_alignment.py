@@ -45,6 +45,15 @@ class DisparityAlignment:
         self.expected_cov = self._expected_cov()  # beside the error of a good calibration
         self._events: list[str] = []
 
+    def begin_with(self, offset: F64) -> None:
+        """Begin with the offset (5,) that earlier flights found, which the map has already."""
+        information = np.eye(TERMS) / self._config.known_px**2
+        self._old_h += information
+        self._old_b += information @ offset
+        self._solve()
+        self.applied = bool(offset.any())
+        self.expected_cov = self._expected_cov()
+
     def add(self, T_c_m: F64, rows: I64, observed: F64) -> F64 | None:
         """Add a frame at T_c_m (4,4) with landmarks in rows (n,) seen at observed (n,3) px.
 

@@ -90,7 +90,7 @@ class Intake:
             elif isinstance(record, GravityAlignment):
                 self.gravity[record.submap] = record
             elif isinstance(record, StereoAlignment):
-                self._map.set_stereo_alignment(record.agent, record.rows_px, record.disparity_px)
+                self._map.set_stereo_alignment(record)
             elif isinstance(record, SubmapScale):
                 self.metres_per_unit[record.submap] = self._map.told_metres[record.submap] = record.metres
                 if record.metres == 1.0:

@@ -48,7 +48,9 @@ class MapView:
         self.measures_depth: set[AgentId] = set()  # agents that measure depth in each observation (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # (5,) by agent, see disparity_calibration
         self.disparity_calibrated: set[AgentId] = set()  # agents with an accurate disparity offset
+        self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: the disparity offset of earlier flights
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
+        self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots whose landmark's keyframe is not received yet
 

@@ -25,6 +25,7 @@ from kiteline_basestation.map.map_tables import (
     grow,
 )
 from kiteline_basestation.map.map_view import MapView
+from kiteline_codec.schema import StereoAlignment
 from kiteline_core.geometry import disparity_offset, se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -60,6 +61,8 @@ class SparseMap(MapView):
         before = self.cameras.get(agent)
         if before is not None and _parameters(before) != _parameters(camera):
             self.rows_px.pop(agent, None)
+            self.rows_read.discard(agent)
+            self.known_offset_px.pop(agent, None)
             if agent in self.disparity_offset_px:
                 self.disparity_offset_px[agent] = disparity_offset.none()
                 self.disparity_calibrated.discard(agent)
@@ -68,14 +71,15 @@ class SparseMap(MapView):
             if agent_of_keyframe(keyframe) == agent:
                 self.keyframes.camera[row] = _parameters(camera)
 
-    def set_stereo_alignment(self, agent: AgentId, rows_px: F64, disparity_px: F64) -> None:
-        """Set what an agent knows of its right camera: rows (5,), and the disparity offset (5,) that it began with.
-
-        An offset that was estimated here counts more.
-        """
-        self.rows_px[agent] = rows_px
-        if agent not in self.disparity_offset_px and np.any(disparity_px != 0.0):
-            self.disparity_offset_px[agent] = disparity_px
+    def set_stereo_alignment(self, record: StereoAlignment) -> None:
+        """Set what an agent knows of its right camera. A disparity offset that was estimated here counts more."""
+        agent = record.agent
+        self.rows_px[agent] = record.rows_px
+        self.rows_read.discard(agent)
+        if record.rows_read:
+            self.rows_read.add(agent)
+        if agent not in self.disparity_offset_px and np.any(record.disparity_px != 0.0):
+            self.disparity_offset_px[agent] = self.known_offset_px[agent] = record.disparity_px
 
     def add_keyframe(self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64, keypoints: int) -> int:
         """Add a keyframe, or update its header. T_p_k: (4,4). Returns its row.

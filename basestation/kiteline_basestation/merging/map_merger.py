@@ -156,8 +156,8 @@ class MapMerger:
             return NOTHING
         map_id, window, agents = bundle.map_id, bundle.window, bundle.calibrated
         result: BundleResult = without_odometry_factors(window, done.result)
-        if agents and not disparity.is_significant(result, self._config.disparity):
-            disparity.reset_offsets(self._map, agents)
+        if agents and not disparity.is_significant(window.problem, result, self._config.disparity):
+            disparity.reset_offsets(self._map, agents, self._config.disparity)
             self._corrections.uncertain_at[map_id] = len(keyframes_of(self._map, map_id))
             self._corrections.request_bundle(map_id, calibrate=False)
             return NOTHING

@@ -56,14 +56,44 @@ def with_border(
     measured = problem.measured.copy()
     measured[ranged, 2] = (sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots])[ranged]
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
-    sigma = np.array([config.prior_px, *[config.prior_rad * focal] * (TERMS - 1)])
+    sigma = _prior_px(focal, config)
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
+    mean = np.stack([prior_mean(sparse_map, a, config) for a in agents])
     tells = sideways_share(problem.T_c_m) >= config.min_sideways
+    believed = np.array([tells or has_bent(sparse_map, a, config) for a in agents])
     border = Border(
         group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined,
-        config.worn, config.inflation**2 * config.contradicts if tells else np.inf,
+        config.worn, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
     )  # fmt: skip
     return replace(problem, measured=measured, border=border), agents
+
+
+def prior_mean(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -> F64:
+    """Offset (5,) px about which an agent's is expected: that of earlier flights if it is a worn rig's, else zero.
+
+    An offset within what good calibrations have may be one that those flights hardly determined. Were the next ones
+    held about it, and those after them about theirs, the prior would be no prior.
+    """
+    known, camera = sparse_map.known_offset_px.get(agent), sparse_map.cameras.get(agent)
+    if known is None or camera is None:
+        return none()
+    deviations = known / _prior_px(camera.fx, config)
+    return known if float(np.sqrt(np.mean(deviations**2))) > config.known_from else none()
+
+
+def _prior_px(focal: float, config: DisparityConfig) -> F64:
+    """Standard deviations (5,) of a good calibration's offset."""
+    return np.array([config.prior_px, *[config.prior_rad * focal] * (TERMS - 1)])
+
+
+def has_bent(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -> bool:
+    """True if rows of an agent's right image say that its mount has bent.
+
+    What bends a mount turns the camera about all axes. Rows show two of the three turns directly: their offset in the
+    middle and its growth along x. The third moves disparities.
+    """
+    rows = sparse_map.rows_px.get(agent)
+    return rows is not None and float(np.sqrt(np.mean(np.square(rows[:2])))) > config.usual_rows_px
 
 
 def sideways_share(T_c_m: F64) -> float:
@@ -78,16 +108,17 @@ def _centres(T_c_m: F64) -> F64:
     return np.asarray(-np.einsum("kji,kj->ki", T_c_m[:, :3, :3], T_c_m[:, :3, 3]))
 
 
-def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:
-    """Set the offsets of agents to zero, where set before."""
+def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...], config: DisparityConfig) -> None:
+    """Set the offsets of agents to what is expected without a bundle, where set before."""
     for agent in agents:
         if agent in sparse_map.disparity_offset_px:
-            sparse_map.disparity_offset_px[agent] = none()
+            sparse_map.disparity_offset_px[agent] = prior_mean(sparse_map, agent, config)
 
 
-def is_significant(result: BundleResult, config: DisparityConfig) -> bool:
-    """True if the estimated offset of at least one agent is significant (Mahalanobis distance)."""
-    for g, offset in enumerate(result.offset):
+def is_significant(problem: BundleProblem, result: BundleResult, config: DisparityConfig) -> bool:
+    """True if the estimate for at least one agent differs significantly from what was known (Mahalanobis distance)."""
+    known = None if problem.border is None else problem.border.mean
+    for g, offset in enumerate(result.offset if known is None else result.offset - known):
         cov = config.inflation**2 * result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > config.min_significance**2 * TERMS:
             return True

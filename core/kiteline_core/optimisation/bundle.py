@@ -44,11 +44,11 @@ class Border:
     """Disparity offsets that are estimated with the poses and points.
 
     group: (m,) int32 group of each observation, -1 for no offset. terms: (m,t): the offset to subtract from the
-    disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) px, standard deviation of c about 0. tail: standard
-    deviations beyond which the prior flattens (a t distribution), so that it yields to data that show a large offset;
-    only for terms whose standard deviation by the data alone is below this share `determined` of sigma. worn: factor on
-    sigma where the data contradict it: where their own estimate of a group is beyond `contradicts` (a squared
-    Mahalanobis distance) of what they and sigma allow.
+    disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) px, standard deviation of c about `mean` (g,t), or
+    about 0. tail: standard deviations beyond which the prior flattens (a t distribution), so that it yields to data
+    that show a large offset; only for terms whose standard deviation by the data alone is below this share `determined`
+    of sigma. worn: factor on sigma where the data contradict it: where their own estimate of a group is beyond
+    `contradicts` (g,) (a squared Mahalanobis distance) of what they and sigma allow.
     """
 
     group: I32
@@ -58,7 +58,8 @@ class Border:
     tail: float = np.inf
     determined: float = 0.7
     worn: float = 1.0
-    contradicts: float = np.inf
+    contradicts: F64 | None = None
+    mean: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,6 +265,7 @@ class _BorderSolver(_Solver):
         self._raw, self._border = problem.measured, border
         self._c = self._new_c = border.start.astype(np.float64, copy=True)
         self._sigma = np.tile(border.sigma, len(border.start))
+        self._mean = np.zeros(b) if border.mean is None else border.mean.ravel()
         self._yields = np.zeros(b, np.bool_)  # terms whose prior flattens
         self._blocks = (np.empty((b, b)), np.empty(b), np.empty((b, 6 * f)), np.empty((len(problem.camera), 3)))
         self._points_rhs = np.empty_like(self.points)
@@ -284,42 +286,44 @@ class _BorderSolver(_Solver):
         """Widen the priors of groups that the data contradict, and let those of terms flatten that the data determine,
         each beside all other unknowns.
         """
-        if np.isinf(self._border.tail) and np.isinf(self._border.contradicts):
+        if np.isinf(self._border.tail) and self._border.contradicts is None:
             return
         cov = self.border_estimate(active)[1]
         variance = np.diag(cov)
         if not np.isfinite(variance).all():
             return
-        self._widen_priors(cov)
+        if self._border.contradicts is not None:
+            self._widen_priors(cov, self._border.contradicts)
         if np.isinf(self._border.tail):
             return
         by_data = 1.0 / np.maximum(1.0 / variance - 1.0 / np.square(self._sigma), 1e-12)
         self._yields = by_data < np.square(self._border.determined * self._sigma)
 
-    def _widen_priors(self, cov: F64) -> None:
+    def _widen_priors(self, cov: F64, contradicts: F64) -> None:
         """Compare the data's own estimate of each group's offsets with its prior. cov: (b,b) with the prior."""
         total = np.linalg.inv(cov)
         own = total - np.diag(np.square(1.0 / self._sigma)) + 1e-9 * np.eye(len(cov))
-        estimate = np.linalg.solve(own, total @ (self._c.ravel() + self._rhs[6 * self._n_free :]))
+        held = np.square(1.0 / self._sigma) * self._mean
+        estimate = np.linalg.solve(own, total @ (self._c.ravel() + self._rhs[6 * self._n_free :]) - held) - self._mean
         spread = np.linalg.inv(own) + np.diag(np.square(self._sigma))
         terms = self._c.shape[1]
-        for first in range(0, len(cov), terms):
-            part = slice(first, first + terms)
+        for group, limit in enumerate(contradicts.tolist()):
+            part = slice(group * terms, (group + 1) * terms)
             distance = float(estimate[part] @ np.linalg.solve(spread[part, part], estimate[part]))
-            if distance > self._border.contradicts:
+            if distance > limit:
                 self._sigma[part] *= self._border.worn
 
     def _correct(self, c: F64) -> None:
         border_kernels.correct(self._raw, self._border.group, self._border.terms, c, self._measured)
 
     def _prior(self, c: F64) -> float:
-        squared = np.square(c.ravel() / self._sigma)
+        squared = np.square((c.ravel() - self._mean) / self._sigma)
         tail = self._border.tail if self._yields.any() else 1.0
         return float(np.sum(np.where(self._yields, tail**2 * np.log1p(squared / tail**2), squared)))
 
     def _prior_weights(self) -> F64:
         """Weight (b,) of the present offsets' squares that has the slope of the prior's cost."""
-        ratio = np.where(self._yields, self._c.ravel() / (self._sigma * self._border.tail), 0.0)
+        ratio = np.where(self._yields, (self._c.ravel() - self._mean) / (self._sigma * self._border.tail), 0.0)
         return np.asarray(1.0 / np.square(self._sigma) / (1.0 + np.square(ratio)))
 
     def _linearise(self, active: U8) -> float:
@@ -330,7 +334,7 @@ class _BorderSolver(_Solver):
         )  # fmt: skip
         weights = self._prior_weights()
         self._blocks[0][np.diag_indices(len(weights))] += weights
-        self._blocks[1][:] -= weights * self._c.ravel()
+        self._blocks[1][:] -= weights * (self._c.ravel() - self._mean)
         return cost + self._prior(self._c)
 
     def _solve(self, active: U8, damping: float) -> bool:

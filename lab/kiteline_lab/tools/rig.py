@@ -73,6 +73,7 @@ class KnownCameras:
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.disparity_px: dict[AgentId, F64] = {}
         self.rows_px: dict[AgentId, F64] = {}
+        self.rows_read: set[AgentId] = set()
         self.calibrated: set[AgentId] = set()
 
     @classmethod
@@ -82,6 +83,7 @@ class KnownCameras:
         out.cameras.update(mapper.map.cameras)
         out.disparity_px.update(mapper.map.disparity_offset_px)
         out.rows_px.update(mapper.map.rows_px)
+        out.rows_read.update(mapper.map.rows_read)
         out.calibrated.update(mapper.map.disparity_calibrated)
         return out
 
@@ -93,6 +95,7 @@ class KnownCameras:
         if camera is not None:
             out.cameras[agent], out.rows_px[agent] = camera, known.rows
             out.disparity_px[agent] = known.disparity
+            out.rows_read.update([agent] if known.rows_read else [])
         return out
 
     def offset_px(self, agent: AgentId) -> F64:
@@ -163,7 +166,8 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
         raise RigError(f"no agent {chosen}: expected one of {', '.join(str(int(a)) for a in sorted(cameras))}")
     if kind == "kiteline":
         rows = known.rows_px.get(chosen, np.zeros(row_alignment.TERMS))
-        return {"rig.toml": rig_file.text_of(known_rig(camera, rows, known.offset_px(chosen)))}
+        read = chosen in known.rows_read
+        return {"rig.toml": rig_file.text_of(known_rig(camera, rows, known.offset_px(chosen), rows_read=read))}
     rig = known.rig(chosen)
     pair = [(rig.left, rig.T_b_c)]
     if camera.stereo and rig.right is not None and rig.T_c_r is not None:

@@ -80,7 +80,7 @@ def some_records(seed: int, n: int) -> list[Record]:
             *steps.normal(0.0, 0.5, (4, n + 1, 3)),
         ),
         StereoAlignment(
-            AgentId(5), np.array([700.0, -88.0, 0.0, 1100.0, -420.0]) / 1024.0,
+            AgentId(5), np.array([700.0, -88.0, 0.0, 1100.0, -420.0]) / 1024.0, True,
             np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0,
         ),
         KeyframePose(keyframe, pose),
