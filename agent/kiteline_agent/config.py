@@ -209,7 +209,7 @@ class DisparityConfig:
     prior_px: float = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
     prior_slope_px: float = 0.5  # px where x or y is 1; of the other terms
     good_px: float = 0.1  # px; standard deviation of all terms of a good calibration
-    worn_share: float = 0.4  # probability of a worn rig before the flight
+    worn_share: float = 0.2  # probability of a worn rig before the flight
     sure: float = 0.95  # the same, above which the offset is applied
     least_px: float = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
     least_change_px: float = 0.04  # px, rms over the image; of a later change that is applied
