@@ -31,6 +31,7 @@ def test_measured_depths_follow_and_others_stay() -> None:
     held = held_map([10.0, 8.0, 0.0])  # the last is a bearing
     one = np.array([1], np.uint16)
     held.refine(RefinedLandmarks(FIRST, one, np.array([0.2], np.float32), np.zeros((1, 2), np.float32)))
+    assert held.apply_corrections()
     bearing = float(held.rho[0, 2])
     held.set_disparity_offset(CONSTANT)
     assert np.allclose(held.rho[0, :3], [9.9 / CAMERA.bf, 0.2, bearing], atol=1e-7)

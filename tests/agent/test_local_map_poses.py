@@ -1,4 +1,4 @@
-"""Poses of the base for keyframes of the local map: taken over together, once they differ by more than errors."""
+"""Corrections of keyframes of the local map: taken over together, once they differ by more than errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_codec.schema import KeyframeHeader, KeyframePose
+from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
@@ -53,7 +53,7 @@ def test_differences_within_the_errors_are_left() -> None:
     held = local_map()
     for k in range(4):
         told(held, k, 0.9 * LEAST_M)
-    assert not held.apply_poses()
+    assert not held.apply_corrections()
     assert shifts(held) == [0.0] * 4
     assert not held.from_base.any()
 
@@ -63,12 +63,12 @@ def test_one_that_counts_brings_all_that_wait(turn: bool) -> None:
     held = local_map()
     told(held, 0, 0.5 * LEAST_M)
     told(held, 2, -0.3 * LEAST_M)
-    assert not held.apply_poses()
+    assert not held.apply_corrections()
     told(held, 1, 0.2 * LEAST_M if turn else 1.1 * LEAST_M, 1.1 * CONFIG.local_map.moved_px / CAMERA.fx if turn else 0)
-    assert held.apply_poses()
+    assert held.apply_corrections()
     assert np.allclose(shifts(held), [0.5 * LEAST_M, (0.2 if turn else 1.1) * LEAST_M, -0.3 * LEAST_M, 0.0])
     assert held.from_base[:4].tolist() == [True, True, True, False]
-    assert not held.apply_poses()  # once
+    assert not held.apply_corrections()  # once
 
 
 def test_differences_count_against_what_is_held_however_they_came_about() -> None:
@@ -76,10 +76,10 @@ def test_differences_count_against_what_is_held_however_they_came_about() -> Non
     held = local_map()
     for share in (0.4, 0.8, 0.4):
         told(held, 0, share * LEAST_M)
-        assert not held.apply_poses()
+        assert not held.apply_corrections()
     for share in (0.6, 0.9, 1.2):
         told(held, 0, share * LEAST_M)
-    assert held.apply_poses()
+    assert held.apply_corrections()
     assert np.isclose(shifts(held)[0], 1.2 * LEAST_M)
 
 
@@ -89,12 +89,12 @@ def test_evicted_keyframes_are_forgotten() -> None:
     add(held, 8)  # takes the slot of keyframe 0
     add(held, 0)
     told(held, 1, 2.0 * LEAST_M) if held.slot_of(1) >= 0 else told(held, 3, 2.0 * LEAST_M)
-    assert held.apply_poses()
+    assert held.apply_corrections()
     assert held.T_m_k[held.slot_of(0)][0, 3] == 0.0
     held = local_map()
     told(held, 0, 0.5 * LEAST_M)
     held.drop_submap(SubmapId(0))
-    assert not held.apply_poses()
+    assert not held.apply_corrections()
 
 
 @given(st.permutations(range(4)), st.lists(st.floats(0.0, 3.0), min_size=4, max_size=4))
@@ -104,5 +104,51 @@ def test_the_order_of_records_does_not_matter(order: list[int], share: list[floa
         told(one, k, share[k] * LEAST_M)
     for k in order:
         told(other, k, share[k] * LEAST_M)
-    assert one.apply_poses() == other.apply_poses()
+    assert one.apply_corrections() == other.apply_corrections()
     assert shifts(one) == shifts(other)
+
+
+def refined(held: LocalMap, k: int, offset_px: float) -> bool:
+    index = np.arange(20, dtype=np.uint16)
+    offset = np.tile(np.array([offset_px, 0.0], np.float32), (20, 1))
+    return held.refine(RefinedLandmarks(KeyframeId(k), index, np.full(20, 1.0 / DEPTH_M, np.float32), offset))
+
+
+def test_refined_landmarks_wait_with_the_poses() -> None:
+    held = local_map()
+    for k in range(4):
+        held.share(KeyframeId(k), 30)
+    before = held.bearing.copy()
+    assert not refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
+    told(held, 1, 0.5 * LEAST_M)
+    assert not held.apply_corrections()
+    assert np.array_equal(held.bearing, before)
+    assert not refined(held, 2, 1.5 * CONFIG.local_map.moved_px)  # these count, and bring all the others
+    assert held.apply_corrections()
+    moved = np.abs(held.bearing - before).max(axis=(1, 2)) * CAMERA.fx / CONFIG.local_map.moved_px
+    assert np.allclose(moved[:4], [0.5, 0.0, 1.5, 0.0])
+    assert np.allclose(shifts(held), [0.0, 0.5 * LEAST_M, 0.0, 0.0])
+    assert not held.apply_corrections()  # once
+
+
+def test_landmarks_that_only_the_base_could_triangulate_wait_for_nothing() -> None:
+    held = local_map()
+    held.share(KeyframeId(0), 30)
+    held.usable[0, :5], held.seed[0, :5] = False, True
+    assert refined(held, 0, 0.2)
+    assert held.usable[0, :5].all()
+    assert not held.seed[0, :5].any()
+    assert np.allclose(held.rho[0, :5], 1.0 / DEPTH_M)
+    assert held.measured[0, 5:20].all()  # known ones are as they were
+
+
+def test_refined_landmarks_of_evicted_keyframes_are_forgotten() -> None:
+    held = local_map(keyframes=8)
+    held.share(KeyframeId(0), 30)
+    refined(held, 0, 0.5)
+    add(held, 8)  # takes the slot of keyframe 0
+    add(held, 0)
+    before = held.bearing[held.slot_of(0)].copy()
+    told(held, 4, 2.0 * LEAST_M)
+    assert held.apply_corrections()
+    assert np.array_equal(held.bearing[held.slot_of(0)], before)

@@ -95,6 +95,7 @@ def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
         offset = (uv - local_map.uv[k, :LANDMARKS]).astype(np.float32)
         inverse = (1.0 / p[:, 2]).astype(np.float32)
         local_map.refine(RefinedLandmarks(KeyframeId(k), index.astype(np.uint16), inverse, offset))
+    assert local_map.apply_corrections()
     T_new_old = anchor.T_new_old(CONFIG.pose)
     assert T_new_old is not None
     assert np.allclose(T_new_old, np.eye(4), atol=1e-5)

@@ -135,3 +135,19 @@ def test_links_stand_aside_of_the_border() -> None:
     assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
     assert (linked.border.group[len(part.slots) :] == -1).all()
     assert bundle(linked, config.bundle).offset.shape == (1, 5)
+
+
+def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
+    """The parent is in the window though it shares no landmark, fixed, and its odometry factor with it."""
+    sparse_map, _ = flight(noise_px=0.5)
+    config = BaseConfig()
+    few = replace(config.bundle_window, max_fixed=0)  # nobody is in the window for what it observes
+    free = [keyframe_id(SUBMAP, k) for k in (3, 4, 5)]
+    part = bundle_window(sparse_map, free, few, config.measurement)
+    assert part is not None
+    ids = sparse_map.keyframes.id[part.rows].tolist()
+    assert ids == [keyframe_id(SUBMAP, k) for k in (2, 3, 4, 5)]
+    assert part.problem.free.tolist() == [False, True, True, True]
+    linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
+    added = linked.camera[len(part.problem.camera) :]
+    assert {0, 1} <= set(added.tolist())

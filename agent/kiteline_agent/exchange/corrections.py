@@ -74,7 +74,7 @@ class Corrections:
             handler = self._handlers.get(type(record))
             if handler is not None:
                 moved |= handler(record)
-        moved |= self._map.apply_poses()
+        moved |= self._map.apply_corrections()
         self._cache.remove(removed)
         for key in removed:
             if key.kind == SubmapPlacement.KIND:  # its merge was undone, and its place is not known yet

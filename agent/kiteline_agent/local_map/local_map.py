@@ -85,7 +85,8 @@ class LocalMap:
         self.misses = np.zeros(k * b, np.int32)  # of a seed: searches without a match
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
         self._new_poses: dict[KeyframeId, F64] = {}  # sent by the base, and not taken over yet
-        self._poses_due = False  # one of them differs by more than both maps' errors
+        self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
+        self._due = False  # some of these differ by more than both maps' errors
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
@@ -123,7 +124,7 @@ class LocalMap:
         angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21).
         """
         slot = self._free_slot(head.parent)
-        self._new_poses.pop(KeyframeId(int(self.keyframe[slot])), None)
+        self._forget_corrections(int(self.keyframe[slot]))
         n = min(len(uv), self.slot_size)
         rows = slice(slot * self.slot_size, slot * self.slot_size + n)
         self.keyframe[slot], self.parent[slot] = head.keyframe, head.parent
@@ -236,35 +237,44 @@ class LocalMap:
         """Drop the keyframes of a submap."""
         slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == submap)
         for keyframe in self.keyframe[slots].tolist():
-            self._new_poses.pop(KeyframeId(keyframe), None)
+            self._forget_corrections(keyframe)
         self.keyframe[slots] = NO_KEYFRAME
         self.counts[slots] = 0
 
     # records of the base
 
+    def _forget_corrections(self, keyframe: int) -> None:
+        self._new_poses.pop(KeyframeId(keyframe), None)
+        self._new_landmarks.pop(KeyframeId(keyframe), None)
+
     def set_pose(self, record: KeyframePose) -> bool:
-        """Hold a keyframe's pose ready for `apply_poses`. False: nothing moves yet."""
+        """Hold a keyframe's pose ready for `apply_corrections`. False: nothing moves yet."""
         slot = self.slot_of(record.keyframe)
         if slot >= 0:
             self._new_poses[record.keyframe] = record.T_m_k
-            self._poses_due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
+            self._due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
         return False
 
-    def apply_poses(self) -> bool:
-        """Take over all poses that the base sent, if one of them moves its landmarks far enough.
+    def apply_corrections(self) -> bool:
+        """Take over all poses and landmarks that the base sent, if those of a keyframe move far enough.
 
         Smaller differences are within the errors of both maps; taken over one by one, they disturb a map that the
         frames of this agent keep consistent. Returns True if the map moved.
         """
-        if not self._poses_due:
+        if not self._due:
             return False
         for keyframe, T_m_k in self._new_poses.items():
             slot = self.slot_of(keyframe)
             if slot >= 0:
                 self.T_m_k[slot] = T_m_k
                 self.from_base[slot] = True
+        for keyframe, (index, rho, bearing) in self._new_landmarks.items():
+            slot = self.slot_of(keyframe)
+            if slot >= 0:
+                self._set_landmarks(slot, index, rho, bearing)
         self._new_poses.clear()
-        self._poses_due = False
+        self._new_landmarks.clear()
+        self._due = False
         return True
 
     def _shift_px(self, slot: int, T_m_k: F64) -> float:
@@ -286,7 +296,7 @@ class LocalMap:
         return True
 
     def refine(self, record: RefinedLandmarks) -> bool:
-        """Take over landmarks that the base optimised or triangulated."""
+        """Take over landmarks that only the base could triangulate; hold the others ready for `apply_corrections`."""
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
@@ -294,12 +304,24 @@ class LocalMap:
         index = record.index[keep].astype(np.int64)
         never = ~self.usable[slot, index] & (self.tried[slot * self.slot_size + index] == 0)
         fresh = never | self.seed[slot, index]
-        self.rho[slot, index] = record.inv_depth[keep]
+        rho, bearing = (
+            record.inv_depth[keep].astype(np.float64),
+            self._bearings(self.uv[slot, index] + record.offset[keep]),
+        )
+        self._set_landmarks(slot, index[fresh], rho[fresh], bearing[fresh])
+        self.promote(slot * self.slot_size + index[fresh])
+        known = ~fresh
+        if known.any():
+            self._new_landmarks[record.keyframe] = index[known], rho[known], bearing[known]
+            turned = np.linalg.norm(bearing[known] - self.bearing[slot, index[known]], axis=1) * self.camera.fx
+            nearer = np.abs(rho[known] - self.rho[slot, index[known]]) * self.camera.bf
+            self._due |= bool(np.median(np.maximum(turned, nearer)) >= self._config.moved_px)
+        return bool(fresh.any())
+
+    def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
+        self.rho[slot, index], self.bearing[slot, index] = rho, bearing
         self.measured[slot, index] = False
         self.sigma_rho[slot, index] = self._filtering.refined_sigma_px / self.camera.bf
-        self.bearing[slot, index] = self._bearings(self.uv[slot, index] + record.offset[keep])
-        self.promote(slot * self.slot_size + index[fresh])  # landmarks that only the base could triangulate
-        return True
 
     def offset_px(self, uv: F64) -> F64:
         """Error (n,) of stereo disparities at pixels (n,2)."""

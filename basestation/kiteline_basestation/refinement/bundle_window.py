@@ -73,7 +73,10 @@ def bundle_window(
     others = np.flatnonzero(counts > 0)
     order = np.lexsort((-keyframes.id[others], -counts[others]))
     others = others[order[: config.max_fixed]].astype(np.int32)
-    rows = np.concatenate([free_rows, others])
+    # Parents too, for the odometry that ties free keyframes with few observations to them.
+    parents = np.array([sparse_map.rows.get(KeyframeId(int(p)), -1) for p in keyframes.parent[free_rows]], np.int32)
+    parents = parents[(parents >= 0) & mask[parents]]
+    rows = np.unique(np.concatenate([free_rows, others, parents]))
     rows = rows[np.argsort(keyframes.id[rows])]
     number = np.full(len(sparse_map), -1, np.int32)
     number[rows] = np.arange(len(rows))
