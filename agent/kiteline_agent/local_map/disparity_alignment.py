@@ -16,6 +16,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import TERMS, none, terms
 from kiteline_core.ids import NO_KEYFRAME
+from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -67,10 +68,10 @@ class DisparityAlignment:
         for slot in slots[counts >= config.min_points].tolist():
             if self._keyframe[slot] != m.keyframe[slot]:
                 self._begin(slot)
-        due = [s for s in slots[counts >= config.min_points].tolist() if self._grown(s, T_c_m) >= config.growth]
-        if not due:
+        grown = {slot: self._grown(slot, T_c_m) for slot in slots[counts >= config.min_points].tolist()}
+        slot = max(grown, key=lambda s: grown[s], default=None)
+        if slot is None or grown[slot] < config.growth:
             return None
-        slot = max(due, key=lambda s: self._grown(s, T_c_m))
         if self._add_pair(slot, T_c_m, rows, observed):
             self._solve()
             change = self._apply()
@@ -95,7 +96,7 @@ class DisparityAlignment:
         """Distance from a keyframe over the depth of its landmarks."""
         T = T_c_m @ self._map.T_m_k[slot]
         usable = self._map.usable[slot]
-        return float(np.linalg.norm(T[:3, 3]) * np.median(self._map.rho[slot, usable])) if usable.any() else 0.0
+        return float(np.linalg.norm(T[:3, 3]) * median(self._map.rho[slot, usable])) if usable.any() else 0.0
 
     def _grown(self, slot: int, T_c_m: F64) -> float:
         return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), 0.02)
