@@ -239,7 +239,7 @@ class Agent:
             return  # there is no right camera, or it was calibrated anew
         self._rows.begin_with(known.rows, read=known.rows_read)
         self.map.set_disparity_offset(known.disparity)
-        if self._disparities is not None:
+        if self._disparities is not None and known.disparity.any():  # zero: not found yet
             self._disparities.begin_with(known.disparity)
         self._began_with_px = known.disparity
         self._channel.put(StereoAlignment(self._identity.agent, known.rows, known.rows_read, known.disparity))

@@ -71,4 +71,4 @@ def known_rig(camera: RectifiedCamera, rows_px: F64, disparity_px: F64, *, rows_
     """What a flight found, rounded to what the next one can use."""
     rows, disparity = (tuple(round(float(v), 3) for v in values) for values in (rows_px, disparity_px))
     T_b_c = tuple(round(float(v), 9) for v in camera.T_b_c.ravel())
-    return KnownRigConfig(numbers_of(camera), T_b_c, rows, rows_read, disparity)
+    return KnownRigConfig(numbers_of(camera), T_b_c, rows, rows_read, disparity if any(disparity) else ())

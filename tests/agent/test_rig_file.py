@@ -75,6 +75,18 @@ def test_an_agent_begins_with_it_and_tells_the_base() -> None:
     assert as_they_came.known_rig() == known_rig(CAMERA, ROWS, DISPARITY, rows_read=False)
 
 
+def test_an_offset_that_was_not_found_is_not_known_to_be_zero() -> None:
+    known = known_rig(CAMERA, ROWS, np.zeros(5), rows_read=True)
+    assert known.disparity_px == ()
+    agent, fresh = flown(known)[0], flown(KnownRigConfig())[0]
+    assert agent._disparities is not None
+    assert fresh._disparities is not None
+    assert np.array_equal(agent._disparities.cov, fresh._disparities.cov)
+    assert not np.array_equal(
+        flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True))[0]._disparities.cov, fresh._disparities.cov
+    )
+
+
 def test_without_knowledge_or_with_another_calibration_nothing_changes() -> None:
     other = RectifiedCamera(640, 400, CAMERA.fx + 0.01, CAMERA.fy, CAMERA.cx, CAMERA.cy, 0.11, True, np.eye(4))
     for known in (KnownRigConfig(), known_rig(other, ROWS, DISPARITY, rows_read=True)):
