@@ -14,17 +14,16 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import FULL, Extra, Governor, governed
-from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
-from kiteline_agent.known_rig import KnownRigConfig, known_rig
-from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
+from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
 from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
+from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
@@ -38,9 +37,8 @@ from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record, StereoAlignment
+from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
-from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import NO_KEYFRAME, SubmapId
 from kiteline_core.places.place_index import Vocabulary
@@ -82,10 +80,13 @@ class Agent:
         self._relocaliser = Relocaliser(
             self.map, self._tracker, config, vocabulary, self.map_cache, self._is_consistent_place, self.work
         )
-        self._rows = None if rig.right is None else RowAlignment(self._rectifier, config.rows)
-        estimates = rig.right is not None and config.disparities.on
-        self._disparities = DisparityAlignment(self.map, config.disparities) if estimates else None
-        maker = KeyframeMaker(self.map, channel, self._rows, self.work)
+        self.right_camera = None
+        if rig.right is not None:
+            self.right_camera = RightCamera(
+                identity.agent, self._camera, self.map, self._rectifier, config, channel
+            )  # fmt: skip
+        rows = None if self.right_camera is None else self.right_camera.rows
+        maker = KeyframeMaker(self.map, channel, rows, self.work)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
@@ -107,8 +108,8 @@ class Agent:
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
-        self._began_with_px = np.zeros(disparity_offset.TERMS)  # error of disparities
-        self._begin_with(config.known_rig)
+        if self.right_camera is not None:
+            self.right_camera.begin_with(config.known_rig)
 
     def step(self, step_input: StepInput, now_ns: int) -> StepOutput:
         """Take in what arrived, track the frame if there is one, return what is to be sent. Never waits."""
@@ -200,12 +201,8 @@ class Agent:
                 self._inertial_start.clear()
             self._depth.update_landmarks(ctx, track)
             self._depth.search_seeds(ctx, track)
-            if self._disparities is not None:
-                change = self._disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
-                camera.covariance.set_disparity_error(self._disparities.expected_cov, self._disparities.worn)
-                if change is not None:
-                    camera.correct_disparities(change)
-                    events += self._disparities.take_events()
+            if self.right_camera is not None:
+                events += self.right_camera.add(track)
             # 7. Make a keyframe if the policy needs one.
             self._relocaliser.enter_keyframes()  # of earlier frames
             events += self._keyframes.add_if_needed(ctx, track)
@@ -216,11 +213,8 @@ class Agent:
                 self._corrections.note_continued(self.submap)
             events += restarted
             outcome = FrameOutcome(True, False, track.inliers, events)
-        if self._rows is not None:
-            outcome.events.extend(self._rows.take_events())
-            rows_px = self._rows.take_change()
-            if rows_px is not None:
-                self._channel.put(StereoAlignment(self._identity.agent, rows_px, self._rows.read, self._began_with_px))
+        if self.right_camera is not None:
+            outcome.events.extend(self.right_camera.share_rows())
         self.work.rectified_px += images.rectified_px
         # 9. Report the pose.
         self._was_lost = not outcome.tracked or outcome.bridged
@@ -232,17 +226,6 @@ class Agent:
         return self._last_estimate, outcome.events
 
     # stages of a frame
-
-    def _begin_with(self, known: KnownRigConfig) -> None:
-        """Take over what earlier flights with this calibration found of the right camera."""
-        if self._rows is None or not known.is_of(self.map.camera):
-            return  # there is no right camera, or it was calibrated anew
-        self._rows.begin_with(known.rows, read=known.rows_read)
-        self.map.set_disparity_offset(known.disparity)
-        if self._disparities is not None and known.disparity.any():  # zero: not found yet
-            self._disparities.begin_with(known.disparity)
-        self._began_with_px = known.disparity
-        self._channel.put(StereoAlignment(self._identity.agent, known.rows, known.rows_read, known.disparity))
 
     def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
@@ -352,10 +335,7 @@ class Agent:
 
     def known_rig(self) -> KnownRigConfig | None:
         """What is known of the right camera now, for the next flight; None without one, and before it was measured."""
-        if self._rows is None or not self._rows.known:
-            return None
-        rows = self._rows
-        return known_rig(self.map.camera, rows.estimate_px, self.map.disparity_offset, rows_read=rows.read)
+        return None if self.right_camera is None else self.right_camera.known()
 
     def time_offset_report(self) -> dict[str, float] | None:
         """InertialTracker.offset_report; None without an IMU."""

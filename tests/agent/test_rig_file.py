@@ -14,6 +14,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.known_rig import KnownRigConfig, known_rig
+from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.runtime import rig_file
 from kiteline_agent.runtime.options import agent_config
 from kiteline_agent.runtime.rig_file import RigFile
@@ -78,13 +79,16 @@ def test_an_agent_begins_with_it_and_tells_the_base() -> None:
 def test_an_offset_that_was_not_found_is_not_known_to_be_zero() -> None:
     known = known_rig(CAMERA, ROWS, np.zeros(5), rows_read=True)
     assert known.disparity_px == ()
-    agent, fresh = flown(known)[0], flown(KnownRigConfig())[0]
-    assert agent._disparities is not None
-    assert fresh._disparities is not None
-    assert np.array_equal(agent._disparities.cov, fresh._disparities.cov)
-    assert not np.array_equal(
-        flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True))[0]._disparities.cov, fresh._disparities.cov
-    )
+    found = known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
+    again, fresh, begun = (disparities(flown(rig)[0]) for rig in (known, KnownRigConfig(), found))
+    assert np.array_equal(again.cov, fresh.cov)
+    assert not np.array_equal(begun.cov, fresh.cov)
+
+
+def disparities(agent: Agent) -> DisparityAlignment:
+    assert agent.right_camera is not None
+    assert agent.right_camera.disparities is not None
+    return agent.right_camera.disparities
 
 
 def test_without_knowledge_or_with_another_calibration_nothing_changes() -> None:
