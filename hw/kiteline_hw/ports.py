@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,35 @@ class FrameSource(Protocol):
 
     def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]: ...
     def close(self) -> None: ...
+
+
+class LiveSource(FrameSource, Protocol):
+    """A camera, or several: a FrameSource whose frames come when they come, stamped by CLOCK_MONOTONIC.
+
+    None of its calls raises because a device is away: it is tried again, and `take_messages` says so.
+    """
+
+    @property
+    def decode_ns(self) -> int:
+        """CPU time that its threads spent on decoding so far."""
+        ...
+
+    def poll(self, until_ns: int) -> Frame | ImuBatch | OdometryBatch | None:
+        """The next sample, awaited until a time of the monotonic clock at most; None if none has come."""
+        ...
+
+    def take_dropped(self) -> int:
+        """Number of frames since the last call that newer ones replaced before they were taken."""
+        ...
+
+    def take_messages(self) -> list[str]:
+        """What is to be told since the last call: what failed with the mend, what works again, what was measured."""
+        ...
+
+
+def is_live(source: FrameSource) -> TypeGuard[LiveSource]:
+    """True if a source is a camera, whose frames are polled."""
+    return hasattr(source, "poll")
 
 
 class ByteLink(Protocol):

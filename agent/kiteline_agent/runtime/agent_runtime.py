@@ -15,6 +15,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.runtime.camera_reader import CameraReader
 from kiteline_agent.runtime.cpu_account import CpuAccount
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
 from kiteline_agent.runtime.frame_counts import FrameCounts
@@ -36,7 +37,7 @@ from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
-from kiteline_hw.ports import FrameSource
+from kiteline_hw.ports import FrameSource, is_live
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import kernel_cache
@@ -73,7 +74,10 @@ class AgentRuntime:
             release_memory()
         self.warm_s = (time.process_time_ns() - begin_ns) / 1e9
         until_ns = options.start_ns + round(options.seconds * 1e9) if options.seconds > 0 else None
-        self.reader = FrameReader(source, until_ns, time.process_time_ns)
+        self.camera = source if is_live(source) else None
+        self.reader: FrameReader | CameraReader = (
+            FrameReader(source, until_ns, time.process_time_ns) if self.camera is None else CameraReader(self.camera)
+        )
         self._files = ExitStack()
         self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
         self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, config.log.waiting))
@@ -138,14 +142,34 @@ class AgentRuntime:
 
     def begin_at(self, begin_ns: int) -> None:
         """Begin a live flight: `begin_ns` of its clock is flight time 0."""
-        assert self.reader.next_ns is not None
         self._live_clock = True
         self._encoder.stores = True
-        self.options = replace(self.options, start_ns=self.reader.next_ns)
+        first_ns = begin_ns if self.camera is not None else self.reader.next_ns  # a camera's stamps are on our clock
+        assert first_ns is not None
+        self.options = replace(self.options, start_ns=first_ns)
         self._log_shift_ns = self.options.start_ns - begin_ns
+
+    def await_frame(self, until_ns: int) -> list[str]:
+        """Await a camera's frame until a time of the clock at most; what the camera has to tell."""
+        if self.camera is None or not isinstance(self.reader, CameraReader):
+            return []
+        self.reader.poll(until_ns)
+        self.counts.dropped += self.camera.take_dropped()
+        messages = self.camera.take_messages()
+        if self._record is not None:
+            for text in messages:
+                self._record.text(text, time.monotonic_ns() + self._log_shift_ns)
+        return messages
+
+    @property
+    def over(self) -> bool:
+        """True after the last frame of a recording; a camera has none."""
+        return self.camera is None and self.next_ns is None
 
     def drop_stale(self, flight_ns: int) -> bool:
         """Drop frames until the next one is the newest at a flight time. False if none is left."""
+        if self.camera is not None:
+            return True  # a camera itself drops what newer frames replaced
         while self.next_ns is not None and 0 < self.reader.period_ns <= flight_ns - self.next_ns:
             self.reader.drop()
             self.counts.dropped += 1

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
-from kiteline_agent.runtime.frame_reader import FrameReader
+
+class Decoder(Protocol):
+    """What reads frames."""
+
+    @property
+    def decode_ns(self) -> int:
+        """Process CPU spent on reading and decoding so far."""
+        ...
 
 
 class CpuAccount:
@@ -14,7 +22,7 @@ class CpuAccount:
     counts; otherwise only that inside its steps. ms: of each frame. last_ns: of the last one.
     """
 
-    def __init__(self, clock: Callable[[], int], camera: FrameReader, whole: bool) -> None:
+    def __init__(self, clock: Callable[[], int], camera: Decoder, whole: bool) -> None:
         self._clock = clock
         self._camera = camera
         self._whole = whole

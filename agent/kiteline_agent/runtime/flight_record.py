@@ -48,6 +48,10 @@ class FlightRecord:
             for key, code in self._channel.take_noted().items():
                 self._log.blob(record_log.TOPIC, log_ns, record_log.write_record(self._agent, key, code))
 
+    def text(self, line: str, log_ns: int) -> None:
+        """Write what was told to the user, for viewers."""
+        self._log.text("/log", log_ns, "info", line)
+
     def pose(self, output: StepOutput) -> None:
         """Write the poses of a frame."""
         self._live.write(live_line(output.estimate))

@@ -32,7 +32,7 @@ _QUIET_S = 1.0  # s that the link has to stay quiet: the base may still be worki
 
 
 def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
-    """Fly on real clocks: frames are paced by their stamps, and late ones are dropped."""
+    """Fly on real clocks: frames of a camera as they come, others paced by their stamps; late ones are dropped."""
     source = opened(options)
     with ExitStack() as stack:
         stack.callback(source.close)
@@ -59,14 +59,15 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
             controller.take_imu(begin_ns)  # drop what was measured before the flight
         schedule = PoseSchedule(0.0 if controller is None else pose_rate_hz(options), begin_ns)
         shift_ns = runtime.options.start_ns - begin_ns
-        while not stop and runtime.next_ns is not None:
-            due_ns = min(begin_ns + runtime.next_ns, schedule.next_ns or begin_ns + runtime.next_ns)
-            wait_s = (due_ns - clock.now_ns()) / 1e9
-            if wait_s > 0.0 and stop.wait(min(wait_s, _IDLE_TICK_S)):
+        while not stop and not runtime.over:
+            told = _wait(runtime, begin_ns, schedule.next_ns, clock, stop)
+            if stop:
                 break
             now_ns = captured_ns = clock.now_ns()
+            if parent is None:
+                process.print_lines(f"{(now_ns - begin_ns) / 1e9:8.1f} s  {line}" for line in told)
             frame = imu = odometry = predict_ns = None
-            if now_ns >= begin_ns + runtime.next_ns:
+            if runtime.next_ns is not None and now_ns >= begin_ns + runtime.next_ns:
                 if not runtime.drop_stale(now_ns - begin_ns):
                     break
                 captured_ns = begin_ns + runtime.next_ns
@@ -99,6 +100,22 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         _drain_live(runtime, link, clock, parent, stop)
         if parent is not None:
             parent.send_event("result", report=runtime.report())
+
+
+def _wait(
+    runtime: AgentRuntime, begin_ns: int, pose_ns: int | None, clock: MonotonicClock, stop: process.StopSignal
+) -> list[str]:
+    """Wait for the next frame, the next pose, or one idle tick; what a camera has to tell. pose_ns: None: no poses."""
+    now_ns = clock.now_ns()
+    until_ns = now_ns + round(_IDLE_TICK_S * 1e9)
+    until_ns = until_ns if pose_ns is None else min(until_ns, pose_ns)
+    if runtime.camera is not None:
+        return runtime.await_frame(until_ns)
+    if runtime.next_ns is not None:
+        until_ns = min(until_ns, begin_ns + runtime.next_ns)
+    if until_ns > now_ns:
+        stop.wait((until_ns - now_ns) / 1e9)
+    return []
 
 
 def _link_text(options: AgentOptions) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 class SourceKind:
     """One kind of source, written SCHEME:ARGUMENT.
 
-    module: "" if it is not supported yet. argument: what follows the colon, in capitals; DIR and FILE are paths
+    argument: what follows the colon, in capitals; DIR and FILE are paths
     that must exist. layout: glob patterns, one of which a folder of this kind matches (with a trailing slash: a
     sub-folder), and `shown` names them in error messages.
     """
@@ -37,7 +37,7 @@ SOURCES: tuple[SourceKind, ...] = (
                "kiteline_hw.sources.mcap", ("*.mcap",), "*.mcap"),
     SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images"),
     SourceKind("sim", "SCENE", "simulated flight: room, hall, corridor or street", "kiteline_hw.sim.source"),
-    SourceKind("v4l2", "DEV[,DEV]", "camera (not supported yet)", ""),
+    SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2"),
 )  # fmt: skip
 
 

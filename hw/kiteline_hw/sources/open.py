@@ -25,8 +25,6 @@ def open_source(spec: str, mono: bool = False, imu: bool = True) -> FrameSource:
         kind, argument = recognise(spec), spec
     if not argument:
         raise SourceError(f"{spec!r} names nothing: expected {kind.scheme}:{kind.argument}")
-    if not kind.module:
-        raise SourceError(f"{spec}: cameras cannot be opened yet: expected a recording or sim:SCENE")
     if kind.argument in ("DIR", "FILE"):
         path = Path(argument).expanduser()
         if not path.exists():

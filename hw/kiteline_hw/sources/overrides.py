@@ -9,7 +9,7 @@ from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.se3 import F64
-from kiteline_hw.ports import FrameSource
+from kiteline_hw.ports import FrameSource, LiveSource, is_live
 
 
 class SourceView:
@@ -57,10 +57,35 @@ class _OtherImuView(SourceView):
 
     def __iter__(self) -> Iterator[Frame | ImuBatch | OdometryBatch]:
         for item in super().__iter__():
-            if self._T_new_old is not None and isinstance(item, OdometryBatch):
-                yield odometry.in_body(item, self._T_new_old)
-            else:
-                yield item
+            yield self._in_new_body(item)
+
+    def _in_new_body(self, item: Frame | ImuBatch | OdometryBatch) -> Frame | ImuBatch | OdometryBatch:
+        if self._T_new_old is not None and isinstance(item, OdometryBatch):
+            return odometry.in_body(item, self._T_new_old)
+        return item
+
+
+class _LiveOtherImuView(_OtherImuView):
+    """The same of a camera."""
+
+    def __init__(self, source: LiveSource, imu: ImuCalibration, T_b_c: F64 | None) -> None:
+        super().__init__(source, imu, T_b_c)
+        self._live = source
+
+    @property
+    def decode_ns(self) -> int:
+        return self._live.decode_ns
+
+    def poll(self, until_ns: int) -> Frame | ImuBatch | OdometryBatch | None:
+        while isinstance(item := self._live.poll(until_ns), ImuBatch):
+            pass
+        return None if item is None else self._in_new_body(item)
+
+    def take_dropped(self) -> int:
+        return self._live.take_dropped()
+
+    def take_messages(self) -> list[str]:
+        return self._live.take_messages()
 
 
 def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) -> FrameSource:
@@ -69,4 +94,4 @@ def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) 
     T_b_c: (4,4) left camera in that IMU's frame, which becomes the body frame of the rig, the ground truth and the
     odometry; None: the body frame of the source stays.
     """
-    return _OtherImuView(source, imu, T_b_c)
+    return _LiveOtherImuView(source, imu, T_b_c) if is_live(source) else _OtherImuView(source, imu, T_b_c)

@@ -9,7 +9,7 @@ from pathlib import Path
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
-from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
 
@@ -66,6 +66,8 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
     try:
         for text in o.sources:
             made.sources.append(open_source(text, mono=o.mono, imu=o.imu))
+            if is_live(made.sources[-1]):
+                raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
         starts = flight_starts(made.sources)
     except BaseException:
         made.close()

@@ -401,7 +401,5 @@ def test_unknown_sources_name_what_was_expected(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(SourceError, match="expected an MCAP file"):
         open_source(str(tmp_path / "notes.txt"))
-    with pytest.raises(SourceError, match="cannot be opened yet"):
-        open_source("v4l2:/dev/video0")
     with pytest.raises(SourceError, match="names nothing"):
         open_source("kitti:")

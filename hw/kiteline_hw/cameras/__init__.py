@@ -1,0 +1,1 @@
+"""Live cameras: captured images enter (encoded or raw, stamped by the driver), a LiveSource of paired Frames leaves."""

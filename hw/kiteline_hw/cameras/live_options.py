@@ -1,0 +1,93 @@
+"""Options of a live camera, written behind its devices: `v4l2:/dev/video0?fps=20&calibration=camera.yaml`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry.cameras import CameraRig, Lens
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sources.calibration import camera_from_yaml, checked_baseline
+from kiteline_hw.sources.open import open_source
+from kiteline_hw.sources.text_files import read_yaml, yaml_number
+
+CALIBRATIONS = ("camera.yaml", "/etc/kiteline/camera.yaml")  # looked for where no calibration is named
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """calibration: a camera.yaml, or a recording or log with the rig; "": the first of CALIBRATIONS that exists.
+
+    fps: Hz. side_by_side: each image holds the left view and the right view. format: four letters, "": chosen.
+    exposure_ms, gain: -1: as the camera wants.
+    """
+
+    calibration: str = ""
+    fps: float = 20.0
+    side_by_side: bool = False
+    format: str = ""
+    exposure_ms: float = -1.0
+    gain: float = -1.0
+
+
+def parse(scheme: str, argument: str) -> tuple[str, LiveOptions]:
+    """Devices and options of an argument. Raises SourceError."""
+    devices, _, query = argument.partition("?")
+    known = {field.name: field.type for field in fields(LiveOptions)}
+    options = LiveOptions()
+    for item in filter(None, query.split("&")):
+        key, _, text = item.partition("=")
+        if key not in known:
+            raise SourceError(f"{scheme}: unknown option {key!r}: expected one of {', '.join(known)}")
+        try:
+            changed: dict[str, Any] = {key: _value(str(known[key]), text)}
+            options = replace(options, **changed)
+        except ValueError as error:
+            raise SourceError(f"{scheme}: option {key}={text!r}: expected a {known[key]}") from error
+    if not 1.0 <= options.fps <= 1000.0:
+        raise SourceError(f"{scheme}: fps={options.fps:g}: expected 1 to 1000 images a second")
+    return devices, options
+
+
+def _value(kind: str, text: str) -> Any:
+    if kind == "bool":
+        if text.lower() not in ("", "1", "true", "0", "false"):
+            raise ValueError(text)
+        return text.lower() not in ("0", "false")
+    return float(text) if kind == "float" else text
+
+
+def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> tuple[CameraRig, ImuCalibration | None]:
+    """The rig of a live camera, and of a recording also the IMU's noise. Raises SourceError."""
+    name = options.calibration or next((path for path in CALIBRATIONS if Path(path).is_file()), "")
+    if not name:
+        raise SourceError(
+            f"{scheme}: the camera's calibration is missing: expected {scheme}:…?calibration=FILE (a camera.yaml with "
+            f"fx, fy, cx, cy, width, height, for a pair baseline_m; or a recording of this camera), or "
+            f"{' or '.join(CALIBRATIONS)}"
+        )
+    path = Path(name).expanduser()
+    if path.suffix not in (".yaml", ".yml"):
+        recorded = open_source(name if ":" in name else str(path), mono=not stereo)
+        try:
+            if stereo and recorded.rig.right is None:
+                raise SourceError(f"{name} knows one camera: expected the calibration of a pair, or --mono")
+            return recorded.rig, recorded.imu
+        finally:
+            recorded.close()
+    table = read_yaml(path, "fx, fy, cx, cy, width, height")
+    camera = camera_from_yaml(table, path)
+    if not stereo:
+        return CameraRig(camera, None, np.eye(4), None, has_body=False), None
+    if camera.lens is not Lens.NONE:
+        raise SourceError(
+            f"{path}: a pair in a camera.yaml must be rectified already: expected no k1 k2 p1 p2 k3; a pair with "
+            "lenses is told by a recording with its calibration (calibration=euroc:DIR or calibration=FILE.mcap)"
+        )
+    T_c_r = np.eye(4)
+    T_c_r[0, 3] = yaml_number(table, "baseline_m", path)
+    return CameraRig(camera, camera, np.eye(4), checked_baseline(T_c_r, f"{path}: baseline_m"), has_body=False), None
