@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
 
@@ -82,3 +83,19 @@ def test_the_table_goes_to_stdout(recording: Path, tmp_path: Path, capsys: pytes
     assert "ATE live" in out
     assert str(tmp_path / "trajectory.png") in out
     assert "digests equal" in out
+
+
+def test_without_matplotlib_the_flight_says_so_first_and_leaves_the_plot_out(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    absent = ("matplotlib", "gtsam")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else find(name))
+    assert main([str(recording), "--out", str(tmp_path), "--mode", "local", "--seconds", "0.5"]) == 0
+    out, err = capsys.readouterr()
+    told = [err.index(f"kiteline: note: {name} is not installed") for name in absent]
+    assert max(told) < err.index("flying")
+    assert "kiteline[lab]" in err
+    assert "plot:" not in out
+    assert not (tmp_path / "trajectory.png").exists()
+    assert (tmp_path / "report.json").exists()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
+import sys
 from pathlib import Path
 
 from kiteline_hw.logs.mcap_repair import repair
@@ -15,6 +17,7 @@ from kiteline_lab.flights.outcome import FlightOutcome
 from kiteline_lab.flights.plan import Options, plan
 from kiteline_lab.flights.processes import fly_processes
 from kiteline_lab.flights.results import write_results
+from kiteline_lab.plots.plot import can_plot
 
 MODES = ("tracker", "local", "monolith", "distributed")
 PROFILES = {"wifi": (0, 0), "radio": (1000, 500)}  # B/s up and down on the wire; 0: what the link takes
@@ -118,11 +121,24 @@ def repair_logs(out: Path) -> None:
             repair(log)
 
 
+def missing_extras(mode: str) -> list[str]:
+    """What this flight goes without, as the plain install leaves it out; a line each with the mend."""
+    lines = []
+    if mode != "tracker" and importlib.util.find_spec("gtsam") is None:
+        lines.append("gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'")
+    if not can_plot():
+        lines.append("matplotlib is not installed: no trajectory.png; pip install 'kiteline[lab]'")
+    return lines
+
+
 def main(argv: list[str]) -> int:
     """Run `kiteline fly`; the exit status: 1 when an agent or the base failed."""
     o = options(argv)
+    for line in missing_extras(o.mode):
+        print(f"kiteline: note: {line}", file=sys.stderr)
     report, outcome = fly(o)
     print(table(report))
-    print(f"plot: {o.out / 'trajectory.png'}")
+    if (o.out / "trajectory.png").exists():
+        print(f"plot: {o.out / 'trajectory.png'}")
     print(f"report: {o.out / 'report.json'}")
     return 1 if outcome.failed else 0

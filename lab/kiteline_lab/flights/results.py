@@ -21,13 +21,13 @@ from kiteline_lab.flights.flight_report import Report, statistic, write_report, 
 from kiteline_lab.flights.outcome import FlightOutcome
 from kiteline_lab.flights.plan import FlightPlan
 from kiteline_lab.flights.refined_path import refined_path
-from kiteline_lab.plots.plot import Line, plot_trajectories
+from kiteline_lab.plots.plot import Line, can_plot, plot_trajectories
 
 F64 = NDArray[np.float64]
 
 
 def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report:
-    """Write what the processes themselves did not, and report.json; returns the report."""
+    """Write what the processes themselves did not, and report.json; returns the report. No plot without matplotlib."""
     report: Report = {"agents": [], "base": None, "drain": {"agents": []}, "notes": sorted(outcome.notes)}
     lines: list[Line] = []
     for k, (source, spec) in enumerate(zip(plan.sources, plan.agents, strict=True)):
@@ -63,7 +63,8 @@ def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report
         base = _with_statistics(outcome.base)
         report["drain"]["base"] = base.pop("drain")
         report["base"] = base
-    _plot(out / "trajectory.png", lines, plan.sources)
+    if can_plot():
+        _plot(out / "trajectory.png", lines, plan.sources)
     write_report(out / "report.json", report)
     return report
 

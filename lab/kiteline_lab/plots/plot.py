@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +31,11 @@ class Line:
 
     name: str
     trajectory: Trajectory
+
+
+def can_plot() -> bool:
+    """True if matplotlib, which the plain install leaves out, is here. Does not import it."""
+    return importlib.util.find_spec("matplotlib") is not None
 
 
 def plot_trajectories(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 from dataclasses import replace
 
@@ -116,6 +117,8 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str]) -> int:
     """Run `kiteline eval`; the exit status."""
     a = parser().parse_args(argv)
+    if a.plot:
+        importlib.import_module("matplotlib")  # an extra that is missing is told at once
     alignment = (
         TrajectoryAlignment.SIM3 if a.scale else TrajectoryAlignment.ORIGIN if a.origin else TrajectoryAlignment.SE3
     )
