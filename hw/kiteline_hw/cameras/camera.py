@@ -36,6 +36,10 @@ class Camera(Protocol):
 
     @property
     def name(self) -> str: ...
+    @property
+    def start_s(self) -> float:
+        """How long it may take from `open` to the first image, in s."""
+        ...
 
     def open(self) -> str:
         """Open the device and begin; what was chosen, for the user. Raises CameraError."""

@@ -9,8 +9,11 @@ RESTART_NS = 2_000_000_000  # ns without any image after which the device is clo
 class CameraWatch:
     """What a camera did, as messages. Each call returns the line to tell, or None."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, start_ns: int) -> None:
+        """start_ns: how long the device may take from its opening to the first image."""
         self._name = name
+        self._start_ns = start_ns
+        self._begun = False  # an image has come since the device was opened
         self._good_ns: int | None = None  # last usable image
         self._any_ns = 0  # last image of any kind, or the last opening
         self._since_ns: int | None = None  # beginning of the outage that was told
@@ -21,7 +24,7 @@ class CameraWatch:
 
     def opened(self, now_ns: int) -> None:
         """The device was opened: its numbering begins anew."""
-        self._any_ns, self._sequence = now_ns, None
+        self._any_ns, self._sequence, self._begun = now_ns, None, False
         if self._good_ns is None:
             self._good_ns = now_ns
 
@@ -32,6 +35,7 @@ class CameraWatch:
                 self.missing += sequence - self._sequence - 1
             self._sequence = sequence
         self._good_ns = self._any_ns = now_ns
+        self._begun = True
         self._bad = ""
         if self._since_ns is None:
             return None
@@ -41,7 +45,7 @@ class CameraWatch:
 
     def bad_image(self, now_ns: int, why: str) -> str | None:
         """An image came that cannot be used."""
-        self._any_ns, self._bad = now_ns, why
+        self._any_ns, self._bad, self._begun = now_ns, why, True
         return self.check(now_ns)
 
     def failed(self, now_ns: int, text: str) -> str | None:
@@ -57,7 +61,7 @@ class CameraWatch:
                 self._good_ns, "bad",
                 f"camera {self._name} sends images that cannot be used ({self._bad}): check its cable and settings",
             )  # fmt: skip
-        if now_ns - self._any_ns < STALL_NS:
+        if now_ns - self._any_ns < (STALL_NS if self._begun else self._start_ns):
             return None
         return self._say(
             self._good_ns,
@@ -67,7 +71,7 @@ class CameraWatch:
 
     def needs_restart(self, now_ns: int) -> bool:
         """True if the device has been silent for so long that it should be opened again."""
-        return now_ns - self._any_ns >= RESTART_NS
+        return now_ns - self._any_ns >= (RESTART_NS if self._begun else self._start_ns)
 
     @property
     def well(self) -> bool:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.calibration import camera_from_yaml, checked_baseline
@@ -61,8 +60,8 @@ def _value(kind: str, text: str) -> Any:
     return float(text) if kind == "float" else text
 
 
-def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> tuple[CameraRig, ImuCalibration | None]:
-    """The rig of a live camera, and of a recording also the IMU's noise. Raises SourceError."""
+def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> CameraRig:
+    """The rig of a live camera. Raises SourceError."""
     name = options.calibration or next((path for path in CALIBRATIONS if Path(path).is_file()), "")
     if not name:
         raise SourceError(
@@ -76,13 +75,13 @@ def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> tuple[CameraRig
         try:
             if stereo and recorded.rig.right is None:
                 raise SourceError(f"{name} knows one camera: expected the calibration of a pair, or --mono")
-            return recorded.rig, recorded.imu
+            return recorded.rig
         finally:
             recorded.close()
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
     camera = camera_from_yaml(table, path)
     if not stereo:
-        return CameraRig(camera, None, np.eye(4), None, has_body=False), None
+        return CameraRig(camera, None, np.eye(4), None, has_body=False)
     if camera.lens is not Lens.NONE:
         raise SourceError(
             f"{path}: a pair in a camera.yaml must be rectified already: expected no k1 k2 p1 p2 k3; a pair with "
@@ -90,4 +89,4 @@ def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> tuple[CameraRig
         )
     T_c_r = np.eye(4)
     T_c_r[0, 3] = yaml_number(table, "baseline_m", path)
-    return CameraRig(camera, camera, np.eye(4), checked_baseline(T_c_r, f"{path}: baseline_m"), has_body=False), None
+    return CameraRig(camera, camera, np.eye(4), checked_baseline(T_c_r, f"{path}: baseline_m"), has_body=False)

@@ -94,7 +94,7 @@ class LivePairs:
             return
         self._told_skew = True
         middle, spread = found
-        text = f"right image {middle / 1e6:+.1f} ms after the left one, give or take {spread / 1e6:.1f} ms"
+        text = f"cameras: right image {middle / 1e6:+.1f} ms after the left one, give or take {spread / 1e6:.1f} ms"
         if abs(middle) + spread > _GOOD_SKEW_NS:
             text += ": in motion stereo depths are wrong by it; trigger both cameras by one signal"
         self._tell(text)
@@ -104,6 +104,6 @@ class LivePairs:
             return
         self._told_apart = True
         self._tell(
-            f"left and right images are {median(self._apart) / 1e6:.1f} ms apart, expected at most "
+            f"cameras: left and right images are {median(self._apart) / 1e6:.1f} ms apart, expected at most "
             f"{self._tolerance_ns / 1e6:.1f} ms: the left camera flies alone; trigger both cameras by one signal"
         )

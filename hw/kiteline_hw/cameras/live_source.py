@@ -33,19 +33,20 @@ class CameraSource:
     side_by_side: the left half of an image is the left view. fps: expected rate in Hz.
     """
 
+    imu: ImuCalibration | None = None
     ground_truth: Trajectory | None = None
     frame_count: int | None = None
 
     def __init__(
-        self, name: str, rig: CameraRig, imu: ImuCalibration | None, cameras: Sequence[Camera], fps: float,
+        self, name: str, rig: CameraRig, cameras: Sequence[Camera], fps: float,
         side_by_side: bool = False,
     ) -> None:  # fmt: skip
-        self.name, self.rig, self.imu = name, rig, imu
+        self.name, self.rig = name, rig
         self.report = SourceReport()
         self._cameras = tuple(cameras)
         self._side_by_side = side_by_side
         self._period_ns = round(1e9 / fps)
-        self._watches = [CameraWatch(camera.name) for camera in cameras]
+        self._watches = [CameraWatch(camera.name, round(camera.start_s * 1e9)) for camera in cameras]
         self._pairs = LivePairs(min(PAIR_TOLERANCE_NS, self._period_ns // 2), self._tell)
         self._clock = MonotonicClock()
         self._lock = threading.Condition()

@@ -14,12 +14,13 @@ KERNEL: Kernel = LinuxKernel()  # a modelled device takes its place in tests
 
 def open_source(argument: str, mono: bool, imu: bool) -> CameraSource:
     """Open cameras. One that is away is awaited in flight; one that cannot do what is asked raises SourceError."""
+    del imu  # cameras come without one; `--imu controller` flies on the flight controller's
     text, options = live_options.parse("v4l2", argument)
     devices = [device for device in text.split(",") if device]
     if not 1 <= len(devices) <= 2 or (options.side_by_side and len(devices) == 2):
         raise SourceError(f"v4l2:{argument}: expected one device, or two (left,right) without side_by_side")
     stereo = (len(devices) == 2 or options.side_by_side) and not mono
-    rig, noise = live_options.read_rig("v4l2", options, stereo)
+    rig = live_options.read_rig("v4l2", options, stereo)
     if mono:
         devices = devices[:1]
     width = rig.left.width * (2 if options.side_by_side else 1)
@@ -43,6 +44,4 @@ def open_source(argument: str, mono: bool, imu: bool) -> CameraSource:
                 raise
         finally:
             camera.close()
-    return CameraSource(
-        f"v4l2:{','.join(devices)}", rig, noise if imu else None, cameras, options.fps, options.side_by_side
-    )
+    return CameraSource(f"v4l2:{','.join(devices)}", rig, cameras, options.fps, options.side_by_side)

@@ -54,6 +54,8 @@ class V4l2Settings:
 class V4l2Camera:
     """One device, opened again after it was away with the same settings."""
 
+    start_s = 2.0  # slow webcams take one
+
     def __init__(self, device: str, settings: V4l2Settings, kernel: api.Kernel) -> None:
         self.name = device
         self._settings = settings
