@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeGuard
 
@@ -164,6 +164,15 @@ class PoseSink(Protocol):
     def close(self) -> None: ...
 
 
+class ControllerFinding(Protocol):
+    """Something that was found about a flight controller."""
+
+    @property
+    def line(self) -> str:
+        """The finding and what to do about it, in one line."""
+        ...
+
+
 class ControllerLink(PoseSink, Protocol):
     """A flight controller that receives poses and may send its own velocity and inertial samples."""
 
@@ -173,6 +182,10 @@ class ControllerLink(PoseSink, Protocol):
 
     def take_imu(self, t_ns: int) -> ImuBatch | None:
         """Its inertial samples since the last call, up to a time on our clock; None if there are none."""
+        ...
+
+    def take_findings(self) -> Sequence[ControllerFinding]:
+        """What was found about it since the last call, each once."""
         ...
 
 

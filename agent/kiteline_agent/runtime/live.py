@@ -90,8 +90,9 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                     controller.push(pose, clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is None:
+                found = [] if controller is None else [f.line for f in controller.take_findings()]
                 process.print_lines(
-                    status.lines(runtime.output, runtime.counts, now_ns - begin_ns) if runtime.output else ()
+                    status.lines(runtime.output, runtime.counts, now_ns - begin_ns, found) if runtime.output else ()
                 )
             elif runtime.counts.frames % PROGRESS_FRAMES == 0:
                 parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)

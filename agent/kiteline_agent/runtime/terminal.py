@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import StepOutput
 
@@ -26,9 +28,11 @@ class StatusMessages:
         self._next_summary_ns = _SUMMARY_NS
         self._bytes_up = 0
 
-    def lines(self, output: StepOutput, counts: FrameCounts, flight_ns: int) -> list[str]:
-        """The lines to print after a step. flight_ns: since the flight began."""
-        out = [event for event in output.events if event.startswith(_SHOWN)]
+    def lines(
+        self, output: StepOutput, counts: FrameCounts, flight_ns: int, findings: Sequence[str] = ()
+    ) -> list[str]:  # fmt: skip
+        """The lines to print after a step. flight_ns: since the flight began. findings: about the flight controller."""
+        out = [*findings, *(event for event in output.events if event.startswith(_SHOWN))]
         estimate = output.estimate
         if estimate is not None:
             tracking = live_pose(estimate) is not None

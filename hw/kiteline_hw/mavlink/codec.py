@@ -8,8 +8,10 @@ from pymavlink.dialects.v20 import common
 
 from kiteline_hw.mavlink import messages
 from kiteline_hw.mavlink.messages import COMPONENT_VIO, MavlinkMessage
+from kiteline_hw.mavlink.watch.messages import MESSAGES as STATUS_MESSAGES
 
 _MARKERS = (0xFD, 0xFE)  # first byte of a frame of MAVLink 2 and 1
+_SIGNED = 1  # bit of a frame's incompatibility flags
 _MIN_FRAME_BYTES = 8  # the length that pymavlink expects before it has read a header
 _MAX_PARSED_BYTES = 4096  # parsed bytes that pymavlink's buffer may hold before it is trimmed
 
@@ -20,9 +22,11 @@ class MavlinkCodec:
     def __init__(self, system: int = 1, component: int = COMPONENT_VIO) -> None:
         self._mav: Any = common.MAVLink(None, srcSystem=system, srcComponent=component)
         self._mav.robust_parsing = True
-        self._kinds = {name: kind for kind in messages.MESSAGES for name in kind.NAMES}
+        self._kinds = {name: kind for kind in (*messages.MESSAGES, *STATUS_MESSAGES) for name in kind.NAMES}
         self.bad = 0  # pieces that were no valid message
         self.unknown = 0  # valid frames of messages that are not in the table
+        self.signed = 0  # signed frames, whoever signed them
+        self.refused = 0  # frames whose signature is missing or is not by our key
 
     def encode(self, message: MavlinkMessage) -> bytes:
         """The frame of a message."""
@@ -81,11 +85,13 @@ class MavlinkCodec:
 
     def _convert(self, frame: Any) -> MavlinkMessage | None:
         name = frame.get_type()
+        if name == "BAD_DATA":
+            self.bad += 1
+            self.refused += "signature" in str(frame.reason)
+            return None
+        self.signed += bool(frame.get_header().incompat_flags & _SIGNED)
         kind = self._kinds.get(name)
         if kind is not None:
             return kind.parse(frame)
-        if name == "BAD_DATA":
-            self.bad += 1
-        else:
-            self.unknown += 1
+        self.unknown += 1
         return None

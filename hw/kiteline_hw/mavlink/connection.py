@@ -127,6 +127,11 @@ class MavlinkConnection:
         self._serial.wake()
         return has_room
 
+    @property
+    def device_fault(self) -> str:
+        """Why the serial port is not open; "" if it is, or if there is none."""
+        return "" if self._serial is None else self._serial.fault
+
     def _next_out(self) -> bytes:
         return self._outbox.popleft() if self._outbox else b""
 

@@ -26,6 +26,8 @@ from kiteline_hw.mavlink.coordinate_frames import (
     upper_triangle,
 )
 from kiteline_hw.mavlink.messages import Heartbeat, MavlinkMessage, Odometry, TimeSync, VehicleImu
+from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
+from kiteline_hw.mavlink.watch.presence import LinkState
 from kiteline_hw.ports import PoseSample
 
 _MAX_POSITION_M = 1e6  # m; beyond it the estimate has failed, and a float32 cannot hold centimetres
@@ -38,6 +40,7 @@ class OdometryConfig:
     rate_hz: float = 30.0  # Hz; PX4 wants 30 to 50, ArduPilot at least 4; 245 bytes each
     rate_slack_ns: int = 4_000_000  # ns; a frame may be sent this much before it is due: cameras jitter
     heartbeat_ns: int = 1_000_000_000  # ns; as MAVLink prescribes
+    watch_ns: int = 100_000_000  # ns between two looks at what has changed
     max_gap_ns: int = 250_000_000  # ns; velocities are not differenced over a longer gap between poses
     min_gap_ns: int = 20_000_000  # ns; nor over a shorter one, in which noise dominates
     floor_m: float = 0.01  # m; added to a pose's own deviation: 5 ms of delay at 2 m/s, and mounting errors
@@ -64,12 +67,14 @@ class OdometryCounters:
 class ControllerSession:
     """Poses in, MAVLink bytes out. T_b_f: (4,4) flight controller (FRD) in the body: coordinate_frames.mounting.
 
-    odometry, imu: receive the controller's velocities and inertial samples; None: they are not requested.
+    odometry, imu: receive the controller's velocities and inertial samples; None: they are not requested. watch: says
+    what is found about the controller.
     """
 
     def __init__(
         self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None,
         odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None,
+        watch: ControllerWatch | None = None,
     ) -> None:  # fmt: skip
         self.config = config or OdometryConfig()
         self.codec = codec or MavlinkCodec()
@@ -82,6 +87,9 @@ class ControllerSession:
         self._autopilot: tuple[Heartbeat, int] | None = None
         self._odometry = odometry
         self._imu = imu
+        self._watch = watch
+        self._next_watch_ns: int | None = None
+        self._received = self._messages = 0
         self._handlers: dict[type[MavlinkMessage], Callable[[Any, int], Sequence[MavlinkMessage]]] = {
             TimeSync: self._on_timesync,
             Heartbeat: self._on_heartbeat,
@@ -100,7 +108,20 @@ class ControllerSession:
             if message is not None:
                 self.counters.odometry += 1
                 out.append(self.codec.encode(message))
+                if self._watch is not None:
+                    self._watch.sent(pose, message.quality, now_ns)
         return out
+
+    def watch(self, now_ns: int, device_fault: str = "") -> list[bytes]:
+        """The frames that the watch sends now. device_fault: why the serial port is not open."""
+        if self._watch is None or (self._next_watch_ns is not None and now_ns < self._next_watch_ns):
+            return []
+        self._next_watch_ns = now_ns + self.config.watch_ns
+        codec = self.codec
+        link = LinkState(
+            self._received, self._messages, codec.signed, codec.refused, has_key=False, device_fault=device_fault
+        )
+        return [codec.encode(message) for message in self._watch.tick(now_ns, link)]
 
     def _pose_message(self, pose: PoseSample, now_ns: int) -> Odometry | None:
         if not np.all(np.isfinite(pose.T_o_b)) or float(np.abs(pose.T_o_b[:3, 3]).max()) > _MAX_POSITION_M:
@@ -179,7 +200,11 @@ class ControllerSession:
     def receive(self, data: bytes, now_ns: int, *, datagram: bool = False) -> list[bytes]:
         """Process bytes from the flight controller, in any pieces; the answers to send at once."""
         out: list[bytes] = []
+        self._received += bool(data)
         for message in self.codec.receive(data, datagram=datagram):
+            self._messages += 1
+            if self._watch is not None:
+                self._watch.receive(message, now_ns)
             handler = self._handlers.get(type(message))
             if handler is not None:
                 out += [self.codec.encode(answer) for answer in handler(message, now_ns)]

@@ -136,10 +136,12 @@ class Attitude(MavlinkMessage):
     t_ms: int
     angles_rad: Vector
     rate_rad_s: Vector
+    system: int = 0
 
     @classmethod
     def parse(cls, m: Any) -> Self:
-        return cls(m.time_boot_ms, (m.roll, m.pitch, m.yaw), (m.rollspeed, m.pitchspeed, m.yawspeed))
+        rates = m.rollspeed, m.pitchspeed, m.yawspeed
+        return cls(m.time_boot_ms, (m.roll, m.pitch, m.yaw), rates, m.get_srcSystem())
 
     def values(self) -> Sequence[Any]:
         return self.t_ms, *self.angles_rad, *self.rate_rad_s

@@ -6,11 +6,13 @@ import threading
 
 from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry.se3 import F64
-from kiteline_hw.mavlink.connection import MavlinkConnection
+from kiteline_hw.mavlink.connection import MavlinkConnection, parse_mavlink_url
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
 from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryConfig, OdometryCounters
 from kiteline_hw.mavlink.messages import Heartbeat
+from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
+from kiteline_hw.mavlink.watch.findings import Finding
 from kiteline_hw.ports import Clock, PoseSample
 from kiteline_hw.system.closing import Closing
 
@@ -31,7 +33,9 @@ class MavlinkPoseSink(Closing):
     ) -> None:  # fmt: skip
         self._clock = clock
         self._lock = threading.Lock()
-        self._session = ControllerSession(T_b_f, config, odometry=odometry, imu=imu)
+        parsed = parse_mavlink_url(url)
+        self._watch = ControllerWatch(T_b_f, url, parsed.port if parsed.kind == "serial" else 0)
+        self._session = ControllerSession(T_b_f, config, odometry=odometry, imu=imu, watch=self._watch)
         self.refused = 0  # messages that could not be sent
         self._connection = MavlinkConnection(
             url, "mavlink", self._on_data, self._on_tick, _TICK_S, _MAX_QUEUED, required=required
@@ -53,7 +57,14 @@ class MavlinkPoseSink(Closing):
 
     def _on_tick(self) -> None:
         with self._lock:
-            self._send(self._session.step(None, self._clock.now_ns()))
+            now_ns = self._clock.now_ns()
+            self._send(self._session.step(None, now_ns))
+            self._send(self._session.watch(now_ns, self._connection.device_fault))
+
+    def take_findings(self) -> list[Finding]:
+        """What was found about the controller since the last call."""
+        with self._lock:
+            return self._watch.take()
 
     @property
     def counters(self) -> OdometryCounters:

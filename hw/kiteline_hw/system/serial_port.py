@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import termios
@@ -20,6 +21,20 @@ _IDLE_S = 0.5  # s that the thread sleeps at most
 
 # pyserial raises TypeError and ValueError if its port vanishes during a call.
 _ERRORS = (serial.SerialException, OSError, termios.error, ValueError, TypeError)
+
+_UNPLUGGED = "the device is gone: unplugged, or without power"
+_REASONS = {
+    errno.ENOENT: "the device is missing",
+    errno.ENODEV: _UNPLUGGED,
+    errno.EACCES: "this user may not open the device",
+    errno.EAGAIN: "another program uses the device",
+    errno.EBUSY: "another program uses the device",
+}
+
+
+def _reason(error: BaseException) -> str:
+    """Why a port could not be opened."""
+    return _REASONS.get(getattr(error, "errno", None) or 0, f"the device cannot be opened ({error})")
 
 
 def parse_serial(spec: str) -> tuple[str, int]:
@@ -55,10 +70,12 @@ class SerialPort:
         self.cut_frames = 0  # frames that were not written in full when the port went away
         self.callback_errors = 0
         self.connected = False
+        self.fault = ""  # why the port is not open
         port: serial.Serial | None = None
         try:
             port = self._open()
         except _ERRORS as error:
+            self.fault = _reason(error)
             if required:
                 self._close_pipe()
                 raise LinkError(
@@ -72,6 +89,7 @@ class SerialPort:
         port = serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
         self.opened += 1
         self.connected = True
+        self.fault = ""
         return port
 
     def wake(self) -> None:
@@ -86,7 +104,8 @@ class SerialPort:
                 try:
                     port = self._open()
                     retry_s = _FIRST_RETRY_S
-                except _ERRORS:
+                except _ERRORS as error:
+                    self.fault = _reason(error)
                     self._closed.wait(retry_s)
                     retry_s = min(2.0 * retry_s, _MAX_RETRY_S)
                     continue
@@ -94,6 +113,7 @@ class SerialPort:
                 self._exchange(port)
             except _ERRORS:
                 self._hang_up(port)
+                self.fault = _UNPLUGGED
                 port = None
                 self._closed.wait(retry_s)
         if port is not None:

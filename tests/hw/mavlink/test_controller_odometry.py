@@ -197,7 +197,7 @@ def test_odometry_through_the_session() -> None:
 
 
 MESSAGES = [
-    Attitude(5, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0)),
+    Attitude(5, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), 1),
     LocalPosition(6, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
     WheelDistance(7, (0.5, -0.25, 8.0)),
 ]

@@ -1,0 +1,1 @@
+"""Watches a flight controller: messages and times in, findings out. Pure."""

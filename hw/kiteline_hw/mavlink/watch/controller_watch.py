@@ -1,0 +1,139 @@
+"""Watches the flight controller of a flight: what it is, whether it uses the poses, whether attitudes agree. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from kiteline_core.geometry.se3 import F64
+from kiteline_hw.mavlink.messages import Attitude, Heartbeat, MavlinkMessage, TimeSync
+from kiteline_hw.mavlink.watch import messages as wire
+from kiteline_hw.mavlink.watch.attitude import TOPIC as AXES
+from kiteline_hw.mavlink.watch.attitude import AttitudeWatch
+from kiteline_hw.mavlink.watch.estimator import EstimatorWatch
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
+from kiteline_hw.mavlink.watch.latency import LatencyWatch
+from kiteline_hw.mavlink.watch.messages import (
+    AutopilotVersion,
+    CommandAck,
+    EkfStatusReport,
+    EstimatorStatus,
+    StatusText,
+)
+from kiteline_hw.mavlink.watch.presence import LinkState, PresenceWatch
+from kiteline_hw.ports import PoseSample
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerWatchConfig:
+    """Which messages are requested, and how texts are sent."""
+
+    report_us: int = 500_000  # us between two reports of the estimator
+    attitude_us: int = 100_000  # us between two ATTITUDE; 5 degrees pass in 0.1 s at 50 degrees a second
+    request_ns: int = 4_000_000_000  # ns of silence after which a message is requested again
+    restart_ms: int = 2_000  # ms by which a controller's clock goes back when it restarts
+    waiting: int = 16  # texts for the controller that wait until it is found; the oldest are dropped
+
+
+class ControllerWatch:
+    """Messages, poses and times in; findings, and messages to send, out.
+
+    T_b_f: (4,4) flight controller in the body. url: of the connection, for messages. baud: of its serial port, else 0.
+    """
+
+    def __init__(self, T_b_f: F64, url: str = "", baud: int = 0, config: ControllerWatchConfig | None = None) -> None:
+        self.config = config or ControllerWatchConfig()
+        self._log = FindingLog()
+        self.presence = PresenceWatch(url, self._log)
+        self.estimator = EstimatorWatch(self._log)
+        self.attitude = AttitudeWatch(np.ascontiguousarray(T_b_f[:3, :3]), self._log)
+        self.latency = LatencyWatch(self._log, baud)
+        self._attitude_ms: int | None = None
+        self._seen_ns: dict[int, int] = {}  # by message id: when it came or was requested
+        self._findings: list[Finding] = []
+        self._texts: list[Finding] = []
+        self._handlers: dict[type[MavlinkMessage], Callable[[Any, int], None]] = {
+            Attitude: self._on_attitude,
+            EkfStatusReport: self._on_report,
+            EstimatorStatus: self._on_report,
+            StatusText: self._on_text,
+            CommandAck: lambda m, now_ns: self.presence.answered(),
+            AutopilotVersion: lambda m, now_ns: self.presence.receive_version(m),
+            TimeSync: lambda m, now_ns: self.presence.answered() if m.tc1_ns != 0 else None,
+        }
+
+    def receive(self, m: MavlinkMessage, now_ns: int) -> None:
+        """Add a message; those of other systems than the controller's are ignored."""
+        if isinstance(m, Heartbeat):
+            self.presence.receive_heartbeat(m, now_ns)
+            return
+        handler = self._handlers.get(type(m))
+        if handler is not None and getattr(m, "system", 0) in (0, self.presence.system):
+            handler(m, now_ns)
+
+    def sent(self, pose: PoseSample, quality: int, now_ns: int) -> None:
+        """Add a pose that was sent."""
+        self.attitude.pose(pose)
+        if self.presence.heartbeat is not None:
+            self.estimator.sent(quality, now_ns)
+            self.latency.sent(now_ns - pose.t_ns, self.presence.autopilot)
+
+    def tick(self, now_ns: int, link: LinkState) -> list[MavlinkMessage]:
+        """Say what has changed; the messages to send: requests, and findings as STATUSTEXT."""
+        out: list[MavlinkMessage] = [*self.presence.tick(now_ns, link)]
+        if self.presence.heartbeat is not None:
+            self.estimator.tick(self.presence.autopilot, now_ns)
+            out += self._requests(self.presence.heartbeat, now_ns)
+        new = self._log.take()
+        self._findings += new
+        self._texts = (self._texts + new)[-self.config.waiting :]
+        if self.presence.heartbeat is not None:
+            out += [StatusText(int(f.level), f.short) for f in self._texts]
+            self._texts = []
+        return out
+
+    def take(self) -> list[Finding]:
+        """The findings since the last call."""
+        new, self._findings = self._findings, []
+        return new
+
+    def _requests(self, controller: Heartbeat, now_ns: int) -> Sequence[MavlinkMessage]:
+        c = self.config
+        report = wire.EKF_STATUS_REPORT if controller.autopilot == wire.ARDUPILOT else wire.ESTIMATOR_STATUS
+        out = []
+        for message, interval_us in ((report, c.report_us), (wire.ATTITUDE, c.attitude_us)):
+            if message in self._seen_ns and now_ns - self._seen_ns[message] < c.request_ns:
+                continue
+            self._seen_ns[message] = now_ns
+            out.append(
+                wire.Command(
+                    controller.system, controller.component, wire.SET_MESSAGE_INTERVAL, float(message),
+                    float(interval_us),
+                )
+            )  # fmt: skip
+        return out
+
+    def _on_attitude(self, m: Attitude, now_ns: int) -> None:
+        self._seen_ns[wire.ATTITUDE] = now_ns
+        before, self._attitude_ms = self._attitude_ms, m.t_ms
+        if before is not None and before - m.t_ms > self.config.restart_ms:
+            self._log.forget("restart")
+            self._log.say(
+                "restart", m.t_ms, Level.WARNING, "flight controller: restarted", "kiteline: controller restarted"
+            )
+            self.attitude.restart()
+            self.estimator.restart()
+            self._log.forget(AXES)
+        self.attitude.receive(m, now_ns)
+
+    def _on_report(self, m: EkfStatusReport | EstimatorStatus, now_ns: int) -> None:
+        message = wire.EKF_STATUS_REPORT if isinstance(m, EkfStatusReport) else wire.ESTIMATOR_STATUS
+        self._seen_ns[message] = now_ns
+        self.estimator.report(m, now_ns)
+
+    def _on_text(self, m: StatusText, now_ns: int) -> None:
+        if m.component == 1:
+            self.estimator.text(m)
