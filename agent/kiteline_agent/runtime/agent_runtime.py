@@ -251,7 +251,7 @@ class AgentRuntime:
 
 def opened(options: AgentOptions) -> FrameSource:
     """The source of a flight. Raises SourceError."""
-    return open_source(options.source, mono=options.mono, imu=options.imu)
+    return open_source(options.source, mono=options.mono, imu=options.imu, calibration=options.calibration)
 
 
 def channel_with_spill(options: AgentOptions) -> RecordChannel:

@@ -30,6 +30,7 @@ class AgentOptions:
     imu: bool = True
     config: str = ""  # a TOML file
     rig: str = ""  # a rig file; "": none
+    calibration: str = ""  # FILE[,FILE…] in place of the source's; "": none
     start_ns: int = 0  # the stamp that is flight time 0
     seconds: float = 0.0  # s of flight time to fly; 0: all
     up_bytes_s: int = 0  # B/s that the link takes; 0: any number
@@ -53,8 +54,8 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
     """Options from the command line. folder: for the log. boot: number of this start."""
     return AgentOptions(
         source=a.source, folder=str(folder), log_name=f"boot{boot:05d}.mcap" if a.log else "", agent=a.agent, boot=boot,
-        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, up_bytes_s=a.up_bytes,
-        profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
+        link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
+        up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu,
     )  # fmt: skip
 
@@ -106,6 +107,10 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument(
         "--rig", metavar="FILE", default="",
         help="begin with what earlier flights found of the cameras, and write what this one finds",
+    )  # fmt: skip
+    p.add_argument(
+        "--calibration", metavar="FILE[,FILE]", default="",
+        help="cameras, extrinsics and IMU noise in place of the source's: kiteline, Kalibr, EuRoC, ROS or OpenCV YAML",
     )  # fmt: skip
     p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
     p.add_argument(

@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 
 from kiteline_core.geometry.cameras import CameraRig, Lens
+from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_hw.calibration.files import read_calibration
+from kiteline_hw.calibration.nodes import read_nodes
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources.calibration import camera_from_yaml, checked_baseline
+from kiteline_hw.sources.calibration import camera_from_yaml
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.sources.text_files import read_yaml, yaml_number
 
@@ -19,7 +23,8 @@ CALIBRATIONS = ("camera.yaml", "/etc/kiteline/camera.yaml")  # looked for where 
 
 @dataclass(frozen=True, slots=True)
 class LiveOptions:
-    """calibration: a camera.yaml, or a recording or log with the rig; "": the first of CALIBRATIONS that exists.
+    """calibration: a camera.yaml, a calibration file of any form, or a recording or log with the rig; "": the first of
+    CALIBRATIONS that exists.
 
     fps: Hz. side_by_side: each image holds the left view and the right view. format: four letters, "": chosen.
     exposure_ms, gain: -1: as the camera wants.
@@ -60,8 +65,15 @@ def _value(kind: str, text: str) -> Any:
     return float(text) if kind == "float" else text
 
 
-def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> CameraRig:
-    """The rig of a live camera. Raises SourceError."""
+def read_rig(scheme: str, options: LiveOptions, stereo: bool, told: ToldCalibration | None = None) -> CameraRig:
+    """The rig of a live camera. told: it goes first. Raises SourceError."""
+    if told is not None:
+        if not told.known:
+            raise SourceError(
+                f"{scheme}: images of a camera that has no calibration cannot be taken yet: record them, and calibrate "
+                "by the recording or by image files"
+            )
+        return told.rig_of_images(scheme, 1 + stereo, (told.cameras[0].height, told.cameras[0].width))
     name = options.calibration or next((path for path in CALIBRATIONS if Path(path).is_file()), "")
     if not name:
         raise SourceError(
@@ -78,6 +90,8 @@ def read_rig(scheme: str, options: LiveOptions, stereo: bool) -> CameraRig:
             return recorded.rig
         finally:
             recorded.close()
+    if "fx" not in read_nodes(path).keys:
+        return read_rig(scheme, options, stereo, read_calibration(str(path)))
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
     camera = camera_from_yaml(table, path)
     if not stereo:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.cameras import live_options
 from kiteline_hw.cameras.live_options import LiveOptions
 from kiteline_hw.cameras.live_source import CameraSource
@@ -14,15 +15,15 @@ from kiteline_hw.ports import SourceError
 _NO_DELAY = ("-fflags", "nobuffer", "-flags", "low_delay", "-probesize", "500000", "-analyzeduration", "500000")
 
 
-def open_source(argument: str, mono: bool, imu: bool) -> CameraSource:
-    """Open streams; one that is away is awaited in flight. Raises SourceError."""
+def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> CameraSource:
+    """Open streams; one that is away is awaited in flight. told: their calibration. Raises SourceError."""
     del imu
     text, options = _split(argument)
     urls = [url for url in text.split(",") if url]
     if not 1 <= len(urls) <= 2 or (options.side_by_side and len(urls) == 2):
         raise SourceError(f"stream:{argument}: expected one URL, or two (left,right) without side_by_side")
     stereo = (len(urls) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("stream", options, stereo)
+    rig = live_options.read_rig("stream", options, stereo, told)
     cameras = [
         PipeCamera(url, ffmpeg_command(url), f"check its address, for instance with `ffplay {shlex.quote(url)}`")
         for url in (urls[:1] if mono else urls)

@@ -1,57 +1,12 @@
-"""Checks of calibration values that all readers share. All raise SourceError; `where` names the file and entry."""
+"""The camera of a flat camera.yaml, and the read-out that several forms tell."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
-from kiteline_hw.ports import SourceError
+from kiteline_hw.calibration.checks import checked_camera, checked_readout
 from kiteline_hw.sources.text_files import Yaml, yaml_number
-
-F64 = NDArray[np.float64]
-
-_LONGEST_READOUT_S = 0.2  # no video camera is slower
-
-_EQUIDISTANT = ("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4", "kb4")
-_RADTAN = ("radialtangential", "radtan", "plumbbob", "rationalpolynomial", "opencv", "browncornrady", "brown")
-
-
-def checked_rigid(values: F64, where: str) -> F64:
-    """A rigid motion (4,4), its rotation orthonormalised."""
-    r = values[:3, :3]
-    if not np.isfinite(values).all() or not np.allclose(r @ r.T, np.eye(3), atol=1e-3) or np.linalg.det(r) < 0:
-        raise SourceError(f"{where} is no rigid motion: expected a 4x4 matrix with an orthonormal rotation")
-    return se3.orthonormalise(values)
-
-
-def parse_lens(model: str, coefficients: list[float], where: str) -> tuple[Lens, tuple[float, ...]]:
-    """The lens behind a distortion model's name, as data sets and ROS write it."""
-    name = model.lower().replace("-", "").replace("_", "").replace(" ", "")
-    if name in ("", "none", "pinhole", "rectified", "undistorted") or not any(coefficients):
-        return (Lens.EQUIDISTANT, (0.0, 0.0, 0.0, 0.0)) if name in _EQUIDISTANT else (Lens.NONE, ())
-    if name in _RADTAN:
-        if len(coefficients) not in (4, 5, 8):
-            raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4, 5 or 8")
-        return Lens.RADTAN, tuple(coefficients)
-    if name in _EQUIDISTANT:
-        if len(coefficients) != 4:
-            raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4")
-        return Lens.EQUIDISTANT, tuple(coefficients)
-    raise SourceError(f"{where}: lens model {model!r} is not known: expected radial-tangential or equidistant")
-
-
-def checked_camera(camera: CameraModel, where: str) -> CameraModel:
-    """The camera, if its intrinsics are usable."""
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
-    if not (np.isfinite(numbers).all() and camera.fx > 0 and camera.fy > 0 and camera.width > 0 and camera.height > 0):
-        raise SourceError(
-            f"{where}: no usable calibration (fx {camera.fx}, fy {camera.fy}, {camera.width}x{camera.height} px)"
-        )
-    return camera
 
 
 def camera_from_yaml(table: Yaml, path: Path) -> CameraModel:
@@ -66,20 +21,5 @@ def camera_from_yaml(table: Yaml, path: Path) -> CameraModel:
 
 def read_out(table: Yaml, height: int, path: Path) -> float:
     """The read-out of a rolling shutter in s: `readout_s` of all rows, or Kalibr's `line_delay` of one; 0 without."""
-    readout_s = yaml_number(table, "readout_s", path, yaml_number(table, "line_delay", path, 0.0) * height)
-    if not 0.0 <= readout_s < _LONGEST_READOUT_S:
-        raise SourceError(
-            f"{path}: a read-out of {readout_s:g} s: expected readout_s or line_delay in s, 0 for a global shutter"
-        )
-    return readout_s
-
-
-def checked_baseline(T_c_r: F64, where: str) -> F64:
-    """T_c_r (4,4), if the distance between left and right camera is that of a stereo pair."""
-    baseline_m = float(np.linalg.norm(T_c_r[:3, 3]))
-    if not 1e-4 < baseline_m < 100.0:
-        raise SourceError(
-            f"{where}: the baseline between left and right camera is {baseline_m:g} m: expected the extrinsics of a "
-            "stereo pair; with mono (--mono) the left camera alone can be used"
-        )
-    return T_c_r
+    told = yaml_number(table, "readout_s", path, yaml_number(table, "line_delay", path, 0.0) * height)
+    return checked_readout(told, str(path))

@@ -1,4 +1,8 @@
-"""EuRoC's ASL folders: mav0/cam0, cam1, imu0, each with sensor.yaml and data.csv. The body frame is the IMU's."""
+"""EuRoC's ASL folders: mav0/cam0, cam1, imu0, each with sensor.yaml and data.csv. The body frame is the IMU's.
+
+TUM-VI's folders have the same layout without a sensor.yaml: their calibration is a Kalibr chain, camchain*.yaml beside
+mav0 or in dso.
+"""
 
 from __future__ import annotations
 
@@ -12,36 +16,38 @@ from numpy.typing import NDArray
 from kiteline_core.frame import ImuCalibration, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_hw.calibration.euroc import read_camera, read_imu
+from kiteline_hw.calibration.files import read_calibration
+from kiteline_hw.calibration.nodes import read_nodes
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sensors.imu_buffer import ImuSamples, ImuTable
-from kiteline_hw.sources.calibration import checked_baseline, checked_camera, checked_rigid, parse_lens, read_out
-from kiteline_hw.sources.recording import Recording, Stamped, list_images, sorted_trajectory
-from kiteline_hw.sources.text_files import (
-    Yaml,
-    pose_from_tum,
-    read_rows,
-    read_tum_poses,
-    read_yaml,
-    yaml_number,
-    yaml_numbers,
-)
+from kiteline_hw.sources.recording import Recording, Stamped, image_size, list_images, sorted_trajectory
+from kiteline_hw.sources.text_files import pose_from_tum, read_rows, read_tum_poses
 
 F64 = NDArray[np.float64]
 
 
-def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
-    """Open an ASL folder (the one that holds mav0, or mav0 itself). Raises SourceError."""
+def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
+    """Open an ASL folder (it holds mav0, or is mav0). told: used where no sensor.yaml is. Raises SourceError."""
     folder = Path(folder_name)
     mav = folder / "mav0" if (folder / "mav0").is_dir() else folder
     if not (mav / "cam0").is_dir():
         raise SourceError(f"{folder}: expected EuRoC's layout, mav0/cam0/sensor.yaml and mav0/cam0/data; no cam0 there")
+    if not (mav / "cam0" / "sensor.yaml").is_file():
+        told = _chain_beside(folder, mav) or told  # what is told is put over it
+        if told is not None:
+            return _open_told(folder, mav, told, mono, imu)
+        raise SourceError(
+            f"{mav / 'cam0' / 'sensor.yaml'}: no such file: expected the camera's calibration, for TUM-VI's folders "
+            "camchain.yaml beside mav0 or in dso, or --calibration FILE"
+        )
     left, T_s_c = _read_camera(mav / "cam0")
     # The files give cameras and ground truth in their own frame "B" (here: s); the body frame is that of the IMU.
-    imu_yaml = mav / "imu0" / "sensor.yaml"
-    table = read_yaml(imu_yaml, "the IMU's calibration") if (mav / "imu0").is_dir() else None
-    T_s_i = _read_extrinsics(table, imu_yaml) if table is not None else np.eye(4)
+    T_s_i, noise = _read_imu_calibration(mav / "imu0")
     right = T_c_r = None
     images = [_list_stamped(mav / "cam0")]
     if not mono and (mav / "cam1").is_dir():
@@ -51,8 +57,36 @@ def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
     rig = CameraRig(left, right, se3.inverse(T_s_i) @ T_s_c, T_c_r)
     return Recording(
         f"euroc:{folder}", rig, len(images[0]), lambda report: _read_frames(images, report),
-        _read_imu_calibration(table, imu_yaml) if imu and table is not None else None,
+        noise if imu else None,
         _read_ground_truth(folder, mav, T_s_i), lambda report: _read_imu(mav / "imu0" / "data.csv", report),
+    )  # fmt: skip
+
+
+def _chain_beside(folder: Path, mav: Path) -> ToldCalibration | None:
+    """TUM-VI's calibration: a Kalibr chain, and the IMU's noise where there is a file of it."""
+    for place in dict.fromkeys((folder, mav, mav.parent, folder / "dso", mav.parent / "dso")):
+        chain = sorted(place.glob("camchain*.yaml"))
+        if chain:
+            return read_calibration(",".join(str(path) for path in (chain[0], *sorted(place.glob("imu*.yaml"))[:1])))
+    return None
+
+
+def _open_told(folder: Path, mav: Path, told: ToldCalibration, mono: bool, imu: bool) -> Recording:
+    """A folder by a calibration from elsewhere."""
+    images = [_list_stamped(mav / "cam0")]
+    if not mono and (mav / "cam1").is_dir():
+        images.append(_list_stamped(mav / "cam1"))
+    rig = told.rig_of_images(f"euroc:{folder}", len(images), image_size([path for _, path in images[0]]))
+    has_imu = imu and told.known and (mav / "imu0" / "data.csv").is_file()
+    if has_imu and not rig.has_body:
+        raise SourceError(
+            f"{told.where}: nothing says where the camera sits against the IMU: expected T_cam_imu (Kalibr), T_BS "
+            "(EuRoC) or T_b_c (kiteline); with --no-imu the images alone are used"
+        )
+    return Recording(
+        f"euroc:{folder}", rig, len(images[0]), lambda report: _read_frames(images, report),
+        (told.imu or ImuCalibration()) if has_imu else None, _read_ground_truth(folder, mav, np.eye(4)),
+        lambda report: _read_imu(mav / "imu0" / "data.csv", report),
     )  # fmt: skip
 
 
@@ -86,35 +120,18 @@ def _read_imu(path: Path, report: SourceReport) -> ImuSamples:
 
 def _read_camera(folder: Path) -> tuple[CameraModel, F64]:
     """The camera and its T_BS (4,4)."""
-    path = folder / "sensor.yaml"
-    table = read_yaml(path, "the camera's calibration (intrinsics, distortion_coefficients, T_BS)")
-    model = table.get("camera_model", "pinhole")
-    if model != "pinhole":
-        raise SourceError(f"{path}: camera_model {model!r} is not known: expected pinhole")
-    fx, fy, cx, cy = yaml_numbers(table, "intrinsics", path, 4)
-    width, height = (int(n) for n in yaml_numbers(table, "resolution", path, 2))
-    distortion = table.get("distortion_coefficients", [])
-    if not isinstance(distortion, list):
-        raise SourceError(f"{path}: expected distortion_coefficients with a list of numbers, found {distortion!r}")
-    lens, coefficients = parse_lens(str(table.get("distortion_model", "none")), distortion, str(path))
-    readout_s = read_out(table, height, path)
-    camera = CameraModel(width, height, fx, fy, cx, cy, lens, coefficients, readout_s)
-    return checked_camera(camera, str(path)), _read_extrinsics(table, path)
+    part = read_camera(read_nodes(folder / "sensor.yaml"))
+    assert part.T_s_c is not None
+    return part.calibration.cameras[0], part.T_s_c
 
 
-def _read_extrinsics(table: Yaml, path: Path) -> F64:
-    return checked_rigid(np.array(yaml_numbers(table, "T_BS.data", path, 16)).reshape(4, 4), f"{path}: T_BS")
-
-
-def _read_imu_calibration(table: Yaml, path: Path) -> ImuCalibration:
-    d = ImuCalibration()
-    return ImuCalibration(
-        yaml_number(table, "gyroscope_noise_density", path, d.gyro_noise),
-        yaml_number(table, "gyroscope_random_walk", path, d.gyro_walk),
-        yaml_number(table, "accelerometer_noise_density", path, d.accel_noise),
-        yaml_number(table, "accelerometer_random_walk", path, d.accel_walk),
-        yaml_number(table, "rate_hz", path, d.rate_hz),
-    )
+def _read_imu_calibration(folder: Path) -> tuple[F64, ImuCalibration | None]:
+    """The IMU's T_BS (4,4) and noise; identity and None without an IMU."""
+    if not folder.is_dir():
+        return np.eye(4), None
+    part = read_imu(read_nodes(folder / "sensor.yaml"))
+    assert part.T_s_i is not None
+    return part.T_s_i, part.calibration.imu
 
 
 def _list_stamped(folder: Path) -> Stamped:
@@ -135,9 +152,10 @@ def _list_stamped(folder: Path) -> Stamped:
 
 
 def _read_ground_truth(folder: Path, mav: Path, T_s_i: F64) -> Trajectory | None:
-    estimate = mav / "state_groundtruth_estimate0" / "data.csv"
+    places = (mav / name / "data.csv" for name in ("state_groundtruth_estimate0", "mocap0"))
+    estimate = next((path for path in places if path.is_file()), None)
     tum = next((d / "gt.tum" for d in (folder, mav, mav.parent) if (d / "gt.tum").is_file()), None)
-    if estimate.is_file():
+    if estimate is not None:
         poses = []
         for cells in read_rows(estimate, "ground truth", ","):
             try:

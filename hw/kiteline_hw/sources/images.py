@@ -14,16 +14,20 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_core.geometry.cameras import CameraRig, Lens
+from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sensors.images import ImageFile
-from kiteline_hw.sources.calibration import camera_from_yaml, checked_baseline
-from kiteline_hw.sources.recording import Recording
+from kiteline_hw.sources.calibration import camera_from_yaml
+from kiteline_hw.sources.recording import Recording, image_size
 from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns, yaml_number
 
+_UNSTAMPED_HZ = 10.0  # rate of images whose names are no stamps
 
-def open_source(pattern: str, mono: bool, imu: bool) -> Recording:
-    """Open images by pattern; they come without an IMU. Raises SourceError."""
+
+def open_source(pattern: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
+    """Open images by pattern; they come without an IMU. told: in place of camera.yaml. Raises SourceError."""
     del imu
     patterns = pattern.split(",")
     if len(patterns) > 2:
@@ -31,11 +35,15 @@ def open_source(pattern: str, mono: bool, imu: bool) -> Recording:
     sides = [_list_files(p) for p in (patterns[:1] if mono else patterns)]
     if len({len(files) for files in sides}) > 1:
         raise SourceError(f"images:{pattern}: {len(sides[0])} left and {len(sides[1])} right images: expected as many")
+    if told is not None:
+        rig = told.rig_of_images(f"images:{pattern}", len(sides), image_size(sides[0]))
+        return _recording(pattern, rig, sides, _parse_times(sides[0], _UNSTAMPED_HZ))
     folder = sides[0][0].parent
     path = next((d / "camera.yaml" for d in (folder, folder.parent) if (d / "camera.yaml").is_file()), None)
     if path is None:
         raise SourceError(
-            f"images:{pattern}: no calibration: expected {folder / 'camera.yaml'} with fx, fy, cx, cy, width, height"
+            f"images:{pattern}: no calibration: expected {folder / 'camera.yaml'} with fx, fy, cx, cy, width, height, "
+            "or --calibration FILE; `kiteline calibrate` makes one"
         )
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
     camera = camera_from_yaml(table, path)
@@ -47,7 +55,11 @@ def open_source(pattern: str, mono: bool, imu: bool) -> Recording:
         T_c_r[0, 3] = yaml_number(table, "baseline_m", path)
         checked_baseline(T_c_r, f"{path}: baseline_m")
     rig = CameraRig(camera, right, np.eye(4), T_c_r, has_body=False)
-    times = _parse_times(sides[0], yaml_number(table, "rate_hz", path, 10.0))
+    times = _parse_times(sides[0], yaml_number(table, "rate_hz", path, _UNSTAMPED_HZ))
+    return _recording(pattern, rig, sides, times)
+
+
+def _recording(pattern: str, rig: CameraRig, sides: list[list[Path]], times: list[int]) -> Recording:
     return Recording(f"images:{pattern}", rig, len(times), lambda report: _read_frames(times, sides))
 
 

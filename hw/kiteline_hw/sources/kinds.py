@@ -13,9 +13,9 @@ from dataclasses import dataclass
 class SourceKind:
     """One kind of source, written SCHEME:ARGUMENT.
 
-    argument: what follows the colon, in capitals; DIR and FILE are paths
-    that must exist. layout: glob patterns, one of which a folder of this kind matches (with a trailing slash: a
-    sub-folder), and `shown` names them in error messages.
+    argument: what follows the colon, in capitals; DIR and FILE are paths that must exist. layout: glob patterns, one of
+    which a folder of this kind matches (with a trailing slash: a sub-folder), and `shown` names them in error messages.
+    told: its open_source takes the calibration that was told as a fourth argument, as there may be no other.
     """
 
     scheme: str
@@ -24,21 +24,23 @@ class SourceKind:
     module: str
     layout: tuple[str, ...] = ()
     shown: str = ""
+    told: bool = False
 
 
 SOURCES: tuple[SourceKind, ...] = (
-    SourceKind("euroc", "DIR", "EuRoC folder (ASL layout), stereo and IMU",
-               "kiteline_hw.sources.euroc", ("mav0/", "cam0/"), "mav0/ (EuRoC)"),
+    SourceKind("euroc", "DIR", "EuRoC or TUM-VI folder (ASL layout), stereo and IMU",
+               "kiteline_hw.sources.euroc", ("mav0/", "cam0/"), "mav0/ (EuRoC)", told=True),
     SourceKind("tum", "DIR", "TUM RGB-D folder",
-               "kiteline_hw.sources.tum", ("rgb.txt", "rgb/"), "rgb.txt (TUM)"),
+               "kiteline_hw.sources.tum", ("rgb.txt", "rgb/"), "rgb.txt (TUM)", told=True),
     SourceKind("kitti", "DIR", "KITTI odometry sequence",
                "kiteline_hw.sources.kitti", ("calib.txt", "image_[0123lr]/"), "calib.txt with image_0/ (KITTI)"),
     SourceKind("mcap", "FILE", "ROS 2 bag, Foxglove recording or kiteline log",
-               "kiteline_hw.sources.mcap", ("*.mcap",), "*.mcap"),
-    SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images"),
+               "kiteline_hw.sources.mcap", ("*.mcap",), "*.mcap", told=True),
+    SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images", told=True),
     SourceKind("sim", "SCENE", "simulated flight: room, hall, corridor or street", "kiteline_hw.sim.source"),
-    SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2"),
-    SourceKind("stream", "URL[,URL]", "network camera (RTSP, UDP, HTTP) through ffmpeg", "kiteline_hw.cameras.stream"),
+    SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2", told=True),
+    SourceKind("stream", "URL[,URL]", "network camera (RTSP, UDP, HTTP) through ffmpeg", "kiteline_hw.cameras.stream",
+               told=True),
 )  # fmt: skip
 
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.calibration.checks import checked_baseline, checked_camera
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sensors.images import ImageFile
-from kiteline_hw.sources.calibration import checked_baseline, checked_camera
 from kiteline_hw.sources.recording import Recording, image_size, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import read_rows, row_values, seconds_to_ns
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.logs.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, ODOMETER, RIG, RIGHT
 from kiteline_hw.logs.rig_json import rig_from_json
@@ -30,10 +31,10 @@ from kiteline_hw.sensors.frames import (
     decode_frames,
     pair_by_time,
 )
-from kiteline_hw.sensors.images import ImageRef
+from kiteline_hw.sensors.images import ImageRef, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames
-from kiteline_hw.sensors.raw_pixels import RawPixels
+from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 from kiteline_hw.sources.mcap_messages import (
     KINDS,
     BadMessage,
@@ -52,7 +53,7 @@ from kiteline_hw.sources.mcap_messages import (
     read_transforms,
     read_velocities,
 )
-from kiteline_hw.sources.mcap_rig import ImageTopic, Selection, TransformTree, select_rig
+from kiteline_hw.sources.mcap_rig import ImageTopic, Selection, TransformTree, select_rig, select_told_rig
 from kiteline_hw.sources.recording import sorted_trajectory
 
 _REORDER_NS = 200_000_000  # ns that a message is held back for older ones recorded after it
@@ -64,8 +65,8 @@ STANDARD_GRAVITY = 9.80665  # m/s^2
 _MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read besides the static ones
 
 
-def open_source(path_name: str, mono: bool, imu: bool) -> McapSource:
-    """Open a recording, or the only one in a folder. Raises SourceError."""
+def open_source(path_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> McapSource:
+    """Open a recording, or the only one in a folder. told: in place of a bag's calibration. Raises SourceError."""
     path = Path(path_name)
     if path.is_dir():
         files = sorted(path.glob("*.mcap"))
@@ -76,13 +77,13 @@ def open_source(path_name: str, mono: bool, imu: bool) -> McapSource:
                 f"{path}: {len(files)} MCAP files: name one, or join them with `kiteline log merge OUT.mcap FILES…`"
             )
         path = files[0]
-    return McapSource(McapFile(path), mono, imu)
+    return McapSource(McapFile(path), mono, imu, told)
 
 
 class McapSource:
     """A FrameSource over an MCAP file, whose messages are read while iterating."""
 
-    def __init__(self, file: McapFile, mono: bool, imu: bool) -> None:
+    def __init__(self, file: McapFile, mono: bool, imu: bool, told: ToldCalibration | None = None) -> None:
         self.name = f"mcap:{file.path}"
         self.report = SourceReport()
         self._file = file
@@ -95,7 +96,7 @@ class McapSource:
         if rig_channel is not None:
             self._open_log(rig_channel, mono)
         else:
-            self._open_bag(mono)
+            self._open_bag(mono, told)
         if not imu:
             self.imu = None
 
@@ -160,10 +161,13 @@ class McapSource:
         self._truth_topic: int | None = topics.get(GROUND_TRUTH)
         self._is_log = True
 
-    def _open_bag(self, mono: bool) -> None:
+    def _open_bag(self, mono: bool, told: ToldCalibration | None) -> None:
         images, calibrations, imu_channel, imu_frame = self._discover()
         tree = TransformTree(self._transforms())
-        found = select_rig(self.name, images, calibrations, tree, imu_frame, mono)
+        if told is None:
+            found = select_rig(self.name, images, calibrations, tree, imu_frame, mono)
+        else:
+            found = select_told_rig(self.name, images, told, self._image_size, tree, imu_frame, mono)
         self._truth_topic = None
         self._is_log = False
         self.rig, self._notes = found.rig, found.notes
@@ -242,6 +246,15 @@ class McapSource:
             raise SourceError(f"{self.name}: {faults[0]}")
         best = max(imus, default=None)
         return images, calibrations, best[1] if best else None, best[2] if best else None
+
+    def _image_size(self, channel: int) -> tuple[int, int]:
+        raw = self._file.first(channel)
+        assert raw is not None  # channels without messages are not chosen
+        try:
+            pixels, _ = decode_grey(read_image(self._decode(raw), self._file.channels[channel].metadata))
+        except (BadImage, BadMessage) as error:
+            raise SourceError(f"{self.name}: {error}") from error
+        return pixels.shape[0], pixels.shape[1]
 
     def _accelerations_in_g(self, channel: int) -> bool:
         """True if gravity measures near 1: some drivers send g although ROS demands m/s^2."""

@@ -7,7 +7,7 @@ of a rectified pair. The body frame is that of the IMU, else the root of the tra
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
+from kiteline_hw.calibration.checks import checked_baseline, checked_camera, parse_lens
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources.calibration import checked_baseline, checked_camera, parse_lens
 from kiteline_hw.sources.mcap_messages import CameraCalibration, Transform
 
 F64 = NDArray[np.float64]
@@ -125,21 +126,47 @@ def select_rig(
     return Selection(rig, left.images, right.images if right else None, depth, imu_usable, t_b_l, tuple(notes))
 
 
+def select_told_rig(
+    name: str,
+    images: list[ImageTopic],
+    told: ToldCalibration,
+    size_of: Callable[[int], tuple[int, int]],
+    tree: TransformTree,
+    imu_frame: str | None,
+    mono: bool,
+) -> Selection:
+    """The topics of a calibration that was told: those that it names, else raw images by name, left before right.
+
+    size_of: height and width of a channel's images. Raises SourceError.
+    """
+    topics = {i.topic: i for i in images if i.count and not i.depth}
+    named = [topics[t] for t in told.topics if t in topics]
+    if len(named) < len(told.cameras):
+        named = sorted(_one_a_camera(name, images, rectified_first=False), key=lambda i: i.topic)
+    chosen = named[: 1 if mono else len(told.cameras)]
+    left = chosen[0]
+    rig = told.rig_of_images(name, len(chosen), size_of(left.channel))
+    depth = None if mono or len(chosen) > 1 else next(
+        (i for i in images if i.depth and i.count and i.frame_id == left.frame_id), None
+    )  # fmt: skip
+    notes: tuple[str, ...] = (f"images are those of {', '.join(i.topic for i in chosen)}",)
+    T_b_l = tree.between(imu_frame, left.frame_id) if imu_frame is not None else None
+    if rig.has_body:
+        T_b_l = rig.T_b_c
+    elif T_b_l is not None:
+        rig = replace(rig, T_b_c=T_b_l, has_body=True)
+    elif imu_frame is not None:
+        notes += (f"imu left out: neither {told.where} nor a static transform says where the camera sits against it",)
+    rig = replace(rig, has_depth=depth is not None)
+    right = chosen[1] if len(chosen) > 1 else None
+    imu_usable = imu_frame is not None and T_b_l is not None
+    return Selection(rig, left, right, depth, imu_usable, rig.T_b_c if T_b_l is None else T_b_l, notes)
+
+
 def _cameras(
     name: str, images: list[ImageTopic], calibrations: list[tuple[str, CameraCalibration]]
 ) -> list[_CameraTopic]:
-    topics = [i for i in images if not i.depth and i.count]
-    if not topics:
-        raise SourceError(
-            f"{name}: no images: expected sensor_msgs/msg/Image, sensor_msgs/msg/CompressedImage, "
-            "foxglove.CompressedImage or foxglove.RawImage"
-        )
-    # One topic per camera: rectified before raw, encoded before raw pixels, then the one with most images.
-    topics.sort(key=lambda i: ("rect" not in i.topic, not i.encoded, -i.count, i.topic))
-    chosen: list[ImageTopic] = []
-    for topic in topics:
-        if not topic.frame_id or topic.frame_id not in [c.frame_id for c in chosen]:
-            chosen.append(topic)
+    chosen = _one_a_camera(name, images, rectified_first=True)
     cameras = []
     for topic in sorted(chosen, key=lambda i: i.topic):
         found = _match_calibration(topic, calibrations, len(chosen))
@@ -149,9 +176,25 @@ def _cameras(
         names = ", ".join(topic.topic for topic in chosen)
         raise SourceError(
             f"{name}: no calibration for {names}: expected sensor_msgs/msg/CameraInfo or foxglove.CameraCalibration "
-            "with the same frame_id"
+            "with the same frame_id, or --calibration FILE"
         )
     return cameras
+
+
+def _one_a_camera(name: str, images: list[ImageTopic], rectified_first: bool) -> list[ImageTopic]:
+    """One topic a camera: rectified or raw first, encoded before raw pixels, then the one with most images."""
+    topics = [i for i in images if not i.depth and i.count]
+    if not topics:
+        raise SourceError(
+            f"{name}: no images: expected sensor_msgs/msg/Image, sensor_msgs/msg/CompressedImage, "
+            "foxglove.CompressedImage or foxglove.RawImage"
+        )
+    topics.sort(key=lambda i: (("rect" in i.topic) != rectified_first, not i.encoded, -i.count, i.topic))
+    chosen: list[ImageTopic] = []
+    for topic in topics:
+        if not topic.frame_id or topic.frame_id not in [c.frame_id for c in chosen]:
+            chosen.append(topic)
+    return chosen
 
 
 def _match_calibration(

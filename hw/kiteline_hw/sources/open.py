@@ -6,18 +6,24 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_hw.calibration.files import read_calibration
+from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sources import kinds
 from kiteline_hw.sources.kinds import SourceKind
+from kiteline_hw.sources.overrides import with_calibration
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
-def open_source(spec: str, mono: bool = False, imu: bool = True) -> FrameSource:
+def open_source(
+    spec: str, mono: bool = False, imu: bool = True, calibration: str | ToldCalibration = ""
+) -> FrameSource:
     """Open a camera or a recording. Only the calibration is read; images are decoded while iterating.
 
     mono: left images alone, without right image or depth. imu: False leaves inertial samples out (the body frame
-    stays). Raises SourceError.
+    stays). calibration: FILE[,FILE…] in place of what the source says of its cameras and its IMU's noise, or what was
+    read of them. Raises SourceError.
     """
     scheme, colon, argument = spec.partition(":")
     kind = _by_scheme(scheme) if colon else None
@@ -32,8 +38,13 @@ def open_source(spec: str, mono: bool = False, imu: bool = True) -> FrameSource:
         if kind.argument == "DIR" and not path.is_dir():
             raise SourceError(f"{path}: expected a folder with the layout of {kind.scheme}")
         argument = str(path)
-    opener: Callable[[str, bool, bool], FrameSource] = import_module(kind.module).open_source
-    return opener(argument, mono, imu)
+    opener: Callable[..., FrameSource] = import_module(kind.module).open_source
+    if not calibration:
+        return opener(argument, mono, imu)
+    told = read_calibration(calibration) if isinstance(calibration, str) else calibration
+    source = opener(argument, mono, imu, told) if kind.told and told.cameras else opener(argument, mono, imu)
+    # a camera has nothing of its own that the told calibration is put over
+    return with_calibration(source, told) if told.known and not is_live(source) else source
 
 
 def recognise(spec: str) -> SourceKind:

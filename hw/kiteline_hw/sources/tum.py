@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
+from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import DEPTH_TOLERANCE_NS, EncodedFrame, pair_by_time
 from kiteline_hw.sensors.images import ImageFile
@@ -27,15 +28,15 @@ FREIBURG = {
 }
 
 
-def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
-    """Open a TUM RGB-D folder, which has no IMU; mono leaves the depth out. Raises SourceError."""
+def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
+    """Open a TUM RGB-D folder, which has no IMU; mono leaves the depth out. told: its camera. Raises SourceError."""
     del imu
     folder = Path(folder_name)
     colour = _list_stamped(folder, "rgb")
     if not colour:
         raise SourceError(f"{folder}: no images: expected TUM's layout, rgb.txt ('t filename' a line) and rgb/*.png")
     depth = [] if mono else _list_stamped(folder, "depth")
-    camera, scale = _read_calibration(folder, colour)
+    camera, scale = _read_calibration(folder, colour, told)
     rig = CameraRig(camera, None, np.eye(4), None, has_depth=bool(depth), has_body=False)
     truth = folder / "groundtruth.txt"
     return Recording(
@@ -73,15 +74,18 @@ def _list_stamped(folder: Path, kind: str) -> Stamped:
     return sorted(out)
 
 
-def _read_calibration(folder: Path, colour: Stamped) -> tuple[CameraModel, float]:
+def _read_calibration(folder: Path, colour: Stamped, told: ToldCalibration | None) -> tuple[CameraModel, float]:
     """The camera and the stored depth units a metre."""
     path = folder / "camera.yaml"
+    if told is not None:
+        scale = yaml_number(read_yaml(path, ""), "depth_scale", path, DEPTH_SCALE) if path.is_file() else DEPTH_SCALE
+        return told.rig_of_images(str(folder), 1, image_size([image for _, image in colour])).left, _checked(
+            scale, path
+        )
     if path.is_file():
         table = read_yaml(path, "fx, fy, cx, cy, width, height, depth_scale")
         scale = yaml_number(table, "depth_scale", path, DEPTH_SCALE)
-        if scale <= 0:
-            raise SourceError(f"{path}: depth_scale is {scale:g}: expected the stored units a metre, such as 5000")
-        return camera_from_yaml(table, path), scale
+        return camera_from_yaml(table, path), _checked(scale, path)
     named = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
     if image_size([path for _, path in colour]) != (480, 640) or named is None:
         raise SourceError(
@@ -90,3 +94,9 @@ def _read_calibration(folder: Path, colour: Stamped) -> tuple[CameraModel, float
         )
     fx, fy, cx, cy, d = FREIBURG[named.group(1)]
     return CameraModel(640, 480, fx, fy, cx, cy, Lens.RADTAN if d else Lens.NONE, d), DEPTH_SCALE
+
+
+def _checked(scale: float, path: Path) -> float:
+    if scale <= 0:
+        raise SourceError(f"{path}: depth_scale is {scale:g}: expected the stored units a metre, such as 5000")
+    return scale

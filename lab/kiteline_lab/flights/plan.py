@@ -41,6 +41,7 @@ class Options:
     kill_agent_at_s: float | None = None
     # when each base in turn is killed, s of flight time and s of real time after it; the next base follows
     base_kills: tuple[tuple[float, float], ...] = ()
+    calibration: str = ""  # FILE[,FILE…] in place of the sources'
 
 
 @dataclass(slots=True)
@@ -65,7 +66,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
     made = FlightPlan(quiet=quiet, base_kills=o.base_kills)
     try:
         for text in o.sources:
-            made.sources.append(open_source(text, mono=o.mono, imu=o.imu))
+            made.sources.append(open_source(text, mono=o.mono, imu=o.imu, calibration=o.calibration))
             if is_live(made.sources[-1]):
                 raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
         starts = flight_starts(made.sources)
@@ -79,7 +80,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
         made.agents.append(
             AgentOptions(
                 source=text, folder=str(o.out / f"agent{k}"), agent=k, boot=boot, mono=o.mono, imu=o.imu,
-                config=o.config, rig=o.rig,
+                config=o.config, rig=o.rig, calibration=o.calibration,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,

@@ -21,10 +21,13 @@ def main(argv: list[str]) -> int:
     p.add_argument("out", metavar="OUT.mcap", type=Path)
     p.add_argument("--mono", action="store_true", help="left images only")
     p.add_argument("--no-imu", dest="imu", action="store_false", help="without inertial samples")
+    p.add_argument(
+        "--calibration", metavar="FILE[,FILE]", default="", help="in place of what SOURCE says of its cameras"
+    )
     p.add_argument("--force", action="store_true", help="overwrite OUT.mcap")
     o = p.parse_args(argv)
     with whole_file(o.out, o.force) as part:
-        source = open_source(o.source, mono=o.mono, imu=o.imu)
+        source = open_source(o.source, mono=o.mono, imu=o.imu, calibration=o.calibration)
         try:
             frames, samples = record(source, part)
         finally:

@@ -1,0 +1,75 @@
+"""Checks of calibration values that all readers share. All raise SourceError; `where` names the file and entry."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, Lens
+from kiteline_hw.ports import SourceError
+
+F64 = NDArray[np.float64]
+
+LONGEST_READOUT_S = 0.2  # no video camera is slower
+
+_EQUIDISTANT = ("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4", "kannalabrandt8", "kb4")
+_RADTAN = ("radialtangential", "radtan", "plumbbob", "rationalpolynomial", "opencv", "browncornrady", "brown")
+
+
+def checked_rigid(values: F64, where: str) -> F64:
+    """A rigid motion (4,4), its rotation orthonormalised."""
+    r = values[:3, :3]
+    # far out numbers would overflow in the product
+    finite = bool(np.isfinite(values).all()) and bool((np.abs(r) < 2.0).all())
+    if not finite or not np.allclose(r @ r.T, np.eye(3), atol=1e-3) or np.linalg.det(r) < 0:
+        raise SourceError(f"{where} is no rigid motion: expected a 4x4 matrix with an orthonormal rotation")
+    if not np.allclose(values[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        raise SourceError(f"{where} is no rigid motion: its last row is {values[3].tolist()}: expected 0 0 0 1")
+    return se3.orthonormalise(values)
+
+
+def parse_lens(model: str, coefficients: list[float], where: str) -> tuple[Lens, tuple[float, ...]]:
+    """The lens behind a distortion model's name, as data sets and ROS write it."""
+    name = model.lower().replace("-", "").replace("_", "").replace(" ", "")
+    if name in ("", "none", "pinhole", "rectified", "undistorted") or not any(coefficients):
+        return (Lens.EQUIDISTANT, (0.0, 0.0, 0.0, 0.0)) if name in _EQUIDISTANT else (Lens.NONE, ())
+    if name in _RADTAN:
+        if len(coefficients) not in (4, 5, 8):
+            raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4, 5 or 8")
+        return Lens.RADTAN, tuple(coefficients)
+    if name in _EQUIDISTANT:
+        if len(coefficients) != 4:
+            raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4")
+        return Lens.EQUIDISTANT, tuple(coefficients)
+    raise SourceError(f"{where}: lens model {model!r} is not known: expected radial-tangential or equidistant")
+
+
+def checked_camera(camera: CameraModel, where: str) -> CameraModel:
+    """The camera, if its intrinsics are usable."""
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
+    if not (np.isfinite(numbers).all() and camera.fx > 0 and camera.fy > 0 and camera.width > 0 and camera.height > 0):
+        raise SourceError(
+            f"{where}: no usable calibration (fx {camera.fx}, fy {camera.fy}, {camera.width}x{camera.height} px)"
+        )
+    return camera
+
+
+def checked_readout(readout_s: float, where: str) -> float:
+    """The read-out of a rolling shutter in s, 0 for a global one."""
+    if not 0.0 <= readout_s < LONGEST_READOUT_S:
+        raise SourceError(
+            f"{where}: a read-out of {readout_s:g} s: expected readout_s or line_delay in s, 0 for a global shutter"
+        )
+    return readout_s
+
+
+def checked_baseline(T_c_r: F64, where: str) -> F64:
+    """T_c_r (4,4), if the distance between left and right camera is that of a stereo pair."""
+    baseline_m = float(np.linalg.norm(T_c_r[:3, 3]))
+    if not 1e-4 < baseline_m < 100.0:
+        raise SourceError(
+            f"{where}: the baseline between left and right camera is {baseline_m:g} m: expected the extrinsics of a "
+            "stereo pair; with mono (--mono) the left camera alone can be used"
+        )
+    return T_c_r

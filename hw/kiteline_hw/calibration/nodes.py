@@ -1,0 +1,122 @@
+"""Entries of a YAML file that know where they are, so that each error names file, key and what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from kiteline_hw.ports import SourceError
+
+F64 = NDArray[np.float64]
+
+_MOST_BYTES = 1 << 20  # calibration files are a few kB
+_MOST_PX = 100_000  # of an image's side
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """An entry of a YAML file: a text, a list or a table of them. key: its path in the file, "" for the whole."""
+
+    path: Path
+    key: str
+    value: object
+
+    def error(self, expected: str) -> SourceError:
+        """The error that this entry is not what was expected."""
+        found = "nothing" if self.value in (None, "") else repr(self.value)
+        return SourceError(f"{self.path}: expected {self.key or 'the file'} to be {expected}, found {found[:80]}")
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """The keys of a table; none of anything else."""
+        return frozenset(str(k) for k in self.value) if isinstance(self.value, dict) else frozenset()
+
+    def get(self, key: str) -> Node:
+        """The entry of a table under a key; its value is None if there is none."""
+        if self.value is not None and not isinstance(self.value, dict):
+            raise self.error("a table of keys and values")
+        table = self.value or {}
+        return Node(self.path, f"{self.key}.{key}" if self.key else key, table.get(key))
+
+    def text(self) -> str:
+        """A text."""
+        if not isinstance(self.value, str):
+            raise self.error("a text")
+        return self.value
+
+    def number(self, expected: str = "a number") -> float:
+        """A finite number."""
+        number = _number(self.value)
+        if not np.isfinite(number):
+            raise self.error(expected)
+        return number
+
+    def positive(self, expected: str) -> float:
+        """A finite number above zero."""
+        number = self.number(expected)
+        if number <= 0.0:
+            raise self.error(expected)
+        return number
+
+    def pixels(self) -> int:
+        """A side of an image in px."""
+        number = self.number("a whole number of px")
+        if number != round(number) or not 0 < number <= _MOST_PX:
+            raise self.error("a whole number of px")
+        return round(number)
+
+    def numbers(self, counts: Sequence[int], expected: str) -> list[float]:
+        """A list of finite numbers, as many as one of `counts` says; any number if it is empty."""
+        if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
+            raise self.error(expected)
+        values = [_number(v) for v in self.value]
+        if not np.isfinite(values).all():
+            raise self.error(f"{expected}, all finite")
+        return values
+
+    def rows(self, rows: int, columns: int) -> F64:
+        """A matrix written as a list of rows."""
+        expected = f"{rows} rows of {columns} numbers"
+        if not isinstance(self.value, list) or len(self.value) != rows:
+            raise self.error(expected)
+        return np.array([Node(self.path, self.key, row).numbers((columns,), expected) for row in self.value])
+
+    def matrix(self, shape: tuple[int, int] | None, expected: str) -> F64:
+        """A matrix written as a table of rows, cols and data. shape: None for any."""
+        rows, columns = (round(self.get(key).number(f"the number of {key}")) for key in ("rows", "cols"))
+        if shape is not None and (rows, columns) != shape:
+            raise self.error(expected)
+        values = self.get("data").numbers((rows * columns,), expected)
+        return np.array(values).reshape(rows, columns) if values else np.zeros((0, 0))
+
+
+def read_nodes(path: Path) -> Node:
+    """The whole of a YAML file, OpenCV's FileStorage included. Raises SourceError."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; expected a calibration file") from error
+    if len(data) > _MOST_BYTES:
+        raise SourceError(f"{path}: {len(data)} bytes: expected a calibration file, which is far smaller")
+    # OpenCV's head "%YAML:1.0" is no YAML.
+    lines = data.decode("utf-8", "replace").splitlines()
+    text = "\n".join("" if line.startswith("%") else line for line in lines)
+    try:
+        value = yaml.load(text, Loader=yaml.BaseLoader)  # all scalars stay texts, tags are ignored
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+        raise SourceError(f"{path}: no YAML: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(value, dict):
+        raise SourceError(f"{path}: expected a calibration file in YAML: keys with values")
+    return Node(path, "", value)
+
+
+def _number(value: object) -> float:
+    try:
+        return float(value) if isinstance(value, str) and "_" not in value else float("nan")
+    except ValueError:
+        return float("nan")
