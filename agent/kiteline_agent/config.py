@@ -335,10 +335,12 @@ class GovernorConfig:
 
 @dataclass(frozen=True, slots=True)
 class LogConfig:
-    """Raw images in the log; those of a source that delivers them encoded are logged as they are."""
+    """Images in the log; those of a source that delivers them encoded are logged as they are."""
 
+    every: int = 1  # frames; of so many, the images of one are logged, 0: none. Only a log with all can be replayed
     compressed: bool = True  # PNG of half an image's size for some 2.7 ms of a fast core, else stored for 0.25 ms
-    waiting: int = 12  # images that wait to be encoded, 4 MB; then live flights store images, others wait
+    apart: bool = True  # live flights encode in another process: 0.2 ms of the agent's CPU time for a pair, not 5
+    waiting: int = 12  # images that wait to be encoded, 9 MB; then live flights store images, others wait
 
 
 @dataclass(frozen=True, slots=True)

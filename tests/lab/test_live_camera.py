@@ -118,3 +118,17 @@ def test_a_camera_is_no_source_for_fly(recording: Path, tmp_path: Path, monkeypa
     spec = f"v4l2:/dev/video0,/dev/video2?calibration={recording}"
     with pytest.raises(SourceError, match="flown with `kiteline agent`"):
         plan(Options(sources=(spec,), out=tmp_path))
+
+
+def test_a_log_without_all_images_says_so_at_replay(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tmp_path / "agent.toml"
+    config.write_text("[agent.log]\nevery = 3\n", encoding="utf-8")
+    a = parser().parse_args([str(recording), "--log", str(tmp_path), "--config", str(config)])
+    fly_live(options_of(a, tmp_path, 0), None, StopAfter())
+    with LogReader(tmp_path / "boot00000.mcap") as log:
+        frames = sum(m.json()["frame_ns"] is not None for m in log.messages(["/step"]))
+        assert log.topics["/left/image"] == -(-frames // 3) > 3
+        with pytest.raises(SourceError, match=r"has no images: it was flown with every = 0 or more than 1"):
+            replay_agent(log)

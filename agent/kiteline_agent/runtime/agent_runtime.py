@@ -80,6 +80,7 @@ class AgentRuntime:
         )
         self._files = ExitStack()
         self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
+        self._log_config = config.log
         self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, config.log.waiting))
         self._record = self._open_record(config) if options.log_name else None
         self.agent = Agent(
@@ -113,7 +114,7 @@ class AgentRuntime:
         live, odometry = (
             self._files.enter_context((folder / name).open("w", buffering=1)) for name in ("live.tum", "odometry.tum")
         )
-        return FlightRecord(log, live, odometry, options.agent, self.channel)
+        return FlightRecord(log, live, odometry, options.agent, self.channel, config.log.every)
 
     @property
     def next_ns(self) -> int | None:
@@ -144,6 +145,7 @@ class AgentRuntime:
         """Begin a live flight: `begin_ns` of its clock is flight time 0."""
         self._live_clock = True
         self._encoder.stores = True
+        self._encoder.apart = self._log_config.apart
         first_ns = begin_ns if self.camera is not None else self.reader.next_ns  # a camera's stamps are on our clock
         assert first_ns is not None
         self.options = replace(self.options, start_ns=first_ns)

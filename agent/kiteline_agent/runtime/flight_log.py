@@ -37,8 +37,13 @@ class StepLog(Protocol):
     def text(self, topic: str, t_ns: int, level: str, text: str) -> None: ...
 
 
-def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int) -> None:
-    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
+def write_step(
+    log: StepLog, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int, with_images: bool = True
+) -> None:
+    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged.
+
+    with_images: else the frame's images are left out, and the log cannot be replayed.
+    """
     frame, imu = step_input.frame, step_input.imu
     log.json(
         STEP,
@@ -58,7 +63,7 @@ def write_step(log: StepLog, step_input: StepInput, output: StepOutput, now_ns: 
         log.imu(IMU, log_ns, imu)
     if step_input.odometry is not None:
         log.odometer(ODOMETER, log_ns, step_input.odometry)
-    if frame is not None:
+    if frame is not None and with_images:
         log.frame(frame)
     for packet in step_input.packets:
         log.blob(PACKETS_IN, log_ns, packet)

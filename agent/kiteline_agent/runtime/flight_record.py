@@ -23,8 +23,12 @@ _LINK_NS = 1_000_000_000  # ns between two link reports in the log
 class FlightRecord:
     """Writes each step, the records that it shared, and the poses."""
 
-    def __init__(self, log: StepLog, live: TextIO, odometry: TextIO, agent: int, channel: RecordChannel) -> None:
-        """live, odometry: files of TUM lines."""
+    def __init__(
+        self, log: StepLog, live: TextIO, odometry: TextIO, agent: int, channel: RecordChannel, every: int = 1
+    ) -> None:
+        """live, odometry: files of TUM lines. every: the images of one frame in so many are written, 0: none."""
+        self._every = every
+        self._frames = 0
         self._log = log
         self._live = live
         self._odometry = odometry
@@ -36,7 +40,9 @@ class FlightRecord:
 
     def step(self, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int) -> None:
         """Write a step. now_ns: the time that was handed to it. log_ns: the time under which it is logged."""
-        write_step(self._log, step_input, output, now_ns, log_ns)
+        with_images = self._every > 0 and self._frames % self._every == 0
+        self._frames += step_input.frame is not None
+        write_step(self._log, step_input, output, now_ns, log_ns, with_images)
         self._shared(log_ns)
         if isinstance(self._channel, CodedChannel) and now_ns >= self._link_due_ns:
             self._link_due_ns = now_ns + _LINK_NS

@@ -100,6 +100,11 @@ def agent_input(step: Step) -> StepInput:
     frame = None
     if step.head["frame_ns"] is not None:
         images: list[EncodedImage] = [m.image() for topic in (LEFT, RIGHT, DEPTH) for m in step.of(topic)]
+        if not images:
+            raise SourceError(
+                f"step {step.number} of the log has no images: it was flown with every = 0 or more than 1 in "
+                "[agent.log]; only a log with all images can be replayed"
+            )
         frame = read_frame(images, step.head["frame_ns"], bool(step.of(DEPTH)))
     imu = step.one_of(flight_log.IMU).imu() if step.head["imu"] else None
     odometry = step.one_of(flight_log.ODOMETER).odometry() if step.head.get("odometer") else None

@@ -1,0 +1,103 @@
+"""Images encoded in another process: the same pixels, in order, also when that process ends before its time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_core.frame import Frame
+from kiteline_hw.logs.encoder_process import EncoderProcess
+from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
+from kiteline_hw.logs.mcap_log import LEFT, RIGHT, LogReader, LogWriter
+from kiteline_hw.sensors.images import decode_grey, encode_image
+
+
+def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
+def test_the_same_bytes_as_here_and_slots_are_used_again() -> None:
+    apart = EncoderProcess((48, 75), 3)
+    for k in range(10):
+        done = apart.submit(picture(k))
+        assert done is not None
+        apart.wait(done)
+        assert done.result() == encode_image(picture(k))
+    waiting = [apart.submit(picture(k)) for k in range(3)]
+    assert all(waiting)
+    assert apart.submit(picture(0, (480, 752))) is None  # larger than a slot
+    for k, done in enumerate(waiting):
+        apart.wait(done)
+        assert np.array_equal(decode_grey(done.result())[0], picture(k))
+    smaller = apart.submit(picture(7, (20, 30)))
+    apart.wait(smaller)
+    assert np.array_equal(decode_grey(smaller.result())[0], picture(7, (20, 30)))
+    apart.close()
+    assert apart._process.returncode == 0
+
+
+def test_no_slot_is_free_and_nobody_waits() -> None:
+    apart = EncoderProcess((48, 75), 2)
+    os.kill(apart._process.pid, signal.SIGSTOP)
+    assert apart.submit(picture(0)) and apart.submit(picture(1))
+    begin_s = time.monotonic()
+    assert apart.submit(picture(2)) is None
+    assert time.monotonic() - begin_s < 0.2
+    os.kill(apart._process.pid, signal.SIGCONT)
+    apart.close()
+
+
+@pytest.mark.parametrize("kill_at", [None, 0, 4])
+def test_a_log_is_whole_whenever_the_process_ends(tmp_path: Path, kill_at: int | None) -> None:
+    encoder = ImageEncoder(EncodingPolicy(most_waiting=6))
+    encoder.stores = encoder.apart = True
+    with LogWriter(tmp_path / "log.mcap", {}, encoder=encoder) as log:
+        for k in range(10):
+            log.json("/step", k, {"k": k})
+            log.frame(Frame(k, picture(k), picture(100 + k)))
+            log.blob("/packets", k, b"%d" % k)
+            if k == kill_at:
+                process = encoder._process
+                assert process is not None
+                process._process.kill()
+            if k % 3 == 2:
+                time.sleep(0.1)
+    with LogReader(tmp_path / "log.mcap") as read:
+        found = list(read.messages())
+    assert [m.topic for m in found] == ["/step", LEFT, RIGHT, "/packets"] * 10
+    for k in range(10):
+        left, right = (decode_grey(m.image())[0] for m in found[4 * k + 1 : 4 * k + 3])
+        assert np.array_equal(left, picture(k)) and np.array_equal(right, picture(100 + k))
+
+
+@pytest.mark.alone
+def test_a_pair_costs_this_process_little(tmp_path: Path) -> None:
+    """Less than a tenth of encoding it here, more than a pair that came encoded."""
+    random = np.random.default_rng(0)
+    frames = [random.integers(0, 16, (2, 480, 752), np.uint8) for _ in range(4)]
+    begin_ns = time.process_time_ns()
+    encoded = [tuple(encode_image(image) for image in pair) for pair in frames]
+    encoding_ms = (time.process_time_ns() - begin_ns) / 4e6
+
+    def cost_ms(raw: bool) -> float:
+        encoder = ImageEncoder(EncodingPolicy())
+        encoder.stores = encoder.apart = True
+        spent = []
+        with LogWriter(tmp_path / "log.mcap", {}, encoder=encoder) as log:
+            for k in range(25):
+                pair = frames[k % 4]
+                begin_ns = time.process_time_ns()
+                log.frame(Frame(k, pair[0], pair[1], None, () if raw else encoded[k % 4]))
+                log.blob("/packets", k, b"")
+                spent.append(time.process_time_ns() - begin_ns)
+                time.sleep(0.12)
+            assert not raw or (encoder._process is not None and encoder._process.alive and not encoder.stored)
+        return float(np.median(spent[5:])) / 1e6
+
+    assert cost_ms(raw=True) - cost_ms(raw=False) < 0.1 * encoding_ms
