@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not a.source:
         p.error("a SOURCE is required")
     folder = (Path(a.log) if a.log else process.state_folder()) / f"agent{a.agent}"
-    options = options_of(a, folder, process.next_number(folder / "boot"))
+    options = options_of(a, folder, process.number_of_start(folder.name, folder))
     fly_live(options, None, process.StopSignal())
     process.exit_now(0)
 

@@ -62,7 +62,9 @@ def find_commands() -> dict[str, list[Command]]:
     for group in commands.GROUPS:
         package = importlib.import_module(f"{commands.__name__}.{group}")
         names = [module.name for module in pkgutil.iter_modules(package.__path__)]
-        found[(package.__doc__ or group).strip(".")] = [Command(n, f"{package.__name__}.{n}") for n in names]
+        found[(package.__doc__ or group).strip(".")] = [
+            Command(n.replace("_", "-"), f"{package.__name__}.{n}") for n in names
+        ]
     return found
 
 

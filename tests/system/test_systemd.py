@@ -102,6 +102,21 @@ def test_tmpfiles_creates_the_folders(tmp_path: Path) -> None:
         assert (tmp_path / folder).is_dir()
 
 
+def test_nothing_is_deleted_by_age() -> None:
+    """Numbers of starts, keys, maps and logs are not temporary: no line has an age, nor a type that removes."""
+    lines = [line.split() for line in (FOLDER / "kiteline.tmpfiles.conf").read_text().splitlines()]
+    entries = [words for words in lines if words and not words[0].startswith("#")]
+    assert len(entries) == 4
+    assert all(words[0] == "d" and words[5] == "-" for words in entries)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_memory_is_limited(unit: str) -> None:
+    s = settings(unit)
+    assert "MemoryMax" in s
+    assert unit != "kiteline-agent.service" or s["MemorySwapMax"] == ["0"]
+
+
 def test_udev_rules_are_well_formed() -> None:
     """udevadm verify is younger than Debian 12: check the grammar by hand, and that every jump has its label."""
     text = (FOLDER / "60-kiteline.rules").read_text()

@@ -21,6 +21,7 @@ from kiteline_agent.runtime.flight_record import FlightRecord, metadata
 from kiteline_agent.runtime.frame_counts import FrameCounts
 from kiteline_agent.runtime.frame_reader import FrameReader
 from kiteline_agent.runtime.options import (
+    LOG_STEM,
     AgentOptions,
     agent_config,
     channel_for,
@@ -35,6 +36,7 @@ from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
+from kiteline_hw.logs.log_budget import make_room
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import FrameSource, is_live
@@ -82,6 +84,7 @@ class AgentRuntime:
         self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
         self._log_config = config.log
         self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, config.log.waiting))
+        self._log: LogWriter | None = None
         self._record = self._open_record(config) if options.log_name else None
         self.agent = Agent(
             source.rig,
@@ -108,7 +111,11 @@ class AgentRuntime:
         folder = Path(options.folder)
         folder.mkdir(parents=True, exist_ok=True)
         about = metadata(options, source.name, config, self.channel)
-        log = self._files.enter_context(LogWriter(folder / options.log_name, about, encoder=self._encoder))
+        cap_bytes = make_room(folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
+        log = self._files.enter_context(
+            LogWriter(folder / options.log_name, about, cap_bytes=cap_bytes, encoder=self._encoder)
+        )
+        self._log = log
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
         live, odometry = (
@@ -222,6 +229,7 @@ class AgentRuntime:
         skipped, notes = self.source.report.skipped, list(self.source.report.notes)
         if self._encoder.stored:
             notes.append(f"log: {self._encoder.stored} images stored uncompressed, as encoding fell behind")
+        notes += self.log_notes()
         return {
             "source": self.source.name,
             **self.flight_counts,
@@ -240,6 +248,11 @@ class AgentRuntime:
                 "rss_mib": round(self.rss_mib, 1),
             },
         }
+
+    def log_notes(self) -> list[str]:
+        """A line if the log is not whole: its limit was reached, or the disk is full."""
+        lost = 0 if self._log is None else self._log.dropped
+        return [f"log: {lost} messages were not written: --log-mib was reached, or the disk is full"] if lost else []
 
     def _save_rig(self) -> None:
         if self._rig_file is not None:

@@ -66,7 +66,7 @@ class FlightRecord:
 
 def metadata(options: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
     """Metadata at the head of a log. source: its name."""
-    plain = {key: value for key, value in asdict(options).items() if key not in ("folder", "config", "rig")}
+    plain = {key: value for key, value in asdict(options).items() if key not in ("folder", "config", "rig", "log_mib")}
     plain["link"] = options.link.partition(":")[
         0
     ]  # the kind of link decides how packets are made, its address does not

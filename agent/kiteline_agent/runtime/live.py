@@ -21,10 +21,11 @@ from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
 from kiteline_hw.ports import ByteLink, LinkError
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
 from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.long_work import starting
 
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
@@ -37,6 +38,10 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
     with ExitStack() as stack:
         stack.callback(source.close)
         source = with_controller_imu(options, source)
+        with starting():
+            kernel_cache.fill("kiteline_agent.runtime.warm", stop)
+        if stop:
+            return
         runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
         stack.callback(runtime.close)
         link = open_link(options.link, "agent", options.agent, framer=StreamFramer, required=False)
@@ -97,7 +102,7 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
             elif runtime.counts.frames % PROGRESS_FRAMES == 0:
                 parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
         if parent is None:
-            process.print_lines([f"over: {summary(runtime.counts)}"])
+            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.log_notes()])
         _drain_live(runtime, link, clock, parent, stop)
         if parent is not None:
             parent.send_event("result", report=runtime.report())

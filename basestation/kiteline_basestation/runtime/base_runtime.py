@@ -18,7 +18,7 @@ from kiteline_basestation.runtime.flight_log import RESTORED, metadata_of, stati
 from kiteline_basestation.runtime.flight_summary import FlightSummary, counts, flight_summary, timings
 from kiteline_basestation.runtime.imports import read_imports
 from kiteline_basestation.runtime.map_files import map_files
-from kiteline_basestation.runtime.options import BaseOptions, base_config
+from kiteline_basestation.runtime.options import LOG_STEM, BaseOptions, base_config
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_basestation.station import Import, Station, StationOutput
@@ -32,6 +32,7 @@ from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
+from kiteline_hw.logs.log_budget import make_room
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
 from kiteline_hw.system import process
@@ -87,7 +88,9 @@ class BaseRuntime:
         self._log: LogWriter | None = None
         if options.log_name:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._log = LogWriter(self._folder / options.log_name, metadata_of(options, self.config, plain))
+            cap_bytes = make_room(self._folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
+            about = metadata_of(options, self.config, plain)
+            self._log = LogWriter(self._folder / options.log_name, about, cap_bytes=cap_bytes)
             self._log.text("/log", options.start_ns, "info", f"base, session {options.session}")
             self._log.flush()  # a base that dies at once leaves a log that can be read
         disorder = LinkModelConfig(

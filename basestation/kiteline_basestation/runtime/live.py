@@ -25,6 +25,7 @@ from kiteline_hw.ports import LinkHub
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.long_work import StoppedError, long_work, starting
 from kiteline_hw.system.memory import return_large_arrays
 
 if TYPE_CHECKING:
@@ -42,16 +43,22 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         link = open_link(options.link, "base", framer=StreamFramer, required=False)
         stack.callback(link.close)
         hub = _sealed(options, link) if options.key else link
+        page = _open_page(options, clock.now_ns(), stack)
         worker = Worker()
         stack.callback(worker.close)
-        base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), worker)
-        stack.callback(base.close)
-        report_restored(base.restore_maps(clock.now_ns()), parent)
+        try:
+            with starting(), long_work(stop, "compiling kernels"):
+                base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), worker)
+            stack.callback(base.close)
+            process.notify("READY=1")  # a store or an import that takes minutes is no failed start
+            with long_work(stop, "reading the map"):
+                restored = base.restore_maps(clock.now_ns())
+        except StoppedError:
+            return
+        report_restored(restored, parent)
         queries = _open_queries(options, link, stack)
-        page = _open_page(options, clock.now_ns(), stack)
         if parent is not None:
             parent.send_event("ready")
-        process.notify("READY=1")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None
         begin_ns, stepped_ns = clock.now_ns(), 0
         if terminal is not None:

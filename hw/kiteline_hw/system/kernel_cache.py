@@ -14,26 +14,45 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from kiteline_hw.system.process import StopSignal
+
 _KERNELS = "_kernels"  # suffix of kernel modules
+_POLL_S = 0.1  # s between two looks at the compiler
 _TIMEOUT_S = 900.0  # s that a slow board may take to compile all
 
 
-def fill(module: str) -> bool:
+def fill(module: str, stop: StopSignal | None = None) -> bool:
     """Run `python -m module` to compile the kernels of all loaded modules, unless they are; True if they are now.
 
-    If nothing can be written, the caller compiles in its own process.
+    If nothing can be written, the caller compiles in its own process. stop: ends the compilation.
     """
     if filled():
         return True
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        done = subprocess.run(
+        compiler = subprocess.Popen(
             [sys.executable, "-m", module],
-            check=False, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            timeout=_TIMEOUT_S,
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        if done.returncode == 0:
-            mark()
+        with compiler:
+            try:
+                if _ended(compiler, stop) and compiler.returncode == 0:
+                    mark()
+            finally:
+                compiler.kill()
     return filled()
+
+
+def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None) -> bool:
+    """Wait for the compiler to end; False if a signal came first. Raises TimeoutExpired."""
+    if stop is None:
+        compiler.wait(_TIMEOUT_S)
+        return True
+    for _ in range(round(_TIMEOUT_S / _POLL_S)):
+        if compiler.poll() is not None:
+            return True
+        if stop.wait(_POLL_S):
+            return False
+    raise subprocess.TimeoutExpired(compiler.args, _TIMEOUT_S)
 
 
 def filled() -> bool:

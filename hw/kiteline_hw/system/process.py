@@ -132,7 +132,10 @@ def run_child(
 
 
 def state_folder() -> Path:
-    """Folder for what survives a restart: $XDG_STATE_HOME/kiteline."""
+    """Folder for what survives a restart: a service's $STATE_DIRECTORY, else $XDG_STATE_HOME/kiteline."""
+    of_service = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if of_service:
+        return Path(of_service)
     return Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
 
 
@@ -157,6 +160,18 @@ def next_number(path: Path, least: int = 1) -> int:
     number = max(last + 1, least)
     write_atomically(path, f"{number}\n".encode())
     return number
+
+
+def number_of_start(name: str, folder: Path) -> int:
+    """The number of this start of `name`: higher than any before it, as ids and nonces are made of it.
+
+    It is kept in `folder`, a service's in its state folder: logs may be deleted. Raises OSError, ValueError.
+    """
+    if not os.environ.get("STATE_DIRECTORY"):
+        return next_number(folder / "boot")
+    earlier = folder / "boot"  # of starts by hand, or of an older version
+    least = int(earlier.read_text()) + 1 if earlier.exists() else 1
+    return next_number(state_folder() / name / "boot", least)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -1,0 +1,139 @@
+"""Agent and base as systemd runs them: ready in time, stopped within a second, numbers and logs kept."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter
+from kiteline_hw.logs.rig_json import rig_from_json
+from kiteline_hw.system import process
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
+from kiteline_lab.flights.processes import free_endpoint
+
+STOP_S = 1.0  # s from SIGTERM to the end, the log closed
+
+Serve = Callable[..., tuple["subprocess.Popen[bytes]", socket.socket]]
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Serve]:
+    """Starts `kiteline …` with the environment of a service; returns it and the socket of its notifications."""
+    with contextlib.ExitStack() as stack:
+
+        def begin(*words: object) -> tuple[subprocess.Popen[bytes], socket.socket]:
+            told = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+            address = tmp_path / f"notify{time.monotonic_ns()}"
+            told.bind(str(address))
+            told.settimeout(60.0)
+            variables = {"NOTIFY_SOCKET": str(address), "STATE_DIRECTORY": str(tmp_path / "state"),
+                         "WATCHDOG_USEC": "5000000", "PYTHONPATH": os.pathsep.join(sys.path)}  # fmt: skip
+            program = subprocess.Popen(
+                [sys.executable, "-m", "kiteline_cli", *map(str, words)], env={**os.environ, **variables},
+                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            )  # fmt: skip
+            stack.callback(program.stderr.close)  # type: ignore[union-attr]
+            stack.callback(program.wait)
+            stack.callback(program.kill)
+            return program, told
+
+        yield begin
+
+
+def until(told: socket.socket, word: str) -> list[str]:
+    """All notifications up to one that holds a word."""
+    lines: list[str] = []
+    while not any(word in line for line in lines):
+        lines += told.recv(4096).decode().splitlines()
+    return lines
+
+
+def stop_in_s(program: subprocess.Popen[bytes]) -> float:
+    program.send_signal(signal.SIGTERM)
+    begin_s = time.monotonic()
+    program.wait(timeout=20)
+    return time.monotonic() - begin_s
+
+
+@pytest.fixture(scope="module")
+def raw_flight(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording stretched to 5 frames a second: long enough to be stopped in its middle."""
+    path = tmp_path_factory.mktemp("slow") / "slow.mcap"
+    with LogReader(recording) as log, LogWriter(path, {"made": "for tests"}) as out:
+        rig, imu = rig_from_json(next(iter(log.messages((RIG,)))).json())
+        out.rig(0, rig, imu)
+        for k, (left, right) in enumerate(zip(log.messages((LEFT,)), log.messages((RIGHT,)))):
+            for topic, message in ((LEFT, left), (RIGHT, right)):
+                out.image(topic, k * 200_000_000, message.image(), "left" if topic == LEFT else "right")
+    return path
+
+
+@pytest.mark.alone
+def test_an_agent_stops_within_a_second_and_closes_its_log(serve: Serve, raw_flight: Path, tmp_path: Path) -> None:
+    program, told = serve("agent", raw_flight, "--log", tmp_path / "logs")
+    until(told, "READY=1")
+    until(told, "WATCHDOG=1")
+    time.sleep(1.5)
+    assert stop_in_s(program) < STOP_S
+    assert program.returncode == 0
+    with LogReader(tmp_path / "logs" / "agent0" / "boot00001.mcap") as log:
+        assert log.cut is None
+        assert sum(1 for _ in log.messages((LEFT,))) >= 3
+
+
+def test_the_number_of_a_start_outlives_the_logs(serve: Serve, recording: Path, tmp_path: Path) -> None:
+    logs = tmp_path / "logs" / "agent0"
+    for number in (1, 2):
+        program, _ = serve("agent", recording, "--log", tmp_path / "logs")
+        program.wait(timeout=100)
+        assert [path.name for path in logs.glob("boot*.mcap")] == [f"boot{number:05d}.mcap"]
+        for path in logs.iterdir():
+            path.unlink()
+    assert (tmp_path / "state" / "agent0" / "boot").read_text() == "2\n"
+
+
+def test_a_service_goes_on_from_numbers_of_starts_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert [process.number_of_start("agent0", tmp_path / "logs") for _ in range(2)] == [1, 2]
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    assert [process.number_of_start("agent0", tmp_path / "logs") for _ in range(2)] == [3, 4]
+
+
+@pytest.mark.alone
+def test_a_base_is_ready_before_it_imports_and_can_be_stopped_meanwhile(
+    serve: Serve, recording: Path, tmp_path: Path
+) -> None:
+    fly(Options((str(recording),), tmp_path / "out", "local"), quiet=True)
+    log = tmp_path / "out" / "base" / "log.mcap"
+    words = ("base", "--link", f"zenoh:{free_endpoint()}", "--store", tmp_path / "maps", "--import", *[log] * 40)
+    program, told = serve(*words)
+    lines = until(told, "STATUS=reading the map")
+    assert "READY=1" in lines
+    assert lines[-2:] == ["STATUS=reading the map", "WATCHDOG_USEC=3600000000"]
+    assert stop_in_s(program) < STOP_S
+    assert program.returncode == 0
+
+
+def test_a_compilation_that_is_stopped_ends(serve: Serve, recording: Path, tmp_path: Path) -> None:
+    """Without a cache the first start compiles: it asks for time, and SIGTERM ends it."""
+    os.environ["NUMBA_CACHE_DIR"], before = str(tmp_path / "cache"), os.environ.get("NUMBA_CACHE_DIR")
+    try:
+        program, told = serve("agent", recording)
+    finally:
+        os.environ.pop("NUMBA_CACHE_DIR")
+        if before is not None:
+            os.environ["NUMBA_CACHE_DIR"] = before
+    until(told, "EXTEND_TIMEOUT_USEC=")
+    time.sleep(1.0)
+    assert stop_in_s(program) < STOP_S
+    assert program.returncode == 0
