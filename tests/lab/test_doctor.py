@@ -57,7 +57,7 @@ def test_serial_ports_are_found_by_pattern(monkeypatch: pytest.MonkeyPatch, tmp_
     (tmp_path / "ttyUSB0").touch()
     found = list(doctor.check_serial())
     assert found[0] == DoctorCheck(Severity.OK, "serial", str(tmp_path / "ttyUSB0"))
-    assert "SERIALx_OPTIONS" in found[1].remedy
+    assert "doctor --mavlink" in found[1].remedy
 
 
 def test_exit_status_is_1_if_a_check_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

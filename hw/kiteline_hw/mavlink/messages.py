@@ -235,13 +235,14 @@ class RadioStatus(MavlinkMessage):
     txbuf: int
     rssi: int = 200
     remote_rssi: int = 200
+    noise: int = 30
 
     @classmethod
     def parse(cls, m: Any) -> Self:
-        return cls(m.txbuf, m.rssi, m.remrssi)
+        return cls(m.txbuf, m.rssi, m.remrssi, m.noise)
 
     def values(self) -> Sequence[Any]:
-        return self.rssi, self.remote_rssi, self.txbuf, 30, 30, 0, 0
+        return self.rssi, self.remote_rssi, self.txbuf, self.noise, self.noise, 0, 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ import glob
 import importlib
 import importlib.metadata
 import importlib.util
+import json
 import os
 import platform
 import subprocess
@@ -14,9 +15,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from enum import Enum
+from dataclasses import asdict
 from pathlib import Path
+
+from kiteline_lab.tools.checks.check import DoctorCheck, Severity
+from kiteline_lab.tools.checks.controller import check_controller
+from kiteline_lab.tools.checks.vehicle import check_disk, check_power, check_temperature, check_time
 
 PLAIN = {  # distribution: module, for what the drone needs
     "numpy": "numpy",
@@ -48,24 +52,6 @@ WARMING = (
 MIN_MEMORY_MIB = 400  # an agent takes 250 MiB; compiling its kernels takes half as much again
 OLDEST_CLOCK_S = 1_735_689_600  # 2025-01-01: without a network, a Raspberry Pi starts in the past
 SERIAL_PORTS = ("/dev/serial0", "/dev/ttyAMA*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyS0", "/dev/ttyTHS*")
-
-
-class Severity(Enum):
-    """How bad the result of a check is."""
-
-    OK = "ok"
-    NOTE = "note"  # good to know
-    FAIL = "FAIL"  # kiteline, or a part of it, will not work
-
-
-@dataclass(frozen=True, slots=True)
-class DoctorCheck:
-    """Result of one check. remedy: what to do about it, empty if nothing."""
-
-    severity: Severity
-    name: str
-    text: str
-    remedy: str = ""
 
 
 def check_python() -> Iterable[DoctorCheck]:
@@ -184,10 +170,7 @@ def check_serial() -> Iterable[DoctorCheck]:
     if usable := [p for p in ports if p not in closed]:
         yield DoctorCheck(Severity.OK, "serial", ", ".join(usable))
     yield DoctorCheck(
-        Severity.NOTE,
-        "flight controller",
-        "one that forwards ODOMETRY to its telemetry radio overloads the radio",
-        "ArduPilot: set bit 1024 of SERIALx_OPTIONS of the port to this computer; PX4: MAV_x_FORWARD = 0",
+        Severity.NOTE, "flight controller", "not asked here", "kiteline doctor --mavlink serial:DEVICE:BAUD"
     )
 
 
@@ -242,6 +225,10 @@ CHECKS: tuple[Callable[[], Iterable[DoctorCheck]], ...] = (
     check_serial,
     check_cgroup,
     check_clock,
+    check_time,
+    check_disk,
+    check_temperature,
+    check_power,
     check_systemd,
 )
 
@@ -283,14 +270,24 @@ def main(argv: list[str]) -> int:
     p.add_argument(
         "--warm", action="store_true", help="compile and cache all kernels, so that agent and base start quickly"
     )
+    p.add_argument("--mavlink", metavar="URL", help="check the flight controller there too; the agent must not run")
+    p.add_argument("--json", action="store_true", help="print the results as JSON")
     a = p.parse_args(argv)
-    results = run_checks() + (warm() if a.warm else [])
+    results = run_checks() + (check_controller(a.mavlink) if a.mavlink else []) + (warm() if a.warm else [])
+    if a.json:
+        lines = [{**asdict(f), "severity": f.severity.name.lower()} for f in results]
+        print(json.dumps({"failed": any(f.severity is Severity.FAIL for f in results), "checks": lines}, indent=1))
+    else:
+        _print(results)
+    return 1 if any(f.severity is Severity.FAIL for f in results) else 0
+
+
+def _print(results: list[DoctorCheck]) -> None:
     width = max(len(f.name) for f in results)
     for f in results:
         print(f"{f.severity.value:>4}  {f.name:{width}}  {f.text}")
         if f.remedy:
             print(f"{'':>4}  {'':{width}}  -> {f.remedy}")
-    return 1 if any(f.severity is Severity.FAIL for f in results) else 0
 
 
 def _writable(folder: Path) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-SUMMARY = "check this machine, and compile the kernels beforehand"
+SUMMARY = "check this machine and its flight controller, and compile the kernels beforehand"
 EXAMPLES = (
     "kiteline doctor",
     "kiteline doctor --warm",
+    "kiteline doctor --mavlink serial:/dev/ttyAMA0:921600",
 )
 
 

@@ -1,0 +1,73 @@
+"""Runs a survey of a flight controller over a real connection."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.connection import MavlinkConnection
+from kiteline_hw.mavlink.messages import MavlinkMessage
+from kiteline_hw.mavlink.watch.findings import Finding
+from kiteline_hw.mavlink.watch.presence import LinkState
+from kiteline_hw.mavlink.watch.survey import ControllerSurvey, SurveyConfig
+from kiteline_hw.ports import Clock
+
+_TICK_S = 0.02  # s between two looks at what to send
+_FLUSH_S = 0.2  # s for the last messages on a serial port
+
+
+class _Surveyor:
+    """Connects the survey's messages with a connection's bytes."""
+
+    def __init__(self, url: str, clock: Clock, config: SurveyConfig | None) -> None:
+        self.survey = ControllerSurvey(url, config)
+        self._clock = clock
+        self._codec = MavlinkCodec()
+        self._lock = threading.Lock()
+        self._received = self._messages = 0
+        self.done = threading.Event()
+        self.connection = MavlinkConnection(url, "survey", self._on_data, self._on_tick, _TICK_S, 0, required=False)
+
+    def _send(self, messages: list[MavlinkMessage]) -> None:
+        for message in messages:
+            self.connection.send(self._codec.encode(message))
+
+    def _on_data(self, data: bytes, datagram: bool) -> None:
+        with self._lock:
+            now_ns = self._clock.now_ns()
+            self._received += bool(data)
+            for message in self._codec.receive(data, datagram=datagram):
+                self._messages += 1
+                self._send(self.survey.receive(message, now_ns))
+
+    def _on_tick(self) -> None:
+        with self._lock:
+            codec = self._codec
+            link = LinkState(
+                self._received, self._messages, codec.signed, codec.refused,
+                device_fault=self.connection.device_fault,
+            )  # fmt: skip
+            self._send(self.survey.step(self._clock.now_ns(), link))
+            if self.survey.done:
+                self.done.set()
+
+    def stop(self) -> None:
+        """Set the streams back."""
+        with self._lock:
+            self._send(self.survey.stop())
+
+
+def survey_controller(
+    url: str, clock: Clock, limit_s: float = 60.0, config: SurveyConfig | None = None
+) -> list[Finding]:
+    """Ask the flight controller at a URL; takes seconds. Raises LinkError for a URL that cannot be used."""
+    surveyor = _Surveyor(url, clock, config)
+    surveyor.connection.start()
+    try:
+        surveyor.done.wait(limit_s)
+        surveyor.stop()
+        time.sleep(_FLUSH_S)
+    finally:
+        surveyor.connection.close()
+    return surveyor.survey.findings()
