@@ -25,6 +25,8 @@ from kiteline_agent.mapping.keyframe_stage import KeyframeStage
 from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
+from kiteline_agent.motion.extrapolation import MotionSource
+from kiteline_agent.motion.recent_motion import RecentMotion
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
@@ -105,6 +107,7 @@ class Agent:
         self._last_t_ns: int | None = None  # of the last processed frame
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
         self._last_estimate: Estimate | None = None
+        self._recent = RecentMotion()
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
@@ -152,9 +155,12 @@ class Agent:
         turn[:3, :3] = R_o_m
         cov_o = last.cov_o + turn @ growth @ turn.T
         quality = min(last.quality, self.odometry_quality(last), camera.covariance.quality(cov_o, None))
+        velocity, rate = R_o_m @ moved.velocity, moved.rate
+        if moved.source is MotionSource.VELOCITY:
+            velocity, rate = self._recent.rates(t_ns) or (velocity, rate)
         return PredictedPose(
-            t_ns, moved.source.value, last.tracked, camera.pose.T_o_m @ moved.T_m_b, R_o_m @ moved.velocity, moved.rate,
-            quality, cov_o, camera.gravity.R_l_o,
+            t_ns, moved.source.value, last.tracked, camera.pose.T_o_m @ moved.T_m_b, velocity, rate, quality,
+            cov_o, camera.gravity.R_l_o,
         )  # fmt: skip
 
     def _process(self, frame: Frame, imu: ImuBatch | None) -> tuple[Estimate, list[str]]:
@@ -223,6 +229,10 @@ class Agent:
         self._last_t_ns = frame.t_ns
         self._last_track = None if self._was_lost else track
         self._last_estimate = self._estimate(ctx, outcome)
+        if self._was_lost:
+            self._recent.clear()
+        else:
+            self._recent.add(frame.t_ns, self._last_estimate.T_o_b)
         return self._last_estimate, outcome.events
 
     # stages of a frame
@@ -355,7 +365,8 @@ class Agent:
         """The estimate of a frame; shares the live pose with the base."""
         camera, tracked = self._camera, outcome.tracked
         T_m_b, T_o_m = camera.T_m_b, camera.pose.T_o_m
-        cov_m, cov_o = camera.covariance.of_poses(camera.pose, T_m_b)
+        in_first = self._has_depth and camera.submaps.active == camera.submaps.first
+        cov_m, cov_o = camera.covariance.of_poses(camera.pose, T_m_b, in_first=in_first)
         quality = camera.covariance.quality(
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
         )

@@ -176,6 +176,10 @@ class ControllerFinding(Protocol):
 class ControllerLink(PoseSink, Protocol):
     """A flight controller that receives poses and may send its own velocity and inertial samples."""
 
+    def tunnel_link(self) -> ByteLink | None:
+        """The tunnel to the base on the same connection; None if the link to the base is another one."""
+        ...
+
     def take_odometry(self, t_ns: int) -> OdometryBatch | None:
         """Its velocities since the last call, up to a time on our clock; None if there are none."""
         ...

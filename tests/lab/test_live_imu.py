@@ -16,7 +16,7 @@ from kiteline_agent.runtime.options import AgentOptions, options_of, parser
 from kiteline_core.config import ConfigError
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.mcap_log import LogReader
-from kiteline_hw.mavlink.connect import connect
+from kiteline_hw.mavlink.connect import ControllerOptions, connect
 from kiteline_hw.ports import LinkError, SourceReport
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
@@ -82,7 +82,7 @@ def test_a_source_that_knows_its_body_needs_letters_only() -> None:
     model, clock, batch = FlightController("px4"), MonotonicClock(), None
     with UdpFlightController(model) as controller:
         url = f"udp:127.0.0.1:{controller.port}"
-        with connect(url, rig, "urf", clock, imu_rate_hz=200.0, report=SourceReport()) as sink:
+        with connect(ControllerOptions(url, "urf"), rig, clock, imu_rate_hz=200.0, report=SourceReport()) as sink:
             end_s = time.monotonic() + 5.0
             while batch is None and time.monotonic() < end_s:
                 with controller.lock:

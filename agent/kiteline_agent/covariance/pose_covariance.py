@@ -293,10 +293,11 @@ class PoseCovariance:
 
     # results
 
-    def of_poses(self, pose: PoseState, T_m_b: F64) -> tuple[F64, F64]:
+    def of_poses(self, pose: PoseState, T_m_b: F64, *, in_first: bool = False) -> tuple[F64, F64]:
         """Covariances (6,6) of T_m_b relative to the start of its submap and of T_o_b relative to that of the flight.
 
-        Each is [translation in m or o, rotation about the body's axes].
+        Each is [translation in m or o, rotation about the body's axes]. in_first: the submap is that in which the
+        flight began, so that it tells how far the odometry frame has gone astray.
         """
         left, cov_m = np.empty((6, 6)), np.empty((6, 6))
         carried, self._carried = self._carried, self._zero
@@ -306,6 +307,10 @@ class PoseCovariance:
             return cov_m, cov_m
         cov_o = np.empty((6, 6))
         self._propagate(pose.T_o_m, T_m_b, self._T_m_b0 if self._T_o_b0 is None else self._T_o_b0, left, cov_o)
+        if in_first and self._unmeasured_s is None:
+            by_map = covariance_by_map(cov_m, pose.T_o_m, T_m_b)
+            if np.trace(by_map[:3, :3]) < np.trace(cov_o[:3, :3]):
+                return cov_m, by_map
         return cov_m, cov_o
 
     def _propagate(self, T_a_m: F64, T_m_b: F64, T_a_b0: F64, left: F64, out: F64) -> None:
@@ -381,6 +386,21 @@ def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
             z = ((limit * limit / mean) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * k)) / math.sqrt(2.0 / (9.0 * k))
             both *= 0.5 * math.erfc(-z / math.sqrt(2.0))
     return both
+
+
+def covariance_by_map(cov_m: F64, T_o_m: F64, T_m_b: F64) -> F64:
+    """Covariance (6,6) of T_o_b relative to the start of the flight, by the first submap, whose frame was o there.
+
+    cov_m: of T_m_b (4,4). The map measures by how much o is off by now; that counts as a standard deviation.
+    """
+    turn = np.eye(6)
+    turn[:3, :3] = T_o_m[:3, :3]
+    off_m = (T_o_m @ T_m_b)[:3, 3] - T_m_b[:3, 3]
+    off_rad = T_m_b[:3, :3].T @ se3.so3_log(T_o_m[:3, :3])
+    cov = turn @ cov_m @ turn.T
+    cov[:3, :3] += np.outer(off_m, off_m)
+    cov[3:, 3:] += np.outer(off_rad, off_rad)
+    return np.asarray(cov)
 
 
 def adjoint(T: F64) -> F64:

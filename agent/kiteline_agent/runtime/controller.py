@@ -23,13 +23,17 @@ def controller_link(
         if options.odometry:
             raise LinkError("--odometry takes velocities from a flight controller: expected --mavlink URL beside it")
         return None
-    from kiteline_hw.mavlink.connect import connect
+    from kiteline_hw.mavlink.connect import ControllerOptions, connect
 
     own = agent_config(options.config).controller_imu
     return stack.enter_context(
         connect(
-            options.mavlink, source.rig, options.axes, clock, odometry=options.odometry,
-            pose_rate_hz=pose_rate_hz(options), imu_rate_hz=own.noise.rate_hz if options.imu_of else 0.0,
+            ControllerOptions(
+                options.mavlink, options.axes, options.offset, options.odometry, options.heading,
+                options.pose_messages, options.origin, options.mavlink_key, options.link, options.folder,
+            ),
+            source.rig, clock, pose_rate_hz=pose_rate_hz(options),
+            imu_rate_hz=own.noise.rate_hz if options.imu_of else 0.0,
             body_is_controller=bool(options.imu_of and own.T_f_c), report=source.report,
         )
     )  # fmt: skip

@@ -44,12 +44,13 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
             return
         runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
         stack.callback(runtime.close)
-        link = open_link(options.link, "agent", options.agent, framer=StreamFramer, required=False)
+        clock = MonotonicClock()
+        controller = controller_link(options, source, clock, stack)
+        shared = None if controller is None else controller.tunnel_link()
+        link = shared or open_link(options.link, "agent", options.agent, framer=StreamFramer, required=False)
         stack.callback(link.close)
         if options.key:
             link = _sealed(options, link)
-        clock = MonotonicClock()
-        controller = controller_link(options, source, clock, stack)
         if options.cpu_percent > 0.0:
             stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
         if parent is not None:

@@ -47,6 +47,11 @@ class AgentOptions:
     mavlink: str = ""  # URL of a flight controller
     axes: str = ""  # where the body's axes point; "": flu, or rdf where the source knows no body
     odometry: str = ""  # from the flight controller: controller, wheels, wheels:TRACK_M; "": none
+    offset: str = ""  # X,Y,Z in m of the flight controller in the body; "": at its origin
+    heading: str = "start"  # of the poses sent: start (0 at the start), controller (as it has it)
+    pose_messages: str = "odometry"  # odometry, or vision: the older messages
+    origin: str = ""  # LAT,LON,ALT to set in the flight controller; "": none
+    mavlink_key: str = ""  # a file with the key of MAVLink's signatures; "": none
     imu_of: str = ""  # whose IMU is used: controller; "": the source's, if it has one
     kill_at_s: float | None = None  # end like a crash at this flight time
     await_base_at_s: float | None = None  # look for a base again at this flight time
@@ -60,7 +65,8 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
         agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
         up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
-        odometry=a.odometry, imu_of=a.imu,
+        odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
+        origin=a.origin, mavlink_key=a.mavlink_key,
     )  # fmt: skip
 
 
@@ -128,6 +134,22 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         "[agent.controller_imu] of --config, or by a source that knows its body, with --axes",
     )  # fmt: skip
     p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
+    p.add_argument(
+        "--offset", metavar="X,Y,Z", default="", help="where the flight controller sits: metres along the body's axes"
+    )
+    p.add_argument(
+        "--heading", choices=("start", "controller"), default="start",
+        help="heading of the poses sent: 0 where the flight starts (default), or as the flight controller has it",
+    )  # fmt: skip
+    p.add_argument(
+        "--pose-messages", choices=("odometry", "vision"), default="odometry",
+        help="send ODOMETRY (default), or VISION_POSITION_ESTIMATE and VISION_SPEED_ESTIMATE",
+    )  # fmt: skip
+    p.add_argument(
+        "--origin", metavar="LAT,LON,ALT", default="",
+        help="set this origin in a flight controller without GPS, while it is disarmed (degrees, metres)",
+    )  # fmt: skip
+    p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
     p.add_argument(
         "--log-mib", metavar="N", type=int, default=0,

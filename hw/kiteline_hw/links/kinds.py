@@ -9,7 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 # Addresses of a flight controller: of `mavlink:` links and of `--mavlink`.
-MAVLINK_FORMS = "udp:HOST:PORT (send to), udpin:HOST:PORT (listen), serial:DEVICE:BAUD"
+MAVLINK_FORMS = (
+    "udp:HOST:PORT (send to), udpin:HOST:PORT (listen), tcp:HOST:PORT, serial:DEVICE:BAUD; ?system=N after it "
+    "names the own system id"
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import common
 
 from kiteline_hw.mavlink import messages
 from kiteline_hw.mavlink.messages import COMPONENT_VIO, MavlinkMessage
+from kiteline_hw.mavlink.transport.signing import Signing, SigningMavlink
 from kiteline_hw.mavlink.watch.messages import MESSAGES as STATUS_MESSAGES
 
 _MARKERS = (0xFD, 0xFE)  # first byte of a frame of MAVLink 2 and 1
@@ -17,19 +18,47 @@ _MAX_PARSED_BYTES = 4096  # parsed bytes that pymavlink's buffer may hold before
 
 
 class MavlinkCodec:
-    """Converts bytes to messages and back, for one sender and one stream. Holds sequence number and parser state."""
+    """Converts bytes to messages and back, for one sender and one stream. Holds sequence number and parser state.
 
-    def __init__(self, system: int = 1, component: int = COMPONENT_VIO) -> None:
-        self._mav: Any = common.MAVLink(None, srcSystem=system, srcComponent=component)
+    only_system: messages about a vehicle are taken of this system alone; None: of all.
+    """
+
+    def __init__(self, system: int = 1, component: int = COMPONENT_VIO, signing: Signing | None = None) -> None:
+        self._mav: Any = SigningMavlink(None, srcSystem=system, srcComponent=component)
+        self._signing = signing
+        if signing is not None:
+            signing.set_up(self._mav)
+        self.only_system: int | None = None
+        self.other_systems = 0  # messages of other systems
         self._mav.robust_parsing = True
         self._kinds = {name: kind for kind in (*messages.MESSAGES, *STATUS_MESSAGES) for name in kind.NAMES}
         self.bad = 0  # pieces that were no valid message
         self.unknown = 0  # valid frames of messages that are not in the table
         self.signed = 0  # signed frames, whoever signed them
-        self.refused = 0  # frames whose signature is missing or is not by our key
+
+    @property
+    def system(self) -> int:
+        """The system id in the messages that are sent."""
+        return int(self._mav.srcSystem)
+
+    @system.setter
+    def system(self, system: int) -> None:
+        self._mav.srcSystem = system
+
+    @property
+    def has_key(self) -> bool:
+        """True if messages are signed, and unsigned ones refused."""
+        return self._signing is not None
+
+    @property
+    def refused(self) -> int:
+        """Messages without a valid signature, where one is demanded."""
+        return int(self._mav.signing.reject_count)
 
     def encode(self, message: MavlinkMessage) -> bytes:
         """The frame of a message."""
+        if self._signing is not None:
+            self._signing.before_signing(self._mav)
         generated = getattr(common, f"MAVLink_{message.NAMES[0].lower()}_message")
         data = bytes(generated(*message.values()).pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
@@ -71,6 +100,8 @@ class MavlinkCodec:
             kind = frame.get_type()
             rest = self._mav.buf[self._mav.buf_index :]
             doubtful = kind.startswith("UNKNOWN") and len(rest) > 0 and rest[0] not in _MARKERS  # checksum unknown
+            if kind == "BAD_DATA" and frame.reason == "Invalid signature":
+                continue
             if not (doubtful or (kind == "BAD_DATA" and len(frame.data) > 1 and frame.data[0] in _MARKERS)):
                 return frame
             self.bad += 1
@@ -87,11 +118,13 @@ class MavlinkCodec:
         name = frame.get_type()
         if name == "BAD_DATA":
             self.bad += 1
-            self.refused += "signature" in str(frame.reason)
             return None
         self.signed += bool(frame.get_header().incompat_flags & _SIGNED)
         kind = self._kinds.get(name)
         if kind is not None:
+            if self.only_system not in (None, frame.get_srcSystem()) and not kind.FROM_ANY_SYSTEM:
+                self.other_systems += 1
+                return None
             return kind.parse(frame)
         self.unknown += 1
         return None

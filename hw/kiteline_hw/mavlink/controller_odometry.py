@@ -20,6 +20,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.messages import (
     Attitude,
+    Heartbeat,
     LocalPosition,
     MavlinkMessage,
     MessageInterval,
@@ -103,13 +104,14 @@ class ControllerOdometry:
             else {Odometry: self._from_odometry, Attitude: self._keep_attitude, LocalPosition: self._from_position}
         )
 
-    def requests(self, now_ns: int) -> list[MessageInterval]:
+    def requests(self, autopilot: Heartbeat, now_ns: int) -> list[MessageInterval]:
         """The requests for messages to send now; none while the messages come."""
         since_ns = max((t for t in (self._received_ns, self._requested_ns) if t is not None), default=None)
         if since_ns is not None and now_ns - since_ns < self.config.request_ns:
             return []
         self._requested_ns = now_ns
-        return [MessageInterval(1, _AUTOPILOT, i, self.config.interval_us) for i in _MESSAGE_IDS[self.source]]
+        target, interval_us = (autopilot.system, autopilot.component), self.config.interval_us
+        return [MessageInterval(*target, i, interval_us) for i in _MESSAGE_IDS[self.source]]
 
     def receive(self, message: MavlinkMessage, now_ns: int) -> None:
         """Add a message; those of other kinds are ignored."""

@@ -1,6 +1,7 @@
-"""The protocol with a flight controller: sends HEARTBEAT, ODOMETRY and TIMESYNC answers. Pure; time is handed in.
+"""The protocol with a flight controller: sends HEARTBEAT, poses, TIMESYNC answers, and what its watch finds. Pure; time is handed in.
 
-Poses are sent in the continuous odometry frame. Map corrections are not sent, because the controller would see jumps.
+Poses are sent in the continuous odometry frame, turned once (`start_frame`). Map corrections are not sent, because the
+controller would see jumps. One system is served: the one told, else that of the first autopilot heard.
 """
 
 from __future__ import annotations
@@ -13,23 +14,39 @@ from typing import Any
 import numpy as np
 
 from kiteline_core.frame import ImuBatch, OdometryBatch
+from kiteline_core.geometry.end_rates import end_rates
 from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
 from kiteline_hw.mavlink.coordinate_frames import (
-    body_rates,
     controller_covariance,
     controller_rates,
+    euler_angles,
     local_covariance,
     local_pose,
+    rotated,
     upper_triangle,
 )
-from kiteline_hw.mavlink.messages import Heartbeat, MavlinkMessage, Odometry, TimeSync, VehicleImu
+from kiteline_hw.mavlink.messages import (
+    Attitude,
+    GlobalOrigin,
+    Heartbeat,
+    LocalPosition,
+    MavlinkMessage,
+    Odometry,
+    SetGlobalOrigin,
+    TimeSync,
+    VehicleImu,
+    VisionPosition,
+    VisionSpeed,
+)
+from kiteline_hw.mavlink.start_frame import LastPose, StartFrame, last_pose
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
 from kiteline_hw.mavlink.watch.presence import LinkState
 from kiteline_hw.ports import PoseSample
 
+_ORIGIN_NS = 5_000_000_000  # ns between two requests for an origin
 _MAX_POSITION_M = 1e6  # m; beyond it the estimate has failed, and a float32 cannot hold centimetres
 
 
@@ -41,14 +58,16 @@ class OdometryConfig:
     rate_slack_ns: int = 4_000_000  # ns; a frame may be sent this much before it is due: cameras jitter
     heartbeat_ns: int = 1_000_000_000  # ns; as MAVLink prescribes
     watch_ns: int = 100_000_000  # ns between two looks at what has changed
-    max_gap_ns: int = 250_000_000  # ns; velocities are not differenced over a longer gap between poses
-    min_gap_ns: int = 20_000_000  # ns; nor over a shorter one, in which noise dominates
+    max_gap_ns: int = 250_000_000  # ns; older poses do not count for a velocity
+    min_gap_ns: int = 20_000_000  # ns; least span of the poses that give one: in a shorter one noise dominates
     floor_m: float = 0.01  # m; added to a pose's own deviation: 5 ms of delay at 2 m/s, and mounting errors
     floor_rad: float = 0.005  # rad; likewise
     position_sigma_m: float = 0.03  # m; of a good pose without covariance; controllers read the diagonal as noise
     angle_sigma_rad: float = 0.02  # rad; likewise
     velocity_sigma_m_s: float = 0.1  # m/s; of two poses a frame apart
     rate_sigma_rad_s: float = 0.1  # rad/s; likewise
+    vision: bool = False  # VISION_POSITION_ESTIMATE and VISION_SPEED_ESTIMATE in place of ODOMETRY
+    origin: GlobalOrigin | None = None  # of the local frame, for a controller without GPS; None: none is set
 
 
 @dataclass(slots=True)
@@ -62,22 +81,28 @@ class OdometryCounters:
     without_velocity: int = 0  # no earlier pose to take a velocity from
     invalid: int = 0  # not finite, or absurdly far away
     stale: int = 0  # not newer than the one before
+    held: int = 0  # before the heading was known
+    other_autopilots: int = 0  # heartbeats of autopilots of other systems
 
 
 class ControllerSession:
     """Poses in, MAVLink bytes out. T_b_f: (4,4) flight controller (FRD) in the body: coordinate_frames.mounting.
 
-    odometry, imu: receive the controller's velocities and inertial samples; None: they are not requested. watch: says
-    what is found about the controller.
+    odometry, imu: receive the controller's velocities and inertial samples; None: they are not requested. start:
+    chooses the frame of the poses; None: they are sent as they come. watch: says what is found about the controller.
+    system: of the vehicle; None: it is learnt.
     """
 
     def __init__(
         self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None,
-        odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None,
-        watch: ControllerWatch | None = None,
+        odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None, start: StartFrame | None = None,
+        watch: ControllerWatch | None = None, system: int | None = None,
     ) -> None:  # fmt: skip
         self.config = config or OdometryConfig()
         self.codec = codec or MavlinkCodec()
+        self.codec.only_system = system or 0
+        if system is not None:
+            self.codec.system = system
         self.counters = OdometryCounters()
         self._T_b_f = T_b_f
         self._period_ns = round(1e9 / self.config.rate_hz)
@@ -90,11 +115,23 @@ class ControllerSession:
         self._watch = watch
         self._next_watch_ns: int | None = None
         self._received = self._messages = 0
-        self._handlers: dict[type[MavlinkMessage], Callable[[Any, int], Sequence[MavlinkMessage]]] = {
-            TimeSync: self._on_timesync,
-            Heartbeat: self._on_heartbeat,
-            VehicleImu: self._on_imu,
-        }
+        self._start = start
+        self._last: LastPose | None = None
+        self._origin_due_ns: int | None = None if self.config.origin is None else 0
+        self._handlers: dict[type[MavlinkMessage], list[Callable[[Any, int], Sequence[MavlinkMessage]]]] = {}
+        self.listen(TimeSync, self._on_timesync)
+        self.listen(Heartbeat, self._on_heartbeat)
+        self.listen(VehicleImu, self._on_imu)
+        self.listen(GlobalOrigin, self._on_origin)
+        if start is not None:
+            self.listen(Attitude, start.on_attitude)
+            self.listen(LocalPosition, start.on_position)
+
+    def listen(
+        self, kind: type[MavlinkMessage], handler: Callable[[Any, int], Sequence[MavlinkMessage]]
+    ) -> None:  # fmt: skip
+        """Call a handler with each message of a kind, and when it came; it returns the answers."""
+        self._handlers.setdefault(kind, []).append(handler)
 
     def step(self, pose: PoseSample | None, now_ns: int) -> list[bytes]:
         """The frames to send now: a heartbeat if it is due, and the newest pose (or None) if the rate allows it."""
@@ -107,7 +144,7 @@ class ControllerSession:
             message = self._pose_message(pose, now_ns)
             if message is not None:
                 self.counters.odometry += 1
-                out.append(self.codec.encode(message))
+                out += [self.codec.encode(m) for m in (self._vision(message) if self.config.vision else (message,))]
                 if self._watch is not None:
                     self._watch.sent(pose, message.quality, now_ns)
         return out
@@ -119,11 +156,16 @@ class ControllerSession:
         self._next_watch_ns = now_ns + self.config.watch_ns
         codec = self.codec
         link = LinkState(
-            self._received, self._messages, codec.signed, codec.refused, has_key=False, device_fault=device_fault
+            self._received, self._messages, codec.signed, codec.refused, has_key=codec.has_key, device_fault=device_fault
         )
         return [codec.encode(message) for message in self._watch.tick(now_ns, link)]
 
     def _pose_message(self, pose: PoseSample, now_ns: int) -> Odometry | None:
+        framed = pose if self._start is None else self._start.in_frame(pose, now_ns)
+        if framed is None:
+            self.counters.held += 1
+            return None
+        pose = framed
         if not np.all(np.isfinite(pose.T_o_b)) or float(np.abs(pose.T_o_b[:3, 3]).max()) > _MAX_POSITION_M:
             self.counters.invalid += 1
             return None
@@ -132,15 +174,17 @@ class ControllerSession:
         if self._past and pose.t_ns <= self._past[-1].t_ns:
             self.counters.stale += 1
             return None
-        before = self._earlier_pose(pose.t_ns)
+        has_earlier = self._has_earlier_pose(pose.t_ns)
         self._past.append(pose)
-        if before is None and pose.velocity is None:
+        if not has_earlier and pose.velocity is None:
             self.counters.without_velocity += 1  # ArduPilot would take NaN velocities into its filter
             return None
         if not self._is_due(now_ns):
             self.counters.rate_limited += 1
             return None
-        velocity, rate = self._rates(before, pose)
+        velocity, rate = self._rates(pose)
+        armed = self._autopilot is not None and self._autopilot[0].armed
+        self._last = last_pose(pose.T_o_b @ self._T_b_f, armed=armed)
         position, q = local_pose(pose.T_o_b, self._T_b_f)
         quality = max(-1, min(100, pose.quality)) if pose.tracked else -1
         pose_cov, velocity_cov = self._covariances(pose, quality)
@@ -156,18 +200,29 @@ class ControllerSession:
             quality=quality,
         )
 
-    def _rates(self, before: PoseSample | None, pose: PoseSample) -> tuple[F64, F64]:
-        """Velocity and angular rate (3,) in f: the pose's own, else between two poses, as of half-way between them."""
-        if pose.velocity is not None and pose.rate is not None:
-            return controller_rates(pose.T_o_b, pose.velocity, pose.rate, self._T_b_f)
-        assert before is not None
-        return body_rates(before.T_o_b, pose.T_o_b, (pose.t_ns - before.t_ns) * 1e-9, self._T_b_f)
+    def _vision(self, m: Odometry) -> Sequence[MavlinkMessage]:
+        """The pose in the older messages, which have no quality: a failed one is not sent."""
+        if m.quality < 0:
+            return ()
+        velocity, sigma = rotated(m.q, m.velocity_m_s), m.velocity_covariance[0]
+        covariance = [sigma, 0.0, 0.0, 0.0, sigma, 0.0, 0.0, 0.0, sigma]
+        return (
+            VisionPosition(m.time_usec, m.position_m, euler_angles(m.q), m.pose_covariance, m.reset_counter),
+            VisionSpeed(m.time_usec, velocity, covariance, m.reset_counter),
+        )
 
-    def _earlier_pose(self, t_ns: int) -> PoseSample | None:
-        """The newest pose old enough to take a velocity from, or None. Drops poses that are too old."""
+    def _rates(self, pose: PoseSample) -> tuple[F64, F64]:
+        """Velocity and angular rate (3,) in f at the time of the pose: its own, else by the poses up to it."""
+        velocity, rate = pose.velocity, pose.rate
+        if velocity is None or rate is None:
+            velocity, rate = end_rates([p.t_ns for p in self._past], [p.T_o_b for p in self._past], pose.t_ns)
+        return controller_rates(pose.T_o_b, velocity, rate, self._T_b_f)
+
+    def _has_earlier_pose(self, t_ns: int) -> bool:
+        """True if a pose is old enough to take a velocity from. Drops poses that are too old."""
         while self._past and t_ns - self._past[0].t_ns > self.config.max_gap_ns:
             self._past.popleft()
-        return next((p for p in reversed(self._past) if t_ns - p.t_ns >= self.config.min_gap_ns), None)
+        return bool(self._past) and t_ns - self._past[0].t_ns >= self.config.min_gap_ns
 
     def _is_due(self, now_ns: int) -> bool:
         """True if the rate allows a message now. An early message delays the next one: the mean rate holds."""
@@ -197,20 +252,33 @@ class ControllerSession:
             pose_cov = controller_covariance(pose.cov, pose.T_o_b, self._T_b_f) + floor
         return upper_triangle(pose_cov), upper_triangle(np.diag(sigma_v**2))
 
-    def receive(self, data: bytes, now_ns: int, *, datagram: bool = False) -> list[bytes]:
-        """Process bytes from the flight controller, in any pieces; the answers to send at once."""
+    def receive(
+        self, data: bytes, now_ns: int, *, datagram: bool = False, adopt: Callable[[], None] | None = None
+    ) -> list[bytes]:
+        """Process bytes from the flight controller, in any pieces; the answers to send at once.
+
+        adopt: serves the sender from now on; None: it is served already. A sender is adopted when an autopilot of the
+        vehicle speaks; before that its messages are ignored.
+        """
+        messages = self.codec.receive(data, datagram=datagram)
+        if adopt is not None:
+            if not any(isinstance(m, Heartbeat) and self._is_vehicle(m) for m in messages):
+                return []
+            adopt()
         out: list[bytes] = []
         self._received += bool(data)
-        for message in self.codec.receive(data, datagram=datagram):
+        for message in messages:
             self._messages += 1
             if self._watch is not None:
                 self._watch.receive(message, now_ns)
-            handler = self._handlers.get(type(message))
-            if handler is not None:
+            for handler in self._handlers.get(type(message), ()):
                 out += [self.codec.encode(answer) for answer in handler(message, now_ns)]
-            elif self._odometry is not None:
+            if self._odometry is not None:
                 self._odometry.receive(message, now_ns)
         return out
+
+    def _is_vehicle(self, m: Heartbeat) -> bool:
+        return m.is_autopilot and self.codec.only_system in (0, m.system)
 
     def _on_timesync(self, m: TimeSync, now_ns: int) -> Sequence[MavlinkMessage]:
         if m.tc1_ns != 0:
@@ -219,11 +287,27 @@ class ControllerSession:
         return (TimeSync(now_ns, m.ts1_ns),)
 
     def _on_heartbeat(self, m: Heartbeat, now_ns: int) -> Sequence[MavlinkMessage]:
-        if not m.is_autopilot:
+        if not self._is_vehicle(m):
+            self.counters.other_autopilots += m.is_autopilot
             return ()
+        self.codec.only_system = self.codec.system = m.system
         self._autopilot = m, now_ns
-        velocities = [] if self._odometry is None else self._odometry.requests(now_ns)
-        return velocities + ([] if self._imu is None else self._imu.requests(m, now_ns))
+        out: list[MavlinkMessage] = []
+        if self._odometry is not None:
+            out += self._odometry.requests(m, now_ns)
+        if self._imu is not None:
+            out += self._imu.requests(m, now_ns)
+        if self._start is not None:
+            out += self._start.requests(m, now_ns)
+        due_ns, origin = self._origin_due_ns, self.config.origin
+        if origin is not None and due_ns is not None and now_ns >= due_ns and not m.armed:
+            self._origin_due_ns = now_ns + _ORIGIN_NS
+            out.append(SetGlobalOrigin(m.system, origin))
+        return out
+
+    def _on_origin(self, m: GlobalOrigin, now_ns: int) -> Sequence[MavlinkMessage]:
+        self._origin_due_ns = None  # it has one: ours, or that of its GPS
+        return ()
 
     def _on_imu(self, m: VehicleImu, now_ns: int) -> Sequence[MavlinkMessage]:
         if self._imu is not None:
@@ -235,6 +319,10 @@ class ControllerSession:
         if self._autopilot is None or now_ns - self._autopilot[1] > 3 * self.config.heartbeat_ns:
             return None
         return self._autopilot[0]
+
+    def last_pose(self) -> LastPose | None:
+        """What an agent after this one has to know; None before the first pose."""
+        return self._last
 
     def take_odometry(self, t_ns: int) -> OdometryBatch | None:
         """The controller's velocities up to a time, in the body frame; None if there are none."""

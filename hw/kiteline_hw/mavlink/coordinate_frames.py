@@ -6,6 +6,9 @@ vehicle. MAVLink: l = MAV_FRAME_LOCAL_FRD, x as in o, z down; f = MAV_FRAME_BODY
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from kiteline_core.geometry import se3
@@ -46,15 +49,6 @@ def local_pose(T_o_b: F64, T_b_f: F64) -> tuple[F64, F64]:
     return R_L_O @ t_o_f[:3, 3], se3.quaternion_from_rotation(R_L_O @ t_o_f[:3, :3])
 
 
-def body_rates(T_o_b_before: F64, T_o_b_now: F64, dt_s: float, T_b_f: F64) -> tuple[F64, F64]:
-    """Velocity (3,) m/s of the flight controller's origin and angular rate (3,) rad/s, both in f, between two poses."""
-    before, now = T_o_b_before @ T_b_f, T_o_b_now @ T_b_f
-    r_f_o = now[:3, :3].T
-    velocity = r_f_o @ (now[:3, 3] - before[:3, 3]) / dt_s
-    rate = se3.so3_log(before[:3, :3].T @ now[:3, :3]) / dt_s
-    return np.asarray(velocity), np.asarray(rate)
-
-
 def controller_rates(T_o_b: F64, velocity: F64, rate: F64, T_b_f: F64) -> tuple[F64, F64]:
     """Velocity (3,) m/s of the flight controller's origin and angular rate (3,) rad/s, both in f.
 
@@ -63,6 +57,18 @@ def controller_rates(T_o_b: F64, velocity: F64, rate: F64, T_b_f: F64) -> tuple[
     r_f_b = T_b_f[:3, :3].T
     at_origin = T_o_b[:3, :3].T @ velocity + np.cross(rate, T_b_f[:3, 3])
     return np.asarray(r_f_b @ at_origin), np.asarray(r_f_b @ rate)
+
+
+def rotated(q: Sequence[float], v: Sequence[float]) -> list[float]:
+    """A vector (3,) in f rotated by the quaternion [w, x, y, z]."""
+    return [float(a) for a in se3.rotation_from_quaternion(np.asarray(q, np.float64)) @ np.asarray(v, np.float64)]
+
+
+def euler_angles(q: Sequence[float]) -> list[float]:
+    """Roll, pitch and yaw (rad; yaw first, about z, y', x'') of a quaternion [w, x, y, z]."""
+    r = se3.rotation_from_quaternion(np.asarray(q, np.float64))
+    pitch = -math.asin(min(1.0, max(-1.0, float(r[2, 0]))))
+    return [math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])]
 
 
 def upper_triangle(covariance: F64) -> list[float]:

@@ -22,10 +22,14 @@ Vector = tuple[float, float, float]
 
 
 class MavlinkMessage:
-    """Base class of messages. NAMES: in the dialect; all of them are parsed, the first one is built."""
+    """Base class of messages. NAMES: in the dialect; all of them are parsed, the first one is built.
+
+    FROM_ANY_SYSTEM: not only those of the vehicle are taken.
+    """
 
     __slots__ = ()
     NAMES: ClassVar[tuple[str, ...]]
+    FROM_ANY_SYSTEM: ClassVar[bool] = False
 
     @classmethod
     def parse(cls, m: Any) -> Self | None:
@@ -42,6 +46,7 @@ class Heartbeat(MavlinkMessage):
     """A component is alive; by default an onboard controller (18) that is no autopilot (8: invalid). armed: may fly."""
 
     NAMES = ("HEARTBEAT",)
+    FROM_ANY_SYSTEM = True
     type: int = 18
     autopilot: int = 8
     armed: bool = False
@@ -208,6 +213,7 @@ class Tunnel(MavlinkMessage):
     """Opaque bytes (at most 128) for a target, forwarded by routers on the way."""
 
     NAMES = ("TUNNEL",)
+    FROM_ANY_SYSTEM = True
     target_system: int
     target_component: int
     payload_type: int
@@ -232,6 +238,7 @@ class RadioStatus(MavlinkMessage):
     """State of a telemetry radio. txbuf: percent of its send buffer that is free."""
 
     NAMES = ("RADIO_STATUS",)
+    FROM_ANY_SYSTEM = True
     txbuf: int
     rssi: int = 200
     remote_rssi: int = 200
@@ -260,7 +267,88 @@ class MessageInterval(MavlinkMessage):
         return *target, 511, 0, float(self.message_id), float(self.interval_us), 0.0, 0.0, 0.0, 0.0, 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class VisionPosition(MavlinkMessage):
+    """Position in local FRD (m), roll, pitch and yaw (rad): the older form of a pose. Only built."""
+
+    NAMES = ("VISION_POSITION_ESTIMATE",)
+    time_usec: int
+    position_m: Sequence[float]
+    angles_rad: Sequence[float]
+    covariance: Sequence[float]
+    reset_counter: int
+
+    def values(self) -> Sequence[Any]:
+        return self.time_usec, *self.position_m, *self.angles_rad, list(self.covariance), self.reset_counter
+
+
+@dataclass(frozen=True, slots=True)
+class VisionSpeed(MavlinkMessage):
+    """Velocity in local FRD (m/s), with a covariance of 9 numbers. Only built."""
+
+    NAMES = ("VISION_SPEED_ESTIMATE",)
+    time_usec: int
+    velocity_m_s: Sequence[float]
+    covariance: Sequence[float]
+    reset_counter: int
+
+    def values(self) -> Sequence[Any]:
+        return self.time_usec, *self.velocity_m_s, list(self.covariance), self.reset_counter
+
+
+@dataclass(frozen=True, slots=True)
+class GlobalOrigin(MavlinkMessage):
+    """Latitude and longitude in 1e-7 degrees, altitude in mm, of the local frame's origin. Parsed: the controller's."""
+
+    NAMES = ("GPS_GLOBAL_ORIGIN",)
+    latitude: int
+    longitude: int
+    altitude_mm: int
+
+    @classmethod
+    def parse(cls, m: Any) -> Self:
+        return cls(m.latitude, m.longitude, m.altitude)
+
+
+@dataclass(frozen=True, slots=True)
+class SetGlobalOrigin(MavlinkMessage):
+    """Asks a flight controller to take an origin for its local frame. Only built."""
+
+    NAMES = ("SET_GPS_GLOBAL_ORIGIN",)
+    target_system: int
+    origin: GlobalOrigin
+
+    def values(self) -> Sequence[Any]:
+        return self.target_system, self.origin.latitude, self.origin.longitude, self.origin.altitude_mm
+
+
+@dataclass(frozen=True, slots=True)
+class ComputerStatus(MavlinkMessage):
+    """Load and temperature of the companion computer. cpu_percent: of each core. None: unknown. Only built."""
+
+    NAMES = ("ONBOARD_COMPUTER_STATUS",)
+    t_us: int
+    uptime_ms: int
+    cpu_percent: Sequence[int]
+    ram_mib: int | None
+    ram_total_mib: int | None
+    temperature_c: int | None
+
+    def values(self) -> Sequence[Any]:
+        n, unknown = min(len(self.cpu_percent), 8), 255
+        cores = [*self.cpu_percent[:n], *[unknown] * (8 - n)]
+        combined = [round(sum(self.cpu_percent) / len(self.cpu_percent)) if n else unknown, *[unknown] * 9]
+        no_word, no_disk = 2**32 - 1, [2**32 - 1] * 4
+        ram = no_word if self.ram_mib is None else self.ram_mib
+        total = no_word if self.ram_total_mib is None else self.ram_total_mib
+        degrees = 127 if self.temperature_c is None else max(-126, min(126, self.temperature_c))
+        return (
+            self.t_us, self.uptime_ms % 2**32, 0, cores, combined, [unknown] * 4, [unknown] * 10, 127, [degrees, *[127] * 7],
+            [2**15 - 1] * 4, ram, total, no_disk, no_disk, no_disk, *[[2**32 - 1] * 6] * 5,
+        )  # fmt: skip
+
+
 # The messages that are parsed; others are counted as unknown.
 MESSAGES: tuple[type[MavlinkMessage], ...] = (
-    Heartbeat, TimeSync, VehicleImu, LocalPosition, Attitude, WheelDistance, Odometry, Tunnel, RadioStatus,
+    Heartbeat, TimeSync, VehicleImu, LocalPosition, Attitude, WheelDistance, Odometry, Tunnel, RadioStatus, GlobalOrigin,
 )  # fmt: skip

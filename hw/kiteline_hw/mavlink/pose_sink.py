@@ -1,23 +1,50 @@
-"""Sends poses to a flight controller over UDP or a serial port."""
+"""Sends poses to a flight controller over UDP, TCP or a serial port, and carries a tunnel on the same line."""
 
 from __future__ import annotations
 
 import threading
+from collections import deque
+from dataclasses import dataclass
 
 from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry.se3 import F64
-from kiteline_hw.mavlink.connection import MavlinkConnection, parse_mavlink_url
+from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
 from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryConfig, OdometryCounters
-from kiteline_hw.mavlink.messages import Heartbeat
+from kiteline_hw.mavlink.messages import ComputerStatus, Heartbeat, RadioStatus, Tunnel
+from kiteline_hw.mavlink.pose_memory import PoseMemory
+from kiteline_hw.mavlink.start_frame import StartFrame
+from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
+from kiteline_hw.mavlink.transport.signing import Signing
+from kiteline_hw.mavlink.transport.url import parse_mavlink_url
+from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
 from kiteline_hw.mavlink.watch.findings import Finding
-from kiteline_hw.ports import Clock, PoseSample
+from kiteline_hw.ports import ByteLink, Clock, PoseSample
 from kiteline_hw.system.closing import Closing
+from kiteline_hw.system.computer import ComputerReader
 
 _TICK_S = 0.1  # s between two checks whether a heartbeat is due
+_TUNNEL_TICK_S = 0.01  # s between two checks of a tunnel's rate
 _MAX_QUEUED = 8  # messages waiting for a slow serial port; the oldest are dropped, because a late pose is of little use
+_TUNNEL_QUEUED = 8  # more of them for a tunnel
+_COMPUTER_NS = 5_000_000_000  # ns between two messages about the computer, which routers send to the radio too
+_INBOX_PACKETS = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class SinkOptions:
+    """What a sink does beside sending poses. signing: of all messages. start: chooses the frame of the poses.
+
+    memory: keeps the last pose. tunnel: one end of a tunnel on the same connection. computer: send its load.
+    """
+
+    signing: Signing | None = None
+    start: StartFrame | None = None
+    memory: PoseMemory | None = None
+    tunnel: TunnelConfig | None = None
+    computer: bool = False
 
 
 class MavlinkPoseSink(Closing):
@@ -30,16 +57,25 @@ class MavlinkPoseSink(Closing):
     def __init__(
         self, url: str, T_b_f: F64, clock: Clock, *, required: bool = True, config: OdometryConfig | None = None,
         odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None,
+        options: SinkOptions | None = None,
     ) -> None:  # fmt: skip
+        address, self._options = parse_mavlink_url(url), options or SinkOptions()
         self._clock = clock
         self._lock = threading.Lock()
-        parsed = parse_mavlink_url(url)
-        self._watch = ControllerWatch(T_b_f, url, parsed.port if parsed.kind == "serial" else 0)
-        self._session = ControllerSession(T_b_f, config, odometry=odometry, imu=imu, watch=self._watch)
+        self._watch = ControllerWatch(T_b_f, url, address.port if address.kind == "serial" else 0)
+        self._session = ControllerSession(
+            T_b_f, config, MavlinkCodec(signing=self._options.signing), odometry, imu, self._options.start, self._watch,
+            address.system,
+        )  # fmt: skip
         self.refused = 0  # messages that could not be sent
+        self._computer = ComputerReader() if self._options.computer else None
+        self._computer_due_ns = 0
+        tunnel = self._options.tunnel
+        self.tunnel = None if tunnel is None else SharedTunnel(tunnel, self._session, self._lock)
         self._connection = MavlinkConnection(
-            url, "mavlink", self._on_data, self._on_tick, _TICK_S, _MAX_QUEUED, required=required
-        )
+            address, "mavlink", self._on_data, self._on_tick, _TICK_S if tunnel is None else _TUNNEL_TICK_S,
+            _MAX_QUEUED + (0 if tunnel is None else _TUNNEL_QUEUED), required=required,
+        )  # fmt: skip
         self._connection.start()
 
     def push(self, pose: PoseSample, now_ns: int) -> None:
@@ -51,15 +87,28 @@ class MavlinkPoseSink(Closing):
         for message in messages:
             self.refused += not self._connection.send(message)
 
-    def _on_data(self, data: bytes, datagram: bool) -> None:
+    def _on_data(self, data: bytes, datagram: bool, adopt: Adopt | None) -> None:
         with self._lock:
-            self._send(self._session.receive(data, self._clock.now_ns(), datagram=datagram))
+            self._send(self._session.receive(data, self._clock.now_ns(), datagram=datagram, adopt=adopt))
 
     def _on_tick(self) -> None:
+        now_ns = self._clock.now_ns()
         with self._lock:
-            now_ns = self._clock.now_ns()
             self._send(self._session.step(None, now_ns))
             self._send(self._session.watch(now_ns, self._connection.device_fault))
+            if self.tunnel is not None:
+                self._send(self.tunnel.poll(now_ns))
+            last = self._session.last_pose()
+        if self._options.memory is not None:
+            self._options.memory.save(last, now_ns)
+        if self._computer is not None and now_ns >= self._computer_due_ns:
+            self._computer_due_ns = now_ns + _COMPUTER_NS
+            c = self._computer.read()
+            status = ComputerStatus(
+                now_ns // 1000, c.uptime_ms, c.cpu_percent, c.ram_mib, c.ram_total_mib, c.temperature_c
+            )
+            with self._lock:
+                self._send([self._session.codec.encode(status)])
 
     def take_findings(self) -> list[Finding]:
         """What was found about the controller since the last call."""
@@ -86,6 +135,46 @@ class MavlinkPoseSink(Closing):
         with self._lock:
             return self._session.take_imu(t_ns)
 
+    def tunnel_link(self) -> ByteLink | None:
+        """The tunnel on the same connection; None if none was asked for."""
+        return self.tunnel
+
     def close(self) -> None:
         """Stop, within a second. May be called twice."""
         self._connection.close()
+
+
+class SharedTunnel:
+    """A ByteLink on the connection of a PoseSink, which closes it. lock: of the session."""
+
+    def __init__(self, config: TunnelConfig, session: ControllerSession, lock: threading.Lock) -> None:
+        self._lock = lock
+        self._end = TunnelEnd(config, session.codec)
+        self._inbox: deque[bytes] = deque(maxlen=_INBOX_PACKETS)
+        session.listen(Tunnel, self._take)
+        session.listen(RadioStatus, self._take)
+
+    def _take(self, message: Tunnel | RadioStatus, now_ns: int) -> tuple[()]:
+        packet = self._end.take(message)
+        if packet is not None:
+            self._inbox.append(packet)
+        return ()
+
+    def poll(self, now_ns: int) -> list[bytes]:
+        """The messages to send now; the lock is held."""
+        return self._end.poll(now_ns)
+
+    def send(self, packet: bytes) -> bool:
+        """Queue one packet; False if too much is queued already. Never blocks."""
+        with self._lock:
+            return self._end.send(packet)
+
+    def receive(self) -> list[bytes]:
+        """All packets that came in since the last call."""
+        with self._lock:
+            packets = list(self._inbox)
+            self._inbox.clear()
+        return packets
+
+    def close(self) -> None:
+        """Nothing to close: the PoseSink owns the connection."""

@@ -1,30 +1,37 @@
-"""The tunnel through a flight controller as a ByteLink, over UDP or a serial port."""
+"""The tunnel through a flight controller as a ByteLink, over UDP, TCP or a serial port."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
 
-from kiteline_hw.links.ends import LinkOptions, OneLinkHub
-from kiteline_hw.mavlink.connection import MavlinkConnection
+from kiteline_hw.links.ends import LinkOptions
+from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
+from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelCounters, TunnelEnd
-from kiteline_hw.ports import LinkHub
+from kiteline_hw.ports import ByteLink, LinkHub
 from kiteline_hw.system.closing import Closing
 
 _TICK_S = 0.01  # s between two checks of the send rate
 _INBOX_PACKETS = 1024
+_ALIVE_NS = 10_000_000_000  # ns after the last message in which an agent counts as reachable
 
 
 class MavlinkTunnelLink(Closing):
-    """A ByteLink. url: udp:HOST:PORT, udpin:HOST:PORT or serial:DEVICE:BAUD. Raises LinkError."""
+    """A ByteLink. url: see MAVLINK_FORMS; its system id, if it has one, is ours. Raises LinkError."""
 
     def __init__(self, url: str, config: TunnelConfig, *, required: bool = True) -> None:
+        address = parse_mavlink_url(url)
+        if address.system is not None:
+            config = replace(config, system=address.system, learns_system=False)
         self._lock = threading.Lock()
         self._end = TunnelEnd(config)
         self._inbox: deque[bytes] = deque(maxlen=_INBOX_PACKETS)
         self._connection = MavlinkConnection(
-            url, "mavlink-tunnel", self._on_data, self._on_tick, _TICK_S, 0, required=required
+            address, "mavlink-tunnel", self._on_data, self._on_tick, _TICK_S, 0, required=required
         )
         self._connection.start()
 
@@ -38,6 +45,16 @@ class MavlinkTunnelLink(Closing):
         """The send rate that the radio allows at present, MAVLink's framing included."""
         return self._end.rate_bytes_s
 
+    @property
+    def heard(self) -> bool:
+        """True once anything came from the other end."""
+        return self._end.heard
+
+    @property
+    def alive(self) -> bool:
+        """True if anything came from the other end lately."""
+        return self._end.heard_within(_ALIVE_NS, time.monotonic_ns())
+
     def send(self, packet: bytes) -> bool:
         """Queue one packet; False if too much is queued already. Never blocks."""
         with self._lock:
@@ -50,9 +67,13 @@ class MavlinkTunnelLink(Closing):
             self._inbox.clear()
         return packets
 
-    def _on_data(self, data: bytes, datagram: bool) -> None:
+    def _on_data(self, data: bytes, datagram: bool, adopt: Adopt | None) -> None:
         with self._lock:
-            self._inbox.extend(self._end.receive(data, datagram=datagram))
+            messages = self._end.codec.receive(data, datagram=datagram)
+            if adopt is not None and messages:
+                adopt()
+            taken = [self._end.take(message) for message in messages]
+            self._inbox.extend(packet for packet in taken if packet is not None)
 
     def _on_tick(self) -> None:
         with self._lock:
@@ -65,6 +86,25 @@ class MavlinkTunnelLink(Closing):
         self._connection.close()
 
 
+class TunnelHub:
+    """A LinkHub with one agent at the other end, which is there once anything of it came."""
+
+    def __init__(self, link: MavlinkTunnelLink, agent: int) -> None:
+        self._link, self._agent = link, agent
+
+    def links(self) -> Mapping[int, ByteLink]:
+        """The link by agent number; none before the agent was heard."""
+        return {self._agent: self._link} if self._link.heard else {}
+
+    def alive(self) -> frozenset[int]:
+        """The agent, if anything of it came in the last ten seconds."""
+        return frozenset((self._agent,) if self._link.alive else ())
+
+    def close(self) -> None:
+        """Close the link."""
+        self._link.close()
+
+
 def open_agent_end(address: str, options: LinkOptions) -> MavlinkTunnelLink:
     """Open the agent's end. Raises LinkError."""
     return MavlinkTunnelLink(address, AGENT_END, required=options.required)
@@ -72,4 +112,4 @@ def open_agent_end(address: str, options: LinkOptions) -> MavlinkTunnelLink:
 
 def open_base_end(address: str, options: LinkOptions) -> LinkHub:
     """Open the base's end, with one agent at the other. Raises LinkError."""
-    return OneLinkHub(MavlinkTunnelLink(address, BASE_END, required=options.required), options.agent)
+    return TunnelHub(MavlinkTunnelLink(address, BASE_END, required=options.required), options.agent)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
+from kiteline_core.geometry.end_rates import end_rates
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_odometry import (
     ControllerOdometry,
@@ -21,7 +22,7 @@ from kiteline_hw.mavlink.controller_odometry import (
     parse_odometry_option,
 )
 from kiteline_hw.mavlink.controller_session import ControllerSession
-from kiteline_hw.mavlink.coordinate_frames import body_rates, local_pose, mounting
+from kiteline_hw.mavlink.coordinate_frames import controller_rates, local_pose, mounting
 from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, Odometry, WheelDistance
 from tests.hw.mavlink.flight_controller import FlightController
 
@@ -186,7 +187,7 @@ def test_a_reboot_of_the_controller_resets_the_clock() -> None:
 
 def test_odometry_through_the_session() -> None:
     wanted = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu"))
-    stream = ControllerSession(mounting("flu"), odometry=wanted)
+    stream = ControllerSession(mounting("flu"), odometry=wanted, system=1)
     stream.receive(CODEC.encode(odometry((1.0, 2.0, 3.0))), 9 * S)
     assert stream.take_odometry(8 * S) is None  # later than that instant
     batch = stream.take_odometry(9 * S)
@@ -236,7 +237,7 @@ def test_our_odometry_read_back_is_our_motion(numbers: np.ndarray, axes: str) ->
     T_b_f = mounting(axes, (0.3, -0.2, 0.1))
     before, twist, dt = se3.exp(numbers[:6]), numbers[6:], 1e-4
     now = before @ se3.exp(twist * dt)
-    velocity, rate = body_rates(before, now, dt, T_b_f)
+    velocity, rate = controller_rates(now, *end_rates((0, 100_000), (before, now), 100_000), T_b_f)
     _, q = local_pose(now, T_b_f)
     message = odometry(tuple(velocity), tuple(rate), q=tuple(q))  # type: ignore[arg-type]
     batch = told(ControllerOdometry(OdometrySource.CONTROLLER, T_b_f), message)

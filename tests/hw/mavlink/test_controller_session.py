@@ -183,7 +183,7 @@ NOISE = st.one_of(st.binary(max_size=80), st.sampled_from([b"\xfd", b"\xfe\x09",
 @settings(max_examples=150, deadline=None)
 @given(st.lists(NOISE, max_size=8))
 def test_messages_after_any_bytes_are_parsed(pieces: list[bytes]) -> None:
-    stream = ControllerSession(mounting("flu"))
+    stream = ControllerSession(mounting("flu"), system=1)
     controller = MavlinkCodec(1, 1)
     for piece in pieces:
         stream.receive(piece, 0)
@@ -245,3 +245,16 @@ def test_a_pose_with_velocity_and_rate_is_sent_at_once_and_as_of_its_time() -> N
     speed = np.linalg.inv(pose.T_o_b @ T_b_f)[:3, :3] @ ((moved - pose.T_o_b) @ T_b_f)[:3, 3] / step_s
     assert message.velocity_m_s == pytest.approx(speed.tolist(), abs=1e-4)
     assert message.rate_rad_s == pytest.approx([0.0, 0.0, -0.4])
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 20.0, 30.0, 60.0])
+def test_velocity_without_a_sensor_is_of_the_instant_of_the_pose(rate_hz: float) -> None:
+    """Starting with 3 m/s^2 forward, half a frame late would be 7.5 cm/s too slow at 20 Hz."""
+    stream = ControllerSession(mounting("flu"))
+    for i in range(round(rate_hz)):
+        t_s = i / rate_hz
+        T_o_b = np.eye(4)
+        T_o_b[0, 3] = 1.5 * t_s**2
+        message = stream._pose_message(PoseSample(round(t_s * S), T_o_b, True, 90), round(t_s * S))
+        if message is not None and t_s > 0.25:
+            assert message.velocity_m_s[0] == pytest.approx(3.0 * t_s, abs=1e-3)

@@ -7,7 +7,14 @@ from math import cos, radians, sin
 import numpy as np
 import pytest
 
-from kiteline_hw.mavlink.coordinate_frames import body_rates, local_covariance, local_pose, mounting, upper_triangle
+from kiteline_core.geometry.end_rates import end_rates
+from kiteline_hw.mavlink.coordinate_frames import (
+    controller_rates,
+    local_covariance,
+    local_pose,
+    mounting,
+    upper_triangle,
+)
 
 FLU = mounting("flu")
 
@@ -78,7 +85,8 @@ def test_offset_of_the_flight_controller() -> None:
 def test_velocity_by_hand(
     rotation: list[list[float]], moved: tuple[float, float, float], velocity: tuple[float, float, float]
 ) -> None:
-    v, w = body_rates(pose(rotation, (0.0, 0.0, 0.0)), pose(rotation, moved), 0.1, FLU)
+    before, now = pose(rotation, (0.0, 0.0, 0.0)), pose(rotation, moved)
+    v, w = controller_rates(now, *end_rates((0, 100_000_000), (before, now), 100_000_000), FLU)
     np.testing.assert_allclose(v, velocity, atol=1e-12)
     np.testing.assert_allclose(w, 0.0, atol=1e-12)
 
@@ -92,7 +100,8 @@ def test_velocity_by_hand(
     ],
 )
 def test_angular_rate_by_hand(rotation: list[list[float]], rate: tuple[float, float, float]) -> None:
-    _, w = body_rates(pose(LEVEL, (0.0, 0.0, 0.0)), pose(rotation, (0.0, 0.0, 0.0)), 1.0, FLU)
+    before, now = pose(LEVEL, (0.0, 0.0, 0.0)), pose(rotation, (0.0, 0.0, 0.0))
+    _, w = controller_rates(now, *end_rates((0, 10**9), (before, now), 10**9), FLU)
     np.testing.assert_allclose(w, rate, atol=1e-8)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from kiteline_core.frame import OdometryBatch
-from kiteline_hw.mavlink.connection import MavlinkUrl, parse_mavlink_url
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry, OdometrySource
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Odometry
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
+from kiteline_hw.mavlink.transport.url import MavlinkUrl, parse_mavlink_url
 from kiteline_hw.ports import LinkError, PoseSample
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock
@@ -152,7 +152,17 @@ def test_urls() -> None:
     assert parse_mavlink_url("udpin:0.0.0.0:14540") == MavlinkUrl("udpin", "0.0.0.0", 14540)
     assert parse_mavlink_url("udpin://0.0.0.0:14540") == MavlinkUrl("udpin", "0.0.0.0", 14540)
     assert parse_mavlink_url("serial:/dev/ttyAMA0:921600") == MavlinkUrl("serial", "/dev/ttyAMA0", 921600)
-    for bad in ("", "udp", "udp:14550", "udp:host:", "udp:host:70000", "tcp:host:5760", "/dev/ttyAMA0:57600"):
+    for bad in (
+        "",
+        "udp",
+        "udp:14550",
+        "udp:host:",
+        "udp:host:70000",
+        "tcp:5760",
+        "udp:h:1?x=1",
+        "udp:h:1?system=0",
+        "/dev/ttyAMA0:57600",
+    ):
         with pytest.raises(LinkError, match="expected udp:HOST:PORT"):
             parse_mavlink_url(bad)
     with pytest.raises(LinkError, match="expected DEVICE:BAUD"):

@@ -1,0 +1,57 @@
+"""The last pose sent, in a file: an agent that is restarted in flight goes on from it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+
+from kiteline_hw.mavlink.start_frame import LastPose
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_OLDEST_NS = 60_000_000_000  # ns after which a flight counts as over
+_EVERY_NS = 500_000_000  # ns between two writes
+
+
+def boot_id() -> str:
+    """Identity of the computer's start: monotonic clocks of different ones do not compare."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+class PoseMemory:
+    """Keeps the last pose in a file. Files that cannot be written or read count as none."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._boot = boot_id()
+        self._written_ns: int | None = None
+
+    def load(self, now_ns: int) -> LastPose | None:
+        """The last pose, if it was sent less than a minute ago."""
+        try:
+            stored = json.loads(self._path.read_text(encoding="utf-8"))
+            x, y, z = (float(v) for v in stored["position_m"])
+            age_ns = now_ns - int(stored["t_ns"])
+            last = LastPose((x, y, z), float(stored["heading_rad"]), bool(stored["armed"]))
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return last if stored["boot"] == self._boot and 0 <= age_ns < _OLDEST_NS else None
+
+    def save(self, last: LastPose | None, now_ns: int) -> None:
+        """Write the last pose, at most twice a second."""
+        if last is None or (self._written_ns is not None and now_ns - self._written_ns < _EVERY_NS):
+            return
+        self._written_ns = now_ns
+        content = {
+            "boot": self._boot, "t_ns": now_ns, "position_m": last.position_m, "heading_rad": last.heading_rad,
+            "armed": last.armed,
+        }  # fmt: skip
+        part = self._path.with_name(f".{self._path.name}.part")
+        with contextlib.suppress(OSError):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_text(json.dumps(content), encoding="utf-8")
+            os.replace(part, self._path)
