@@ -118,8 +118,8 @@ def shared_tunnel(url: str, link: str) -> TunnelConfig | None:
     ours = parse_mavlink_url(url)
     if scheme == "serial" and ours.kind == "serial" and address.rpartition(":")[0] == ours.address:
         raise LinkError(
-            f"--link {link} and --mavlink {url} name one port, but packets for a base go through a flight controller as "
-            f"a tunnel: expected --link mavlink:{url}"
+            f"--link {link} and --mavlink {url} name one port. Packets for a base go through a flight controller as a "
+            f"tunnel: expected --link mavlink:{url}"
         )
     if scheme != "mavlink":
         return None

@@ -343,12 +343,13 @@ class ComputerStatus(MavlinkMessage):
         total = no_word if self.ram_total_mib is None else self.ram_total_mib
         degrees = 127 if self.temperature_c is None else max(-126, min(126, self.temperature_c))
         return (
-            self.t_us, self.uptime_ms % 2**32, 0, cores, combined, [unknown] * 4, [unknown] * 10, 127, [degrees, *[127] * 7],
-            [2**15 - 1] * 4, ram, total, no_disk, no_disk, no_disk, *[[2**32 - 1] * 6] * 5,
+            self.t_us, self.uptime_ms % 2**32, 0, cores, combined, [unknown] * 4, [unknown] * 10, 127,
+            [degrees, *[127] * 7], [2**15 - 1] * 4, ram, total, no_disk, no_disk, no_disk, *[[2**32 - 1] * 6] * 5,
         )  # fmt: skip
 
 
 # The messages that are parsed; others are counted as unknown.
 MESSAGES: tuple[type[MavlinkMessage], ...] = (
-    Heartbeat, TimeSync, VehicleImu, LocalPosition, Attitude, WheelDistance, Odometry, Tunnel, RadioStatus, GlobalOrigin,
+    Heartbeat, TimeSync, VehicleImu, LocalPosition, Attitude, WheelDistance, Odometry, Tunnel, RadioStatus,
+    GlobalOrigin,
 )  # fmt: skip
