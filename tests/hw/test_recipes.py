@@ -152,6 +152,7 @@ def test_every_message_of_the_table_can_be_built_and_parsed() -> None:
         ),
         messages.Tunnel(255, 197, 40000, b"packet", 1, 1),
         messages.RadioStatus(40, 1, 2),
+        messages.GlobalOrigin(473_566_100, 85_190_300, 408_000),
     ]
     assert {type(example) for example in examples} == set(messages.MESSAGES)
     for example in examples:

@@ -298,7 +298,7 @@ class VisionSpeed(MavlinkMessage):
 
 @dataclass(frozen=True, slots=True)
 class GlobalOrigin(MavlinkMessage):
-    """Latitude and longitude in 1e-7 degrees, altitude in mm, of the local frame's origin. Parsed: the controller's."""
+    """Latitude and longitude in 1e-7 degrees, altitude in mm, of the local frame's origin: the controller's."""
 
     NAMES = ("GPS_GLOBAL_ORIGIN",)
     latitude: int
@@ -308,6 +308,9 @@ class GlobalOrigin(MavlinkMessage):
     @classmethod
     def parse(cls, m: Any) -> Self:
         return cls(m.latitude, m.longitude, m.altitude)
+
+    def values(self) -> Sequence[Any]:
+        return self.latitude, self.longitude, self.altitude_mm
 
 
 @dataclass(frozen=True, slots=True)

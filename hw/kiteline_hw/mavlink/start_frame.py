@@ -118,7 +118,8 @@ class StartFrame:
         )
 
     def _choose(self, pose: PoseSample, now_ns: int) -> F64 | None:
-        c, last, waited_ns = self.config, self._last, now_ns - (self._first_ns or now_ns)
+        c, last = self.config, self._last
+        waited_ns = 0 if self._first_ns is None else now_ns - self._first_ns
         armed = self._autopilot is not None and self._autopilot.armed
         if self._autopilot is None and not c.north and waited_ns < c.greeting_ns:
             return None
