@@ -153,7 +153,7 @@ def telemetry_p95_ms(rate_bytes_s: int, seconds: int = 120) -> tuple[float, floa
     draw = random.Random(2)
     controller = RoutingController(None, TelemetryConfig(bytes_s=500))
     a = TunnelEnd(TunnelConfig(rate_bytes_s=max(1, rate_bytes_s)))
-    b = TunnelEnd(TunnelConfig(system=255, peer_system=1, rate_bytes_s=max(1, rate_bytes_s // 2)))
+    b = TunnelEnd(TunnelConfig(system=255, peer_system=1, is_base=True, rate_bytes_s=max(1, rate_bytes_s // 2)))
     to_a: list[bytes] = []
     to_b: list[bytes] = []
     arrived = 0

@@ -1,4 +1,4 @@
-"""The protocol with a flight controller: sends HEARTBEAT, poses, TIMESYNC answers, and what its watch finds. Pure; time is handed in.
+"""The protocol with a flight controller: sends HEARTBEAT, poses, TIMESYNC answers and findings. Pure, without a clock.
 
 Poses are sent in the continuous odometry frame, turned once (`start_frame`). Map corrections are not sent, because the
 controller would see jumps. One system is served: the one told, else that of the first autopilot heard.
@@ -156,7 +156,12 @@ class ControllerSession:
         self._next_watch_ns = now_ns + self.config.watch_ns
         codec = self.codec
         link = LinkState(
-            self._received, self._messages, codec.signed, codec.refused, has_key=codec.has_key, device_fault=device_fault
+            self._received,
+            self._messages,
+            codec.signed,
+            codec.refused,
+            has_key=codec.has_key,
+            device_fault=device_fault,
         )
         return [codec.encode(message) for message in self._watch.tick(now_ns, link)]
 
@@ -269,13 +274,16 @@ class ControllerSession:
         self._received += bool(data)
         for message in messages:
             self._messages += 1
-            if self._watch is not None:
+            if self._watch is not None and not self._is_other_vehicle(message):
                 self._watch.receive(message, now_ns)
             for handler in self._handlers.get(type(message), ()):
                 out += [self.codec.encode(answer) for answer in handler(message, now_ns)]
             if self._odometry is not None:
                 self._odometry.receive(message, now_ns)
         return out
+
+    def _is_other_vehicle(self, m: MavlinkMessage) -> bool:
+        return isinstance(m, Heartbeat) and m.is_autopilot and not self._is_vehicle(m)
 
     def _is_vehicle(self, m: Heartbeat) -> bool:
         return m.is_autopilot and self.codec.only_system in (0, m.system)
@@ -297,7 +305,7 @@ class ControllerSession:
             out += self._odometry.requests(m, now_ns)
         if self._imu is not None:
             out += self._imu.requests(m, now_ns)
-        if self._start is not None:
+        if self._start is not None and not (self._start.known and self._odometry is not None):
             out += self._start.requests(m, now_ns)
         due_ns, origin = self._origin_due_ns, self.config.origin
         if origin is not None and due_ns is not None and now_ns >= due_ns and not m.armed:

@@ -155,7 +155,7 @@ class SharedTunnel:
         session.listen(RadioStatus, self._take)
 
     def _take(self, message: Tunnel | RadioStatus, now_ns: int) -> tuple[()]:
-        packet = self._end.take(message)
+        packet = self._end.take(message, now_ns)
         if packet is not None:
             self._inbox.append(packet)
         return ()

@@ -41,7 +41,7 @@ class StartConfig:
     patience_ns: int = 5_000_000_000  # ns to wait for the controller's attitude where the last pose would do too
     fresh_ns: int = 500_000_000  # ns; an older attitude or position does not count
     interval_us: int = 50_000  # us between two messages while one is waited for
-    idle_interval_us: int = 250_000  # us afterwards
+    idle_interval_us: int = 100_000  # us between two attitudes afterwards
     request_ns: int = 1_000_000_000  # ns between two requests
 
 
@@ -78,7 +78,10 @@ class StartFrame:
             if self._slowed or self._requested_ns is None:
                 return ()
             self._slowed = True
-            return self._intervals(m, c.idle_interval_us)
+            return [
+                MessageInterval(m.system, m.component, _ATTITUDE, c.idle_interval_us),
+                MessageInterval(m.system, m.component, _POSITION, -1),
+            ]
         if not (c.north or self._last is not None or m.armed):
             return ()
         if self._requested_ns is not None and now_ns - self._requested_ns < c.request_ns:

@@ -162,9 +162,10 @@ class TunnelEnd:
         taken = [self.take(message) for message in self.codec.receive(data, datagram=datagram)]
         return [packet for packet in taken if packet is not None]
 
-    def take(self, message: MavlinkMessage) -> bytes | None:
-        """Process a message of any kind; the packet that it completes."""
+    def take(self, message: MavlinkMessage, now_ns: int | None = None) -> bytes | None:
+        """Process a message of any kind; the packet that it completes. now_ns: None: as at the last poll."""
         packet = None
+        self._now_ns = self._now_ns if now_ns is None else now_ns
         if isinstance(message, RadioStatus):
             self._radio_ns = self._now_ns
             self._adapt_rate(message.txbuf)

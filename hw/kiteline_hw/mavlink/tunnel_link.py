@@ -72,7 +72,8 @@ class MavlinkTunnelLink(Closing):
             messages = self._end.codec.receive(data, datagram=datagram)
             if adopt is not None and messages:
                 adopt()
-            taken = [self._end.take(message) for message in messages]
+            now_ns = time.monotonic_ns()
+            taken = [self._end.take(message, now_ns) for message in messages]
             self._inbox.extend(packet for packet in taken if packet is not None)
 
     def _on_tick(self) -> None:

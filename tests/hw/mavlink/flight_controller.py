@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from kiteline_hw.mavlink.codec import MavlinkCodec
-from kiteline_hw.mavlink.messages import Heartbeat, Odometry, TimeSync, VehicleImu
+from kiteline_hw.mavlink.messages import Heartbeat, MavlinkMessage, Odometry, TimeSync, VehicleImu
 from kiteline_hw.system.closing import Closing
 
 Vector = tuple[float, float, float]
@@ -73,8 +73,15 @@ class FlightController:
 
     def receive(self, data: bytes, now_ns: int) -> list[bytes]:
         """Process a datagram; returns the answers."""
+        return self._process(self.codec.receive(data, datagram=True), now_ns)
+
+    def receive_stream(self, data: bytes, now_ns: int) -> list[bytes]:
+        """Process bytes of a stream; returns the answers."""
+        return self._process(self.codec.receive(data), now_ns)
+
+    def _process(self, messages: list[MavlinkMessage], now_ns: int) -> list[bytes]:
         out = []
-        for message in self.codec.receive(data, datagram=True):
+        for message in messages:
             if isinstance(message, Heartbeat):
                 self.heartbeats[message.system, message.component] += 1
             elif isinstance(message, TimeSync):
