@@ -27,6 +27,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
     sensitivity,
 )
 from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
+from kiteline_agent.covariance.odometry_drift import covariance_by_map
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -386,21 +387,6 @@ def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
             z = ((limit * limit / mean) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * k)) / math.sqrt(2.0 / (9.0 * k))
             both *= 0.5 * math.erfc(-z / math.sqrt(2.0))
     return both
-
-
-def covariance_by_map(cov_m: F64, T_o_m: F64, T_m_b: F64) -> F64:
-    """Covariance (6,6) of T_o_b relative to the start of the flight, by the first submap, whose frame was o there.
-
-    cov_m: of T_m_b (4,4). The map measures by how much o is off by now; that counts as a standard deviation.
-    """
-    turn = np.eye(6)
-    turn[:3, :3] = T_o_m[:3, :3]
-    off_m = (T_o_m @ T_m_b)[:3, 3] - T_m_b[:3, 3]
-    off_rad = T_m_b[:3, :3].T @ se3.so3_log(T_o_m[:3, :3])
-    cov = turn @ cov_m @ turn.T
-    cov[:3, :3] += np.outer(off_m, off_m)
-    cov[3:, 3:] += np.outer(off_rad, off_rad)
-    return np.asarray(cov)
 
 
 def adjoint(T: F64) -> F64:

@@ -6,8 +6,9 @@ import threading
 import time
 
 from kiteline_hw.mavlink.codec import MavlinkCodec
-from kiteline_hw.mavlink.connection import MavlinkConnection
-from kiteline_hw.mavlink.messages import MavlinkMessage
+from kiteline_hw.mavlink.messages import Heartbeat, MavlinkMessage
+from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
+from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.watch.findings import Finding
 from kiteline_hw.mavlink.watch.presence import LinkState
 from kiteline_hw.mavlink.watch.survey import ControllerSurvey, SurveyConfig
@@ -27,17 +28,24 @@ class _Surveyor:
         self._lock = threading.Lock()
         self._received = self._messages = 0
         self.done = threading.Event()
-        self.connection = MavlinkConnection(url, "survey", self._on_data, self._on_tick, _TICK_S, 0, required=False)
+        self.connection = MavlinkConnection(
+            parse_mavlink_url(url), "survey", self._on_data, self._on_tick, _TICK_S, 0, required=False
+        )
 
     def _send(self, messages: list[MavlinkMessage]) -> None:
         for message in messages:
             self.connection.send(self._codec.encode(message))
 
-    def _on_data(self, data: bytes, datagram: bool) -> None:
+    def _on_data(self, data: bytes, datagram: bool, adopt: Adopt | None) -> None:
         with self._lock:
             now_ns = self._clock.now_ns()
+            messages = self._codec.receive(data, datagram=datagram)
+            if adopt is not None:
+                if not any(isinstance(m, Heartbeat) and m.is_autopilot for m in messages):
+                    return
+                adopt()
             self._received += bool(data)
-            for message in self._codec.receive(data, datagram=datagram):
+            for message in messages:
                 self._messages += 1
                 self._send(self.survey.receive(message, now_ns))
 
