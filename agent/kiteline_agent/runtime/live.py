@@ -38,8 +38,9 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
     with ExitStack() as stack:
         stack.callback(source.close)
         source = with_controller_imu(options, source)
-        with starting():
-            kernel_cache.fill("kiteline_agent.runtime.warm", stop)
+        if not kernel_cache.filled():
+            with starting():
+                kernel_cache.fill("kiteline_agent.runtime.warm", stop)
         if stop:
             return
         runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
