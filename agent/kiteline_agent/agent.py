@@ -155,9 +155,8 @@ class Agent:
         turn[:3, :3] = R_o_m
         cov_o = last.cov_o + turn @ growth @ turn.T
         quality = min(last.quality, self.odometry_quality(last), camera.covariance.quality(cov_o, None))
-        velocity, rate = R_o_m @ moved.velocity, moved.rate
-        if moved.source is MotionSource.VELOCITY:
-            velocity, rate = self._recent.rates(t_ns) or (velocity, rate)
+        by_poses = self._recent.rates(t_ns) if moved.source is MotionSource.VELOCITY else None
+        velocity, rate = by_poses or (R_o_m @ moved.velocity, moved.rate)
         return PredictedPose(
             t_ns, moved.source.value, last.tracked, camera.pose.T_o_m @ moved.T_m_b, velocity, rate, quality,
             cov_o, camera.gravity.R_l_o,
@@ -229,10 +228,7 @@ class Agent:
         self._last_t_ns = frame.t_ns
         self._last_track = None if self._was_lost else track
         self._last_estimate = self._estimate(ctx, outcome)
-        if self._was_lost:
-            self._recent.clear()
-        else:
-            self._recent.add(frame.t_ns, self._last_estimate.T_o_b)
+        self._recent.add(frame.t_ns, self._last_estimate.T_o_b, measured=not self._was_lost)
         return self._last_estimate, outcome.events
 
     # stages of a frame
@@ -365,7 +361,7 @@ class Agent:
         """The estimate of a frame; shares the live pose with the base."""
         camera, tracked = self._camera, outcome.tracked
         T_m_b, T_o_m = camera.T_m_b, camera.pose.T_o_m
-        in_first = self._has_depth and camera.submaps.active == camera.submaps.first
+        in_first = self._has_depth and camera.submaps.in_first
         cov_m, cov_o = camera.covariance.of_poses(camera.pose, T_m_b, in_first=in_first)
         quality = camera.covariance.quality(
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
@@ -401,4 +397,4 @@ class Agent:
         Always for monocular maps, each of which has a unit of its own.
         """
         submaps = self._camera.submaps
-        return not self._has_depth or submaps.active == submaps.first or self._corrections.is_recognised(submaps.active)
+        return not self._has_depth or submaps.in_first or self._corrections.is_recognised(submaps.active)

@@ -34,6 +34,11 @@ class Submaps:
         """The submap in which the flight begins."""
         return submap_id(self._identity.agent, self._identity.boot, 0)
 
+    @property
+    def in_first(self) -> bool:
+        """True if the active submap is the one in which the flight began."""
+        return self.active == self.first
+
     def open_next(self) -> SubmapId:
         """Open another submap, and make it the active one."""
         self._number = self.opened

@@ -21,15 +21,14 @@ class RecentMotion:
     def __init__(self) -> None:
         self._poses: deque[tuple[int, F64]] = deque()
 
-    def add(self, t_ns: int, T_o_b: F64) -> None:
-        """Add a measured pose (4,4)."""
+    def add(self, t_ns: int, T_o_b: F64, *, measured: bool) -> None:
+        """Add the pose (4,4) of a frame. measured: by images; else the earlier ones are forgotten with it."""
+        if not measured:
+            self._poses.clear()
+            return
         while self._poses and t_ns - self._poses[0][0] > _WINDOW_NS:
             self._poses.popleft()
         self._poses.append((t_ns, T_o_b))
-
-    def clear(self) -> None:
-        """Forget the poses: the next ones are not measured, or continue elsewhere."""
-        self._poses.clear()
 
     def rates(self, t_ns: int) -> tuple[F64, F64] | None:
         """Velocity (3,) m/s in o and rate (3,) rad/s in b at t_ns; None with fewer than three poses."""

@@ -154,6 +154,8 @@ class ControllerSession:
         if self._watch is None or (self._next_watch_ns is not None and now_ns < self._next_watch_ns):
             return []
         self._next_watch_ns = now_ns + self.config.watch_ns
+        if self._start is not None:
+            self._watch.heading(held=self._start.holds(now_ns))
         codec = self.codec
         link = LinkState(
             self._received,

@@ -39,6 +39,7 @@ class StartConfig:
     north: bool = False  # heading as the controller has it
     greeting_ns: int = 1_500_000_000  # ns to wait for a heartbeat: an armed controller is in flight
     patience_ns: int = 5_000_000_000  # ns to wait for the controller's attitude where the last pose would do too
+    said_ns: int = 3_000_000_000  # ns after which it is said that poses are held back
     fresh_ns: int = 500_000_000  # ns; an older attitude or position does not count
     interval_us: int = 50_000  # us between two messages while one is waited for
     idle_interval_us: int = 100_000  # us between two attitudes afterwards
@@ -65,10 +66,9 @@ class StartFrame:
         """True once the frame is chosen."""
         return self._T_s_o is not None
 
-    @property
-    def holds(self) -> bool:
-        """True while poses are held back because the heading is not known."""
-        return self._first_ns is not None and self._T_s_o is None
+    def holds(self, now_ns: int) -> bool:
+        """True if poses have been held back for seconds because the heading is not known."""
+        return self._T_s_o is None and self._first_ns is not None and now_ns - self._first_ns > self.config.said_ns
 
     def requests(self, m: Heartbeat, now_ns: int) -> Sequence[MessageInterval]:
         """The controller is there: the requests for what it knows of its own pose."""

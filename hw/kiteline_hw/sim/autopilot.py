@@ -7,6 +7,7 @@ mavlink_parameters and EKF2.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -16,6 +17,7 @@ from kiteline_hw.mavlink.messages import (
     HIGHRES_IMU,
     Attitude,
     Heartbeat,
+    LocalPosition,
     MavlinkMessage,
     Odometry,
     TimeSync,
@@ -52,6 +54,8 @@ _HEARTBEAT_NS = 1_000_000_000
 _FUSED_AFTER_NS = 1_000_000_000  # ns of poses until they are fused
 _STALE_NS = 500_000_000  # ns without poses until the estimator counts as dead reckoning
 _AIDING_TIMEOUT_NS = {"ardupilot": 15_000_000_000, "px4": 5_000_000_000}  # ns without them until it has no position
+_SLEW_RAD_S = math.radians(15.0)  # of EKF3's yaw towards that of poses, as seen in the loop
+_LOCAL_POSITION = 32  # message id
 _TIMESYNC_NS = {"ardupilot": 10_000_000_000, "px4": 100_000_000}
 
 
@@ -84,6 +88,8 @@ class ModelledAutopilot:
     armed: bool = False
     angles_rad: Vector = (0.0, 0.0, 0.0)
     rate_rad_s: Vector = (0.0, 0.0, 0.0)
+    position_m: Vector = (0.0, 0.0, 0.0)
+    turns_with_poses: bool = False  # its yaw and position follow the poses, as EKF3's with EK3_SRC1_YAW 6
     texts: list[StatusText] = field(default_factory=list)  # received
     codec: MavlinkCodec = field(init=False)
     _values: dict[str, float] = field(init=False)
@@ -140,7 +146,19 @@ class ModelledAutopilot:
             return
         if self._last_pose_ns is None or now_ns - self._last_pose_ns > _STALE_NS:
             self._first_pose_ns = now_ns
+        elif self.turns_with_poses:
+            self._turn(m, (now_ns - self._last_pose_ns) * 1e-9)
         self._last_pose_ns = now_ns
+
+    def _turn(self, m: Odometry, dt_s: float) -> None:
+        """Pull the yaw to that of a pose; take over its position."""
+        w, x, y, z = m.q
+        roll, pitch, yaw = self.angles_rad
+        off = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) - yaw
+        off = math.atan2(math.sin(off), math.cos(off))
+        yaw += max(-_SLEW_RAD_S * dt_s, min(_SLEW_RAD_S * dt_s, off))
+        self.angles_rad = roll, pitch, yaw
+        self.position_m = m.position_m[0], m.position_m[1], m.position_m[2]
 
     def _parameter(self, name: str) -> ParamValue:
         value = self._values[name]
@@ -182,6 +200,8 @@ class ModelledAutopilot:
         flags = _HEALTHY_FLAGS if self.has_position(now_ns) else _BLIND_FLAGS
         if message == wire.ATTITUDE:
             return [Attitude(boot_ns // 1_000_000, self.angles_rad, self.rate_rad_s)]
+        if message == _LOCAL_POSITION:
+            return [LocalPosition(boot_ns // 1_000_000, self.position_m, (0.0, 0.0, 0.0))]
         if message == HIGHRES_IMU:
             return [VehicleImu(boot_ns // 1_000, (0.0, 0.0, -9.81), self.rate_rad_s)]
         if message == wire.EKF_STATUS_REPORT and self.kind == "ardupilot":

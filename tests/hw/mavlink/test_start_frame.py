@@ -17,7 +17,9 @@ from kiteline_hw.mavlink.coordinate_frames import euler_angles, mounting
 from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, MavlinkMessage, Odometry
 from kiteline_hw.mavlink.pose_memory import PoseMemory
 from kiteline_hw.mavlink.start_frame import LastPose, StartConfig, StartFrame, heading_of
+from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
 from kiteline_hw.ports import PoseSample
+from kiteline_hw.sim.autopilot import ModelledAutopilot
 
 S = 1_000_000_000
 LETTERS = ("flu", "frd", "rdf", "urf", "bru", "lbu")
@@ -79,9 +81,9 @@ def test_a_flight_begins_with_heading_zero_however_the_body_is_mounted(axes: str
 def test_without_a_controller_the_first_pose_waits_for_a_heartbeat_but_not_for_long() -> None:
     flight = Flight()
     assert flight.pose(0) is None and flight.pose(S) is None
-    assert flight.session.counters.held == 2 and flight.start.holds
+    assert flight.session.counters.held == 2
     assert yaw_of(flight.pose(2 * S)) == pytest.approx(0.0)
-    assert not flight.start.holds
+    assert flight.start.known
 
 
 @pytest.mark.parametrize("axes", LETTERS)
@@ -120,6 +122,23 @@ def test_a_silent_controller_is_replaced_by_the_last_pose() -> None:
     np.testing.assert_allclose(m.position_m, [4.0, -3.0, -2.0], atol=1e-9)
 
 
+def test_held_poses_are_said() -> None:
+    T_b_f, model = mounting("flu"), MavlinkCodec(1, 1)
+    watch = ControllerWatch(T_b_f)
+    session = ControllerSession(T_b_f, start=StartFrame(T_b_f), watch=watch)
+    for i in range(60):
+        now_ns = i * S // 10
+        session.receive(model.encode(Heartbeat(2, 3, armed=True)), now_ns)
+        session.step(PoseSample(now_ns, np.eye(4), True, 90), now_ns)
+        session.watch(now_ns)
+    session.receive(model.encode(Attitude(0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))), 6 * S)
+    for i in range(60, 70):
+        session.step(PoseSample(i * S // 10, np.eye(4), True, 90), i * S // 10)
+        session.watch(i * S // 10)
+    found = [f.text for f in watch.take() if f.topic == "heading"]
+    assert len(found) == 2 and "held back" in found[0] and "known" in found[1]
+
+
 def test_an_old_attitude_does_not_count() -> None:
     flight = Flight(last=LastPose((0.0, 0.0, 0.0), 0.5, armed=True))
     flight.hear(Heartbeat(2, 3, armed=True), 0)
@@ -139,29 +158,41 @@ def test_north_is_the_controllers() -> None:
     np.testing.assert_allclose(m.position_m, 0.0, atol=1e-9)  # a flight begins at the origin
 
 
-def test_a_restart_disturbs_a_controller_that_takes_its_yaw_from_poses_by_less_than_three_degrees() -> None:
-    """A filter whose yaw is pulled to the poses' at 15 degrees/s, as EKF3 does, and holds it while none come."""
-    yaw, truth, worst = radians(70.0), radians(70.0), 0.0
-    last: LastPose | None = None
+def restarted(*, goes_on: bool) -> tuple[float, float]:
+    """Degrees by which the yaw of a hovering controller is disturbed when the agent restarts, and metres."""
+    model = ModelledAutopilot("ardupilot", armed=True, turns_with_poses=True, angles_rad=(0.0, 0.0, 2.0))
+    T_b_f, last, worst_rad, worst_m = mounting("urf"), None, 0.0, 0.0
+    hover = se3.from_rt(level_start("urf"), np.array([0.0, 0.0, 1.0]))
+    first: tuple[float, float, float] | None = None
     for life in range(2):
-        flight = Flight("urf", last=last)
-        if life == 0:
-            flight.start._T_s_o = np.eye(4)
-            flight.R_o_b = flight.R_o_b  # any heading will do: the filter begins with it
-            yaw = truth = yaw_of(flight.pose(0))
-        for i in range(1, 200):
-            now_ns = life * 20 * S + i * S // 20
-            if i % 20 == 1:
-                flight.hear(Heartbeat(2, 3, armed=True), now_ns)
-            if flight.requested:
-                flight.hear(Attitude(0, (0.0, 0.0, yaw), (0.0, 0.0, 0.0)), now_ns)
-            m = flight.pose(now_ns)
-            if m is not None:
-                error = (yaw_of(m) - yaw + pi) % (2 * pi) - pi
-                yaw += max(-radians(15.0) / 20, min(radians(15.0) / 20, error))
-            worst = max(worst, abs((yaw - truth + pi) % (2 * pi) - pi))
-        last = flight.session.last_pose()
-    assert degrees(worst) < 3.0
+        # the odometry frame of each life is another one
+        T_o_b = hover if life == 0 else se3.exp(np.array([3.0, 1.0, 0.0, 0.0, 0.0, 1.1])) @ hover
+        start = StartFrame(T_b_f, last=last) if goes_on else None
+        session = ControllerSession(T_b_f, start=start)
+        for i in range(400):
+            now_ns = life * 22 * S + i * S // 20
+            for data in session.step(PoseSample(now_ns, T_o_b, True, 90), now_ns):
+                for answer in model.receive(data, now_ns):
+                    session.receive(answer, now_ns)
+            for data in model.poll(now_ns):
+                for answer in session.receive(data, now_ns):
+                    model.receive(answer, now_ns)
+            if life == 0 and i == 399:
+                yaw, first = model.angles_rad[2], model.position_m
+            elif life == 1:
+                assert first is not None
+                worst_rad = max(worst_rad, abs((model.angles_rad[2] - yaw + pi) % (2 * pi) - pi))
+                worst_m = max(worst_m, float(np.linalg.norm(np.subtract(model.position_m, first))))
+        last = session.last_pose()
+        assert session.counters.odometry > 300
+    return degrees(worst_rad), worst_m
+
+
+def test_a_restart_disturbs_a_controller_that_takes_its_yaw_from_poses_by_less_than_three_degrees() -> None:
+    turned, moved_m = restarted(goes_on=True)
+    assert turned < 0.1 and moved_m < 0.01
+    turned, moved_m = restarted(goes_on=False)
+    assert turned > 20.0 and moved_m > 1.0  # the model is one that suffers
 
 
 @pytest.mark.parametrize("axes", LETTERS)

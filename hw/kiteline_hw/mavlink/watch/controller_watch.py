@@ -81,6 +81,17 @@ class ControllerWatch:
             self.estimator.sent(quality, now_ns)
             self.latency.sent(now_ns - pose.t_ns, self.presence.autopilot)
 
+    def heading(self, *, held: bool) -> None:
+        """Say that poses are held back because the heading is not known, and that it is."""
+        if held:
+            self._log.say(
+                "heading", True, Level.WARNING,
+                "poses: held back, because the flight controller's heading is not known", "kiteline: waits for heading",
+                "It must send ATTITUDE: check that the wire to it carries our requests",
+            )  # fmt: skip
+        elif self._log.state("heading"):
+            self._log.say("heading", False, Level.INFO, "poses: the heading is known", "kiteline: heading known")
+
     def tick(self, now_ns: int, link: LinkState) -> list[MavlinkMessage]:
         """Say what has changed; the messages to send: requests, and findings as STATUSTEXT."""
         out: list[MavlinkMessage] = [*self.presence.tick(now_ns, link)]
