@@ -18,6 +18,7 @@ from kiteline_hw.ports import SourceError
 
 BENCHMARKS = {
     "first-flight": "kiteline_bench.system.first_flight",
+    "live-camera": "kiteline_bench.system.live_camera",
     "house": "kiteline_bench.system.house",
     "reality": "kiteline_bench.reality.reality",
     "agent": "kiteline_bench.agent.flights",

@@ -132,7 +132,7 @@ def main(memory: int, slots: int, slot_bytes: int) -> None:
     cv2.setNumThreads(1)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the log is closed by the process that writes it
-    os.nice(5)
+    os.nice(10)  # tracking comes first; what is late is stored
     images = mmap.mmap(memory, slots * slot_bytes)
     while request := _read_request():
         slot, h, w = _REQUEST.unpack(request)
