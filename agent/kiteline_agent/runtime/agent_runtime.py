@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -192,11 +192,17 @@ class AgentRuntime:
     def step(
         self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int,
         odometry: OdometryBatch | None = None, predict_ns: int | None = None,
+        publish: Callable[[StepOutput], None] | None = None,
     ) -> list[bytes]:  # fmt: skip
-        """One step of the agent, logged and counted. Returns the packets to send."""
+        """One step of the agent, logged and counted. Returns the packets to send.
+
+        publish: gets the output before it is logged, since a flight controller waits for its pose.
+        """
         self._account.begin()
         step_input = StepInput(frame, imu, tuple(packets), self._last_cpu_ns, odometry, predict_ns)
         self.output = output = self.agent.step(step_input, now_ns)
+        if publish is not None:
+            publish(output)
         if self._record is not None:
             self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
 from kiteline_agent.runtime.controller import controller_link, pose_rate_hz, pose_sample, with_controller_imu
 from kiteline_agent.runtime.options import (
@@ -14,13 +16,14 @@ from kiteline_agent.runtime.options import (
 )
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.runtime.terminal import StatusMessages, summary
+from kiteline_agent.step import StepOutput
 from kiteline_codec.channel import settled
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
-from kiteline_hw.ports import ByteLink, LinkError
+from kiteline_hw.ports import ByteLink, ControllerLink, LinkError
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
@@ -89,12 +92,11 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                 samples = controller.take_imu(now_ns) if options.imu_of else None
                 imu = runtime.reader.take_imu(predict_ns)
                 imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
-            for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns):
+            push = None
+            if controller is not None and schedule.on == (frame is None):
+                push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
+            for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push):
                 link.send(packet)
-            if controller is not None and runtime.output is not None and schedule.on == (frame is None):
-                pose = pose_sample(runtime.agent, runtime.output, captured_ns, options.boot)
-                if pose is not None:
-                    controller.push(pose, clock.now_ns())
             process.notify("WATCHDOG=1")
             if parent is None:
                 found = [] if controller is None else [f.line for f in controller.take_findings()]
@@ -108,6 +110,15 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         _drain_live(runtime, link, clock, parent, stop)
         if parent is not None:
             parent.send_event("result", report=runtime.report())
+
+
+def _push(
+    controller: ControllerLink, agent: Agent, captured_ns: int, boot: int, clock: MonotonicClock, output: StepOutput
+) -> None:
+    """Send the pose of a step to the flight controller, if there is one."""
+    pose = pose_sample(agent, output, captured_ns, boot)
+    if pose is not None:
+        controller.push(pose, clock.now_ns())
 
 
 def _wait(
