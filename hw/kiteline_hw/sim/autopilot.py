@@ -52,7 +52,6 @@ _HEALTHY_FLAGS = 1 | 2 | 4 | 8 | 16 | 32 | 256 | 512
 _BLIND_FLAGS = 1 | 4 | 32 | 128
 _HEARTBEAT_NS = 1_000_000_000
 _FUSED_AFTER_NS = 1_000_000_000  # ns of poses until they are fused
-_STALE_NS = 500_000_000  # ns without poses until the estimator counts as dead reckoning
 _AIDING_TIMEOUT_NS = {"ardupilot": 15_000_000_000, "px4": 5_000_000_000}  # ns without them until it has no position
 _SLEW_RAD_S = math.radians(15.0)  # of EKF3's yaw towards that of poses, as seen in the loop
 _LOCAL_POSITION = 32  # message id
@@ -144,7 +143,7 @@ class ModelledAutopilot:
     def _pose(self, m: Odometry, now_ns: int) -> None:
         if m.quality < 0:
             return
-        if self._last_pose_ns is None or now_ns - self._last_pose_ns > _STALE_NS:
+        if self._last_pose_ns is None or now_ns - self._last_pose_ns > _AIDING_TIMEOUT_NS[self.kind]:
             self._first_pose_ns = now_ns
         elif self.turns_with_poses:
             self._turn(m, (now_ns - self._last_pose_ns) * 1e-9)
