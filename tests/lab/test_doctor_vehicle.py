@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_hw.mavlink.codec import MavlinkCodec
+from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.sim.autopilot import ModelledAutopilot
 from kiteline_lab.tools import doctor
 from kiteline_lab.tools.checks import vehicle
 from kiteline_lab.tools.checks.check import Severity
 
 
-def test_the_flight_controller_is_checked_and_printed_as_json(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model, over = ModelledAutopilot("ardupilot", parameters={"VISO_TYPE": 0}), threading.Event()
-    monkeypatch.setattr(doctor, "CHECKS", ())
+def ask(model: ModelledAutopilot, *options: str) -> int:
+    """`kiteline doctor` with a model behind a socket; the exit status."""
+    over = threading.Event()
     with socket.socket(type=socket.SOCK_DGRAM) as s:
         s.bind(("127.0.0.1", 0))
         s.settimeout(0.002)
@@ -40,16 +40,38 @@ def test_the_flight_controller_is_checked_and_printed_as_json(
         thread = threading.Thread(target=serve)
         thread.start()
         try:
-            assert doctor.main(["--mavlink", f"udp:127.0.0.1:{s.getsockname()[1]}", "--json"]) == 1
+            return doctor.main(["--mavlink", f"udp:127.0.0.1:{s.getsockname()[1]}", *options])
         finally:
             over.set()
             thread.join()
+
+
+def test_the_flight_controller_is_checked_and_printed_as_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", ())
+    assert ask(ModelledAutopilot("ardupilot", parameters={"VISO_TYPE": 0}), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert told["failed"] is True
     by_name = {check["name"]: check for check in told["checks"]}
     assert by_name["VISO_TYPE"]["severity"] == "fail" and by_name["VISO_TYPE"]["remedy"] == "set VISO_TYPE to 3"
     assert "ArduPilot 4.6.3" in by_name["heartbeat"]["text"]
     assert {"streams", "timesync", "forwarding", "radio"} <= set(by_name)
+
+
+def test_a_controller_that_signs_needs_the_key(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", ())
+    (tmp_path / "key").write_text("a pass phrase")
+    model = ModelledAutopilot("px4", system=4)
+    signing = Signing(read_key(tmp_path / "key"), StampFile(tmp_path / "stamp"))
+    model.codec = MavlinkCodec(4, 1, signing)
+    assert ask(model) == 1
+    without = capsys.readouterr().out
+    assert "signs its messages, and will refuse ours" in without and "no parameter was told" in without
+    assert ask(model, "--mavlink-key", str(tmp_path / "key")) == 0
+    assert "9 are as kiteline needs them" in capsys.readouterr().out
 
 
 def test_power_of_a_raspberry_pi(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from pathlib import Path
 
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.messages import Heartbeat, MavlinkMessage
 from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
+from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.watch.findings import Finding
 from kiteline_hw.mavlink.watch.presence import LinkState
@@ -15,16 +17,17 @@ from kiteline_hw.mavlink.watch.survey import ControllerSurvey, SurveyConfig
 from kiteline_hw.ports import Clock
 
 _TICK_S = 0.02  # s between two looks at what to send
+_COMPONENT = 191  # MAV_COMP_ID_ONBOARD_COMPUTER; not the agent's, as stamps of signatures are counted for each
 _FLUSH_S = 0.2  # s for the last messages on a serial port
 
 
 class _Surveyor:
     """Connects the survey's messages with a connection's bytes."""
 
-    def __init__(self, url: str, clock: Clock, config: SurveyConfig | None) -> None:
+    def __init__(self, url: str, clock: Clock, signing: Signing | None, config: SurveyConfig | None) -> None:
         self.survey = ControllerSurvey(url, config)
         self._clock = clock
-        self._codec = MavlinkCodec()
+        self._codec = MavlinkCodec(component=_COMPONENT, signing=signing)
         self._lock = threading.Lock()
         self._received = self._messages = 0
         self.done = threading.Event()
@@ -53,10 +56,12 @@ class _Surveyor:
         with self._lock:
             codec = self._codec
             link = LinkState(
-                self._received, self._messages, codec.signed, codec.refused,
+                self._received, self._messages, codec.signed, codec.refused, codec.has_key,
                 device_fault=self.connection.device_fault,
             )  # fmt: skip
             self._send(self.survey.step(self._clock.now_ns(), link))
+            if self.survey.presence.system is not None:
+                codec.system = self.survey.presence.system
             if self.survey.done:
                 self.done.set()
 
@@ -67,10 +72,17 @@ class _Surveyor:
 
 
 def survey_controller(
-    url: str, clock: Clock, limit_s: float = 60.0, config: SurveyConfig | None = None
+    url: str, clock: Clock, key: str = "", limit_s: float = 60.0, config: SurveyConfig | None = None
 ) -> list[Finding]:
-    """Ask the flight controller at a URL; takes seconds. Raises LinkError for a URL that cannot be used."""
-    surveyor = _Surveyor(url, clock, config)
+    """Ask the flight controller at a URL; takes seconds. Raises LinkError for a URL or key that cannot be used.
+
+    key: a file with the key of MAVLink's signatures; "": messages are not signed.
+    """
+    signing = None
+    if key:
+        path = Path(key)
+        signing = Signing(read_key(path), StampFile(path.with_name(f"{path.name}.doctor_stamp")))
+    surveyor = _Surveyor(url, clock, signing, config)
     surveyor.connection.start()
     try:
         surveyor.done.wait(limit_s)

@@ -271,9 +271,12 @@ def main(argv: list[str]) -> int:
         "--warm", action="store_true", help="compile and cache all kernels, so that agent and base start quickly"
     )
     p.add_argument("--mavlink", metavar="URL", help="check the flight controller there too; the agent must not run")
+    p.add_argument("--mavlink-key", metavar="FILE", default="", help="key of its signatures, as the agent's")
     p.add_argument("--json", action="store_true", help="print the results as JSON")
     a = p.parse_args(argv)
-    results = run_checks() + (check_controller(a.mavlink) if a.mavlink else []) + (warm() if a.warm else [])
+    results = (
+        run_checks() + (check_controller(a.mavlink, a.mavlink_key) if a.mavlink else []) + (warm() if a.warm else [])
+    )
     if a.json:
         lines = [{**asdict(f), "severity": f.severity.name.lower()} for f in results]
         print(json.dumps({"failed": any(f.severity is Severity.FAIL for f in results), "checks": lines}, indent=1))

@@ -197,5 +197,5 @@ class AttitudeWatch:
         self._log.say(
             TOPIC, tuple(fitting), Level.ERROR,
             f"attitude: --axes {used} are wrong: by the flight controller's attitude they are {right}",
-            f"kiteline: axes {used} wrong, {'/'.join(fitting)}", remedy,
+            f"kiteline: axes {used} wrong, fit: {'/'.join(fitting)}", remedy,
         )  # fmt: skip

@@ -5,12 +5,15 @@ from __future__ import annotations
 from kiteline_lab.tools.checks.check import DoctorCheck, Severity
 
 
-def check_controller(url: str) -> list[DoctorCheck]:
-    """Ask the flight controller at a URL for all that decides whether it can fly on poses. Raises LinkError."""
+def check_controller(url: str, key: str = "") -> list[DoctorCheck]:
+    """Ask the flight controller at a URL for all that decides whether it can fly on poses. Raises LinkError.
+
+    key: a file with the key of MAVLink's signatures; "": none.
+    """
     from kiteline_hw.mavlink.surveyor import survey_controller
     from kiteline_hw.mavlink.watch.findings import Level
     from kiteline_hw.system.clock import MonotonicClock
 
     severities = {Level.ERROR: Severity.FAIL, Level.WARNING: Severity.NOTE, Level.INFO: Severity.OK}
-    found = survey_controller(url, MonotonicClock())
+    found = survey_controller(url, MonotonicClock(), key)
     return [DoctorCheck(severities[f.level], f.topic, f.text, f.remedy) for f in found]
