@@ -63,6 +63,10 @@ def test_a_plain_install_flies_and_tells_what_it_goes_without(wheel: Path, recor
     assert "matplotlib is not installed: no trajectory.png" in done.stderr.partition("flying")[0]
     agent = json.loads((tmp_path / "out" / "report.json").read_text())["agents"][0]
     assert agent["tracked"] == agent["frames"] == 30
+    units = run(kiteline, "install-units", "--root", "image", folder=tmp_path)
+    assert units.returncode == 0, units.stderr
+    unit = (tmp_path / "image/etc/systemd/system/kiteline-agent.service").read_text()
+    assert f"Environment=PATH={environment / 'bin'}:" in unit
     asked = run(kiteline, "eval", "out/agent0/live.tum", recording, "--plot", "a.png", folder=tmp_path)
     assert asked.returncode == 2
     assert "pip install 'kiteline[lab]'" in asked.stderr

@@ -107,6 +107,7 @@ def test_a_service_goes_on_from_numbers_of_starts_by_hand(tmp_path: Path, monkey
     assert [process.number_of_start("agent0", tmp_path / "logs") for _ in range(2)] == [1, 2]
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     assert [process.number_of_start("agent0", tmp_path / "logs") for _ in range(2)] == [3, 4]
+    assert process.kept_folder("agent0", tmp_path / "logs") == tmp_path / "state" / "agent0"
 
 
 @pytest.mark.alone

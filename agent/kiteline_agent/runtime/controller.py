@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from pathlib import Path
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.options import (
@@ -12,6 +13,7 @@ from kiteline_agent.runtime.options import (
 from kiteline_agent.step import Estimate, PredictedPose, StepOutput
 from kiteline_hw.ports import ControllerLink, FrameSource, LinkError, PoseSample
 from kiteline_hw.sources.overrides import with_other_imu
+from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 
 
@@ -30,7 +32,8 @@ def controller_link(
         connect(
             ControllerOptions(
                 options.mavlink, options.axes, options.offset, options.odometry, options.heading,
-                options.pose_messages, options.origin, options.mavlink_key, options.link, options.folder,
+                options.pose_messages, options.origin, options.mavlink_key, options.link,
+                str(process.kept_folder(f"agent{options.agent}", Path(options.folder))),
             ),
             source.rig, clock, pose_rate_hz=pose_rate_hz(options),
             imu_rate_hz=own.noise.rate_hz if options.imu_of else 0.0,

@@ -162,16 +162,22 @@ def next_number(path: Path, least: int = 1) -> int:
     return number
 
 
+def kept_folder(name: str, folder: Path) -> Path:
+    """Where `name` keeps what must outlive its logs in `folder`: a service in its state folder, else there too."""
+    return state_folder() / name if os.environ.get("STATE_DIRECTORY") else folder
+
+
 def number_of_start(name: str, folder: Path) -> int:
     """The number of this start of `name`: higher than any before it, as ids and nonces are made of it.
 
-    It is kept in `folder`, a service's in its state folder: logs may be deleted. Raises OSError, ValueError.
+    folder: of its logs. Raises OSError, ValueError.
     """
-    if not os.environ.get("STATE_DIRECTORY"):
+    kept = kept_folder(name, folder)
+    if kept == folder:
         return next_number(folder / "boot")
     earlier = folder / "boot"  # of starts by hand, or of an older version
     least = int(earlier.read_text()) + 1 if earlier.exists() else 1
-    return next_number(state_folder() / name / "boot", least)
+    return next_number(kept / "boot", least)
 
 
 def write_atomically(path: Path, content: bytes) -> None:
