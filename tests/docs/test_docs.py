@@ -66,7 +66,9 @@ def test_commands_that_are_named_exist() -> None:
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         blocks = "".join(re.findall(r"^```(?!text).*?^```", text, re.DOTALL | re.MULTILINE))
-        for name in re.findall(r"`kiteline ([a-z][a-z-]*)", text) + re.findall(r"^kiteline ([a-z][a-z-]*)", blocks, re.MULTILINE):
+        for name in re.findall(r"`kiteline ([a-z][a-z-]*)", text) + re.findall(
+            r"^kiteline ([a-z][a-z-]*)", blocks, re.MULTILINE
+        ):
             assert name in commands | {"hello"}, f"{page.name}: kiteline {name}"
         if page.name != "results.md":
             for name in re.findall(r"`kiteline bench ([a-z/-]+)", text):
