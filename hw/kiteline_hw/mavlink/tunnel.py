@@ -136,7 +136,7 @@ class TunnelEnd:
             out.append(self.codec.encode(Heartbeat()))
         if self._report_ns is None or now_ns - self._report_ns >= c.report_ns:
             self._report_ns = now_ns
-            report = self._arrivals.report(now_ns, is_base=c.is_base)
+            report = self._arrivals.report(is_base=c.is_base)
             # A peer that is not known yet is looked for everywhere.
             to = 0 if self._peer is None else self._peer[0]
             out.append(self.codec.encode(Tunnel(to, c.peer_component, c.payload_type + 1, report)))

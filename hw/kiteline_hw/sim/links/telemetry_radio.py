@@ -23,6 +23,7 @@ class RadioConfig:
     gap_ns: int = 10_000_000  # ns between turns
     buffer_bytes: int = 4096  # of each side; messages that do not fit are lost
     status_ns: int = 500_000_000  # ns between RADIO_STATUS
+    forwards_status: bool = True  # the controller hands RADIO_STATUS on to its companion, as PX4 does; ArduPilot not
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +120,8 @@ class RoutingController:
         to_companion = self.down.advance(now_ns)
         if now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + self.radio.status_ns
-            # Each radio reports to its own side; the controller forwards the report to its companion.
-            to_companion.append(self._codec.encode(RadioStatus(self.up.free_percent)))
+            # Each radio reports to its own side; the controller may forward its own to the companion.
+            if self.radio.forwards_status:
+                to_companion.append(self._codec.encode(RadioStatus(self.up.free_percent)))
             to_ground.append(self._codec.encode(RadioStatus(self.down.free_percent)))
         return to_companion, to_ground

@@ -1,0 +1,34 @@
+"""A live flight whose poses and packets for a base share one connection to a flight controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kiteline_agent.runtime.live import fly_live
+from kiteline_agent.runtime.options import AgentOptions
+from kiteline_hw.mavlink.messages import MavlinkMessage, Tunnel
+from kiteline_hw.system import process
+from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
+
+
+class Listening(FlightController):
+    """Counts what it would forward to the radio."""
+
+    packets = 0
+
+    def _process(self, messages: list[MavlinkMessage], now_ns: int) -> list[bytes]:
+        self.packets += sum(isinstance(m, Tunnel) and m.payload_type == 0xB17E for m in messages)
+        return super()._process(messages, now_ns)
+
+
+def test_packets_for_the_base_go_through_the_controllers_connection(recording: Path, tmp_path: Path) -> None:
+    model = Listening("ardupilot")
+    with UdpFlightController(model) as controller:
+        url = f"udp:127.0.0.1:{controller.port}"
+        spec = AgentOptions(source=str(recording), folder=str(tmp_path), mavlink=url, link=f"mavlink:{url}", axes="frd",
+                            seconds=3.0)  # fmt: skip
+        stop = process.StopSignal()
+        fly_live(spec, None, stop)
+    assert len(model.accepted) > 10 and not model.dropped
+    assert model.packets > 3
+    assert (tmp_path / "last_pose.json").exists()
