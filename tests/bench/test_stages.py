@@ -49,7 +49,7 @@ def test_every_stage_of_a_stereo_flight_takes_time(recording: Path, tmp_path: Pa
     found = profile(tmp_path / "agent0" / "log.mcap")
     assert found["frame"] and found["keyframe"]
     timed = {stage for own in [*found["frame"], *found["keyframe"]] for stage, ns in own.items() if ns > 0}
-    assert timed >= {stage for _, stage in STAGES}
+    assert {stage for _, stage in STAGES} - timed == {"rectification"}  # the recording's images are rectified
 
 
 def test_table_has_a_line_a_stage() -> None:
