@@ -20,7 +20,7 @@ TITLE = "Stages"
 # Functions that are timed, and what they are called in the table: a stage's own time, without that of stages inside.
 STAGES: tuple[tuple[str, str], ...] = (
     ("kiteline_agent.agent:Agent.step", "all else"),
-    ("kiteline_core.geometry.cameras:Rectifier.rectify", "rectification"),
+    ("kiteline_core.geometry.cameras:Rectifier.rectify", "rectification"),  # of raw images, in keyframes
     ("kiteline_agent.tracking.frame_images:build_pyramid", "pyramids"),
     ("kiteline_agent.tracking.tracker:Tracker.track", "tracking, but for:"),
     ("kiteline_agent.imaging.alignment_kernels:align", "alignment"),
