@@ -6,7 +6,7 @@ import pytest
 
 from kiteline_cli import main as cli
 
-WITH_VERBS = ("grid", "log", "maps", "rig", "keys")  # a verb's own help explains its flags
+WITH_VERBS = ("grid", "log", "maps", "rig", "keys", "calibrate")  # a verb's own help explains its flags
 
 
 COMMANDS = {c.name: c for group in cli.find_commands().values() for c in group}

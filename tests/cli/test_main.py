@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import types
@@ -37,7 +38,7 @@ def test_a_new_command_is_one_file(
     text = 'SUMMARY = "a toy"\nEXAMPLES = ("kiteline toy",)\n\ndef run(argv):\n    print("ran", argv)\n'
     (tmp_path / "toy.py").write_text(text)
     monkeypatch.setattr(machine, "__path__", [*machine.__path__, str(tmp_path)])
-    assert "  toy      a toy\n" in cli.parser().format_help()
+    assert re.search(r"^  toy +a toy$", cli.parser().format_help(), re.MULTILINE)
     assert cli.main(["toy", "--fast"]) == 0
     assert capsys.readouterr().out == "ran ['--fast']\n"
 
