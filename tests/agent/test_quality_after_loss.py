@@ -38,7 +38,6 @@ def test_quality_comes_back_as_the_map_says(dark: int) -> None:
     assert last.T_m_b is not None
     off_m = float(np.linalg.norm(last.T_o_b[:3, 3] - last.T_m_b[:3, 3]))
     quality, sigma_m = agent.odometry_quality(last), float(np.sqrt(np.trace(last.cov_o[:3, :3])))
-    print(off_m, quality, sigma_m, [agent.odometry_quality(f) for f in found[::4]])
     assert off_m <= sigma_m < off_m + 0.1  # what the map measured is what the covariance holds
     assert (quality >= 50) == (off_m < 0.3)
     lost = [agent.odometry_quality(e) for e in found if not e.tracked]
