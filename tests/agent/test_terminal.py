@@ -33,3 +33,8 @@ def test_changes_are_told_once_and_a_summary_now_and_then() -> None:
     assert words[3:] == ["lost: no pose from the images", "tracking again after 0.2 s"]
     assert told[4].startswith("    15.7 s")
     assert summary(tally).startswith("400 frames: 386 tracked, 14 lost")
+
+
+def test_what_is_found_of_the_flight_controller_is_shown() -> None:
+    (line,) = StatusMessages().lines(output(False), FrameCounts(), 2_000_000_000, ["flight controller: found: PX4"])
+    assert line == "     2.0 s  flight controller: found: PX4"

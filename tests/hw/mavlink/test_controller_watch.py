@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import radians, sin
 
 import numpy as np
@@ -284,3 +285,21 @@ def test_messages_of_another_vehicle_do_not_count() -> None:
         bench.session.receive(other.codec.encode(EkfStatusReport(8 | 16)), bench.now_ns, datagram=True)
         bench.run(0.1)
     assert "ignores them" in bench.topic("poses")[-1].text
+
+
+@pytest.mark.parametrize(("late_s", "tilt_deg"), [(0.1, 8.0), (-0.1, 8.0), (0.2, 3.0)])
+def test_late_stamps_and_a_slightly_tilted_camera_never_make_right_axes_wrong(late_s: float, tilt_deg: float) -> None:
+    def shaken(t_s: float) -> Angles:
+        return radians(22.0) * sin(5.0 * t_s), radians(22.0) * sin(4.0 * t_s + 1.0), 1.5 * t_s
+
+    bench = Bench(ModelledAutopilot("ardupilot"), motion=shaken)
+    bench.T_b_f = bench.T_b_f @ se3.from_rt(se3.so3_exp(np.radians([tilt_deg, tilt_deg / 2, tilt_deg])), np.zeros(3))
+    true_pose = bench.pose
+
+    def late_pose(t_ns: int, quality: int) -> PoseSample:
+        return replace(true_pose(t_ns - round(late_s * S), quality), t_ns=t_ns)
+
+    bench.pose = late_pose  # type: ignore[method-assign]
+    bench.run(12.0)
+    assert all("--axes" not in f.text for f in bench.topic("axes"))
+    assert len(bench.topic("axes")) <= 1

@@ -37,14 +37,17 @@ class AttitudeWatchConfig:
     size_share: float = 0.3  # by which the two angles may differ; more is a jump of heading, or a false pose
     down_ns: int = 400_000_000  # ns between two looks at gravity: neighbours have the same error
     downs: int = 8  # looks at gravity kept
+    down_rate_rad_s: float = 0.4  # of the turn above which gravity is not compared: 0.1 s of delay is 2 degrees
     down_sigma_rad: float = 0.10  # of gravity; mountings are off by degrees, and accelerations tilt it
     gap_ns: int = 300_000_000  # ns; attitudes are not interpolated over longer gaps between poses
     wrong_chi2: float = 30.0  # by which other axes fit better than those in use
     tie_chi2: float = 12.0  # within which two axes fit equally well
+    fit_chi2: float = 3.0  # of a mean rotation by the best axes, above which nothing is said of others
     sure_chi2: float = 20.0  # by which all others are worse, so that the axes in use are confirmed
     misfit_chi2: float = 6.0  # of a mean rotation by the best axes: they do not fit either
     misfit_turns: int = 8  # rotations before that is said
     tilt_rad: float = 0.17  # 10 degrees between the two directions of gravity are said
+    level_rad: float = 0.10  # 6 degrees, below which that is over
 
 
 def _candidates() -> dict[str, F64]:
@@ -119,16 +122,18 @@ class AttitudeWatch:
             t_ns, r_n_f = self._waiting.popleft()
             if t_ns > before[0]:
                 share = (t_ns - before[0]) / (pose.t_ns - before[0])
-                step = share * se3.so3_log(before[1].T @ self._before[1])
-                changed |= self._compare(t_ns, before[1] @ se3.so3_exp(step), r_n_f)
+                step = se3.so3_log(before[1].T @ self._before[1])
+                rate = float(np.linalg.norm(step)) * 1e9 / (pose.t_ns - before[0])
+                changed |= self._compare(t_ns, before[1] @ se3.so3_exp(share * step), r_n_f, rate)
         if changed:
             self._judge()
 
-    def _compare(self, t_ns: int, r_l_b: F64, r_n_f: F64) -> bool:
+    def _compare(self, t_ns: int, r_l_b: F64, r_n_f: F64, rate_rad_s: float) -> bool:
         """Add the samples of one instant; True if there is a new one."""
         c = self.config
         added = False
-        if self._next_down_ns is None or t_ns >= self._next_down_ns:
+        due = self._next_down_ns is None or t_ns >= self._next_down_ns
+        if due and (rate_rad_s < c.down_rate_rad_s or len(self._downs) < 2):
             self._next_down_ns = t_ns + c.down_ns
             predicted = _R_F_B @ r_l_b[2]  # (24, 3) down in f: the third row of a rotation into a frame with z down
             angles = np.arccos(np.clip(predicted @ r_n_f[2], -1.0, 1.0))
@@ -157,18 +162,16 @@ class AttitudeWatch:
         chi2 = np.sum([d for d, _ in self._downs], axis=0) + (np.sum(self._turns, axis=0) if self._turns else 0.0)
         best = float(chi2.min())
         used = _LETTERS[self._in_use]
-        if float(chi2[self._in_use]) - best > c.wrong_chi2:
+        turns = np.mean(self._turns, axis=0) if self._turns else np.zeros(len(_LETTERS))
+        if float(chi2[self._in_use]) - best > c.wrong_chi2 and float(turns[chi2.argmin()]) < c.fit_chi2:
             self._say_wrong(used, [_LETTERS[i] for i in np.flatnonzero(chi2 < best + c.tie_chi2)])
             return
-        if (
-            len(self._turns) >= c.misfit_turns
-            and float(np.mean([t[self._in_use] for t in self._turns])) > c.misfit_chi2
-        ):
+        if len(self._turns) >= c.misfit_turns and float(turns[self._in_use]) > c.misfit_chi2:
             self._log.say(
                 TOPIC, "none", Level.WARNING,
                 f"attitude: the vehicle turns otherwise than the flight controller says, by any axes (now {used})",
                 "kiteline: mounting fits no axes",
-                "The camera is mounted at an angle: give its true orientation in the calibration, or check it",
+                "The camera is mounted at an angle that its calibration does not say, or its stamps are late",
             )  # fmt: skip
             return
         others = np.delete(chi2, self._in_use)
@@ -182,7 +185,10 @@ class AttitudeWatch:
                     f"kiteline: tilt is off by {np.degrees(tilt_rad):.0f} deg",
                     "Check the camera's angle in the calibration, and calibrate the level of the controller",
                 )  # fmt: skip
-        elif self._turns and float(others.min()) - float(chi2[self._in_use]) > c.sure_chi2 and tilt_rad < c.tilt_rad:
+            return
+        level = tilt_rad < (c.level_rad if self._log.state(TOPIC) == "tilt" else c.tilt_rad)
+        fits = bool(self._turns) and float(turns[self._in_use]) < c.fit_chi2
+        if fits and level and float(others.min()) - float(chi2[self._in_use]) > c.sure_chi2:
             self._log.say(
                 TOPIC, "good", Level.INFO, f"attitude: agrees with the flight controller's, axes {used} are right",
                 f"kiteline: axes {used} are right",
