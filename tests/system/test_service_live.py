@@ -110,6 +110,20 @@ def test_a_service_goes_on_from_numbers_of_starts_by_hand(tmp_path: Path, monkey
     assert process.kept_folder("agent0", tmp_path / "logs") == tmp_path / "state" / "agent0"
 
 
+def test_logs_of_all_starts_stay_within_their_limit(serve: Serve, recording: Path, tmp_path: Path) -> None:
+    logs = tmp_path / "logs" / "agent0"
+    for number in (1, 2):
+        program, _ = serve("agent", recording, "--log", tmp_path / "logs", "--log-mib", "1")
+        assert program.stderr is not None
+        said = program.stderr.read().decode()
+        assert "--log-mib was reached" in said  # the recording's images are larger
+        files = sorted(logs.glob("boot*.mcap"))
+        assert [path.name for path in files] == [f"boot{number:05d}.mcap"]  # the first went when the second began
+        assert files[0].stat().st_size < 1.1 * 2**20
+        with LogReader(files[0]) as log:
+            assert log.cut is None
+
+
 @pytest.mark.alone
 def test_a_base_is_ready_before_it_imports_and_can_be_stopped_meanwhile(
     serve: Serve, recording: Path, tmp_path: Path
