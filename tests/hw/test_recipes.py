@@ -145,7 +145,7 @@ def test_every_message_of_the_table_can_be_built_and_parsed() -> None:
         messages.TimeSync(5, 6, 1, 1),
         messages.VehicleImu(7, three, three),
         messages.LocalPosition(8, three, three),
-        messages.Attitude(9, three, three),
+        messages.Attitude(9, three, three, 1),
         messages.WheelDistance(10, (1.5, 2.5)),
         messages.Odometry(
             11, three, (1.0, 0.0, 0.0, 0.0), three, three, covariance, covariance, 3, 50, system=1, component=1
