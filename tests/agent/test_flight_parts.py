@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
-from kiteline_agent.runtime.cpu_account import CpuAccount
 from kiteline_agent.runtime.flight_log import estimate_from_json, estimate_to_json
-from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
+from kiteline_agent.runtime.frame_counts import CpuAccount, FrameCounts, live_line, odometry_line
 from kiteline_agent.runtime.frame_reader import FrameReader
 from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.step import Estimate

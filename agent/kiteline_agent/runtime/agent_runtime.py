@@ -16,9 +16,8 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.camera_reader import CameraReader
-from kiteline_agent.runtime.cpu_account import CpuAccount
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
-from kiteline_agent.runtime.frame_counts import FrameCounts
+from kiteline_agent.runtime.frame_counts import CpuAccount, FrameCounts
 from kiteline_agent.runtime.frame_reader import FrameReader
 from kiteline_agent.runtime.options import (
     LOG_STEM,
