@@ -67,13 +67,13 @@ def _value(kind: str, text: str) -> Any:
 
 def read_rig(scheme: str, options: LiveOptions, stereo: bool, told: ToldCalibration | None = None) -> CameraRig:
     """The rig of a live camera. told: it goes first. Raises SourceError."""
-    if told is not None:
-        if not told.known:
-            raise SourceError(
-                f"{scheme}: images of a camera that has no calibration cannot be taken yet: record them, and calibrate "
-                "by the recording or by image files"
-            )
+    if told is not None and told.known:
         return told.rig_of_images(scheme, 1 + stereo, (told.cameras[0].height, told.cameras[0].width))
+    if told is not None and not options.calibration:
+        raise SourceError(
+            f"{scheme}: the size of the images is not known: expected {scheme}:…?calibration=FILE, a camera.yaml with "
+            "width and height (fx, fy, cx, cy, baseline_m are not used to calibrate), or recorded images"
+        )
     name = options.calibration or next((path for path in CALIBRATIONS if Path(path).is_file()), "")
     if not name:
         raise SourceError(

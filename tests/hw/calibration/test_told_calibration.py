@@ -175,5 +175,9 @@ def test_a_live_pair_by_a_calibration_file(tmp_path: Path) -> None:
     chain.write_text(CHAIN.split("cam1:")[0])
     with pytest.raises(SourceError, match="one camera"):
         read_rig("v4l2", options, stereo=True)
-    with pytest.raises(SourceError, match="record them"):
-        read_rig("v4l2", options, stereo=True, told=UNCALIBRATED)
+    with pytest.raises(SourceError, match="size of the images is not known"):
+        read_rig("v4l2", LiveOptions(), stereo=True, told=UNCALIBRATED)
+    rough = tmp_path / "camera.yaml"
+    rough.write_text("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 640\nheight: 480\nbaseline_m: 0.1\n")
+    rig = read_rig("v4l2", LiveOptions(calibration=str(rough)), stereo=True, told=UNCALIBRATED)
+    assert rig.right is not None and (rig.left.width, rig.left.height) == (640, 480)
