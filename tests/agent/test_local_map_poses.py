@@ -24,8 +24,8 @@ DEPTH_M = 4.0
 LEAST_M = CONFIG.local_map.moved_px * DEPTH_M / CAMERA.fx  # of a shift that counts
 
 
-def local_map(keyframes: int = 4, slots: int = 8) -> LocalMap:
-    out = LocalMap(CAMERA, replace(CONFIG.local_map, keyframes=slots), CONFIG.depth_filter)
+def local_map(keyframes: int = 4, slots: int = 8, camera: RectifiedCamera = CAMERA) -> LocalMap:
+    out = LocalMap(camera, replace(CONFIG.local_map, keyframes=slots), CONFIG.depth_filter)
     for k in range(keyframes):
         add(out, k)
     return out
@@ -112,6 +112,14 @@ def refined(held: LocalMap, k: int, offset_px: float) -> bool:
     index = np.arange(20, dtype=np.uint16)
     offset = np.tile(np.array([offset_px, 0.0], np.float32), (20, 1))
     return held.refine(RefinedLandmarks(KeyframeId(k), index, np.full(20, 1.0 / DEPTH_M, np.float32), offset))
+
+
+def test_a_monocular_camera_takes_refined_landmarks_at_once() -> None:
+    held = local_map(camera=replace(CAMERA, stereo=False))
+    held.share(KeyframeId(0), 30)
+    before = held.bearing.copy()
+    assert refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
+    assert np.abs(held.bearing - before)[held.slot_of(KeyframeId(0))].max() > 0.0
 
 
 def test_refined_landmarks_wait_with_the_poses() -> None:

@@ -296,7 +296,10 @@ class LocalMap:
         return True
 
     def refine(self, record: RefinedLandmarks) -> bool:
-        """Take over landmarks that only the base could triangulate; hold the others ready for `apply_corrections`."""
+        """Take over landmarks that only the base could triangulate; hold the others ready for `apply_corrections`.
+
+        Without a right camera, all are taken over: depths by the agent's own motion are worse than the base's.
+        """
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
@@ -308,15 +311,16 @@ class LocalMap:
             record.inv_depth[keep].astype(np.float64),
             self._bearings(self.uv[slot, index] + record.offset[keep]),
         )
-        self._set_landmarks(slot, index[fresh], rho[fresh], bearing[fresh])
+        at_once = fresh | (not self.camera.stereo)
+        self._set_landmarks(slot, index[at_once], rho[at_once], bearing[at_once])
         self.promote(slot * self.slot_size + index[fresh])
-        known = ~fresh
+        known = ~at_once
         if known.any():
             self._new_landmarks[record.keyframe] = index[known], rho[known], bearing[known]
             turned = np.linalg.norm(bearing[known] - self.bearing[slot, index[known]], axis=1) * self.camera.fx
             nearer = np.abs(rho[known] - self.rho[slot, index[known]]) * self.camera.bf
             self._due |= bool(np.median(np.maximum(turned, nearer)) >= self._config.moved_px)
-        return bool(fresh.any())
+        return bool(at_once.any())
 
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
         self.rho[slot, index], self.bearing[slot, index] = rho, bearing
