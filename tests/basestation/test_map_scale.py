@@ -215,16 +215,16 @@ def a_sparse_map(culled: set[int]) -> tuple[SparseMap, BundleWindow, list[Keyfra
 
 def test_steps_over_culled_keyframes_are_joined() -> None:
     sparse_map, window, _ = a_sparse_map({2})
-    found = segments_of(sparse_map, window)
+    found = segments_of(sparse_map, window.rows, window.problem)
     assert [(s.first, s.last, len(s.dt_s)) for s in found] == [(0, 1, 3), (1, 2, 6), (2, 3, 3)]
 
 
 def test_a_lost_record_breaks_the_chain_and_another_unit_has_none() -> None:
     sparse_map, window, keyframes = a_sparse_map(set())
     del sparse_map.inertial_steps[keyframes[2]]
-    assert [(s.first, s.last) for s in segments_of(sparse_map, window)] == [(0, 1), (2, 3), (3, 4)]
+    assert [(s.first, s.last) for s in segments_of(sparse_map, window.rows, window.problem)] == [(0, 1), (2, 3), (3, 4)]
     sparse_map.metric_submaps.clear()
-    assert segments_of(sparse_map, window) == ()
+    assert segments_of(sparse_map, window.rows, window.problem) == ()
 
 
 UNIT = 0.96

@@ -16,9 +16,10 @@ from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import lenses
+from kiteline_lab.calibration.best_lens import best_lens
 from kiteline_lab.calibration.boards import BoardError, Corners, parse_board, same_order
 from kiteline_lab.calibration.calibrate import NoBoard, main
-from kiteline_lab.calibration.solve import Calibrated, CalibrationFailed, best_lens, calibrate
+from kiteline_lab.calibration.solve import Calibrated, CalibrationFailed, calibrate
 from kiteline_lab.calibration.verdict import judge
 from kiteline_lab.calibration.views import Coverage, View, ViewCollector
 from tests.lab.rendered_boards import directions_of, intrinsics, picture, poses

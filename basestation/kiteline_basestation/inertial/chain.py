@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_codec.schema import InertialSteps
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.optimisation.bundle import BundleProblem
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 
 _MAX_STEPS = 8000  # of a map, the newest: twenty minutes
 _LEAST_M = 0.05  # distance between keyframes from which the path's length follows theirs
@@ -64,11 +65,11 @@ class Path:
     unit: F64
 
 
-def segments_of(sparse_map: SparseMap, window: BundleWindow) -> tuple[Segment, ...]:
-    """Segments of a window in order of time; steps over culled keyframes are joined."""
+def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tuple[Segment, ...]:
+    """Segments of a bundle of the keyframes in `rows` (k,), in order of time; steps over culled ones are joined."""
     table = sparse_map.keyframes
-    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    depths = _depths(window)
+    number = {int(table.id[row]): i for i, row in enumerate(rows.tolist())}
+    depths = _depths(problem)
     out: list[Segment] = []
     for keyframe, i in number.items():
         agent = agent_of_keyframe(KeyframeId(keyframe))
@@ -90,7 +91,7 @@ def segments_of(sparse_map: SparseMap, window: BundleWindow) -> tuple[Segment, .
                 sparse_map.told_metres.get(submap, 1.0) / sparse_map.scale(submap), records[-1].noise, *fields,
             )
         )  # fmt: skip
-    out.sort(key=lambda s: int(table.t_ns[window.rows[s.last]]))
+    out.sort(key=lambda s: int(table.t_ns[rows[s.last]]))
     kept, n = len(out), 0
     while kept > 0 and n + len(out[kept - 1].dt_s) <= _MAX_STEPS:
         kept, n = kept - 1, n + len(out[kept - 1].dt_s)
@@ -100,9 +101,8 @@ def segments_of(sparse_map: SparseMap, window: BundleWindow) -> tuple[Segment, .
 _STEPS = ("dt_s", "turn", "moved", "velocity", "position")
 
 
-def _depths(window: BundleWindow) -> F64:
-    """Median distance (k,) of the landmarks that each keyframe of a window observes; 1 without any."""
-    problem = window.problem
+def _depths(problem: BundleProblem) -> F64:
+    """Median distance (k,) of the landmarks that each keyframe of a bundle observes; 1 without any."""
     point = np.repeat(np.arange(len(problem.starts) - 1), np.diff(problem.starts))
     T = problem.T_c_m[problem.camera]
     distance = np.linalg.norm(np.einsum("mij,mj->mi", T[:, :3, :3], problem.points[point]) + T[:, :3, 3], axis=1)

@@ -139,7 +139,7 @@ class CorrectionJobs:
                 problem = with_odometry_factors(self._map, bundle.window, self._config.odometry_factors)
                 trials = self._config.graph.robust_trials, self._config.graph.final_trials
                 solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
-                chain = segments_of(self._map, bundle.window) if self.fits(map_id) else ()
+                chain = segments_of(self._map, bundle.window.rows, bundle.window.problem) if self.fits(map_id) else ()
                 bundle = replace(bundle, inertial=tells_scale(chain, self._config.inertial_scale))
                 chain = chain if bundle.inertial else ()
                 held = int(np.flatnonzero(~bundle.window.problem.free)[0])

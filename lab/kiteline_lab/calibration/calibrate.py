@@ -20,9 +20,10 @@ from kiteline_hw.calibration.told import UNCALIBRATED, ToldCalibration
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import boards
+from kiteline_lab.calibration.best_lens import best_lens
 from kiteline_lab.calibration.boards import Board, parse_board
 from kiteline_lab.calibration.picture import residual_picture
-from kiteline_lab.calibration.solve import Calibrated, best_lens
+from kiteline_lab.calibration.solve import Calibrated
 from kiteline_lab.calibration.verdict import Finding, judge, overall
 from kiteline_lab.calibration.views import ViewCollector
 from kiteline_lab.flights.out_file import whole_file

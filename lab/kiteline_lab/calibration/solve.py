@@ -7,7 +7,7 @@ each camera and the place of the right one. One solver for both lenses, and for 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -384,24 +384,3 @@ def _view_rms(points_m: F64, views: Sequence[View], state: _State, lens: Lens) -
         np.add.at(square, r.view, (r.error_px**2).sum(1))
         np.add.at(count, r.view, 1.0)
     return np.sqrt(square / np.maximum(count, 1.0))
-
-
-def best_lens(
-    points_m: F64, views: Sequence[View], sizes: Sequence[tuple[int, int]], lens: str, coefficients: int
-) -> Calibrated:
-    """Calibrate with a lens of that name; "auto": the one that fits better. Raises CalibrationFailed."""
-    if lens != "auto":
-        return calibrate(points_m, views, sizes, Lens(lens), coefficients)
-    found: list[tuple[float, Calibrated]] = []
-    errors: list[CalibrationFailed] = []
-    for which, penalty in ((Lens.RADTAN, 1.0), (Lens.EQUIDISTANT, 1.05)):  # the lens of most cameras wins a draw
-        try:
-            result = calibrate(points_m, views, sizes, which, coefficients)
-        except CalibrationFailed as error:
-            errors.append(error)
-            continue
-        lost = 1.0 + result.left_out / len(views)
-        found.append((penalty * lost * float(np.mean([r.rms_px for r in result.residuals])), result))
-    if not found:
-        raise errors[0]
-    return replace(min(found, key=lambda f: f[0])[1])
