@@ -182,6 +182,7 @@ class LoopDetector:
         return out
 
     def is_kept_apart(self, a: SubmapId, b: SubmapId) -> bool:
+        """True if a user has split the maps of two submaps."""
         return any((a in x and b in y) or (b in x and a in y) for x, y in self.kept_apart)
 
     # -- acceptance --------------------------------------------------------------------------------------------------

@@ -8,17 +8,11 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
-from kiteline_hw.calibration.kalibr import imu_numbers
+from kiteline_hw.calibration.kalibr import IMU_KEYS, imu_numbers
 from kiteline_hw.calibration.nodes import F64, Node
 from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
-_IMU_KEYS = {
-    "gyro_noise": "gyroscope_noise_density",
-    "gyro_walk": "gyroscope_random_walk",
-    "accel_noise": "accelerometer_noise_density",
-    "accel_walk": "accelerometer_random_walk",
-    "rate_hz": "rate_hz",
-}
+_IMU_KEYS = IMU_KEYS | {"rate_hz": "rate_hz"}
 
 
 def is_sensor(node: Node) -> bool:

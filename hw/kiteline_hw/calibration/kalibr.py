@@ -14,7 +14,7 @@ from kiteline_hw.calibration.nodes import F64, Node
 from kiteline_hw.calibration.told import FilePart, ToldCalibration
 from kiteline_hw.ports import SourceError
 
-_IMU_KEYS = {
+IMU_KEYS = {
     "gyro_noise": "gyroscope_noise_density",
     "gyro_walk": "gyroscope_random_walk",
     "accel_noise": "accelerometer_noise_density",
@@ -56,7 +56,7 @@ def read_imu(node: Node) -> FilePart:
     table = node.get("imu0") if "imu0" in node.keys else node
     if "T_i_b" in table.keys and not np.allclose(_rigid(table.get("T_i_b")), np.eye(4), atol=1e-9):
         raise table.get("T_i_b").error("the identity: the body frame is that of the first IMU")
-    imu = ImuCalibration(**imu_numbers(table, _IMU_KEYS))
+    imu = ImuCalibration(**imu_numbers(table, IMU_KEYS))
     where = str(node.path)
     return FilePart(where, ToldCalibration(where, imu=imu))
 
@@ -98,7 +98,7 @@ def texts(told: ToldCalibration) -> dict[str, str]:
     if lines:
         out["camchain.yaml" if told.T_b_c is None else "camchain-imucam.yaml"] = "\n".join(lines) + "\n"
     if told.imu is not None:
-        imu = [f"{key}: {getattr(told.imu, field)!r}" for field, key in _IMU_KEYS.items()]
+        imu = [f"{key}: {getattr(told.imu, field)!r}" for field, key in IMU_KEYS.items()]
         out["imu.yaml"] = "\n".join([*imu, "rostopic: /imu0"]) + "\n"
     return out
 
