@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from dataclasses import dataclass
 
 from kiteline_core.frame import ImuBatch, OdometryBatch
@@ -19,6 +18,7 @@ from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
 from kiteline_hw.mavlink.transport.signing import Signing
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
+from kiteline_hw.mavlink.tunnel_link import TunnelQueue
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
 from kiteline_hw.mavlink.watch.findings import Finding
 from kiteline_hw.ports import ByteLink, Clock, PoseSample
@@ -30,7 +30,6 @@ _TUNNEL_TICK_S = 0.01  # s between two checks of a tunnel's rate
 _MAX_QUEUED = 8  # messages waiting for a slow serial port; the oldest are dropped, because a late pose is of little use
 _TUNNEL_QUEUED = 8  # more of them for a tunnel
 _COMPUTER_NS = 5_000_000_000  # ns between two messages about the computer, which routers send to the radio too
-_INBOX_PACKETS = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +143,11 @@ class MavlinkPoseSink(Closing):
         self._connection.close()
 
 
-class SharedTunnel:
+class SharedTunnel(TunnelQueue):
     """A ByteLink on the connection of a PoseSink, which closes it. lock: of the session."""
 
     def __init__(self, config: TunnelConfig, session: ControllerSession, lock: threading.Lock) -> None:
-        self._lock = lock
-        self._end = TunnelEnd(config, session.codec)
-        self._inbox: deque[bytes] = deque(maxlen=_INBOX_PACKETS)
+        super().__init__(TunnelEnd(config, session.codec), lock)
         session.listen(Tunnel, self._take)
         session.listen(RadioStatus, self._take)
 
@@ -163,18 +160,6 @@ class SharedTunnel:
     def poll(self, now_ns: int) -> list[bytes]:
         """The messages to send now; the lock is held."""
         return self._end.poll(now_ns)
-
-    def send(self, packet: bytes) -> bool:
-        """Queue one packet; False if too much is queued already. Never blocks."""
-        with self._lock:
-            return self._end.send(packet)
-
-    def receive(self) -> list[bytes]:
-        """All packets that came in since the last call."""
-        with self._lock:
-            packets = list(self._inbox)
-            self._inbox.clear()
-        return packets
 
     def close(self) -> None:
         """Nothing to close: the PoseSink owns the connection."""

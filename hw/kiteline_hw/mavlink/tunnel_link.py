@@ -20,16 +20,35 @@ _INBOX_PACKETS = 1024
 _ALIVE_NS = 10_000_000_000  # ns after the last message in which an agent counts as reachable
 
 
-class MavlinkTunnelLink(Closing):
+class TunnelQueue:
+    """Sends and receives packets by one end of a tunnel. lock: held while the end is used."""
+
+    def __init__(self, end: TunnelEnd, lock: threading.Lock) -> None:
+        self._end = end
+        self._lock = lock
+        self._inbox: deque[bytes] = deque(maxlen=_INBOX_PACKETS)
+
+    def send(self, packet: bytes) -> bool:
+        """Queue one packet; False if too much is queued already. Never blocks."""
+        with self._lock:
+            return self._end.send(packet)
+
+    def receive(self) -> list[bytes]:
+        """All packets that came in since the last call."""
+        with self._lock:
+            packets = list(self._inbox)
+            self._inbox.clear()
+        return packets
+
+
+class MavlinkTunnelLink(TunnelQueue, Closing):
     """A ByteLink. url: see MAVLINK_FORMS; its system id, if it has one, is ours. Raises LinkError."""
 
     def __init__(self, url: str, config: TunnelConfig, *, required: bool = True) -> None:
         address = parse_mavlink_url(url)
         if address.system is not None:
             config = replace(config, system=address.system, learns_system=False)
-        self._lock = threading.Lock()
-        self._end = TunnelEnd(config)
-        self._inbox: deque[bytes] = deque(maxlen=_INBOX_PACKETS)
+        super().__init__(TunnelEnd(config), threading.Lock())
         self._connection = MavlinkConnection(
             address, "mavlink-tunnel", self._on_data, self._on_tick, _TICK_S, 0, required=required
         )
@@ -54,18 +73,6 @@ class MavlinkTunnelLink(Closing):
     def alive(self) -> bool:
         """True if anything came from the other end lately."""
         return self._end.heard_within(_ALIVE_NS, time.monotonic_ns())
-
-    def send(self, packet: bytes) -> bool:
-        """Queue one packet; False if too much is queued already. Never blocks."""
-        with self._lock:
-            return self._end.send(packet)
-
-    def receive(self) -> list[bytes]:
-        """All packets that came in since the last call."""
-        with self._lock:
-            packets = list(self._inbox)
-            self._inbox.clear()
-        return packets
 
     def _on_data(self, data: bytes, datagram: bool, adopt: Adopt | None) -> None:
         with self._lock:
