@@ -122,14 +122,13 @@ class PoseConfig:
 class KeyframeConfig:
     """When a frame becomes a keyframe; see keyframes.policy.RULES."""
 
-    min_gap_frames: int = 2  # frames: the tracker uses a new keyframe before the next one is made
     max_gap_s: float = 3.0  # s: the base hears at least so often from a vehicle at rest
     min_share: float = 0.65  # inliers relative to those of the reference keyframe
     min_inliers: int = 90  # inliers of a comfortable track
     min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
     rotation_rad: float = 0.30  # rad: a rotation that has replaced a quarter of the view
-    wait_right_frames: int = 5  # frames that a keyframe waits for a lost right image; without it points have no depth
+    wait_right_s: float = 0.26  # that a keyframe waits for a lost right image: without it points have no depth
     thin: float = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
 
@@ -164,8 +163,8 @@ class TwoViewStartConfig:
     window_px: int = 15  # px: window of the optical flow; the smallest that keeps hold of corners
     min_flow: float = 0.02  # of the focal length, median: with less flow two views have no parallax
     min_share: float = 0.4  # of the first corners; with fewer left a new first frame is taken
-    max_frames: int = 40  # frames after which a new first frame is taken: the view has changed too much
-    scale_every: int = 10  # frames between two tests of the metric scale
+    max_s: float = 1.98  # s after which a new first frame is taken: the view has changed too much
+    scale_every: int = 10  # frames between two tests of the metric scale: each may correct it needlessly
     scale_sigma: float = 0.02  # relative deviation below which the metric scale is used
     two_view: TwoViewConfig = field(default_factory=TwoViewConfig)
 
@@ -231,7 +230,7 @@ class RelocalisationConfig:
     dead_reckoning_m: float = 0.08  # m: standard deviation up to which dead reckoning extends the map; below good_m
     dead_reckoning_rad: float = 0.02  # rad: the same for the rotation, a degree
     failures: int = 2  # failed searches in frames with texture before a new submap is opened
-    join_frames: int = 20  # frames for which older submaps are searched beside a new one: 1 s
+    join_s: float = 1.02  # s for which older submaps are searched beside a new one
     agree_ratio: float = 0.05  # of the depth: difference between two results beside a new submap
     agree_rad: float = 0.035  # rad: the same for the rotation, 2 degrees
     ambiguous_candidates: int = 2  # further places of the same submap that are tried; each costs about 1 ms
@@ -266,7 +265,7 @@ class CovarianceConfig:
     surprise: float = 7.0  # standard deviations between a relocalised pose and the IMU's prediction, at most
     surprise_unmeasured: float = 10.0  # the same if nothing measured the motion: 2 g all the time
     far_deviations: float = 4.0  # the same beyond which a relocalised pose has low quality at first: nearly 1 g
-    low_quality_frames: int = 20  # frames of that low quality: one second, in which a wrong place fails to track
+    low_quality_s: float = 0.98  # s of that low quality, in which a wrong place fails to track
     surprise_m: float = 0.1  # m: standard deviation added to that comparison, since maps are corrected meanwhile
     surprise_rad: float = 0.05  # rad: the same for the rotation
 

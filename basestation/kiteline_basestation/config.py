@@ -285,7 +285,6 @@ class GridConfig:
     log_through: float = -0.3  # log-odds of one ray through an obstacle's heights (p = 0.43)
     log_free: float = -0.7  # log-odds of one ray over a cell without obstacle (p = 0.33)
     log_limit: float = 3.5  # log-odds; p stays within 0.03..0.97, so that cells can still change
-    quartile: float = 0.675  # standard deviations from the mean to a quartile of a normal distribution
     fence: float = 1.5  # interquartile ranges above the upper quartile: longer rays are outliers (Segfloor eq. 5.3)
     ground: GroundConfig = field(default_factory=GroundConfig)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment as imu_alignment
+from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
+from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
@@ -104,3 +109,11 @@ def test_scale_is_not_believed_without_acceleration() -> None:
 def test_too_few_poses_give_nothing() -> None:
     poses, _, motions = measured(1, 3, np.zeros(6))
     assert imu_alignment.align(poses, P_B_C, motions, np.zeros(6), 9.81, with_scale=False) is None
+
+
+@pytest.mark.parametrize(("rate_hz", "kept"), [(20, 60), (10, 30), (2, 7)])
+def test_the_window_is_as_long_at_any_frame_rate_but_never_too_thin(rate_hz: int, kept: int) -> None:
+    window = ImuInitialiser(InertialConfig(), CALIBRATION, np.zeros(3), cast(SampleBuffer, None))
+    for k in range(100):
+        window.add(TimedPose(k * 1_000_000_000 // rate_hz, np.eye(4), cast(Samples, object()) if k else None))
+    assert len(window._poses) == kept

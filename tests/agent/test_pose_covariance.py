@@ -372,3 +372,17 @@ def test_the_kernel_of_poses_composes_as_written() -> None:
     np.testing.assert_allclose(left, want, rtol=1e-10)
     e = j @ adjoint(T_a_b0) @ (np.eye(6) - adjoint(se3.inverse(T_a_b0) @ T_a_b))
     np.testing.assert_allclose(out, j @ want @ j.T + turn @ blind @ turn.T + e @ extrinsic @ e.T, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0])
+def test_low_quality_after_a_far_relocalisation_lasts_as_long_at_any_frame_rate(rate_hz: float) -> None:
+    local_map = map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4)))
+    track = tracked(local_map, seen_with(np.zeros(SHAPES), scene(), np.eye(4)), np.eye(4))
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance._far_relocalisation = True
+    covariance.confirm_relocalisation()
+    frames, sure = 0, 1e-8 * np.eye(6)
+    while covariance.quality(sure, 100) < CovarianceConfig().flagged_below and frames < 100:
+        covariance.update(track, 1.0 / rate_hz)
+        frames += 1
+    assert frames == rate_hz  # one second

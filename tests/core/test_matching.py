@@ -60,7 +60,7 @@ def test_matches_that_turn_unlike_the_others_leave() -> None:
 
 def test_guided_search_sees_exactly_its_circle() -> None:
     rng = np.random.default_rng(2)
-    n, config = 120, MatchConfig(cell_px=32.0)
+    n, config = 120, MatchConfig()
     uv2 = rng.uniform((0, 0), (320, 200), (n, 2))
     b = rng.integers(0, 256, (n, 32), np.uint8)
     a = noisy(rng, b, 20)

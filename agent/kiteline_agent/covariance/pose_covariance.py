@@ -77,7 +77,7 @@ class PoseCovariance:
         self._has_imu_motion = False  # an IMU measures all motion
         self._metric = has_depth
         self._far_relocalisation = False  # the last relocalisation is far from the predicted pose
-        self._doubtful_frames = 0  # frames left in which such a relocalisation has low quality
+        self._doubtful_s = 0.0  # for which such a relocalisation still has low quality
         self._imu_offset = np.zeros(6)  # mean offset of fused poses from those of images, on the left of T_c_m
         self._imu_offset_cov = np.zeros((6, 6))  # its covariance
         self._unmeasured_s: float | None = 0.0  # time without any measured motion; None: the last frame was measured
@@ -104,13 +104,13 @@ class PoseCovariance:
         if self._T_o_b0 is None:
             self._T_o_b0 = T_m_b
 
-    def update(self, track: Track) -> None:
-        """Update after images gave the pose, from landmarks of the local map.
+    def update(self, track: Track, dt_s: float = 0.0) -> None:
+        """Update after images gave the pose, from landmarks of the local map. dt_s: since the last such frame.
 
         As a perturbation on the left, the covariance changes slowly: it is evaluated for every keyframe, after every
         frame without a pose from images, and every few frames.
         """
-        self._doubtful_frames = max(self._doubtful_frames - 1, 0)
+        self._doubtful_s = max(self._doubtful_s - dt_s, 0.0)
         if self._unmeasured_s is None and self._age < _EVERY and track.inliers >= _FEWER * self._inliers:
             self._age += 1
             self._track = track
@@ -358,7 +358,7 @@ class PoseCovariance:
 
     def confirm_relocalisation(self) -> None:
         """Accept the last consistent relocalisation; if it is far from the prediction, its quality is low at first."""
-        self._doubtful_frames = self._config.low_quality_frames if self._far_relocalisation else 0
+        self._doubtful_s = self._config.low_quality_s if self._far_relocalisation else 0.0
 
     def quality(self, cov: F64, inliers: int | None) -> int:
         """Probability in percent, at least 1, that a pose of covariance cov (6,6) is good, as configured.
@@ -369,7 +369,7 @@ class PoseCovariance:
         trust = 1.0
         if inliers is not None:
             trust = min(max((inliers - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
-        most = 100 if self._doubtful_frames == 0 else c.flagged_below - 1
+        most = 100 if self._doubtful_s == 0.0 else c.flagged_below - 1
         return min(max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad))), most)
 
 

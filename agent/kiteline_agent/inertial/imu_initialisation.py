@@ -66,7 +66,9 @@ class ImuInitialiser:
         """Append a pose; one without samples begins a new window."""
         if pose.samples is None:
             self._poses = []
-        self._poses = [*self._poses, pose][-self._config.window_frames :]
+        self._poses.append(pose)
+        recent = sum((pose.t_ns - p.t_ns) * 1e-9 <= self._config.window_s for p in self._poses)
+        del self._poses[: -max(recent, self._config.motion_frames)]
 
     def transform(self, function: Callable[[F64], F64]) -> None:
         """Replace every pose T_m_b by function(T_m_b)."""
@@ -84,7 +86,7 @@ class ImuInitialiser:
         config = self._config
         if len(self._poses) < _MIN_FRAMES or self._span_s() < config.level_window_s:
             return None
-        poses, motions = self._window(config.window_frames, bias)
+        poses, motions = self._window(len(self._poses), bias)
         if len(motions) < len(poses) - 1:
             return None
         found = initial_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)

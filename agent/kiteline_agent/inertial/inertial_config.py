@@ -48,7 +48,7 @@ class InertialConfig:
     level_patience_s: float = 2.0  # longest time that a flight controller waits for gravity-aligned poses
     motion_window_s: float = 0.7  # window of the initialisation in motion
     motion_frames: int = 7  # least frames of that window: with five, noise could pass for acceleration
-    window_frames: int = 60  # most frames kept before the initialisation
+    window_s: float = 2.97  # s of poses kept before the initialisation, for gravity at rest and in slow flight
     max_residual_m: float = 0.02  # of the initialisation; above it the poses do not fit the IMU
     max_gravity_error: float = 0.12  # relative, of the length that is found without imposing it
     trusted_dead_reckoning_s: float = 1.0  # dead reckoning by the IMU counts as tracking for this long

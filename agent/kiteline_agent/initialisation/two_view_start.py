@@ -102,7 +102,7 @@ class TwoViewStart:
         few = len(self._uv) < max(config.two_view.min_points, config.min_share * len(self._templates))
         if start is not None:
             self._first = None
-        elif few or self._frames >= config.max_frames:
+        elif few or (ctx.t_ns - self._first_t_ns) * 1e-9 >= config.max_s:
             self._begin(ctx)
         return start
 

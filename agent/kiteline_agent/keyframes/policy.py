@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 
-_COVER_CELL_PX = 96  # about 8 x 5 cells at 752x480: coarse enough that an even track fills nearly all
+_COVER_CELLS = 39  # of the image, 8 x 5 at 752x480: coarse enough that an even track fills nearly all
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,7 @@ class Rule:
     pressing: bool = False
 
 
-# A frame becomes a keyframe when min_gap_frames have passed and any row needs one.
+# A frame becomes a keyframe if any row needs one; the frame after a keyframe never does.
 RULES = (
     Rule("few points left", lambda s, c: s.inliers < c.min_inliers, True),
     Rule("share of the reference", lambda s, c: s.inliers < c.min_share * s.reference_inliers, True),
@@ -62,8 +63,8 @@ class KeyframeNeed:
 
 def keyframe_need(situation: Situation, config: KeyframeConfig) -> KeyframeNeed | None:
     """The rules that need a keyframe; None if none does."""
-    if situation.frames_since < config.min_gap_frames:
-        return None
+    if situation.frames_since < 2:
+        return None  # the tracker uses a keyframe before the next one is made
     rows = [rule for rule in RULES if rule.needs(situation, config)]
     return KeyframeNeed(rows[0].name, any(rule.pressing for rule in rows)) if rows else None
 
@@ -73,9 +74,10 @@ def situation(
 ) -> Situation:
     """Measure what the rules read. T_m_k: (4,4) of the reference keyframe."""
     uv = track.observed[track.inlier, :2]
-    columns = -(-camera.width // _COVER_CELL_PX)
-    rows = -(-camera.height // _COVER_CELL_PX)
-    row, column = (uv[:, 1] // _COVER_CELL_PX).astype(np.int64), (uv[:, 0] // _COVER_CELL_PX).astype(np.int64)
+    side_px = round(math.sqrt(camera.width * camera.height / _COVER_CELLS))
+    columns = -(-camera.width // side_px)
+    rows = -(-camera.height // side_px)
+    row, column = (uv[:, 1] // side_px).astype(np.int64), (uv[:, 0] // side_px).astype(np.int64)
     covered = np.zeros((rows, columns), np.bool_)
     covered[row, column] = True
     T_c_k = track.T_c_m @ T_m_k

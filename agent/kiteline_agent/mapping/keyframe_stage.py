@@ -33,18 +33,19 @@ class KeyframeStage:
         self._governor = governor
         self._channel = channel
         self._work = work
-        self._without_right = 0  # frames since the last right image of a stereo camera
+        self._right_t_ns = 0  # of the last frame with all images of its camera
 
     def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
         """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events."""
-        self._without_right = self._without_right + 1 if self._maker.lacks_right_image(ctx) else 0
+        if not self._maker.lacks_right_image(ctx):
+            self._right_t_ns = ctx.t_ns
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
             return []
         urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
             return ["governor: keyframe postponed"]
-        if not urgent and 0 < self._without_right <= ctx.config.keyframe.wait_right_frames:
+        if not urgent and 0.0 < (ctx.t_ns - self._right_t_ns) * 1e-9 < ctx.config.keyframe.wait_right_s:
             return []  # its new landmarks would have no depth
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             self._add_unshared(ctx, track)

@@ -75,7 +75,7 @@ class SubmapStage:
             camera.set_first_pose(ctx.imu)
         else:
             camera.leave_submap()
-            self._relocaliser.start_joining(ctx.number)
+            self._relocaliser.start_joining(ctx.t_ns)
         camera.open_submap()
         camera.pose.reset_motion()
         self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)

@@ -71,7 +71,7 @@ class Relocaliser:
         )
         self._index = None if vocabulary is None else PlaceIndex(vocabulary)
         self._waiting: list[KeyframeId] = []  # keyframes that are not in the index yet
-        self._join_until: int | None = None  # last frame of the search for an older submap
+        self._join_until_ns: int | None = None  # end of the search for an older submap
         self._unconfirmed: tuple[SubmapId, F64] | None = None  # the older submap as found once, T_old_new
         self.has_texture = True  # the last frame that was searched had enough corners
 
@@ -101,9 +101,9 @@ class Relocaliser:
         )
         index.add(keyframe, self._map.descriptor[np.union1d(own, in_view.rows)])
 
-    def start_joining(self, frame_number: int) -> None:
-        """A new submap was opened at this frame: search for older ones for a while."""
-        self._join_until = frame_number + self._config.relocalisation.join_frames
+    def start_joining(self, t_ns: int) -> None:
+        """A new submap was opened at t_ns: search for older ones for a while."""
+        self._join_until_ns = t_ns + round(self._config.relocalisation.join_s * 1e9)
         self._unconfirmed = None
 
     def relocalise(self, ctx: FrameContext, reference: KeyframeId) -> Relocalisation | None:
@@ -116,7 +116,7 @@ class Relocaliser:
 
         Two results in a row have to agree, since the tracked submap would be left for the old one.
         """
-        if self._join_until is None or ctx.number > self._join_until or self._index is None:
+        if self._join_until_ns is None or ctx.t_ns > self._join_until_ns or self._index is None:
             return None
         found = self._search(ctx, NO_KEYFRAME, exclude=self._map.active)
         if found is None:
@@ -130,7 +130,7 @@ class Relocaliser:
         angle = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
         if np.linalg.norm(change[:3, 3]) > limits.agree_ratio * found.depth_m or angle > limits.agree_rad:
             return None
-        self._join_until = None
+        self._join_until_ns = None
         return found
 
     def _search(self, ctx: FrameContext, reference: KeyframeId, exclude: SubmapId | None) -> Relocalisation | None:

@@ -34,6 +34,7 @@ Bool = NDArray[np.bool_]
 _T = TypeVar("_T", bound=np.generic)
 
 TILE = kernels.TILE
+_QUARTILE = 0.675  # of a normal distribution, in standard deviations
 UNKNOWN = -1
 
 UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of map points
@@ -153,7 +154,7 @@ def _overlong(config: GridConfig, seen: I64, length: F64, labels: U8) -> Bool:
     mean = np.bincount(seen[floor, 0], length[floor], n) / count
     variance = np.bincount(seen[floor, 0], length[floor] ** 2, n) / count - mean**2
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    upper = mean + config.quartile * sigma + config.fence * 2.0 * config.quartile * sigma
+    upper = mean + (1.0 + 2.0 * config.fence) * _QUARTILE * sigma
     return np.asarray(floor & (length > upper[seen[:, 0]] + 1e-9))
 
 

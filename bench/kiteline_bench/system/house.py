@@ -1,28 +1,19 @@
-"""The bars of the sources themselves: structure, replay of an older build's logs, CPU beside it, compilation."""
+"""The bars of the sources themselves: structure, CPU beside an older build, compilation."""
 
 from __future__ import annotations
 
 from statistics import median
 from typing import Any
 
-import cv2
-
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
-from kiteline_bench.harness.simulated import rendered_paths
 from kiteline_bench.system.compile_time import measure
-from kiteline_bench.system.older_build import REVISION, older_build, replay_difference, todays_build
+from kiteline_bench.system.older_build import REVISION, older_build, todays_build
 from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circles
 
 _MODULES, _LINES, _ALL_LINES = 14, 400, 38_000  # in a folder, in a file, in all rooms
 _COMPILE_S = 12.0
 _ROUNDS = 5
 _CPU_RATIO = 1.02
-_TWO_AGENTS_S = 15.0
-_KNOWN_DIFFERENCES = (
-    "Flights with a merge differ by design: the placement of a recognised submap has one more byte "
-    "(docs/decisions/recognised-placements.md), and new keyframes no longer take depths from the map cache "
-    "(docs/decisions/map-cache-without-images.md, with twenty flights of each)."
-)
 
 
 def _structure(bench: Bench) -> list[Bar]:
@@ -48,35 +39,6 @@ def _structure(bench: Bench) -> list[Bar]:
         at_most("import circles of sub-packages", len(packages_in_circles), 0, "", 0),
         at_most("lines of all rooms", sum(lines.values()), _ALL_LINES, "", 0),
     ]  # fmt: skip
-
-
-def _replay(bench: Bench) -> list[Bar]:
-    """Logs of an older build, replayed by this one."""
-    cv2.setNumThreads(1)
-    build = older_build(bench)
-    room = bench.source("room_flight.mcap")
-    both = [str(path.resolve()) for path in rendered_paths(
-        bench, "house", "hall", ["MH_01_easy.txt", "MH_03_medium.txt"], _TWO_AGENTS_S)]  # fmt: skip
-    flights: dict[str, tuple[list[str], list[str]]] = {
-        "stereo and IMU": ([room], []),
-        "monocular": ([bench.source("kitti07_mono")], ["--mono"]),
-        "RGB-D": ([bench.source("tum_rgbd_xyz")], []),
-        "lossy link": ([room], ["--link-loss", "0.2"]),
-        "two agents": (both, []),
-    }
-    bars = []
-    bench.more.append(_KNOWN_DIFFERENCES)
-    for name, (sources, options) in flights.items():
-        bench.say(f"flying with {REVISION[:8]}: {name}")
-        out = bench.folder.resolve() / f"older {name}"
-        build.fly(sources, out, *options)
-        logs = [*(out / f"agent{k}" / "log.mcap" for k in range(len(sources))), out / "base" / "log.mcap"]
-        bench.say(f"replaying its logs: {name}")
-        found = {log.parent.name: replay_difference(build, log) for log in logs}
-        differences = [f"{half}: {difference}" for half, difference in found.items() if difference is not None]
-        bars.append(is_true(f"logs of {REVISION[:8]}, {name}", "every output as in the log", not differences,
-                            "; ".join(differences) or f"{len(logs)} logs equal bit for bit"))  # fmt: skip
-    return bars
 
 
 def _cpu(bench: Bench) -> list[Bar]:
@@ -123,7 +85,6 @@ def _compile(bench: Bench) -> list[Bar]:
 
 PARTS = {
     "structure": ("Sources: structure", _structure),
-    "replay": ("Sources: logs of an older build", _replay),
     "cpu": ("Sources: CPU beside an older build", _cpu),
     "compile": ("Sources: compilation of kernels", _compile),
 }

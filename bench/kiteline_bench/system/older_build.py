@@ -1,4 +1,4 @@
-"""The build of an older revision, run beside today's: its flights, and the logs that they leave."""
+"""The build of an older revision, run beside today's."""
 
 from __future__ import annotations
 
@@ -12,12 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from kiteline_bench.harness.bars import Bench
-from kiteline_bench.system import job_values
-from kiteline_bench.system.renamed_logs import copy_renamed
 from kiteline_bench.system.structure import ROOMS, ROOT
-from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
-from kiteline_lab.replay.replay import replay_agent, replay_base
 
 REVISION = "384637ec35adaf05e73532fa9ac33b0a977b2137"  # before the rooms were cut into sub-packages
 _TIMEOUT_S = 900.0
@@ -67,15 +63,3 @@ def older_build(bench: Bench) -> Build:
         subprocess.run(["tar", "-xf", str(archive), "-C", str(folder)], check=True)
         archive.unlink()
     return Build(folder, bench.folder.resolve() / "older-cache")
-
-
-def replay_difference(build: Build, log: Path) -> str | None:
-    """Replay an older build's log by today's code, names mapped; the first difference in words, None without any."""
-    if log.parent.name == "base":
-        build.run([str(Path(job_values.__file__)), str(log)])
-    renamed = log.with_name("renamed.mcap")
-    copy_renamed(log, renamed)
-    with LogReader(renamed) as reader:
-        replay = replay_base if reader.metadata.get("role") == "base" else replay_agent
-        result = replay(reader)
-    return result.difference if result.steps else "it has no steps"

@@ -14,6 +14,8 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
 
+_CELL_PX = 32  # of the guided search; it changes its speed alone
+
 
 @dataclass(frozen=True, slots=True)
 class MatchConfig:
@@ -23,7 +25,6 @@ class MatchConfig:
     ratio: float = 0.85  # of the best to the second-best distance: above it, the match is ambiguous
     turn_bins: int = 16  # bins of the histogram of rotations between the two views; 22.5 degrees each
     turn_kept: int = 3  # bins that are kept: neighbours share a rotation between them
-    cell_px: float = 32.0  # cells of the guided search
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +57,13 @@ def match_near(
 
     octave: (n,) predicted pyramid level; octave2: (m,) measured. size: width, height px of the image.
     """
-    columns = -(-size[0] // int(config.cell_px))
-    rows = -(-size[1] // int(config.cell_px))
+    columns = -(-size[0] // _CELL_PX)
+    rows = -(-size[1] // _CELL_PX)
     start, item = np.empty((rows, columns + 1), np.int32), np.empty(len(uv2), np.int32)
-    kernels.fill_cells(uv2, config.cell_px, start, item)
+    kernels.fill_cells(uv2, float(_CELL_PX), start, item)
     best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
     kernels.match_cells(
-        uv, radius_px, octave, words(a), uv2, octave2, words(b), config.cell_px, start, item,
+        uv, radius_px, octave, words(a), uv2, octave2, words(b), float(_CELL_PX), start, item,
         octave_gap, config.max_hamming, config.ratio, best, distance,
     )  # fmt: skip
     return _pairs(best, distance)
