@@ -296,6 +296,7 @@ class SmoothingConfig:
     time_s: float = 10.0  # s in which a larger correction is done, but for the last e-th: it moves faster
     max_rad_s: float = 0.0  # rad/s at which it rotates about the vehicle; 0: at once, which moves nothing
     snap_m: float = 1.0  # m: a correction that moves the vehicle farther at once is a map merge, and not smoothed
+    scale_sigma: float = 0.03  # relative deviation of a monocular map's scale before the base tells one
 
 
 @dataclass(frozen=True, slots=True)

@@ -245,7 +245,7 @@ class Mapper:
         self._placements.rescale(changes.rescaled)
         for map_id in sorted(changes.moved):
             self._local_bundles.cancel(map_id)
-            self._placements.update_map(map_id)
+            self._placements.update_map(map_id, changes.scale_sigma.get(map_id))
             self._grid.rebuild()
         return tuple(
             (agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0))

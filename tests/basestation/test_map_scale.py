@@ -188,8 +188,9 @@ def test_a_change_that_does_not_matter_waits() -> None:
     result = BundleResult(np.linalg.inv(T_w_c), np.zeros((0, 3)), np.ones(0, np.bool_), 0.0, 0.0, 0, 0)
     patient = replace(CONFIG, hold=1.1 * abs(np.log(found.metres)) / found.sigma)
     hasty = replace(CONFIG, hold=0.9 * abs(np.log(found.metres)) / found.sigma)
-    assert in_metres(result, segments, 0, patient) is result
-    assert in_metres(result, segments, 0, hasty) is not result
+    assert in_metres(result, segments, 0, patient).T_c_m is result.T_c_m
+    assert in_metres(result, segments, 0, hasty).T_c_m is not result.T_c_m
+    assert in_metres(result, segments, 0, patient).scale_sigma == found.sigma
 
 
 def a_sparse_map(culled: set[int]) -> tuple[SparseMap, BundleWindow, list[KeyframeId]]:

@@ -18,7 +18,7 @@ from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.packet import PROTOCOL_VERSION
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import submap_id
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -131,7 +131,10 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         S = np.array(s.pose())
         S[:3, :3] *= scale
         out["S_w_m"] = S
-        out["recognised"] = s.at < len(data) and s.u8() == 1
+        flags = s.u8() if s.at < len(data) else 0
+        e, m = divmod(flags >> 1, 8)
+        out["recognised"] = bool(flags & 1)
+        out["scale_sigma"] = (8 + m) * 2.0 ** (e - 20) if flags >> 1 else 0.0
         out["batch"] = s.batch()
     elif kind == 23:
         out["submap"] = s.varint()
@@ -207,14 +210,22 @@ def test_a_recognised_placement_has_one_byte_more() -> None:
     key = messages.key(recognised)
     assert_agree(read_code(key.kind, key.id, code), messages.decode(key, code))
     assert messages.encode(messages.decode(key, code)) == code
-    with pytest.raises(WireError, match="is 0 or 1"):
+    with pytest.raises(WireError, match="a byte of 0"):
         messages.decode(key, code[:-1] + b"\0")
-    with pytest.raises(WireError, match="is 0 or 1"):
-        messages.decode(key, code[:-1] + b"\2\1")
     with pytest.raises(WireError, match="above 0"):
         messages.decode(key, code + b"\0")
     with pytest.raises(WireError, match="too many"):
         messages.decode(key, code + b"\1\1")
+
+
+def test_the_deviation_of_a_placement_costs_no_byte_beside_another_one() -> None:
+    S_w_m = sim3.of(0.98, se3.exp(np.array([0.4, 0.1, -0.2, 0.3, 0.0, 0.05])))
+    record = SubmapPlacement(submap_id(1, 1, 2), S_w_m, True, 7, 0.0112)
+    code = messages.encode(record)
+    assert len(code) == len(messages.encode(SubmapPlacement(submap_id(1, 1, 2), S_w_m, True, 7)))
+    read = messages.decode(messages.key(record), code)
+    assert isinstance(read, SubmapPlacement) and read.scale_sigma == pytest.approx(0.0112, rel=0.06)
+    assert_agree(read_code(21, messages.key(record).id, code), read)
 
 
 def exchange() -> list[tuple[str, bytes]]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.exchange.correction_batches import CorrectionBatches
+from kiteline_agent.exchange.correction_filter import CorrectionFilter
 from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
@@ -45,6 +46,8 @@ class Corrections:
         self._map = local_map
         self._cache = cache
         self._smoothing = Smoothing(smoothing)
+        self._filter = CorrectionFilter(smoothing)
+        self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths in w, by submap
         self._batches = CorrectionBatches()
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
@@ -88,9 +91,11 @@ class Corrections:
         if not record.recognised and self._contradicts_gravity(record.submap, record.S_w_m):
             return False  # sent before the base knew of gravity; the upright placement follows
         self._S_w_m[record.submap] = record.S_w_m
+        self._scale_sigma[record.submap] = record.scale_sigma
         if record.recognised:
             lost_before = record.submap == self._map.active and record.submap != self._continued
             if record.submap not in self._recognised and lost_before:
+                self._filter.clear()
                 self._smoothing.snap()  # a merge: until now the submap lay where odometry put it
             self._recognised.add(record.submap)
         else:
@@ -148,7 +153,9 @@ class Corrections:
         if not self._smoothing.on:
             return self._body_in_world(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b
-        return self._body_in_world(self._smoothing.follow(S_w_m @ se3.inverse(T_o_m), T_o_b[:3, 3], t_ns), T_o_b)
+        here = T_o_b[:3, 3]
+        T_w_o = self._filter.weigh(S_w_m @ se3.inverse(T_o_m), here, self._scale_sigma.get(submap, 0.0))
+        return self._body_in_world(self._smoothing.follow(T_w_o, here, t_ns), T_o_b)
 
     def _body_in_world(self, S_w_x: F64, T_x_b: F64) -> F64:
         """T_w_b (4,4). S_w_x scales the camera's position, but not the lever arm to the body, which is in metres."""

@@ -50,7 +50,10 @@ def in_metres(
     """The result of a bundle, scaled about the camera `held` by what the segments tell, if that matters."""
     T_w_c: F64 = np.linalg.inv(result.T_c_m).astype(np.float64)
     found = map_scale(segments, T_w_c, config)
-    if found is None or abs(np.log(found.metres)) < config.hold * found.sigma:
+    if found is None:
+        return result
+    result = replace(result, scale_sigma=found.sigma)
+    if abs(np.log(found.metres)) < config.hold * found.sigma:
         return result
     centre = T_w_c[held, :3, 3].copy()
     T_w_c[:, :3, 3] = centre + found.metres * (T_w_c[:, :3, 3] - centre)

@@ -43,6 +43,7 @@ class SubmapPlacements:
         self.S_w_m: dict[SubmapId, F64] = {}  # the first submap of all comes first
         self.unmerged: dict[SubmapId, F64] = {}  # S_w_m of submaps that have a placement without a merge
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge with another submap
+        self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths, where accelerations told it
 
     @property
     def first(self) -> SubmapId | None:
@@ -122,14 +123,18 @@ class SubmapPlacements:
     def delete(self, submap: SubmapId) -> None:
         """Drop the placement of a submap."""
         self.S_w_m.pop(submap, None)
+        self._scale_sigma.pop(submap, None)
         self._recognised.discard(submap)
 
-    def update_map(self, map_id: SubmapId) -> None:
+    def update_map(self, map_id: SubmapId, scale_sigma: float | None = None) -> None:
         """Place all submaps of a map as they lie to each other, if one of them is placed.
 
-        A map in metres keeps its unit: if w had another unit, w is rescaled.
+        A map in metres keeps its unit: if w had another unit, w is rescaled. scale_sigma: relative deviation of the
+        map's lengths; None: as before.
         """
         submaps = self._map.submaps_of_map(map_id)
+        if scale_sigma is not None:
+            self._scale_sigma |= dict.fromkeys(submaps, scale_sigma)
         root = self._map.map_id(map_id)
         first = self.first
         anchor = next((s for s in [first, root, *submaps] if s in self.S_w_m and s in submaps), None)
@@ -164,7 +169,8 @@ class SubmapPlacements:
 
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
         self.S_w_m[submap] = S_w_m
-        self._publisher.publish_placement(submap, S_w_m, submap in self._recognised)
+        sigma = self._scale_sigma.get(submap, 0.0)
+        self._publisher.publish_placement(submap, S_w_m, submap in self._recognised, sigma)
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
         """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale."""

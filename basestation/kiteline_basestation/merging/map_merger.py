@@ -395,4 +395,5 @@ class MapMerger:
             targets[keyframe] = pose
         move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
         apply_bundle(self._map, window, result, self._publisher, self._config.cull, self._config.publish)
-        return MergeResult(moved=frozenset({map_id}), rescaled=units)
+        told = {map_id: result.scale_sigma} if result.scale_sigma > 0.0 else {}
+        return MergeResult(moved=frozenset({map_id}), rescaled=units, scale_sigma=told)

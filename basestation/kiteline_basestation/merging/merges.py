@@ -36,20 +36,22 @@ class MergeResult:
     """Changes of whole maps that the mapper has to apply.
 
     moved: ids of maps in which all keyframes may have moved. rescaled: factors by which units of submaps grew in their
-    map. split: submaps that no longer belong to the map that they were merged into. requeried: keyframes for which loop
-    closures were searched again; local bundles are due around them.
+    map. scale_sigma: relative deviations of lengths, by map id, where accelerations told them. split: submaps that no
+    longer belong to the map that they were merged into. requeried: keyframes for which loop closures were searched
+    again; local bundles are due around them.
     """
 
     moved: frozenset[SubmapId] = frozenset()
     rescaled: Mapping[SubmapId, float] = field(default_factory=dict)
+    scale_sigma: Mapping[SubmapId, float] = field(default_factory=dict)
     split: frozenset[SubmapId] = frozenset()
     requeried: tuple[KeyframeId, ...] = ()
 
     def __add__(self, later: MergeResult) -> MergeResult:
         factors = {submap: self.rescaled.get(submap, 1.0) * factor for submap, factor in later.rescaled.items()}
         return MergeResult(
-            self.moved | later.moved, {**self.rescaled, **factors}, self.split | later.split,
-            self.requeried + later.requeried,
+            self.moved | later.moved, {**self.rescaled, **factors}, {**self.scale_sigma, **later.scale_sigma},
+            self.split | later.split, self.requeried + later.requeried,
         )  # fmt: skip
 
 

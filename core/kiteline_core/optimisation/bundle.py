@@ -88,7 +88,8 @@ class BundleResult:
     """Adjusted poses and points.
 
     inlier: (m,) observations that passed the outlier test. cost_ops: arithmetic operations. offset: (g,t) px of the
-    border and offset_cov: (g*t,g*t), both empty without one.
+    border and offset_cov: (g*t,g*t), both empty without one. scale_sigma: relative standard deviation of all lengths as
+    something besides images tells them; 0 without that.
     """
 
     T_c_m: F64
@@ -100,6 +101,7 @@ class BundleResult:
     cost_ops: int
     offset: F64 = field(default_factory=lambda: np.empty((0, 0)))
     offset_cov: F64 = field(default_factory=lambda: np.empty((0, 0)))
+    scale_sigma: float = 0.0
 
 
 def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:

@@ -129,6 +129,22 @@ def test_poses_without_a_code_are_refused(bad: np.ndarray) -> None:
         quantise.pose_codes(bad)
 
 
+@given(st.floats(2.0**-16, 0.46))
+def test_a_deviation_keeps_three_bits(sigma: float) -> None:
+    code = quantise.deviation_code(sigma)
+    assert 0 < code < quantise.DEVIATION_CODES
+    assert quantise.deviation(code) == pytest.approx(sigma, rel=1.0 / 16.0)
+    assert quantise.deviation_code(quantise.deviation(code)) == code
+
+
+def test_every_code_of_a_deviation_has_its_own_value() -> None:
+    values = [quantise.deviation(code) for code in range(quantise.DEVIATION_CODES)]
+    assert np.all(np.diff(values) > 0.0) and values[0] == 0.0
+    assert [quantise.deviation_code(value) for value in values] == list(range(quantise.DEVIATION_CODES))
+    assert quantise.deviation_code(9.0) == quantise.DEVIATION_CODES - 1
+    assert quantise.deviation_code(1e-9) == 1
+
+
 def test_occupancy_bounds() -> None:
     cells = np.arange(-1, 101, dtype=np.int8)
     got = quantise.occupancy(quantise.occupancy_codes(cells))

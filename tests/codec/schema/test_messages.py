@@ -106,6 +106,8 @@ def some_records(seed: int, n: int) -> list[Record]:
         SubmapPlacement(SubmapId(submap ^ 1), sim3.of(1.0 + 0.37 * n, pose), False, 5),
         SubmapPlacement(SubmapId(submap ^ 2), sim3.of(1.0, pose), True, 5),
         DisparityCalibration(AgentId(4), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0, 5),
+        SubmapPlacement(SubmapId(submap ^ 3), sim3.of(1.0 + 0.37 * n, pose), False, 0, 0.5**7),
+        SubmapPlacement(SubmapId(submap ^ 4), sim3.of(1.0, pose), True, 5, 13.0 / 1024.0),
     ]  # fmt: skip
 
 
