@@ -75,7 +75,6 @@ class Agent:
         self._governor = Governor(config.governor, inertial=imu is not None)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
-        self._corrections = Corrections(self.map, self.map_cache, config.smoothing)
         self._tracker = Tracker(self.map, self.work)
         self._image_shift = ImageShift(self._rectifier)
         self._stuck_camera = StuckCamera(camera)
@@ -87,6 +86,10 @@ class Agent:
             self.right_camera = RightCamera(
                 identity.agent, self._camera, self.map, self._rectifier, config, channel
             )  # fmt: skip
+        self._corrections = Corrections(
+            self.map, self.map_cache, config.smoothing,
+            None if self.right_camera is None else self.right_camera.take_base,
+        )  # fmt: skip
         rows = None if self.right_camera is None else self.right_camera.rows
         maker = KeyframeMaker(self.map, channel, rows, self.work)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)

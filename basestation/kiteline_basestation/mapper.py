@@ -267,7 +267,9 @@ class Mapper:
             sent = self._sent_offsets.get(agent)
             if sent is None or not np.array_equal(sent, offset):
                 self._sent_offsets[agent] = offset
-                self._publisher.send(agent, DisparityCalibration(agent, offset))
+                if agent not in self.map.told_sigma_px or offset is not self.map.known_offset_px[agent]:
+                    sigma_px = self.map.disparity_sigma_px.get(agent)
+                    self._publisher.send(agent, DisparityCalibration(agent, offset, sigma_px))
 
     def _delete(self, submaps: Collection[SubmapId]) -> None:
         """Cull submaps, publish it, and ignore later records of them."""

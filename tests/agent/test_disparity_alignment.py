@@ -144,6 +144,34 @@ def test_a_true_rig_is_left_alone(seed: int) -> None:
     assert np.trace(flight.alignment.expected_cov) < 0.05 * begin
 
 
+def test_whoever_knows_more_sets_the_offset() -> None:
+    flight = Flight(WORN, 0, SIDEWAYS)
+    alignment, offsets = flight.alignment, flight.map
+    assert alignment.take_base(0.1 * WORN, None)  # nothing was found here yet
+    assert np.array_equal(offsets.disparity_offset, 0.1 * WORN)
+    assert flight.fly(40)  # the base takes the rig for a good one; here it is known to be worn
+    found = offsets.disparity_offset.copy()
+    assert not alignment.take_base(0.1 * WORN, None)
+    assert not alignment.take_base(WORN, 1.1 * alignment.sigma_px)
+    assert np.array_equal(offsets.disparity_offset, found)
+    assert alignment.take_base(WORN, 0.01)
+    assert flight.fly(60) == []
+    assert np.array_equal(offsets.disparity_offset, WORN)
+
+
+def test_an_estimate_here_replaces_one_of_the_base_once_more_is_known() -> None:
+    flight = Flight(WORN, 0, SIDEWAYS)
+    flight.fly(40)
+    before = flight.alignment.sigma_px
+    assert flight.alignment.take_base(0.5 * WORN, 0.99 * before)
+    for _ in range(20):  # keyframes that tell anew
+        flight.alignment._begin(0)
+        flight.alignment._keyframe[0] = -2
+        flight.fly(40)
+    assert flight.alignment.sigma_px < 0.9 * before
+    assert not np.array_equal(flight.map.disparity_offset, 0.5 * WORN)
+
+
 def test_forward_motion_alone_changes_nothing() -> None:
     flight = Flight(WORN, 1, AHEAD)
     assert flight.fly(60) == []
@@ -152,7 +180,7 @@ def test_forward_motion_alone_changes_nothing() -> None:
 
 def test_the_base_s_map_is_left_to_the_base() -> None:
     flight = Flight(WORN, 1, SIDEWAYS)
-    flight.map.from_base[0] = True
+    assert flight.alignment.take_base(NOTHING, 0.001)
     assert flight.fly(80) == []
     assert flight.alignment.worn > 0.95  # the covariance knows
 

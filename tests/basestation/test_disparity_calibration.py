@@ -109,6 +109,24 @@ def test_the_next_flight_begins_with_the_offset_unless_the_rig_was_calibrated_ag
     assert AgentId(0) not in after.map.disparity_calibrated
 
 
+def test_what_an_agent_found_counts_until_the_base_knows_more(make_flight: MakeFlight, words: Any) -> None:
+    worn = np.array([-0.6, 0.1, -0.2, -0.5, 0.8])
+    flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    close = worn + [0.3, 0.0, 0.2, 0.0, 0.0]
+    said = StereoAlignment(flight.agent, NONE, False, close, 0.15)
+    mapper = Mapper(BaseConfig(), words)
+    first = (CameraIntrinsics(flight.agent, flight.camera), said)
+    output = mapper.step(MapperInput(((flight.agent, first),), ()), 0)
+    sent = [r for _, records in output.publish for r in records]
+    assert not any(isinstance(r, DisparityCalibration) for r in sent)  # the agent has it
+    assert np.array_equal(mapper.map.disparity_offset_px[flight.agent], close)
+    fly(mapper, flight, worn, (said,))
+    assert mapper.map.disparity_sigma_px[flight.agent] < 0.1
+    assert np.sqrt(np.mean((terms(CORNERS) @ (mapper.map.disparity_offset_px[flight.agent] - worn)) ** 2)) < 0.12
+    mapper.map.set_stereo_alignment(said)  # less certain than what the base knows now
+    assert not np.array_equal(mapper.map.disparity_offset_px[flight.agent], close)
+
+
 def test_an_offset_of_a_worn_rig_is_found_early(make_flight: MakeFlight, words: Any) -> None:
     worn = np.array([1.2, 0.1, -0.2, 0.6, 0.2])
     flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)

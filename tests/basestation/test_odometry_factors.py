@@ -121,6 +121,20 @@ def test_turns_that_are_all_off_the_same_way_count_less() -> None:
     assert sigma["alike"] > 1.3 * sigma["by chance"]
 
 
+def test_links_of_a_worn_rig_count_less() -> None:
+    sparse_map, _ = flight(noise_px=0.3)
+    config = BaseConfig()
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
+    assert part is not None
+    sparse_map.keyframes.t_ns[: len(sparse_map)] = 2_000_000_000 * np.arange(len(sparse_map))  # as over a radio
+    good = with_odometry_factors(sparse_map, part, config.odometry_factors).sigma[len(part.slots) :]
+    sparse_map.disparity_sigma_px[AgentId(0)] = 0.2
+    worn = with_odometry_factors(sparse_map, part, config.odometry_factors).sigma[len(part.slots) :]
+    assert good.max() < 0.3
+    assert worn.min() > 5.0 * good.max()
+
+
 def test_links_stand_aside_of_the_border() -> None:
     sparse_map, _ = flight(noise_px=0.3)
     config = BaseConfig()

@@ -42,8 +42,13 @@ _METRES = 0.2  # difference of two scales in metres that IMU and base estimate: 
 class Corrections:
     """Applies the base's records, one handler for each kind, and holds where submaps lie in the world."""
 
-    def __init__(self, local_map: LocalMap, cache: MapCache, smoothing: SmoothingConfig) -> None:
+    def __init__(
+        self, local_map: LocalMap, cache: MapCache, smoothing: SmoothingConfig,
+        calibrate: Callable[[DisparityCalibration], list[str]] | None = None,
+    ) -> None:  # fmt: skip
+        """calibrate: takes over an offset of disparities, and returns events; None without a right camera."""
         self._map = local_map
+        self._calibrate = calibrate
         self._cache = cache
         self._smoothing = Smoothing(smoothing)
         self._filter = CorrectionFilter(smoothing)
@@ -64,7 +69,7 @@ class Corrections:
             SubmapPlacement: self._place,
             CachedKeyframe: cache.store,
             CachedLandmarks: cache.store,
-            DisparityCalibration: self._calibrate,
+            DisparityCalibration: self._take_calibration,
             GridTile: self._add_tile,
         }
         self._events: list[str] = []  # of the records that are being applied
@@ -102,10 +107,9 @@ class Corrections:
             self._recognised.discard(record.submap)
         return False
 
-    def _calibrate(self, record: DisparityCalibration) -> bool:
-        if self._map.camera.stereo:
-            self._map.set_disparity_offset(record.disparity_px)
-            self._events.append(f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large")
+    def _take_calibration(self, record: DisparityCalibration) -> bool:
+        if self._calibrate is not None:
+            self._events += self._calibrate(record)
         return False
 
     def _add_tile(self, record: GridTile) -> bool:

@@ -42,7 +42,8 @@ class DisparityAlignment:
         self._frames = 0
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
         self.worn = config.worn_share  # probability of it
-        self.applied = False  # the rig is worn: the map's offset is that found here
+        self.applied = False  # the rig is worn: an offset found here was applied
+        self._base_sigma_px: float | None = None  # of the map's offset, if the base found it
         self.expected_cov = self._expected_cov()  # beside the error of a good calibration
         self._events: list[str] = []
 
@@ -78,6 +79,23 @@ class DisparityAlignment:
             self.expected_cov = self._expected_cov()
             return change
         return None
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of the estimate, rms over the image."""
+        return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", self._grid, self.cov, self._grid))))
+
+    def take_base(self, offset: F64, sigma_px: float | None) -> bool:
+        """Set the map's offset to the base's (5,), unless more is known here. Returns whether it was set.
+
+        sigma_px: its standard deviation, rms over the image; None while the base takes the rig for well calibrated.
+        """
+        if self.applied and (sigma_px is None or sigma_px > self.sigma_px):
+            return False
+        self._base_sigma_px = np.inf if sigma_px is None else sigma_px
+        self._map.set_disparity_offset(offset)
+        self.expected_cov = self._expected_cov()
+        return True
 
     def take_events(self) -> list[str]:
         """Changes since the last call, for the log."""
@@ -161,13 +179,13 @@ class DisparityAlignment:
     def _expected_cov(self) -> F64:
         """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
         if self._map.disparity_offset.any():
-            left = none() if self._map.from_base.any() else self._estimate - self._map.disparity_offset
+            left = none() if self._base_sigma_px is not None else self._estimate - self._map.disparity_offset
             return np.asarray(self.cov + np.outer(left, left))
         return np.asarray(self.worn * (self.cov + np.outer(self._estimate, self._estimate)))
 
     def _apply(self) -> F64 | None:
-        """Change the offset of the map's disparities where the rig is worn. The base knows better, once it is there."""
-        if self._map.from_base.any():
+        """Change the offset of the map's disparities where the rig is worn, unless the base knows better."""
+        if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
         config, change = self._config, self._estimate - self._map.disparity_offset
         moved = self._old_moved + self._moved.sum(0)
@@ -178,7 +196,7 @@ class DisparityAlignment:
         least = config.least_change_px if self.applied else config.least_px
         if float(np.sqrt(np.mean((self._grid @ change) ** 2))) < least:
             return None
-        self.applied = True
+        self.applied, self._base_sigma_px = True, None
         self._map.set_disparity_offset(self._estimate)
         self._events.append(f"disparities in the middle are {self._estimate[0]:+.2f} px too large, by parallax")
         return np.asarray(change)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging.row_alignment import RowAlignment
@@ -12,10 +13,12 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import StereoAlignment
+from kiteline_codec.schema import DisparityCalibration, StereoAlignment
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import AgentId
+
+F64 = NDArray[np.float64]
 
 
 class RightCamera:
@@ -31,7 +34,8 @@ class RightCamera:
         self._channel = channel
         self.rows = RowAlignment(rectifier, config.rows)
         self.disparities = DisparityAlignment(local_map, config.disparities) if config.disparities.on else None
-        self._began_with_px = np.zeros(disparity_offset.TERMS)  # error of disparities
+        self._found_px = disparity_offset.none()  # error of disparities, without the base's part
+        self._sigma_px: float | None = None  # of it, once this flight found it
 
     def begin_with(self, known: KnownRigConfig) -> None:
         """Take over what earlier flights found, unless the camera was calibrated anew."""
@@ -41,8 +45,8 @@ class RightCamera:
         self._map.set_disparity_offset(known.disparity)
         if self.disparities is not None and known.disparity.any():  # zero: not found yet
             self.disparities.begin_with(known.disparity)
-        self._began_with_px = known.disparity
-        self._channel.put(StereoAlignment(self._agent, known.rows, known.rows_read, known.disparity))
+        self._found_px = known.disparity
+        self._put(known.rows)
 
     def add(self, track: Track) -> list[str]:
         """Estimate the disparity offset with a tracked frame; map and camera move with it. Returns events."""
@@ -53,14 +57,27 @@ class RightCamera:
         if change is None:
             return []
         self._camera.correct_disparities(change)
+        self._found_px, self._sigma_px = self._map.disparity_offset, self.disparities.sigma_px
+        self._put(self.rows.estimate_px)
         return self.disparities.take_events()
 
     def share_rows(self) -> list[str]:
         """Tell the base of rows that have changed. Returns events."""
         rows_px = self.rows.take_change()
         if rows_px is not None:
-            self._channel.put(StereoAlignment(self._agent, rows_px, self.rows.read, self._began_with_px))
+            self._put(rows_px)
         return self.rows.take_events()
+
+    def take_base(self, record: DisparityCalibration) -> list[str]:
+        """Take over the base's disparity offset, unless more is known here. Returns events."""
+        if self.disparities is None:
+            self._map.set_disparity_offset(record.disparity_px)
+        elif not self.disparities.take_base(record.disparity_px, record.sigma_px):
+            return []
+        return [f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large"]
+
+    def _put(self, rows_px: F64) -> None:
+        self._channel.put(StereoAlignment(self._agent, rows_px, self.rows.read, self._found_px, self._sigma_px))
 
     def known(self) -> KnownRigConfig | None:
         """What is known now, for the next flight; None before anything was measured."""

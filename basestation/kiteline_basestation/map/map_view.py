@@ -48,7 +48,9 @@ class MapView:
         self.measures_depth: set[AgentId] = set()  # agents that measure depth in each observation (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # (5,) by agent, see disparity_calibration
         self.disparity_calibrated: set[AgentId] = set()  # agents with an accurate disparity offset
-        self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: the disparity offset of earlier flights
+        self.disparity_sigma_px: dict[AgentId, float] = {}  # its deviation, rms over the image, if the rig is worn
+        self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: that of earlier flights, or found on board
+        self.told_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self._children: dict[KeyframeId, list[int]] = {}

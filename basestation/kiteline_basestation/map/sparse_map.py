@@ -63,6 +63,8 @@ class SparseMap(MapView):
             self.rows_px.pop(agent, None)
             self.rows_read.discard(agent)
             self.known_offset_px.pop(agent, None)
+            self.told_sigma_px.pop(agent, None)
+            self.disparity_sigma_px.pop(agent, None)
             if agent in self.disparity_offset_px:
                 self.disparity_offset_px[agent] = disparity_offset.none()
                 self.disparity_calibrated.discard(agent)
@@ -72,14 +74,24 @@ class SparseMap(MapView):
                 self.keyframes.camera[row] = _parameters(camera)
 
     def set_stereo_alignment(self, record: StereoAlignment) -> None:
-        """Set what an agent knows of its right camera. A disparity offset that was estimated here counts more."""
+        """Set what an agent knows of its right camera. A disparity offset of earlier flights that was estimated here
+        counts more; one that the agent finds in this flight counts until the offset is better known here.
+        """
         agent = record.agent
         self.rows_px[agent] = record.rows_px
         self.rows_read.discard(agent)
         if record.rows_read:
             self.rows_read.add(agent)
-        if agent not in self.disparity_offset_px and np.any(record.disparity_px != 0.0):
+        if not np.any(record.disparity_px != 0.0):
+            return
+        if agent not in self.disparity_offset_px and record.sigma_px is None:
             self.disparity_offset_px[agent] = self.known_offset_px[agent] = record.disparity_px
+        if record.sigma_px is None or (agent in self.known_offset_px and agent not in self.told_sigma_px):
+            return
+        self.known_offset_px[agent], self.told_sigma_px[agent] = record.disparity_px, record.sigma_px
+        if self.disparity_sigma_px.get(agent, np.inf) > record.sigma_px:
+            self.disparity_offset_px[agent], self.disparity_sigma_px[agent] = record.disparity_px, record.sigma_px
+            self.disparity_calibrated.discard(agent)
 
     def add_keyframe(self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64, keypoints: int) -> int:
         """Add a keyframe, or update its header. T_p_k: (4,4). Returns its row.

@@ -56,11 +56,14 @@ def with_border(
     measured = problem.measured.copy()
     measured[ranged, 2] = (sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots])[ranged]
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
-    sigma = _prior_px(focal, config)
+    prior = _prior_px(focal, config)
+    told = [sparse_map.told_sigma_px.get(a) for a in agents]
+    sigma = np.stack([prior if s is None else np.full(TERMS, s) for s in told])
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
     mean = np.stack([prior_mean(sparse_map, a, config) for a in agents])
     tells = sideways_share(problem.T_c_m) >= config.min_sideways
-    believed = np.array([tells or has_bent(sparse_map, a, config) for a in agents])
+    # What was found on board rests on this flight: data that contradict it are the fewer ones.
+    believed = np.array([s is None and (tells or has_bent(sparse_map, a, config)) for a, s in zip(agents, told)])
     border = Border(
         group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined,
         config.worn, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
@@ -69,7 +72,8 @@ def with_border(
 
 
 def prior_mean(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -> F64:
-    """Offset (5,) px about which an agent's is expected: that of earlier flights if it is a worn rig's, else zero.
+    """Offset (5,) px about which an agent's is expected: that found on board, or of earlier flights if it is a worn
+    rig's, else zero.
 
     An offset within what good calibrations have may be one that those flights hardly determined. Were the next ones
     held about it, and those after them about theirs, the prior would be no prior.
@@ -77,8 +81,12 @@ def prior_mean(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -
     known, camera = sparse_map.known_offset_px.get(agent), sparse_map.cameras.get(agent)
     if known is None or camera is None:
         return none()
-    deviations = known / _prior_px(camera.fx, config)
-    return known if float(np.sqrt(np.mean(deviations**2))) > config.known_from else none()
+    return known if agent in sparse_map.told_sigma_px or _is_worn(known, camera.fx, config) else none()
+
+
+def _is_worn(offset: F64, focal: float, config: DisparityConfig) -> bool:
+    """True if an offset (5,) px is beyond those of good calibrations."""
+    return float(np.sqrt(np.mean((offset / _prior_px(focal, config)) ** 2))) > config.known_from
 
 
 def _prior_px(focal: float, config: DisparityConfig) -> F64:
@@ -113,6 +121,9 @@ def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...], config: Di
     for agent in agents:
         if agent in sparse_map.disparity_offset_px:
             sparse_map.disparity_offset_px[agent] = prior_mean(sparse_map, agent, config)
+            sparse_map.disparity_sigma_px.pop(agent, None)
+            if agent in sparse_map.told_sigma_px:
+                sparse_map.disparity_sigma_px[agent] = sparse_map.told_sigma_px[agent]
 
 
 def is_significant(problem: BundleProblem, result: BundleResult, config: DisparityConfig) -> bool:
@@ -134,12 +145,17 @@ def set_offsets(
     if border is None or not (np.isfinite(result.offset).all() and np.isfinite(result.offset_cov).all()):
         return
     for g, agent in enumerate(agents):
+        if agent in sparse_map.told_sigma_px and (border.mean is None or not border.mean[g].any()):
+            continue  # the bundle began before the agent told its own
         sparse_map.disparity_offset_px[agent] = result.offset[g].copy()
         at = border.terms[border.group == g]
         cov = result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         sigma_px = config.inflation * float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", at, cov, at))))
         if sigma_px < config.calibrated_px:
             sparse_map.disparity_calibrated.add(agent)
+        sparse_map.disparity_sigma_px.pop(agent, None)
+        if agent in sparse_map.told_sigma_px or _is_worn(result.offset[g], sparse_map.cameras[agent].fx, config):
+            sparse_map.disparity_sigma_px[agent] = sigma_px
 
 
 def _agents(sparse_map: SparseMap, slots: I32) -> I64:

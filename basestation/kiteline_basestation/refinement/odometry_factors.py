@@ -4,7 +4,8 @@ The agent tracked all frames in between, with an IMU if it has one, and with ten
 carries. A relative pose is added as synthetic points that both keyframes observe exactly where that pose puts them. For
 a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the
 agent measures best (0.1 to 0.2 mrad an axis between keyframes). A disparity offset biases the agent's translations and,
-all in one direction, its rotations: the weight decreases where rotations differ. Images of a monocular submap in metres
+all in one direction, its rotations: the weight decreases where rotations differ, and for rigs that are known to be
+worn. Images of a monocular submap in metres
 tell no scale: there weak points nearby hold the agent's, which rests on its IMU.
 """
 
@@ -37,9 +38,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
     table = sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    rotation_sigma = max(
-        config.rotation_sigma_px, _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
-    )
+    difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
     points, camera, measured, sigma = [], [], [], []
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
@@ -47,8 +46,11 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
         if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
             continue
+        gap_s = float(table.t_ns[row] - table.t_ns[window.rows[p]]) * 1e-9
+        worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
+        rotation_sigma = max(config.rotation_sigma_px, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        point_sigma = 1.0 / np.hypot(few / config.sigma_px, 1.0 / rotation_sigma)
+        point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
         if not (sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth):
             sets.append((_DEPTHS, config.scale_sigma_px))

@@ -26,6 +26,7 @@ OFFSET_CODES = 1 << 12  # +-128 px: a larger offset is another point
 
 CALIBRATION_STEPS = 1024  # per px: a tenth of the estimate's error
 CALIBRATION_CODES = 1 << 14  # +-8 px; real ones are below two pixels, half a pixel in the middle
+CALIBRATION_SIGMA_CODES = 1 << 13  # up to 8 px
 
 DEPTH_SCALE = 2.0**-7  # 1/m: nearly linear below (farther than 128 m), nearly logarithmic above
 DEPTH_MANTISSA = 1 << 10  # steps an octave: error <= 2^-11 (x + 2^-7) 1/m

@@ -44,11 +44,11 @@ class Border:
     """Disparity offsets that are estimated with the poses and points.
 
     group: (m,) int32 group of each observation, -1 for no offset. terms: (m,t): the offset to subtract from the
-    disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) px, standard deviation of c about `mean` (g,t), or
-    about 0. tail: standard deviations beyond which the prior flattens (a t distribution), so that it yields to data
-    that show a large offset; only for terms whose standard deviation by the data alone is below this share `determined`
-    of sigma. worn: factor on sigma where the data contradict it: where their own estimate of a group is beyond
-    `contradicts` (g,) (a squared Mahalanobis distance) of what they and sigma allow.
+    disparity is terms @ c[group]. start: (g,t) px of c. sigma: (t,) or (g,t) px, standard deviation of c about `mean`
+    (g,t), or about 0. tail: standard deviations beyond which the prior flattens (a t distribution), so that it yields
+    to data that show a large offset; only for terms whose standard deviation by the data alone is below this share
+    `determined` of sigma. worn: factor on sigma where the data contradict it: where their own estimate of a group is
+    beyond `contradicts` (g,) (a squared Mahalanobis distance) of what they and sigma allow.
     """
 
     group: I32
@@ -266,7 +266,7 @@ class _BorderSolver(_Solver):
         b, f = border.start.size, self._n_free
         self._raw, self._border = problem.measured, border
         self._c = self._new_c = border.start.astype(np.float64, copy=True)
-        self._sigma = np.tile(border.sigma, len(border.start))
+        self._sigma = np.broadcast_to(border.sigma, border.start.shape).flatten()
         self._mean = np.zeros(b) if border.mean is None else border.mean.ravel()
         self._yields = np.zeros(b, np.bool_)  # terms whose prior flattens
         self._blocks = (np.empty((b, b)), np.empty(b), np.empty((b, 6 * f)), np.empty((len(problem.camera), 3)))

@@ -83,6 +83,7 @@ def some_records(seed: int, n: int) -> list[Record]:
             AgentId(5), np.array([700.0, -88.0, 0.0, 1100.0, -420.0]) / 1024.0, True,
             np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0,
         ),
+        StereoAlignment(AgentId(6), np.zeros(5), False, np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0, 0.25),
         KeyframePose(keyframe, pose),
         RefinedLandmarks(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
         FusedLandmarks(keyframe, index, point),
@@ -105,7 +106,7 @@ def some_records(seed: int, n: int) -> list[Record]:
         ),
         SubmapPlacement(SubmapId(submap ^ 1), sim3.of(1.0 + 0.37 * n, pose), False, 5),
         SubmapPlacement(SubmapId(submap ^ 2), sim3.of(1.0, pose), True, 5),
-        DisparityCalibration(AgentId(4), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0, 5),
+        DisparityCalibration(AgentId(4), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0, 0.5, 5),
         SubmapPlacement(SubmapId(submap ^ 3), sim3.of(1.0 + 0.37 * n, pose), False, 0, 0.5**7),
         SubmapPlacement(SubmapId(submap ^ 4), sim3.of(1.0, pose), True, 5, 13.0 / 1024.0),
     ]  # fmt: skip
