@@ -23,10 +23,9 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
 from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
+from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
-from kiteline_agent.motion.extrapolation import MotionSource
-from kiteline_agent.motion.recent_motion import RecentMotion
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
@@ -39,10 +38,10 @@ from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import CameraIntrinsics, GridTile, LivePose, Record
+from kiteline_codec.schema import CameraIntrinsics, GridTile, Record
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
-from kiteline_core.ids import NO_KEYFRAME, SubmapId
+from kiteline_core.ids import SubmapId
 from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
@@ -105,12 +104,11 @@ class Agent:
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,
         )  # fmt: skip
+        self._report = PoseReport(identity.agent, self._camera, self._corrections, channel, has_depth=self._has_depth)
         self._skipped_imu: list[ImuBatch] = []  # since the last processed frame
         self._frame_number = 0
         self._last_t_ns: int | None = None  # of the last processed frame
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
-        self._last_estimate: Estimate | None = None
-        self._recent = RecentMotion()
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         channel.put(CameraIntrinsics(identity.agent, camera))
@@ -142,28 +140,8 @@ class Agent:
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
 
     def predict(self, t_ns: int) -> PredictedPose | None:
-        """Predict the pose at t_ns by the samples since the last processed frame. Changes no state.
-
-        None before there is a map, at or before the last frame, and when that is too long ago.
-        """
-        last, camera, config = self._last_estimate, self._camera, self._full_config
-        dt_s = 0.0 if last is None else (t_ns - last.t_ns) * 1e-9
-        if last is None or last.initialising or not 0.0 < dt_s <= config.prediction.max_s:
-            return None
-        moved = camera.motion.extrapolate(t_ns, joined(self._skipped_imu), dt_s)
-        R_o_m, growth = camera.pose.T_o_m[:3, :3], moved.growth
-        if growth is None:
-            growth = camera.covariance.unmeasured_growth(dt_s, moves=camera.pose.moves)
-        turn = np.eye(6)
-        turn[:3, :3] = R_o_m
-        cov_o = last.cov_o + turn @ growth @ turn.T
-        quality = min(last.quality, self.odometry_quality(last), camera.covariance.quality(cov_o, None))
-        by_poses = self._recent.rates(t_ns) if moved.source is MotionSource.VELOCITY else None
-        velocity, rate = by_poses or (R_o_m @ moved.velocity, moved.rate)
-        return PredictedPose(
-            t_ns, moved.source.value, last.tracked, camera.pose.T_o_m @ moved.T_m_b, velocity, rate, quality,
-            cov_o, camera.gravity.R_l_o,
-        )  # fmt: skip
+        """PoseReport.predict, by the samples since the last processed frame."""
+        return self._report.predict(t_ns, joined(self._skipped_imu), self._full_config.prediction.max_s)
 
     def _process(self, frame: Frame, imu: ImuBatch | None) -> tuple[Estimate, list[str]]:
         """The algorithm of one frame. Returns the estimate and events."""
@@ -230,9 +208,7 @@ class Agent:
             self._image_shift.remember(images.sampled, camera.pose.T_c_m)
         self._last_t_ns = frame.t_ns
         self._last_track = None if self._was_lost else track
-        self._last_estimate = self._estimate(ctx, outcome)
-        self._recent.add(frame.t_ns, self._last_estimate.T_o_b, measured=not self._was_lost)
-        return self._last_estimate, outcome.events
+        return self._report.report(ctx, outcome), outcome.events
 
     # stages of a frame
 
@@ -340,64 +316,12 @@ class Agent:
 
     def odometry_quality(self, estimate: Estimate) -> int:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""
-        return min(estimate.quality, self._camera.covariance.quality(estimate.cov_o, None))
+        return self._report.odometry_quality(estimate)
 
     def known_rig(self) -> KnownRigConfig | None:
         """What is known of the right camera now, for the next flight; None without one, and before it was measured."""
         return None if self.right_camera is None else self.right_camera.known()
 
-    def time_offset_report(self) -> dict[str, float] | None:
-        """InertialTracker.offset_report; None without an IMU."""
-        tracker = self._camera.motion.tracker
-        return None if tracker is None else tracker.offset_report()
-
-    def imu_calibration_report(self) -> dict[str, Any] | None:
-        """InertialTracker.calibration_report; None without an IMU."""
-        tracker = self._camera.motion.tracker
-        return None if tracker is None else tracker.calibration_report()
-
-    def odometer_report(self) -> dict[str, float | bool] | None:
-        """Odometer.report; None without one."""
-        return self._camera.motion.odometer.report()
-
-    def _estimate(self, ctx: FrameContext, outcome: FrameOutcome) -> Estimate:
-        """The estimate of a frame; shares the live pose with the base."""
-        camera, tracked = self._camera, outcome.tracked
-        T_m_b, T_o_m = camera.T_m_b, camera.pose.T_o_m
-        in_first = self._has_depth and camera.submaps.in_first
-        cov_m, cov_o = camera.covariance.of_poses(camera.pose, T_m_b, in_first=in_first)
-        quality = camera.covariance.quality(
-            cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
-        )
-        carried = camera.submaps.any and camera.motion.measures_motion
-        if not tracked and (not carried or quality < ctx.config.covariance.flagged_below):
-            quality = -1
-        keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
-        if keyframe != NO_KEYFRAME:
-            self._channel.put(LivePose(self._identity.agent, ctx.t_ns, keyframe, T_k_c, quality))
-        T_w_b = self._corrections.in_world(self.submap, T_m_b, T_o_m, ctx.t_ns, metric=self.metric)
-        return Estimate(
-            ctx.t_ns,
-            tracked,
-            outcome.bridged,
-            T_m_b if tracked else None,
-            T_o_m @ T_m_b,
-            keyframe,
-            T_k_c.copy(),
-            self.submap,
-            outcome.inliers,
-            quality,
-            cov_m,
-            cov_o,
-            camera.gravity.R_l_o,
-            T_w_b if tracked else None,
-            not camera.submaps.any,
-        )
-
-    def _knows_place(self) -> bool:
-        """True if the active submap's pose in the flight's first one rests on more than odometry.
-
-        Always for monocular maps, each of which has a unit of its own.
-        """
-        submaps = self._camera.submaps
-        return not self._has_depth or submaps.in_first or self._corrections.is_recognised(submaps.active)
+    def motion_reports(self) -> dict[str, Any]:
+        """What was found of time offset, IMU and odometer; None for each that is not there."""
+        return self._camera.motion.reports()

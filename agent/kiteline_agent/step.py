@@ -37,8 +37,33 @@ class StepInput:
     predict_ns: int | None = None
 
 
+class _InOdometryFrame:
+    """A pose in the odometry frame, which may be known to be tilted."""
+
+    __slots__ = ()
+    T_o_b: F64
+    cov_o: F64
+    R_l_o: F64 | None
+
+    @property
+    def T_l_b(self) -> F64 | None:
+        """(4,4) body in the gravity-aligned odometry frame, for a flight controller; None until that is known."""
+        if self.R_l_o is None:
+            return None
+        T = self.T_o_b.copy()
+        T[:3] = self.R_l_o @ T[:3]
+        return T
+
+    @property
+    def cov_l(self) -> F64:
+        """cov_o with translations in the gravity-aligned frame."""
+        rotation = np.eye(6)
+        rotation[:3, :3] = np.eye(3) if self.R_l_o is None else self.R_l_o
+        return np.asarray(rotation @ self.cov_o @ rotation.T)
+
+
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(_InOdometryFrame):
     """Pose of the vehicle at one frame, with covariance and quality.
 
     tracked: T_m_b is measured from at least 15 image inliers, or (bridged) dead reckoning for at most 1 s.
@@ -71,19 +96,9 @@ class Estimate:
     T_w_b: F64 | None
     initialising: bool = False
 
-    @property
-    def T_l_b(self) -> F64 | None:
-        """(4,4) body in the gravity-aligned odometry frame, for a flight controller; None until that is known."""
-        return level_pose(self.T_o_b, self.R_l_o)
-
-    @property
-    def cov_l(self) -> F64:
-        """cov_o with translations in the gravity-aligned frame."""
-        return level_cov(self.cov_o, self.R_l_o)
-
 
 @dataclass(frozen=True, slots=True)
-class PredictedPose:
+class PredictedPose(_InOdometryFrame):
     """Pose of an instant after the last tracked frame: of a skipped frame, or between frames.
 
     source: what measured the motion since then: imu, odometer, or velocity (nothing: it is that of the last frames).
@@ -102,35 +117,9 @@ class PredictedPose:
     R_l_o: F64 | None
 
     @property
-    def T_l_b(self) -> F64 | None:
-        """As in Estimate."""
-        return level_pose(self.T_o_b, self.R_l_o)
-
-    @property
-    def cov_l(self) -> F64:
-        """As in Estimate."""
-        return level_cov(self.cov_o, self.R_l_o)
-
-    @property
     def velocity_l(self) -> F64:
         """velocity_o in the gravity-aligned frame."""
         return self.velocity_o if self.R_l_o is None else np.asarray(self.R_l_o @ self.velocity_o)
-
-
-def level_pose(T_o_b: F64, R_l_o: F64 | None) -> F64 | None:
-    """(4,4) body in the gravity-aligned odometry frame; None until that is known."""
-    if R_l_o is None:
-        return None
-    T = T_o_b.copy()
-    T[:3] = R_l_o @ T[:3]
-    return T
-
-
-def level_cov(cov_o: F64, R_l_o: F64 | None) -> F64:
-    """A covariance (6,6) of a pose in o with translations in the gravity-aligned frame."""
-    rotation = np.eye(6)
-    rotation[:3, :3] = np.eye(3) if R_l_o is None else R_l_o
-    return np.asarray(rotation @ cov_o @ rotation.T)
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,9 +47,7 @@ def scene(seed: int = 0) -> tuple[LocalMap, Track]:
     observed = np.column_stack([
         CAMERA.fx * p[:, 0] / p[:, 2] + CAMERA.cx, CAMERA.fy * p[:, 1] / p[:, 2] + CAMERA.cy, CAMERA.bf / p[:, 2],
     ])  # fmt: skip
-    return local_map, Track(
-        T_c_m, rows, observed, np.full(n, 0.3), p[:, 2], np.ones(n, np.bool_), np.eye(6), n, 1.0, n, xyz, ray
-    )
+    return local_map, Track(T_c_m, rows, observed, np.full(n, 0.3), p[:, 2], np.ones(n, np.bool_), n, 1.0, n, xyz, ray)
 
 
 def move(local_map: LocalMap, k: int, motion: F64) -> None:

@@ -30,14 +30,13 @@ class World:
 
     def seen(self, T_m_c: F64, rng: np.random.Generator, share: float = 0.6, noise_px: float = 0.5) -> FrameFeatures:
         """Corners of a view: some of the points in it, and as many others."""
-        rows, uv, z = self.in_view(T_m_c)
+        rows, uv, _ = self.in_view(T_m_c)
         keep = rng.random(len(rows)) < share
-        rows, uv, z = rows[keep], uv[keep] + rng.normal(0, noise_px, (int(keep.sum()), 2)), z[keep]
+        rows, uv = rows[keep], uv[keep] + rng.normal(0, noise_px, (int(keep.sum()), 2))
         n = len(rows)
         flips = np.packbits(rng.random((n, 256)) < 0.08, axis=1)
         return FrameFeatures(
             np.concatenate([uv, rng.uniform((8, 8), (744, 472), (n, 2))]),
-            np.concatenate([CAMERA.bf / z, np.full(n, -1.0)]),
             np.zeros(2 * n, np.uint8),
             np.zeros(2 * n, np.uint8),
             np.concatenate([self.descriptor[rows] ^ flips, rng.integers(0, 256, (n, 32), dtype=np.uint8)]),
@@ -110,8 +109,11 @@ def test_corners_match_cached_landmarks_and_give_the_camera_pose(world: World) -
     assert np.linalg.norm(error[:3]) < 0.005
     assert np.linalg.norm(error[3:]) < 0.001
     assert np.all(met.corner < len(seen.uv) // 2), "a corner of noise"
-    truth = CAMERA.bf / seen.disparity[met.corner]
-    assert np.median(np.abs(met.depth_m - truth) / truth) < 0.01
+    # Where the corners lie at those depths, the world has points.
+    at = (seen.uv[met.corner] - (376.0, 240.0)) / 420.0
+    lifted = se3.transform(true, np.column_stack([at, np.ones(len(at))]) * met.depth_m[:, None])
+    off_m = np.linalg.norm(lifted[:, None] - world.points, axis=2).min(axis=1)
+    assert np.median(off_m / met.depth_m) < 0.01
 
 
 def test_cached_keyframes_of_another_submap_are_not_matched(world: World) -> None:
@@ -127,7 +129,6 @@ def test_a_lost_frame_is_found(world: World, turn: float) -> None:
     ring(world, box)
     true = look(turn, (0.3, 0.2))
     seen = world.seen(true, rng)
-    seen = replace(seen, disparity=np.full(len(seen.uv), -1.0))
     found = box.find(seen, {HERE}, 0)
     assert found is not None
     assert found[0] == HERE

@@ -91,12 +91,10 @@ def test_what_a_calibration_leaves_is_measured_against_the_true_rig() -> None:
         def __init__(self, share: float) -> None:
             self.share = share
 
-        def imu_calibration_report(self) -> dict[str, Any]:
+        def motion_reports(self) -> dict[str, Any]:
             matrices = {"gyro": worn.imu.gyro_matrix @ turn, "accel": worn.imu.accel_matrix @ turn}
-            return {n: {"matrix": (np.eye(3) + self.share * (m - np.eye(3))).tolist()} for n, m in matrices.items()}
-
-        def time_offset_report(self) -> dict[str, float]:
-            return {"ms": -1000.0 * self.share * worn.late_s}
+            found = {n: {"matrix": (np.eye(3) + self.share * (m - np.eye(3))).tolist()} for n, m in matrices.items()}
+            return {"imu_calibration": found, "time_offset": {"ms": -1000.0 * self.share * worn.late_s}}
 
     for share in (1.0, 0.6, 0.0):
         found = unfound(cast(Agent, Box(share)), truth)

@@ -12,7 +12,7 @@ from kiteline_codec.schema import Key, LivePose, NewLandmarks, RefinedLandmarks
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, seal_bytes, suite_for
 from kiteline_hw.links.kinds import link_traits
-from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
+from kiteline_hw.mavlink.tunnel.tunnel_end import TunnelConfig, TunnelEnd
 
 SECOND = 1_000_000_000
 KEY = bytes(range(32))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy import float64
@@ -202,6 +203,15 @@ class MotionModel:
     def scale_correction(self) -> tuple[float, float] | None:
         """Factor by which the map in metres is to be scaled, and its deviation; None if nothing says so."""
         return None if self._metric or self.tracker is None else self.tracker.scale_correction()
+
+    def reports(self) -> dict[str, Any]:
+        """What was found of time offset, IMU and odometer; None for each that is not there."""
+        tracker = self.tracker
+        return {
+            "time_offset": None if tracker is None else tracker.offset_report(),
+            "imu_calibration": None if tracker is None else tracker.calibration_report(),
+            "odometer": self.odometer.report(),
+        }
 
     def set_scale(self, t_ns: int, metres_per_unit: float, T_new_old: F64) -> None:
         """Scale the state to metres, in a submap that begins at this frame; the old one lies at T_new_old (4,4)."""

@@ -17,10 +17,9 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class FrameFeatures:
-    """Corners of a frame. uv: (n,2) px. disparity: (n,) px, < 0 none. octave, angle: (n,). descriptor: (n,32)."""
+    """Corners of a frame. uv: (n,2) px. octave, angle: (n,). descriptor: (n,32)."""
 
     uv: F64
-    disparity: F64
     octave: U8
     angle: U8
     descriptor: U8
@@ -34,4 +33,4 @@ def frame_features(images: FrameImages, detector: DetectorConfig, min_corners: i
     if len(corners.uv) < min_corners:
         return None
     angle, descriptor = features.describe(images.left, corners.uv, corners.octave)
-    return FrameFeatures(corners.uv, np.full(len(corners.uv), -1.0), corners.octave, angle, descriptor)
+    return FrameFeatures(corners.uv, corners.octave, angle, descriptor)

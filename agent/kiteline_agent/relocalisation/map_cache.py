@@ -176,7 +176,7 @@ class MapCache:
         if len(found.a) < self._config.min_matches:
             return None
         xyz, ray = projected.xyz[found.a], projected.ray[found.a]
-        observed = np.column_stack([seen.uv[found.b], seen.disparity[found.b]])
+        observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         sigma_px = self._config.corner_px * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
         T, inlier = T_c_m.copy(), np.ones(len(found.a), np.bool_)
         inliers, _ = optimise_pose(

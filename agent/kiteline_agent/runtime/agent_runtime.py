@@ -242,9 +242,7 @@ class AgentRuntime:
             "skipped": dict(sorted(skipped.items())),
             "notes": notes,
             "scale": "metric" if self.agent.metric else "own",
-            "time_offset": self.agent.time_offset_report(),
-            "imu_calibration": self.agent.imu_calibration_report(),
-            "odometer": self.agent.odometer_report(),
+            **self.agent.motion_reports(),
             "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
                 "cpu_ms_per_frame": self._account.ms,

@@ -20,9 +20,9 @@ class Track:
     """A pose measured from n landmarks of the local map.
 
     T_c_m: (4,4). rows: (n,) of the local map. observed: (n,3) u, v, disparity px (< 0: none). sigma_px: (n,).
-    depth_m: (n,) of the landmarks in the camera. inlier: (n,). information: (6,6) of T_c_m, left perturbation.
-    inliers: how many. rms: whitened error of the inliers. tried: number of landmarks that were searched for.
-    xyz: (n,3) m, landmark positions in m. ray: (n,3) m, one standard deviation of depth as a vector.
+    depth_m: (n,) of the landmarks in the camera. inlier: (n,). inliers: how many. rms: whitened error of the inliers.
+    tried: number of landmarks that were searched for. xyz: (n,3) m, landmark positions in m. ray: (n,3) m, one standard
+    deviation of depth as a vector.
     """
 
     T_c_m: F64
@@ -31,7 +31,6 @@ class Track:
     sigma_px: F64
     depth_m: F64
     inlier: Bools
-    information: F64
     inliers: int
     rms: float
     tried: int
@@ -52,6 +51,6 @@ def track_without_landmarks(T_c_m: F64, inliers: int) -> Track:
     """A pose (4,4) from `inliers` cached landmarks, none of which is in the local map."""
     none = np.zeros(0)
     return Track(
-        T_c_m, np.zeros(0, np.int64), np.zeros((0, 3)), none, none, np.zeros(0, np.bool_), np.zeros((6, 6)), inliers,
-        0.0, inliers, np.zeros((0, 3)), np.zeros((0, 3)),
+        T_c_m, np.zeros(0, np.int64), np.zeros((0, 3)), none, none, np.zeros(0, np.bool_), inliers, 0.0,
+        inliers, np.zeros((0, 3)), np.zeros((0, 3)),
     )  # fmt: skip

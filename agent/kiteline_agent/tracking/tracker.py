@@ -110,15 +110,15 @@ class Tracker:
     ) -> Track:  # fmt: skip
         """The pose from observations (n,3) of the chosen candidates (n,), by robust motion-only optimisation."""
         pose, n = config.pose, len(chosen)
-        T, inlier, information = T_c_m.copy(), np.ones(n, np.bool_), np.zeros((6, 6))
+        T, inlier = T_c_m.copy(), np.ones(n, np.bool_)
         xyz, ray = candidates.xyz.take(chosen, 0), candidates.ray.take(chosen, 0)
         inliers, rms = pose_kernels.optimise_pose(
             T, xyz, ray, observed, sigma_px, self._map.intrinsics, T_c_m, self._no_prior, pose.rounds, pose.iterations,
-            pose.chi2, inlier, information,
+            pose.chi2, inlier, np.empty((6, 6)),
         )  # fmt: skip
         return Track(
             T_c_m=se3.orthonormalise(T), rows=candidates.rows[chosen], observed=observed, sigma_px=sigma_px,
-            depth_m=candidates.depth[chosen], inlier=inlier, information=information, inliers=int(inliers),
+            depth_m=candidates.depth[chosen], inlier=inlier, inliers=int(inliers),
             rms=float(rms), tried=tried, xyz=xyz, ray=ray,
         )  # fmt: skip
 

@@ -110,7 +110,8 @@ def unfound(box: Agent | None, truth: dict[str, Any]) -> dict[str, float]:
     truth: rig_truth.json. Axes of the IMU are those of the body by the camera, as the agent has them: an error of the
     camera's rotation is one of both.
     """
-    found, offset = (None, None) if box is None else (box.imu_calibration_report(), box.time_offset_report())
+    reports = {} if box is None else box.motion_reports()
+    found, offset = reports.get("imu_calibration"), reports.get("time_offset")
     if found is None or offset is None:
         return {}
     told, true = (rig_from_json(truth[name])[0].T_b_c[:3, :3] for name in ("told", "true"))

@@ -51,7 +51,7 @@ LINKS: tuple[LinkKind, ...] = (
     LinkKind("serial", "DEVICE:BAUD", "cable or transparent radio",
              "kiteline_hw.links.serial_link", LinkTraits(7, "radio", thin=True)),  # COBS, two zeros and a CRC-32
     LinkKind("mavlink", "udp:HOST:PORT", "tunnel through a flight controller's telemetry",
-             "kiteline_hw.mavlink.tunnel_link", LinkTraits(76, "radio", thin=True)),  # four pieces in TUNNEL messages
+             "kiteline_hw.mavlink.tunnel.tunnel_link", LinkTraits(76, "radio", thin=True)),  # four TUNNEL messages
     LinkKind("none", "", "no base", "kiteline_hw.links.no_link"),
 )  # fmt: skip
 

@@ -24,7 +24,7 @@ from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink, SinkOptions
 from kiteline_hw.mavlink.start_frame import StartConfig, StartFrame
 from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
-from kiteline_hw.mavlink.tunnel import AGENT_END, TunnelConfig
+from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, TunnelConfig
 from kiteline_hw.ports import Clock, LinkError, SourceReport
 
 HEADINGS = ("start", "controller")  # of the frame of the poses

@@ -17,8 +17,8 @@ from kiteline_hw.mavlink.start_frame import StartFrame
 from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
 from kiteline_hw.mavlink.transport.signing import Signing
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
-from kiteline_hw.mavlink.tunnel import TunnelConfig, TunnelEnd
-from kiteline_hw.mavlink.tunnel_link import TunnelQueue
+from kiteline_hw.mavlink.tunnel.tunnel_end import TunnelConfig, TunnelEnd
+from kiteline_hw.mavlink.tunnel.tunnel_link import TunnelQueue
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
 from kiteline_hw.mavlink.watch.findings import Finding
 from kiteline_hw.ports import ByteLink, Clock, PoseSample

@@ -18,7 +18,7 @@ from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Heartbeat, VehicleImu
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink, SinkOptions
 from kiteline_hw.mavlink.transport import sockets
-from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelEnd
+from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelEnd
 from kiteline_hw.ports import LinkError, PoseSample, SourceReport
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.messages import Heartbeat, RadioStatus, Tunnel
-from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
-from kiteline_hw.mavlink.tunnel_link import MavlinkTunnelLink, open_base_end
+from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
+from kiteline_hw.mavlink.tunnel.tunnel_link import MavlinkTunnelLink, open_base_end
 from kiteline_hw.sim.links.telemetry_radio import RadioConfig, RoutingController, TelemetryConfig
 from tests.hw.processes import free_port
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
-from kiteline_hw.mavlink.tunnel import AGENT_END, BASE_END, TunnelConfig, TunnelCounters, TunnelEnd
+from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelConfig, TunnelCounters, TunnelEnd
 from kiteline_hw.ports import ByteLink, LinkHub
 from kiteline_hw.system.closing import Closing
 

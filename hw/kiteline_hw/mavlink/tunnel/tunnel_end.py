@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.messages import COMPONENT_VIO, Heartbeat, MavlinkMessage, RadioStatus, Tunnel
-from kiteline_hw.mavlink.tunnel_reports import Arrivals, Departures, is_of_base
+from kiteline_hw.mavlink.tunnel.tunnel_reports import Arrivals, Departures, is_of_base
 
 _HEAD_BYTES = 2
 _MAX_CHUNKS = 16
