@@ -319,8 +319,9 @@ class Agent:
         return self._report.odometry_quality(estimate)
 
     def known_rig(self) -> KnownRigConfig | None:
-        """What is known of the right camera now, for the next flight; None without one, and before it was measured."""
-        return None if self.right_camera is None else self.right_camera.known()
+        """What is known of right camera and IMU, for the next flight; None before anything was measured."""
+        right = None if self.right_camera is None else self.right_camera.known()
+        return self._full_config.known_rig.updated(self.map.camera, right, self._camera.motion.known_imu())
 
     def motion_reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU and odometer; None for each that is not there."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.imaging.row_alignment import TERMS as ROW_TERMS
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
 
@@ -24,10 +25,11 @@ class KnownRigConfig:
 
     # the rectified camera: width, height, fx, fy, cx, cy in px, baseline in m; (): nothing is known
     camera: tuple[float, ...] = ()
-    T_b_c: tuple[float, ...] = ()  # row-major 4x4: rectified left camera in the body, m; for exports
+    T_b_c: tuple[float, ...] = ()  # row-major 4x4: rectified left camera in the body, m
     rows_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x y, y^2 by which the right image is too low
     rows_read: bool = False  # disparities were measured in a right image that was read there
     disparity_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x^2, x y by which disparities are too large
+    imu: KnownImuConfig = field(default_factory=KnownImuConfig)
 
     def __post_init__(self) -> None:
         sizes = {"camera": _CAMERA_NUMBERS, "T_b_c": 16, "rows_px": ROW_TERMS, "disparity_px": disparity_offset.TERMS}
@@ -41,6 +43,20 @@ class KnownRigConfig:
     def is_of(self, camera: RectifiedCamera) -> bool:
         """True if it was found with the calibration that gives this rectified camera."""
         return bool(self.camera) and np.allclose(self.camera, numbers_of(camera), rtol=_SAME, atol=0.0)
+
+    def knows_imu_of(self, camera: RectifiedCamera) -> bool:
+        """True if the IMU was compared with this camera, told to be there in the body."""
+        return self.is_of(camera) and bool(self.T_b_c) and np.allclose(self.T_b_c, camera.T_b_c.ravel(), atol=_SAME)
+
+    def updated(
+        self, camera: RectifiedCamera, right: KnownRigConfig | None, imu: KnownImuConfig | None
+    ) -> KnownRigConfig | None:
+        """This, with what a flight found of the right camera and the IMU; None if that is nothing."""
+        if right is None and imu is None:
+            return None
+        if right is None:
+            right = self if self.is_of(camera) else KnownRigConfig(numbers_of(camera), _extrinsics_of(camera))
+        return replace(right, imu=imu or (self.imu if self.knows_imu_of(camera) else KnownImuConfig()))
 
     def rectified(self) -> RectifiedCamera | None:
         """The rectified camera; None if nothing is known."""
@@ -67,8 +83,13 @@ def numbers_of(camera: RectifiedCamera) -> tuple[float, ...]:
     return (float(c.width), float(c.height), c.fx, c.fy, c.cx, c.cy, c.baseline_m)
 
 
+def _extrinsics_of(camera: RectifiedCamera) -> tuple[float, ...]:
+    return tuple(round(float(v), 9) for v in camera.T_b_c.ravel())
+
+
 def known_rig(camera: RectifiedCamera, rows_px: F64, disparity_px: F64, *, rows_read: bool) -> KnownRigConfig:
-    """What a flight found, rounded to what the next one can use."""
+    """What a flight found of the right camera, rounded to what the next one can use."""
     rows, disparity = (tuple(round(float(v), 3) for v in values) for values in (rows_px, disparity_px))
-    T_b_c = tuple(round(float(v), 9) for v in camera.T_b_c.ravel())
-    return KnownRigConfig(numbers_of(camera), T_b_c, rows, rows_read, disparity if any(disparity) else ())
+    return KnownRigConfig(
+        numbers_of(camera), _extrinsics_of(camera), rows, rows_read, disparity if any(disparity) else ()
+    )  # fmt: skip

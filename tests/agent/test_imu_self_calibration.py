@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
@@ -59,10 +60,13 @@ def flight(
 
 
 def calibrated(
-    f: Flight, config: SelfCalibrationConfig | None = None, turn_map_at: int | None = None
-) -> SelfCalibration:
-    """A calibration after a flight, in a map that is turned at a frame."""
-    calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), P_B_C, 9.81)
+    f: Flight, config: SelfCalibrationConfig | None = None, turn_map_at: int | None = None,
+    known: KnownImuConfig | None = None, *, metric: bool = True,
+) -> SelfCalibration:  # fmt: skip
+    """A calibration after a flight, in a map that is turned at a frame. known: from earlier flights."""
+    calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), P_B_C, 9.81, metric=metric)
+    if known is not None:
+        calibration.begin_with(known)
     buffer, done, moved = SampleBuffer(3.0, 0.2), 0, np.eye(4)
     for k, (t_ns, T) in enumerate(zip(f.t_ns, f.seen, strict=True)):
         end = int(np.searchsorted(f.samples.t_ns, t_ns, "right"))
@@ -156,8 +160,8 @@ def test_without_motion_nothing_is_learned() -> None:
     samples = Samples(np.arange(3.0), np.eye(3), np.eye(3))
     assert calibration.correct(samples).gyro is samples.gyro
     assert calibration.offset_s == 0.0
-    assert np.abs(calibration.gyro.matrix - np.eye(3)).max() < 0.2 * config.axes_sigma
-    assert np.sqrt(np.diag(calibration.gyro.axes_cov)).min() > 0.9 * config.axes_sigma
+    assert np.abs(calibration.gyro.matrix - np.eye(3)).max() < 0.2 * config.misalignment_sigma
+    assert (np.sqrt(np.diag(calibration.gyro.axes_cov)) / config.axes_sigma).min() > 0.9
     assert calibration.gyro.offset_sigma_s > config.offset_trusted_s  # gyro noise looks like some motion
 
 
@@ -176,7 +180,8 @@ def test_the_report_names_what_was_found() -> None:
     np.testing.assert_allclose(report["gyro"]["scale"], np.diag(GYRO), atol=4e-3)
     np.testing.assert_allclose(report["gyro"]["matrix"], GYRO, atol=6e-3)
     events = calibration.take_events()
-    assert len(events) == 1 and events[0].startswith("gyro: scale off by up to")
+    assert [event.split(":")[0] for event in events] == ["gyro", "accelerometer"]
+    assert "scale off by up to" in events[0]
     assert calibration.take_events() == []
     turned = se3.so3_exp(np.array([4e-3, -3e-3, 2e-3]))
     found = calibrated(flight(25.0, 0, turned, turned)).report()
@@ -189,3 +194,58 @@ def test_axes_can_be_held() -> None:
     samples = Samples(np.arange(3.0), np.eye(3), np.eye(3))
     assert held.correct(samples).gyro is samples.gyro
     assert np.linalg.norm(held.gyro.matrix - np.eye(3)) > 0.01
+
+
+def left(calibration: SelfCalibration, gyro: F64) -> float:
+    """Share of the gyro's error that is left."""
+    wear = np.linalg.inv(gyro) - np.eye(3)
+    return float(np.linalg.norm(calibration.gyro.matrix - np.eye(3) - wear) / np.linalg.norm(wear))
+
+
+def test_the_next_flight_begins_with_what_was_found_and_adds_to_it() -> None:
+    short = [calibrated(flight(6.0, seed, GYRO, ACCEL, 4_000_000)) for seed in (4, 5)]
+    known = short[0].known()
+    assert known is not None
+    begun = SelfCalibration(CALIBRATION, SelfCalibrationConfig(), P_B_C, 9.81)
+    begun.begin_with(known)
+    np.testing.assert_allclose(applied(begun)[0], short[0].gyro.matrix, atol=1e-5)
+    assert begun.offset_s == pytest.approx(known.offset_s[0])
+    second = calibrated(flight(6.0, 5, GYRO, ACCEL, 4_000_000), known=known)
+    assert left(second, GYRO) < min(left(flown, GYRO) for flown in short)
+    found = second.known()
+    assert found is not None
+    assert np.mean(np.square(found.gyro_sigma)) < np.mean(np.square(known.gyro_sigma))
+
+
+def test_an_imu_that_was_replaced_is_found_anew() -> None:
+    known = calibrated(flight(25.0, 0, GYRO, ACCEL, 4_000_000)).known()
+    other = np.linalg.inv(GYRO)
+    fresh, begun = (calibrated(flight(25.0, 1, other, late_ns=-3_000_000), known=k) for k in (None, known))
+    assert any("calibrated anew" in event for event in begun.take_events())
+    np.testing.assert_allclose(begun.gyro.matrix, fresh.gyro.matrix, atol=2e-3)
+    assert begun.offset_s == pytest.approx(3e-3, abs=5e-4)
+    np.testing.assert_allclose(applied(begun)[0], begun.gyro.matrix, atol=1e-3)
+    # the same IMU is not refuted
+    again = calibrated(flight(25.0, 1, GYRO, ACCEL, 4_000_000), known=known)
+    assert not any("calibrated anew" in event for event in again.take_events())
+
+
+def test_a_true_imu_is_left_alone_in_later_flights() -> None:
+    known = None
+    for _ in range(4):  # the same flight: its errors add up
+        calibration = calibrated(flight(12.0, 2), known=known)
+        known = calibration.known()
+        assert calibration.take_events() == []
+
+
+def test_what_a_flight_cannot_tell_is_kept() -> None:
+    known = calibrated(flight(25.0, 0, GYRO, ACCEL)).known()
+    assert known is not None
+    assert SelfCalibration(CALIBRATION, SelfCalibrationConfig(), P_B_C, 9.81).known() is None
+    monocular = calibrated(flight(12.0, 1, GYRO, ACCEL), known=known, metric=False).known()
+    assert monocular is not None
+    assert monocular.accel == known.accel
+    resting = calibrated(flight(6.0, 1, GYRO, ACCEL, at_rest=True), known=known).known()
+    assert resting is not None
+    np.testing.assert_allclose(resting.gyro, known.gyro, atol=5e-4)
+    assert np.all(np.array(resting.gyro_sigma) > 0.9 * np.array(known.gyro_sigma))

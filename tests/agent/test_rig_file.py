@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.runtime import rig_file
@@ -22,6 +24,7 @@ from kiteline_agent.step import Identity
 from kiteline_codec.schema import Record, StereoAlignment
 from kiteline_core import config as configuration
 from kiteline_core.config import ConfigError
+from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, RectifiedCamera, Rectifier
 from kiteline_core.ids import AgentId
@@ -31,6 +34,8 @@ RIG = CameraRig(LEFT, LEFT, np.eye(4), se3.from_rt(np.eye(3), np.array([0.11, 0.
 CAMERA = Rectifier(RIG).camera
 ROWS = np.array([0.8, -0.3, 0.1, 0.4, -0.2])
 DISPARITY = np.array([-1.3, 0.1, 0.2, -1.2, 0.5])
+UNIT = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+IMU = KnownImuConfig((-0.004, 0.0003), tuple(v + 0.01 for v in UNIT), (0.001,) * 9, tuple(UNIT), (0.009,) * 9)
 numbers = st.lists(st.floats(-8.0, 8.0), min_size=5, max_size=5).map(np.array)
 
 
@@ -119,6 +124,41 @@ def test_the_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
         RigFile(str(tmp_path)).save(known)
 
 
+def test_an_imu_is_kept_with_the_cameras(tmp_path: Path) -> None:
+    known = replace(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), imu=IMU)
+    path = tmp_path / "rig.toml"
+    RigFile(str(path)).save(known)
+    assert rig_file.load(str(path)) == known
+    with_imu = Agent(RIG, ImuCalibration(), AgentConfig(known_rig=known), Identity(AgentId(0), 0), NoBaseChannel())
+    reports = with_imu.motion_reports()
+    assert reports["time_offset"]["applied_ms"] == -4.0
+    axes = reports["imu_calibration"]
+    assert axes["gyro"]["applied"] and not axes["accel"]["applied"]
+    # a flight without an IMU keeps what others found, one that has measured nothing yet writes the same again
+    assert flown(known)[0].known_rig() == known
+    assert with_imu.known_rig() == known
+
+
+def test_an_imu_is_compared_with_one_place_of_the_camera() -> None:
+    known = replace(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), imu=IMU)
+    moved = CameraRig(LEFT, LEFT, se3.from_rt(se3.so3_exp(np.array([0.0, 0.01, 0.0])), np.zeros(3)), RIG.T_c_r)
+    agent = Agent(moved, ImuCalibration(), AgentConfig(known_rig=known), Identity(AgentId(0), 0), NoBaseChannel())
+    assert agent.motion_reports()["time_offset"]["applied_ms"] == 0.0
+    found = agent.known_rig()
+    assert found is not None
+    assert found.imu == KnownImuConfig()
+    assert found.rows_px == known.rows_px
+
+
+def test_one_eye_keeps_its_imu() -> None:
+    mono = CameraRig(LEFT, None, np.eye(4), None)
+    camera = Rectifier(mono).camera
+    known = KnownRigConfig().updated(camera, None, IMU)
+    assert known is not None and known.rows_px == ()
+    agent = Agent(mono, ImuCalibration(), AgentConfig(known_rig=known), Identity(AgentId(0), 0), NoBaseChannel())
+    assert agent.motion_reports()["time_offset"]["applied_ms"] == -4.0
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -128,6 +168,10 @@ def test_the_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
         ("[known_rig]\nrows_px = [1.0]\n", "rows_px has 1 numbers"),
         ("[known_rig]\nrows_px = [nan, 0.0, 0.0, 0.0, 0.0]\n", "finite"),
         ("[known_rig]\ndisparity_px = [0.0, 0.0, 0.0, 0.0, 9.5]\n", "at most 8"),
+        ("[known_rig.imu]\noffset_s = [0.004]\n", "offset_s has 1 numbers"),
+        ("[known_rig.imu]\noffset_s = [0.004, 0.0]\n", "not positive"),
+        (f"[known_rig.imu]\ngyro = {UNIT}\n", "belong together"),
+        (f"[known_rig.imu]\ngyro = {[2.0, *UNIT[1:]]}\ngyro_sigma = {[0.01] * 9}\n", "by more than"),
         ("[known_rig\n", "no readable"),
         ("\udcff", "no readable"),
     ],

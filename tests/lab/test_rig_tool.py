@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,9 @@ import pytest
 import yaml
 
 from kiteline_agent.imaging import row_alignment
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
+from kiteline_agent.known_rig import known_rig
+from kiteline_agent.runtime import rig_file
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.mapper_state import MapperState, MapState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
@@ -135,3 +139,21 @@ def known_mapper() -> Mapper:
     mapper = known()
     mapper.map.rows_px[AgentId(0)] = np.array([0.7, -0.1, 0.0, 0.3, 0.2])
     return mapper
+
+
+def test_an_imu_of_a_rig_file_is_shown_and_exported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    turned = (
+        se3.so3_exp(np.array([0.0, 0.0, -0.01])) / 1.02
+    )  # corrects an IMU that is turned by 0.01 rad, 2 % too large
+    imu = KnownImuConfig((-0.004, 0.0003), tuple(turned.ravel().tolist()), (0.002,) * 9)
+    path = tmp_path / "rig.toml"
+    rig = known_rig(CAMERA, np.zeros(5), OFFSET, rows_read=False)
+    path.write_text(rig_file.text_of(replace(rig, imu=imu)))
+    assert main(["show", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "camera stamps + -4.00 ms are the IMU's time (deviation 0.30 ms)" in shown
+    assert "gyro: scales off by +1.99 +1.99 +2.00 %, turned by +0.00 +0.00 +0.57 degrees" in shown
+    assert "accelerometer" not in shown
+    known_cameras = KnownCameras.of_file(rig_file.load(str(path)))
+    assert "timeshift_cam_imu: -0.004" in exported(known_cameras, None, "kalibr")["camchain-imucam.yaml"]
+    assert "[known_rig.imu]" in exported(known_cameras, None, "kiteline")["rig.toml"]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.fixed_lag import (
     BodyVelocity,
@@ -152,6 +153,16 @@ class InertialTracker:
             *events,
             f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)",
         ]
+
+    def begin_with(self, known: KnownImuConfig) -> None:
+        """Begin with what earlier flights found of the IMU."""
+        self._self_calibration.begin_with(known)
+        self._reported_s = self.applied_offset_s
+
+    @property
+    def known(self) -> KnownImuConfig | None:
+        """SelfCalibration.known."""
+        return self._self_calibration.known()
 
     # per frame
 

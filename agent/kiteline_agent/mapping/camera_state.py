@@ -41,6 +41,8 @@ class CameraState:
         self.T_c_b = se3.inverse(camera.T_b_c)
         self.pose = PoseState()
         self.motion = MotionModel(camera, imu, config.inertial, config.odometer, self.pose, metric=has_depth)
+        if self.motion.tracker is not None and config.known_rig.knows_imu_of(camera):
+            self.motion.tracker.begin_with(config.known_rig.imu)
         self.covariance = PoseCovariance(
             local_map, camera.T_b_c, config.covariance, has_body=rig.has_body, has_depth=has_depth
         )  # fmt: skip

@@ -39,7 +39,7 @@ class RightCamera:
 
     def begin_with(self, known: KnownRigConfig) -> None:
         """Take over what earlier flights found, unless the camera was calibrated anew."""
-        if not known.is_of(self._map.camera):
+        if not known.is_of(self._map.camera) or not known.rows_px:
             return
         self.rows.begin_with(known.rows, read=known.rows_read)
         self._map.set_disparity_offset(known.disparity)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.covariance.pose_covariance import adjoint
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.imu_watch import ImuWatch
@@ -80,6 +81,10 @@ class MotionModel:
     def drives(self) -> bool:
         """True if an odometer gives samples."""
         return self.odometer.has_samples
+
+    def known_imu(self) -> KnownImuConfig | None:
+        """What is known of the IMU, for the next flight; None before anything was measured."""
+        return None if self.tracker is None else self.tracker.known
 
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""

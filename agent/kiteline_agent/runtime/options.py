@@ -116,7 +116,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
     p.add_argument(
         "--rig", metavar="FILE", default="",
-        help="begin with what earlier flights found of the cameras, and write what this one finds",
+        help="begin with what earlier flights found of cameras and IMU, and write what this one finds",
     )  # fmt: skip
     p.add_argument(
         "--calibration", metavar="FILE[,FILE]", default="",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from kiteline_agent.known_rig import KnownRigConfig
@@ -13,14 +14,20 @@ from kiteline_core.config import ConfigError
 _TABLE = "known_rig"
 _HEAD = """\
 # What kiteline found of a rig beyond its calibration; written by `kiteline agent --rig` and `kiteline rig export`.
-# rows_px: by how much the right image is too low; disparity_px: by how much disparities are too large. Delete this file
-# after repairs. It is not used with another calibration.
+# rows_px: by how much the right image is too low; disparity_px: by how much disparities are too large; imu: the time
+# offset and the axes of its sensors, with deviations. Delete this file after repairs. It is not used with another
+# calibration.
 """
+
+
+@dataclass(frozen=True, slots=True)
+class _Content:
+    known_rig: KnownRigConfig = field(default_factory=KnownRigConfig)
 
 
 def text_of(known: KnownRigConfig) -> str:
     """The content of a rig file."""
-    return f"{_HEAD}[{_TABLE}]\n{configuration.describe(known)}"
+    return _HEAD + configuration.describe(_Content(known))
 
 
 def load(path: str) -> KnownRigConfig:

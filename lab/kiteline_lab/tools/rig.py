@@ -7,6 +7,7 @@ right camera that is turned, and whose focal length and centre differ.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.imaging import row_alignment
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.runtime import rig_file
 from kiteline_basestation.mapper import Mapper
@@ -67,7 +69,7 @@ def found_rig(camera: RectifiedCamera, offset_px: F64, rows_px: F64 | None) -> C
 
 
 class KnownCameras:
-    """What a store or a rig file knows of cameras, by agent."""
+    """What a store or a rig file knows of cameras, by agent, and a rig file of the IMU."""
 
     def __init__(self) -> None:
         self.cameras: dict[AgentId, RectifiedCamera] = {}
@@ -75,6 +77,7 @@ class KnownCameras:
         self.rows_px: dict[AgentId, F64] = {}
         self.rows_read: set[AgentId] = set()
         self.calibrated: set[AgentId] = set()
+        self.imu = KnownImuConfig()  # of a rig file
 
     @classmethod
     def of_base(cls, mapper: Mapper) -> KnownCameras:
@@ -93,9 +96,11 @@ class KnownCameras:
         out, agent = cls(), AgentId(0)
         camera = known.rectified()
         if camera is not None:
-            out.cameras[agent], out.rows_px[agent] = camera, known.rows
-            out.disparity_px[agent] = known.disparity
+            out.cameras[agent], out.disparity_px[agent] = camera, known.disparity
+            if known.rows_px:
+                out.rows_px[agent] = known.rows
             out.rows_read.update([agent] if known.rows_read else [])
+            out.imu = known.imu
         return out
 
     def offset_px(self, agent: AgentId) -> F64:
@@ -127,8 +132,27 @@ def summary(known: KnownCameras) -> dict[str, Any]:
             "rows_px": None if rows is None else rows.tolist(),
             "calibrated": agent in known.calibrated,
             "right_camera_turned_deg": np.degrees(turned).tolist(),
+            "imu": {name: list(values) for name, values in dataclasses.asdict(known.imu).items()},
         }
     return out
+
+
+def _imu_lines(imu: dict[str, Any]) -> list[str]:
+    """What is known of an IMU, beside the deviations of a sensor whose axes are unknown."""
+    lines = []
+    if imu["offset_s"]:
+        lines.append("  camera stamps + {:.2f} ms are the IMU's time (deviation {:.2f} ms)".format(
+            *(1000.0 * v for v in imu["offset_s"])))  # fmt: skip
+    for sensor, name in (("gyro", "gyro"), ("accel", "accelerometer")):
+        if imu[sensor]:
+            measured = np.linalg.inv(np.reshape(imu[sensor], (3, 3)))
+            u, _, vt = np.linalg.svd(measured)
+            scale = " ".join(f"{100.0 * (v - 1.0):+.2f}" for v in np.diag(measured))
+            turn = " ".join(f"{v:+.2f}" for v in np.degrees(se3.so3_log(u @ vt)))
+            sigma = float(np.sqrt(np.mean(np.square(imu[f"{sensor}_sigma"]))))
+            lines.append(f"  {name}: scales off by {scale} %, turned by {turn} degrees against the camera "
+                         f"(deviation {100.0 * sigma:.2f} %, {np.degrees(sigma):.2f} degrees)")  # fmt: skip
+    return lines
 
 
 def table(rigs: dict[str, Any]) -> str:
@@ -138,7 +162,7 @@ def table(rigs: dict[str, Any]) -> str:
         width, height = rig["size_px"]
         lines.append(f"agent {agent}: {width}x{height} px, focal length {rig['focal_px'][0]:.2f} px (rectified)")
         if rig["baseline_m"] is None:
-            lines.append("  no right camera")
+            lines += ["  no right camera", *_imu_lines(rig["imu"])]
             continue
         offset = " ".join(f"{c:+.3f}" for c in rig["disparity_offset_px"])
         turned = " ".join(f"{a:+.4f}" for a in rig["right_camera_turned_deg"])
@@ -149,6 +173,7 @@ def table(rigs: dict[str, Any]) -> str:
             rows = " ".join(f"{c:+.3f}" for c in rig["rows_px"])
             lines.append(f"  rows of the right image too low by {rows} px of 1, x, y, x y, y^2")
         lines.append(f"  like a right camera turned by {turned} degrees about x, y, z")
+        lines += _imu_lines(rig["imu"])
     return "\n".join(lines)
 
 
@@ -167,7 +192,8 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
     if kind == "kiteline":
         rows = known.rows_px.get(chosen, np.zeros(row_alignment.TERMS))
         read = chosen in known.rows_read
-        return {"rig.toml": rig_file.text_of(known_rig(camera, rows, known.offset_px(chosen), rows_read=read))}
+        rig_known = known_rig(camera, rows, known.offset_px(chosen), rows_read=read)
+        return {"rig.toml": rig_file.text_of(dataclasses.replace(rig_known, imu=known.imu))}
     rig = known.rig(chosen)
     pair = [(rig.left, rig.T_b_c)]
     if camera.stereo and rig.right is not None and rig.T_c_r is not None:
@@ -179,6 +205,8 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
         lines += [f"cam{k}:", "  camera_model: pinhole", f"  intrinsics: {_four(model)}", "  distortion_model: radtan",
                   "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]", f"  resolution: [{model.width}, {model.height}]",
                   f"  rostopic: /cam{k}/image_rect", "  T_cam_imu:", *_rows(se3.inverse(T_b_c))]  # fmt: skip
+        if known.imu.offset_s:
+            lines.append(f"  timeshift_cam_imu: {known.imu.offset_s[0]!r}")
         if k:
             lines += ["  T_cn_cnm1:", *_rows(se3.inverse(T_b_c) @ pair[k - 1][1])]
     return {"camchain-imucam.yaml": "\n".join(lines) + "\n"}

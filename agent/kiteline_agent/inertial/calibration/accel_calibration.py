@@ -23,14 +23,20 @@ class AccelCalibration:
     specific force, weighted by a hat over both, and of gravity: the velocity between them is not needed.
     """
 
-    def __init__(self, axes_sigma: float, scale_sigma: float, walk_m_s3: float, gravity_m_s2: float) -> None:
-        """axes_sigma, scale_sigma: of the calibration. walk_m_s3: of the bias, per sqrt(s)."""
+    def __init__(self, axes_sigma: F64, scale_sigma: float, walk_m_s3: float, gravity_m_s2: float) -> None:
+        """axes_sigma (9,), scale_sigma: of the calibration. walk_m_s3: of the bias, per sqrt(s)."""
         self._gravity_m_s2 = gravity_m_s2
         self._x = np.zeros(16)
-        self._cov = np.diag(np.repeat([axes_sigma, _BIAS_M_S2, _TILT_RAD, scale_sigma], [9, 3, 3, 1]) ** 2)
+        others = np.repeat([_BIAS_M_S2, _TILT_RAD, scale_sigma], [3, 3, 1])
+        self._cov = np.diag(np.concatenate([axes_sigma, others]) ** 2)
         self._walk = np.repeat([1e-5, walk_m_s3, _TILT_WALK_RAD, 1e-4], [9, 3, 3, 1]) ** 2
         self._gravity: F64 | None = None
         self.excess = 0.0
+
+    def begin_with(self, axes: F64, axes_sigma: F64) -> None:
+        """Begin with axes (3,3) that earlier flights found, and the deviations of their elements."""
+        self._x[_AXES] = (axes - np.eye(3)).ravel()
+        self._cov[_AXES, _AXES] = np.diag(np.minimum(axes_sigma.ravel() ** 2, np.diag(self.axes_cov)))
 
     @property
     def matrix(self) -> F64:
@@ -66,6 +72,10 @@ class AccelCalibration:
     def has_vertical(self) -> bool:
         """True if gravity in the map is known."""
         return self._gravity is not None
+
+    def continue_map(self, other: AccelCalibration) -> None:
+        """Take over the vertical of another filter in the same map."""
+        self._gravity = other._gravity
 
     def rotate_map(self, R_new_old: F64) -> None:
         """Rotate gravity with the map by R_new_old (3,3)."""

@@ -23,13 +23,20 @@ class GyroCalibration:
     rate at its start), after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems", 2014.
     """
 
-    def __init__(self, axes_sigma: float, offset_sigma_s: float, offset_s: float, walk_rad_s2: float) -> None:
-        """axes_sigma, offset_sigma_s: of the calibration. offset_s: calibrated. walk_rad_s2: of the bias."""
+    def __init__(self, axes_sigma: F64, offset_sigma_s: float, offset_s: float, walk_rad_s2: float) -> None:
+        """axes_sigma (9,), offset_sigma_s: of the calibration. offset_s: calibrated. walk_rad_s2: of the bias."""
         self._x = np.zeros(13)
         self._x[_OFFSET] = offset_s
-        self._cov = np.diag(np.repeat([axes_sigma, offset_sigma_s, _BIAS_RAD_S], [9, 1, 3]) ** 2)
+        self._cov = np.diag(np.concatenate([axes_sigma, [offset_sigma_s], np.full(3, _BIAS_RAD_S)]) ** 2)
         self._walk = np.repeat([1e-5, 1e-4, walk_rad_s2], [9, 1, 3]) ** 2
         self.excess = 0.0  # mean squared error of a rotation over what was expected
+        self.log_likelihood = 0.0  # natural logarithm, of all rotations as they were predicted
+
+    def begin_with(self, axes: F64, axes_sigma: F64, offset_s: float, offset_sigma_s: float) -> None:
+        """Begin with axes (3,3) and a time offset that earlier flights found, and their deviations."""
+        self._x[_AXES], self._x[_OFFSET] = (axes - np.eye(3)).ravel(), offset_s
+        sigma = np.concatenate([axes_sigma.ravel(), [offset_sigma_s]])
+        self._cov[:10, :10] = np.diag(np.minimum(sigma**2, np.diag(self._cov)[:10]))
 
     @property
     def matrix(self) -> F64:
@@ -60,21 +67,22 @@ class GyroCalibration:
         """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
         return significance(self._x[_AXES], self.axes_cov, self.excess)
 
-    def add(self, window: Window, R_b0_b1: F64, turn_variance: float) -> float:
+    def add(self, window: Window, R_b0_b1: F64, turn_variance: float, offset_s: float) -> float:
         """Add a window over which the images rotated by R_b0_b1 (3,3).
 
-        window: integrated at the present offset, matrix and bias. turn_variance: rad^2 of an axis, of images and gyro.
-        Returns the variance of the predicted rotation about an axis, rad^2.
+        window: integrated with the present matrix and bias. turn_variance: rad^2 of an axis, of images and gyro.
+        offset_s: at which the window was cut. Returns the variance of the predicted rotation about an axis, rad^2.
         """
         back = window.turn.T
         j = np.empty((3, 13))
         j[:, _AXES] = back @ window.by_rate
         j[:, _OFFSET] = window.last_rate - back @ window.first_rate
         j[:, _BIAS] = -back @ window.time[0]
-        error = se3.so3_log(back @ R_b0_b1)
+        error = se3.so3_log(back @ R_b0_b1) - j[:, _OFFSET] * (self._x[_OFFSET] - offset_s)
         self._cov[np.diag_indices(13)] += self._walk * window.duration_s
         update = robust_update(j, self._cov, error, turn_variance)
         self.excess += 0.05 * (min(update.square, 25.0) - self.excess)
+        self.log_likelihood += update.log_likelihood
         self._x += update.gain @ error
         self._cov -= update.gain @ update.s @ update.gain.T
         self._cov = 0.5 * (self._cov + self._cov.T)

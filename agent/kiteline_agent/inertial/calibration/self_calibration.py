@@ -6,7 +6,7 @@ the filters contradict that significantly; then their estimates correct the samp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, known_axes
 from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples
@@ -29,10 +30,11 @@ class SelfCalibrationConfig:
     """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
 
     turn_window_s: float = 0.25  # over which rotations are compared
-    move_window_s: float = 0.3  # of two windows over which velocities are compared
+    move_window_s: float = 0.6  # of two windows over which velocities are compared: vibration averages out
     turn_sigma_rad: float = 4e-4  # error of a rotation by images over a window
     position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows
-    axes_sigma: float = 0.012  # of scales and axes of gyro and accelerometer: 1 % and 0.7 degrees
+    sensor_scale_sigma: float = 0.01  # of the scales of gyro and accelerometer; data sheets give 1 to 3 %
+    misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
     scale_sigma: float = 0.015  # relative, of lengths by the images
     significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
     apply_s: float = 0.5  # time constant with which applied axes follow
@@ -41,8 +43,17 @@ class SelfCalibrationConfig:
     offset_trusted_s: float = 3e-3  # deviation below which the offset is applied
     offset_significance: float = 3.0  # deviations from the configured offset below which it stays: most rigs have none
     offset_rate: float = 0.05  # s/s, how fast the applied offset follows
+    kept_axes_sigma: float = 1e-3  # of axes between two flights: temperature, and what images are off by in both
+    kept_offset_sigma_s: float = 3e-4  # of the time offset between two flights: another exposure
+    refuted: float = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
     apply_axes: bool = True  # False: axes are only estimated
     apply_offset: bool = True  # False: only the configured offset is used
+
+    @property
+    def axes_sigma(self) -> F64:
+        """(9,) deviations of the elements of a sensor's matrix, row-major, before a flight."""
+        scale, misalignment = self.sensor_scale_sigma, self.misalignment_sigma
+        return np.where(np.eye(3, dtype=np.bool_), scale, misalignment).ravel()
 
 
 class SelfCalibration:
@@ -56,8 +67,9 @@ class SelfCalibration:
         self._metric = metric
         self._calibration, self._config, self._p_b_c = calibration, config, p_b_c
         self._gravity_m_s2 = gravity_m_s2
-        self.gyro = GyroCalibration(config.axes_sigma, config.offset_sigma_s, config.offset_s, calibration.gyro_walk)
-        self.accel = AccelCalibration(config.axes_sigma, config.scale_sigma, calibration.accel_walk, gravity_m_s2)
+        self.gyro, self.accel = self._unknown_gyro(), self._unknown_accel()
+        self._doubt: GyroCalibration | None = None  # the gyro as if earlier flights were of another one
+        self._kept = KnownImuConfig()  # what earlier flights found
         self._turns = PoseChain(config.turn_window_s)
         self._moves = PoseChain(config.move_window_s)
         self._before: tuple[Window, Link, float] | None = None  # the last window of moves, its density
@@ -66,6 +78,45 @@ class SelfCalibration:
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
         self.camera_rotation_rad = 0.0  # against the gyro, rms as expected
         self._events: list[str] = []
+
+    def _unknown_gyro(self) -> GyroCalibration:
+        c = self._config
+        return GyroCalibration(c.axes_sigma, c.offset_sigma_s, c.offset_s, self._calibration.gyro_walk)
+
+    def _unknown_accel(self) -> AccelCalibration:
+        c = self._config
+        return AccelCalibration(c.axes_sigma, c.scale_sigma, self._calibration.accel_walk, self._gravity_m_s2)
+
+    def begin_with(self, known: KnownImuConfig) -> None:
+        """Begin with what earlier flights found, as a prior; it is dropped if the flight refutes it: after repairs."""
+        config, self._kept = self._config, known
+        if known.gyro and known.offset_s:
+            self._doubt = self._unknown_gyro()
+            offset_s, offset_sigma_s = known.offset_s
+            self.gyro.begin_with(
+                np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
+                offset_s, float(np.hypot(offset_sigma_s, config.kept_offset_sigma_s)),
+            )  # fmt: skip
+            self._follow_offset(np.inf)
+            self._judge_gyro()
+        if known.accel:
+            sigma = np.hypot(known.accel_sigma, config.kept_axes_sigma)
+            self.accel.begin_with(np.reshape(known.accel, (3, 3)), sigma)
+            self._judge_accel()
+        self._gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
+        self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
+
+    def known(self) -> KnownImuConfig | None:
+        """What is known now, for the next flight; None before a rotation was measured."""
+        gyro, accel = self.gyro, self.accel
+        if gyro.log_likelihood == 0.0:
+            return None
+        offset = (round(gyro.offset_s, 6), max(round(gyro.offset_sigma_s, 6), 1e-6))
+        out = KnownImuConfig(offset, *known_axes(gyro.matrix, gyro.axes_cov * max(gyro.excess, 1.0)))
+        if not self._metric:
+            return replace(out, accel=self._kept.accel, accel_sigma=self._kept.accel_sigma)
+        axes, sigma = known_axes(accel.matrix, accel.axes_cov * max(accel.excess, 1.0))
+        return replace(out, accel=axes, accel_sigma=sigma)
 
     def correct(self, samples: Samples) -> Samples:
         """Samples with the applied scales and axes."""
@@ -121,9 +172,13 @@ class SelfCalibration:
         """
         turn = self._turns.take(buffer, self.gyro.offset_s)
         if isinstance(turn, Link):
-            window = self._integrate(turn)
-            variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
-            self.gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance)
+            offset_s = self.gyro.offset_s
+            for gyro in (self.gyro, self._doubt):
+                if gyro is not None:
+                    window = self._integrate(turn, gyro)
+                    variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
+                    gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance, offset_s)
+            self._doubt_earlier_flights()
             self._judge_gyro()
         if gravity is not None:
             if not self.accel.has_vertical:
@@ -137,9 +192,18 @@ class SelfCalibration:
         self._follow_offset(dt_s)
         return self._follow_axes(buffer, dt_s)
 
+    def _doubt_earlier_flights(self) -> None:
+        """Drop what earlier flights found if rotations are likelier without it. Applied axes follow the new ones."""
+        doubt = self._doubt
+        if doubt is not None and doubt.log_likelihood - self.gyro.log_likelihood > self._config.refuted:
+            self.gyro, self._doubt = doubt, None
+            accel, self.accel = self.accel, self._unknown_accel()
+            self.accel.continue_map(accel)
+            self._events.append("the IMU is not the one of the rig file: calibrated anew")
+
     def _judge_gyro(self) -> None:
         config = self._config
-        self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, config.axes_sigma)
+        self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, config.misalignment_sigma)
         if config.apply_axes and not self._corrects_gyro and self.gyro.significance() > config.significance:
             self._corrects_gyro = True
             self._events.append(_event("gyro", self.gyro.matrix))
@@ -174,7 +238,7 @@ class SelfCalibration:
         return change
 
     def _add_move(self, link: Link) -> None:
-        window, density = self._integrate(link), float(self._density(link)[1])
+        window, density = self._integrate(link, self.gyro), float(self._density(link)[1])
         if self._before is not None:
             first, before, density_before = self._before
             t0, t1 = first.duration_s, window.duration_s
@@ -184,8 +248,8 @@ class SelfCalibration:
             self.accel.add((first, window), (before.T_m_b0, link.T_m_b0, link.T_m_b1), self._p_b_c, images + imu + tilt)
         self._before = (window, link, density)
 
-    def _integrate(self, link: Link) -> Window:
-        matrix, bias = self.gyro.matrix, self.gyro.bias
+    def _integrate(self, link: Link, gyro: GyroCalibration) -> Window:
+        matrix, bias = gyro.matrix, gyro.bias
         rates = link.rates @ matrix.T - bias
         return Window.of(link.samples, matrix, bias, rates[0], rates[1])
 
@@ -203,18 +267,18 @@ def _measured(matrix: F64) -> tuple[F64, F64]:
     return measured, se3.so3_log(u @ vt)
 
 
-def _rotation_rad(matrix: F64, cov: F64, axes_sigma: float) -> float:
+def _rotation_rad(matrix: F64, cov: F64, misalignment_sigma: float) -> float:
     """Size of the rotation in the correction `matrix` (3,3), rad. cov: (9,9) of its elements.
 
     Its square is weighted with the probability that there is one at all, by the Bayes factor of a rotation as large as
-    axes_sigma allows against none.
+    misalignment_sigma allows against none.
     """
     turned = 0.5 * np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
     j = np.zeros((3, 9))
     j[0, [7, 5]], j[1, [2, 6]], j[2, [3, 1]] = [0.5, -0.5], [0.5, -0.5], [0.5, -0.5]
     own = j @ cov @ j.T
     log_factor = 0.5 * float(turned @ np.linalg.solve(own, turned))
-    log_factor += 0.5 * float(np.linalg.slogdet(own)[1]) - 1.5 * float(np.log(0.5 * axes_sigma**2))
+    log_factor += 0.5 * float(np.linalg.slogdet(own)[1]) - 1.5 * float(np.log(0.5 * misalignment_sigma**2))
     probability = 1.0 / (1.0 + float(np.exp(-np.clip(log_factor, -50.0, 50.0))))
     return float(np.sqrt(probability * (turned @ turned)))
 
