@@ -18,7 +18,7 @@ from kiteline_hw.ports import SourceError
 
 BENCHMARKS = {
     "first-flight": "kiteline_bench.system.first_flight",
-    "live-camera": "kiteline_bench.system.live_camera",
+    "vehicle": "kiteline_bench.vehicle.vehicle",
     "house": "kiteline_bench.system.house",
     "reality": "kiteline_bench.reality.reality",
     "agent": "kiteline_bench.agent.flights",

@@ -16,12 +16,12 @@ from kiteline_core.frame import Frame
 from kiteline_hw.cameras import v4l2
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
+from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.sim.sensors.video_device import ModelDevice, ModelKernel
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
 from kiteline_lab.flights.plan import Options, plan
 from kiteline_lab.replay.replay import replay_agent
-from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
 
 FPS = 20.0
 

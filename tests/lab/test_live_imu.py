@@ -18,10 +18,10 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.mavlink.connect import ControllerOptions, connect
 from kiteline_hw.ports import LinkError, SourceReport
+from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_lab.replay.replay import replay_agent
-from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
 
 OFFSET_NS = 7_000_000_000  # the controller's clock ahead of ours
 DOWN, UP = (0.0, 0.0, -9.81), 2  # what a level controller feels; the axis of height

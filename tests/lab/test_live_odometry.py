@@ -13,9 +13,9 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.mavlink.messages import WheelDistance
 from kiteline_hw.ports import LinkError
+from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.system import process
 from kiteline_lab.replay.replay import replay_agent
-from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
 
 SPEED_M_S, OFFSET_NS = 0.4, 7_000_000_000  # of the wall's recording: 2 cm a frame to the camera's right
 

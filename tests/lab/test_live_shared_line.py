@@ -7,8 +7,8 @@ from pathlib import Path
 from kiteline_agent.runtime.live import fly_live
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.mavlink.messages import MavlinkMessage, Tunnel
+from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.system import process
-from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
 
 
 class Listening(FlightController):

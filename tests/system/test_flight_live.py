@@ -171,7 +171,7 @@ def drain(s: socket.socket) -> None:
 
 
 def test_poses_go_to_a_flight_controller(recording: Path, start: Start) -> None:
-    from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
+    from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 
     model = FlightController("ardupilot")
     with UdpFlightController(model) as controller:

@@ -14,8 +14,8 @@ from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Heartbeat, VehicleImu
 from kiteline_hw.ports import SourceReport
+from kiteline_hw.sim.flight_controller import FlightController
 from kiteline_hw.sources.overrides import with_other_imu
-from tests.hw.mavlink.flight_controller import FlightController
 
 S, MS = 1_000_000_000, 1_000_000
 

@@ -24,7 +24,7 @@ from kiteline_hw.mavlink.controller_odometry import (
 from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import controller_rates, local_pose, mounting
 from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, Odometry, WheelDistance
-from tests.hw.mavlink.flight_controller import FlightController
+from kiteline_hw.sim.flight_controller import FlightController
 
 S = 1_000_000_000
 NAN = float("nan")

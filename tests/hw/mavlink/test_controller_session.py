@@ -15,7 +15,7 @@ from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Heartbeat, Odometry, TimeSync
 from kiteline_hw.ports import PoseSample
-from tests.hw.mavlink.flight_controller import FlightController
+from kiteline_hw.sim.flight_controller import FlightController
 
 S = 1_000_000_000
 KINDS = ("ardupilot", "px4")

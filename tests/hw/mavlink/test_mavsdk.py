@@ -16,8 +16,8 @@ import pytest
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.ports import PoseSample
+from kiteline_hw.sim.flight_controller import FlightController
 from kiteline_hw.system.clock import MonotonicClock
-from tests.hw.mavlink.flight_controller import FlightController
 from tests.hw.processes import free_port
 
 CLIENT = """

@@ -18,9 +18,9 @@ from kiteline_hw.mavlink.messages import Odometry
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.mavlink.transport.url import MavlinkUrl, parse_mavlink_url
 from kiteline_hw.ports import LinkError, PoseSample
+from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock
-from tests.hw.mavlink.flight_controller import FlightController, UdpFlightController
 from tests.hw.processes import free_port
 
 CLOCK = MonotonicClock()

@@ -20,9 +20,9 @@ from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink, SinkOptions
 from kiteline_hw.mavlink.transport import sockets
 from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelEnd
 from kiteline_hw.ports import LinkError, PoseSample, SourceReport
+from kiteline_hw.sim.flight_controller import FlightController
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock
-from tests.hw.mavlink.flight_controller import FlightController
 from tests.hw.processes import free_port
 
 CLOCK, FLU = MonotonicClock(), mounting("flu")
