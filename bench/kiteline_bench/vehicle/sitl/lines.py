@@ -14,8 +14,8 @@ from kiteline_bench.vehicle.sitl.onboard import Onboard
 from kiteline_codec.channel import coded_channel
 from kiteline_core.ids import AgentId
 from kiteline_hw.mavlink.transport.signing import read_key
-from kiteline_hw.mavlink.tunnel import BASE_END
-from kiteline_hw.mavlink.tunnel_link import MavlinkTunnelLink
+from kiteline_hw.mavlink.tunnel.tunnel_end import BASE_END
+from kiteline_hw.mavlink.tunnel.tunnel_link import MavlinkTunnelLink
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 _SETTLE_S, _SPAN_S, _ARRIVE_S = 8.0, 20.0, 2.0
