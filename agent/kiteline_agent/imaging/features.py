@@ -59,9 +59,17 @@ class Corners:
     score: NDArray[np.float64]
 
 
+def for_kernels(image: U8) -> U8:
+    """The image as kernels are compiled for: contiguous, writable bytes. A copy only where it is not."""
+    flags = image.flags
+    if image.dtype == np.uint8 and flags.c_contiguous and flags.writeable:
+        return image
+    return np.require(image, np.uint8, ("C", "W"))
+
+
 def build_pyramid(image: U8, levels: int) -> Pyramid:
     """Build a Gaussian pyramid; pixel x of level k is at x * 2^k of level 0."""
-    out = [np.require(image, np.uint8, ("C", "W"))]  # kernels are compiled for writable images
+    out = [for_kernels(image)]
     for _ in range(levels - 1):
         out.append(np.asarray(cv2.pyrDown(out[-1]), np.uint8))
     return tuple(out)

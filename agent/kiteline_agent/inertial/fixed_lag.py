@@ -122,6 +122,7 @@ class FixedLagSmoother:
         self._n = 0
         self._rot, self._state, self._tilt = np.zeros((n, 3, 3)), np.zeros((n, 12)), np.zeros(2)
         self._samples: list[Samples] = []
+        self._newest: tuple[Samples, Preintegrated] | None = None  # preintegrated last
         self._imu_dt, self._imu_turn, self._imu_vp = np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 6))
         self._imu_jac, self._imu_bias = np.zeros((n, 9, 6)), np.zeros((n, 6))
         self._imu_info, self._imu_walk = np.zeros((n, 9, 9)), np.zeros((n, 2))
@@ -186,8 +187,16 @@ class FixedLagSmoother:
     def predict(self, samples: Samples) -> tuple[F64, F64]:
         """Predict pose (4,4) and velocity (3,) after the samples, which begin at the newest state."""
         state = self.state
-        motion = preintegrate(samples, state.bias, self._calibration, self._config.imu_inflation)
+        motion = self._integrated(samples, state.bias)
         return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)
+
+    def _integrated(self, samples: Samples, bias: F64) -> Preintegrated:
+        """The samples preintegrated; a frame's prediction and its update ask for the same ones."""
+        held = self._newest
+        if held is None or held[0] is not samples or not (held[1].bias == bias).all():
+            motion = preintegrate(samples, bias, self._calibration, self._config.imu_inflation)
+            held = self._newest = samples, motion
+        return held[1]
 
     def add(
         self, samples: Samples, points: VisualPoints | None, odometry: BodyVelocity | None = None
@@ -201,7 +210,7 @@ class FixedLagSmoother:
             return None
         k = self._n
         bias = self._state[k - 1, 6:].copy()
-        motion = preintegrate(samples, bias, self._calibration, self._config.imu_inflation)
+        motion = self._integrated(samples, bias)
         T_m_b, velocity = motion.propagate(
             se3.from_rt(self._rot[k - 1], self._state[k - 1, :3]), self._state[k - 1, 3:6], bias, self.gravity
         )

@@ -26,6 +26,7 @@ from kiteline_codec.schema import (
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId, point_id
+from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -177,7 +178,7 @@ class LocalMap:
         submap: None for the active one. Views into buffers: use them at once.
         """
         wanted = self.active if submap is None else submap
-        slots = self._searched(np.flatnonzero(self.keyframe >> SEQUENCE_BITS == wanted))
+        slots = self._searched((self.keyframe >> SEQUENCE_BITS == wanted).nonzero()[0])
         n = kernels.project(
             T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.counts,
             self.seed if seeds else self.usable,
@@ -281,7 +282,7 @@ class LocalMap:
         """By how much landmarks at the keyframe's typical depth move in its image if its pose is set to T_m_k (4,4)."""
         change = se3.inverse(self.T_m_k[slot]) @ T_m_k
         usable = self.usable[slot]
-        inverse_m = float(np.median(self.rho[slot, usable])) if usable.any() else 0.0
+        inverse_m = median(self.rho[slot, usable]) if usable.any() else 0.0
         turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
         return float(self.camera.fx * (float(np.linalg.norm(change[:3, 3])) * inverse_m + turn))
 
@@ -319,7 +320,7 @@ class LocalMap:
             self._new_landmarks[record.keyframe] = index[known], rho[known], bearing[known]
             turned = np.linalg.norm(bearing[known] - self.bearing[slot, index[known]], axis=1) * self.camera.fx
             nearer = np.abs(rho[known] - self.rho[slot, index[known]]) * self.camera.bf
-            self._due |= bool(np.median(np.maximum(turned, nearer)) >= self._config.moved_px)
+            self._due |= median(np.maximum(turned, nearer)) >= self._config.moved_px
         return bool(at_once.any())
 
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:

@@ -136,8 +136,7 @@ def frame_images(
     right = None if frame.right is None else RightImage(frame.right, rectifier, config.levels, offset_px)
     depth_m = None if frame.depth_m is None else rectifier.depth(frame.depth_m)
     rectifier.check_size(frame.left)
-    image = np.require(frame.left, np.uint8, ("C", "W"))
-    pyramid, grid = build_pyramid(image, config.levels), rectifier.left_grid
+    pyramid, grid = build_pyramid(frame.left, config.levels), rectifier.left_grid
     if grid is None:
         return FrameImages(pyramid, right, depth_m)
     return FrameImages(pyramid, right, depth_m, first, grid, rectifier)

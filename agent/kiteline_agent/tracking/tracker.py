@@ -51,7 +51,7 @@ class Tracker:
         rows = candidates.rows
         recent = frame_number - self._map.last_hit.take(rows) <= 1
         sigma = self._map.sigma_rho.take(rows)
-        order = np.argsort(sigma, kind="stable")  # candidates come in order of rows, which decides between equals
+        order = sigma.argsort(kind="stable")  # candidates come in order of rows, which decides between equals
         seen_last = recent[order]
         order = np.concatenate((order[seen_last], order[~seen_last]))
         camera = self._map.camera
@@ -90,10 +90,10 @@ class Tracker:
         self._work.projected += len(candidates.rows)
         self._work.alignments += len(rows) * (first - last + 1)
         self._work.posed_points += int(np.count_nonzero(found))
-        kept = np.flatnonzero(found)
+        kept = found.nonzero()[0]
         octave, chosen = (octave + raised).take(kept), chosen.take(kept)
-        observed = np.full((len(kept), 3), -1.0)
-        observed[:, :2] = uv.take(kept, 0)
+        observed = np.empty((len(kept), 3))
+        observed[:, :2], observed[:, 2] = uv.take(kept, 0), -1.0
         if not coarse_only:
             self._add_disparities(images, candidates.rows[chosen], octave, candidates.depth[chosen], observed, config)
         if shutter is not None:

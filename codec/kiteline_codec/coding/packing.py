@@ -34,7 +34,7 @@ def unzigzag(value: int) -> int:
 
 def varint_bytes(value: int) -> int:
     """Bytes that `Writer.varint` takes for a value."""
-    return max(1, (value.bit_length() + 6) // 7)
+    return (value.bit_length() + 6) // 7 or 1
 
 
 class Writer:

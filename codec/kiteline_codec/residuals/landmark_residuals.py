@@ -96,7 +96,9 @@ class RefinedLandmarkResiduals:
 
 def _gaps(index: I64) -> I64:
     """How many numbers are left out before each of increasing ones."""
-    return np.diff(index, prepend=-1) - 1
+    gaps = index.copy()
+    gaps[1:] -= index[:-1] + 1
+    return gaps
 
 
 def _measured_depths(landmarks: I32, parts: Iterable[int], index: I64) -> I64:

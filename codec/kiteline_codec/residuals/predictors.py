@@ -178,5 +178,9 @@ def parts_at(landmarks: I32, keypoint: I64) -> set[int]:
 
 def _widened(landmarks: I32, width: int) -> I32:
     """The same with room for at least so many keypoints."""
-    more = width - landmarks.shape[1]
-    return landmarks if more <= 0 else np.pad(landmarks, ((0, 0), (0, more)), constant_values=_NO_PART)
+    held = landmarks.shape[1]
+    if width <= held:
+        return landmarks
+    out = np.full((len(landmarks), width), _NO_PART, np.int32)
+    out[:, :held] = landmarks
+    return out

@@ -17,11 +17,12 @@ MODULUS = 1 << 8 * DIGEST_BYTES
 
 def hash_value(key: Key, version: int, code: bytes) -> int:
     """The 128-bit hash of one value: BLAKE2b over the varints kind, id, part, version, then the code."""
-    out = Writer()
-    for number in (key.kind, key.id, key.part, version):
-        out.varint(number)
-    out.raw(code)
-    return int.from_bytes(blake2b(out.bytes(), digest_size=DIGEST_BYTES).digest(), "little")
+    head = Writer()
+    head.varint(key.kind)
+    head.varint(key.id)
+    head.varint(key.part)
+    head.varint(version)
+    return int.from_bytes(blake2b(head.bytes() + code, digest_size=DIGEST_BYTES).digest(), "little")
 
 
 class Digest:

@@ -7,7 +7,6 @@ then sends a checksum in place of such a code. See SPEC.md, "Session resumption"
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from struct import pack
 from zlib import crc32
 
@@ -97,7 +96,7 @@ def expand_items(items: Sequence[Item], coder: ResidualCoder, held: Held, earlie
                 code = resolve(item.data, earlier.get(item.key) or (known(item.key) or (0, None))[1])
             else:
                 code = coder.expand(item.key, item.data, known)
-            item = replace(item, data=code, total=len(code), residual=False)
+            item = Item(item.key, item.version, len(code), item.offset, code)
         if item.whole:
             in_packet[item.key] = item.version, item.data
         out.append(item)

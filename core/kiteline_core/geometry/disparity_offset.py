@@ -17,7 +17,11 @@ TERMS = 5
 def terms(xy: F64) -> F64:
     """1, x, y, x^2, x y (n,5) of normalised image coordinates (n,2)."""
     x, y = xy[:, 0], xy[:, 1]
-    return np.stack([np.ones(len(xy)), x, y, x * x, x * y], 1)
+    out = np.empty((len(xy), TERMS))
+    out[:, 0] = 1.0
+    out[:, 1], out[:, 2] = x, y
+    out[:, 3], out[:, 4] = x * x, x * y
+    return out
 
 
 def none() -> F64:
