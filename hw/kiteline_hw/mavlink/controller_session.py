@@ -81,7 +81,7 @@ class OdometryCounters:
     without_velocity: int = 0  # no earlier pose to take a velocity from
     invalid: int = 0  # not finite, or absurdly far away
     stale: int = 0  # not newer than the one before
-    held: int = 0  # before the heading was known
+    held: int = 0  # before the heading was known, or because the axes are wrong
     other_autopilots: int = 0  # heartbeats of autopilots of other systems
 
 
@@ -117,6 +117,7 @@ class ControllerSession:
         self._received = self._messages = 0
         self._start = start
         self._last: LastPose | None = None
+        self._axes_hold = False
         self._origin_due_ns: int | None = None if self.config.origin is None else 0
         self._handlers: dict[type[MavlinkMessage], list[Callable[[Any, int], Sequence[MavlinkMessage]]]] = {}
         self.listen(TimeSync, self._on_timesync)
@@ -141,13 +142,26 @@ class ControllerSession:
             self.counters.heartbeats += 1
             out.append(self.codec.encode(Heartbeat()))
         if pose is not None:
-            message = self._pose_message(pose, now_ns)
+            message = None if self._is_held(pose) else self._pose_message(pose, now_ns)
             if message is not None:
                 self.counters.odometry += 1
                 out += [self.codec.encode(m) for m in (self._vision(message) if self.config.vision else (message,))]
                 if self._watch is not None:
                     self._watch.sent(pose, message.quality, now_ns)
         return out
+
+    def _is_held(self, pose: PoseSample) -> bool:
+        """True if the axes were found wrong on the ground: no such pose may arm the vehicle, or begin in flight."""
+        watch = self._watch
+        if watch is None:
+            return False
+        armed = self._autopilot is not None and self._autopilot[0].armed
+        self._axes_hold = watch.axes_are_wrong and (self._axes_hold or not armed)
+        watch.axes(held=self._axes_hold)
+        if self._axes_hold:
+            self.counters.held += 1
+            watch.compare(pose)
+        return self._axes_hold
 
     def watch(self, now_ns: int, device_fault: str = "") -> list[bytes]:
         """The frames that the watch sends now. device_fault: why the serial port is not open."""

@@ -119,6 +119,28 @@ def test_wrong_axes_are_named_within_five_seconds_of_motion(true: str) -> None:
             assert f"--axes {used} are wrong" in said[-1].text
 
 
+def test_wrong_axes_hold_poses_back_until_they_fit_and_arming_does_not_change_that() -> None:
+    bench = Bench(ModelledAutopilot("ardupilot"), used="flu", true="lbu")
+    bench.run(6.0)
+    assert bench.topic("held")[-1].level is Level.ERROR
+    sent = bench.session.counters.odometry
+    bench.controller.armed = True
+    bench.run(6.0)
+    assert bench.session.counters.odometry == sent and bench.session.counters.held > 100
+    bench.T_b_f = mounting("flu")  # the camera is turned
+    bench.run(40.0)
+    assert bench.session.counters.odometry > sent + 100
+    assert [f.level for f in bench.topic("held")] == [Level.ERROR, Level.INFO]
+
+
+def test_a_vehicle_that_flies_goes_on_getting_poses_by_wrong_axes() -> None:
+    """Poses that end in flight are a failsafe, too: the pilot is told, and decides."""
+    bench = Bench(ModelledAutopilot("ardupilot", armed=True), used="flu", true="lbu")
+    bench.run(8.0)
+    assert "are wrong" in bench.topic("axes")[-1].text
+    assert not bench.topic("held") and bench.session.counters.odometry > 200
+
+
 def test_on_the_ground_axes_are_wrong_as_far_as_gravity_tells() -> None:
     upside_down = Bench(ModelledAutopilot("px4"), used="flu", true="frd", motion=still)
     upside_down.run(5.0)

@@ -81,6 +81,26 @@ class ControllerWatch:
             self.estimator.sent(quality, now_ns)
             self.latency.sent(now_ns - pose.t_ns, self.presence.autopilot)
 
+    def compare(self, pose: PoseSample) -> None:
+        """Add a pose that was held back."""
+        self.attitude.pose(pose)
+
+    @property
+    def axes_are_wrong(self) -> bool:
+        """True if the flight controller's attitude contradicts the axes in use, and fits others."""
+        return isinstance(self._log.state(AXES), tuple)
+
+    def axes(self, *, held: bool) -> None:
+        """Say that poses are held back because the axes are wrong, and that they no longer are."""
+        if held:
+            self._log.say(
+                "held", True, Level.ERROR, "poses: held back, because --axes are wrong",
+                "kiteline: poses held, axes wrong",
+                "A vehicle that is in the air already goes on getting them",
+            )  # fmt: skip
+        elif self._log.state("held"):
+            self._log.say("held", False, Level.INFO, "poses: the axes fit, they are sent", "kiteline: axes fit")
+
     def heading(self, *, held: bool) -> None:
         """Say that poses are held back because the heading is not known, and that it is."""
         if held:
