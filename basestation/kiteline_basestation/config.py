@@ -16,6 +16,8 @@ class IntakeConfig:
     patience_s: float = 2.0  # s; after this long a keyframe is used without its missing sections
     missing_root_s: float = 10.0  # s; after this long a submap without its first keyframe begins at its oldest one
     odometry_gap_s: float = 1.5  # s; a submap that begins within this time of the last one is placed by odometry
+    tie_m: float = 0.2  # m; deviation of the motion over a loss up to which it places a submap: half a metre at worst
+    tie_rad: float = 0.03  # rad; the same of the rotation
     max_per_step: int = 4  # keyframes; used in one step, so that a backlog does not delay the rest
     max_pending: int = 20_000  # sections kept without their header: only a faulty agent has more
 
@@ -131,6 +133,8 @@ class LoopConfig:
     drift_m: float = 0.3  # m; correction of a loop that drift explains
     drift_path: float = 0.02  # added share of the path between the two keyframes
     drift_rad: float = 0.1  # rad; correction of a loop that drift explains
+    tilt_rad: float = 0.05  # rad; by which gravity of two maps may differ that are merged: cameras on worn mounts
+    tilt_deviations: float = 4.0  # added, of what their agents know gravity to
     drift_rad_m: float = 0.002  # rad/m; added for each metre of the path
     monocular_drift_path: float = 0.05  # share of the path instead of drift_path if the scale drifts too
     max_scale_drift: float = 0.4  # logarithm of the scale drift along a loop
@@ -154,6 +158,7 @@ class GraphConfig:
     loop_sigma_scale: float = 0.01  # of the logarithm of the scale of a loop edge
     loop_sigma_depth: float = 0.005  # of a loop edge: added share of the median depth
     loop_sigma_rad: float = 0.003  # rad; of a loop edge
+    level_inflation: float = 4.5  # of deviations of gravity, whose errors are the same over some 20 keyframes
     huber: float = 3.0  # standard deviations; loop edges with larger residuals weigh less
     iterations: int = 8  # of Gauss-Newton
     scale_iterations: int = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther

@@ -108,6 +108,8 @@ class Mapper:
         # 3. Refine the map with each new keyframe, and search for loop closures and merges.
         for keyframe in self._intake.ready(now_ns):
             changes += self._add_keyframe(keyframe)
+        if self._placements.follow_ties():
+            self._grid.rebuild()
         if self.merger is not None:
             changes += self.merger.requery()
             while (tie := self._intake.ties.take()) is not None:
@@ -279,6 +281,7 @@ class Mapper:
             for keyframe in keyframes:
                 slots = self.map.slots_of(keyframe)
                 self.map.inertial_steps.pop(keyframe, None)
+                self.map.up.pop(keyframe, None)
                 self.map.set_flags(slots[self.map.keypoints.kind[slots] == LANDMARK], CULLED)
                 self.map.cull_keyframe(keyframe)
                 self._publisher.mark_changed(CulledLandmarks.KIND, keyframe)

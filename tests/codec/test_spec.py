@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
+from dataclasses import replace
 from hashlib import blake2b
 from math import sqrt
 from pathlib import Path
@@ -13,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_codec.schema import RECORD_TYPES, Key, Record, SubmapPlacement, WireError, messages
+from kiteline_codec.schema import RECORD_TYPES, Key, KeyframeHeader, Record, SubmapPlacement, WireError, messages
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import frame
 from kiteline_codec.transport.packet import PROTOCOL_VERSION
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import submap_id
+from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -87,6 +88,10 @@ def inverse_depth(code: int) -> float:
     return float(((1 + m / 1024) * 2**e - 1) / 128)
 
 
+def deviation(code: int) -> float:
+    return (8 + code % 8) * 2.0 ** (code // 8 - 20) if code else 0.0
+
+
 def points(s: Source, n: int) -> list[int]:
     table, last = [], 0
     for _ in range(s.varint() if n else 0):
@@ -111,6 +116,12 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         z = s.varint() - 1
         out["parent"] = -1 if z < 0 else id_ - (-(z + 1) // 2 if z % 2 else z // 2)
         out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
+        if s.at < len(data):
+            half, sigma = divmod(s.u8(), 128)
+            p, q = s.signed() / 8191, s.signed() / 8191
+            ss = p * p + q * q
+            out["up"] = [2 * p / (1 + ss), (1 if half else -1) * (1 - ss) / (1 + ss), 2 * q / (1 + ss)]
+            out["up_rad"] = deviation(sigma)
     elif kind in (6, 16):
         out[{6: "T_l_m", 16: "T_m_k"}[kind]] = s.pose()
         if kind == 16:
@@ -127,6 +138,9 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["rows_read"] = s.u8() == 1
         out["rows_px"], out["disparity_px"] = ([s.signed() / 1024 for _ in range(5)] for _ in range(2))
         out["sigma_px"] = s.varint() / 1024 or None
+    elif kind == 10:
+        out["since"], out["T_k_f"] = s.varint(), s.pose()
+        out["sigma_m"], out["sigma_rad"] = deviation(s.u8()), deviation(s.u8())
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())
@@ -332,3 +346,18 @@ def test_the_names_in_the_specification_exist() -> None:
     for kind, record_type in RECORD_TYPES.items():
         assert f"| {kind} | {record_type.__name__} |" in text
     assert f"The protocol version is **{PROTOCOL_VERSION}**" in text
+
+
+def test_gravity_is_at_most_five_bytes_of_a_keyframe() -> None:
+    plain = KeyframeHeader(keyframe_id(submap_id(1, 1, 2), 3), 5, NO_KEYFRAME, np.eye(4), 7)
+    known = replace(plain, up=np.array([0.48, -0.6, 0.64]), up_rad=0.01)
+    code, key = messages.encode(known), messages.key(known)
+    assert code[:-5] == messages.encode(plain)
+    assert_agree(read_code(key.kind, key.id, code), messages.decode(key, code))
+    assert messages.encode(messages.decode(key, code)) == code
+    with pytest.raises(WireError, match="above 0"):
+        messages.decode(key, code[:-5] + bytes([code[-5] & 128]) + code[-4:])
+    with pytest.raises(WireError, match="half of the sphere"):
+        messages.decode(key, code[:-4] + b"\xfe\x7f\xfe\x7f")
+    with pytest.raises(WireError, match="end within"):
+        messages.decode(key, code[:-1])

@@ -30,12 +30,23 @@ class ScaleFilterConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LossMotionConfig:
+    """How the motion over a loss follows from the velocity after it."""
+
+    after_s: float = 0.19  # time in the new submap after which the velocity is known: four frames at 20 Hz
+    most_s: float = 1.0  # later it tells as little of the loss as the IMU of the time since
+    accel_m_s2: float = 0.3  # error of a worn accelerometer under vibration, meanwhile
+    image_m: float = 0.004  # error of the motion by images, meanwhile
+
+
+@dataclass(frozen=True, slots=True)
 class InertialConfig:
     """How the inertial state is initialised, and how long dead reckoning is trusted."""
 
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
     calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     scale_filter: ScaleFilterConfig = field(default_factory=ScaleFilterConfig)
+    loss_motion: LossMotionConfig = field(default_factory=LossMotionConfig)
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     silent_s: float = 3.0  # time without a sample after which an event is logged
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked

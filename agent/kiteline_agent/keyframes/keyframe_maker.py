@@ -67,11 +67,12 @@ class KeyframeMaker:
 
     def make(
         self, ctx: FrameContext, track: Track | None, points: NewPoints, keyframe: KeyframeId, parent: KeyframeId,
-        T_p_k: F64,
+        T_p_k: F64, up: tuple[F64, float] | None = None,
     ) -> F64:  # fmt: skip
         """Share and store a keyframe. Returns its pose T_m_k (4,4) as both sides hold it, after quantisation.
 
-        track: None for a keyframe without observations of older landmarks.
+        track: None for a keyframe without observations of older landmarks. up: (3,) against gravity in the camera, and
+        its deviation in rad; None if unknown.
         """
         rows, seen = (np.zeros(0, np.int64), np.zeros((0, 3))) if track is None else self._inliers(track)
         profile = self._channel.profile
@@ -82,7 +83,7 @@ class KeyframeMaker:
         sections = profile.choose(landmarks, strength, observations)
         n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
         self._count(ctx, len(landmarks.index), len(observations.index))
-        header = self._channel.put(KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, n_keypoints))
+        header = self._channel.put(KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, n_keypoints, *(up or ())))
         assert isinstance(header, KeyframeHeader)
         uv, rho = landmarks.uv.astype(np.float64), landmarks.inv_depth.astype(np.float64)
         for part in sections[0]:

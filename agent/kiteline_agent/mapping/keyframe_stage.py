@@ -91,7 +91,7 @@ class KeyframeStage:
         """
         reference, submap = self._camera.reference, self._camera.submaps.active
         keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
-        T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k)
+        T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k, self._camera.motion.up())
         steps = self._camera.motion.take_steps(keyframe, ctx.t_ns)
         if steps is not None and self._channel.profile.inertial_steps:
             self._channel.put(steps)

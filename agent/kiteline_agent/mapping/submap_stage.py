@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
@@ -16,13 +17,17 @@ from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
+from kiteline_agent.motion.loss_motion import LossMotion
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import SubmapScale
+from kiteline_codec.schema import SubmapScale, SubmapTie
 from kiteline_core.geometry import se3
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +57,9 @@ class SubmapStage:
         self._inertial_start = inertial_start
         self._governor = governor
         self._channel = channel
+        # of the loss before the newest submap: the last keyframe and the camera in it, and how the submap begins
+        self._left: tuple[KeyframeId, F64] | None = None
+        self._first: tuple[SubmapId, F64] = SubmapId(-1), np.eye(3)
 
     def may_open(self, ctx: FrameContext, failed_searches: int) -> bool:
         """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
@@ -71,15 +79,35 @@ class SubmapStage:
         if points is None:
             return None
         camera = self._camera
+        since, T_k_c, R_o_m = camera.reference.keyframe, camera.reference.T_k_c, camera.pose.T_o_m[:3, :3]
+        self._left = None
         if not camera.submaps.any:
             camera.set_first_pose(ctx.imu)
         else:
+            self._left = since, T_k_c.copy()
             camera.leave_submap()
             self._relocaliser.start_joining(ctx.t_ns)
-        camera.open_submap()
+        submap = camera.open_submap()
         camera.pose.reset_motion()
         self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)
+        if self._left is not None and camera.motion.over_loss is not None:
+            self._first = submap, camera.pose.T_m_c[:3, :3].copy()
+            self._tie(camera.motion.over_loss.begin(ctx.t_ns, camera.T_m_b, R_o_m))
         return OpenedSubmap(True, ["submap: opened"])
+
+    def _measure_loss(self, ctx: FrameContext) -> None:
+        """Tell the base again how the submap lies to the one before it, once images have shown the velocity."""
+        over_loss = self._camera.motion.over_loss
+        if over_loss is not None and self._camera.submaps.active == self._first[0]:
+            self._tie(over_loss.update(ctx.t_ns, self._camera.T_m_b))
+
+    def _tie(self, motion: LossMotion | None) -> None:
+        if motion is None or self._left is None or self._left[0] == NO_KEYFRAME:
+            return
+        (since, T_k_c), (submap, R_m_c) = self._left, self._first
+        T_k_f = T_k_c.copy()
+        T_k_f[:3, 3] += T_k_c[:3, :3] @ R_m_c.T @ motion.shift
+        self._channel.put(SubmapTie(submap, since, se3.orthonormalise(T_k_f), motion.sigma_m, motion.sigma_rad))
 
     def _open_from_inertial_window(self, ctx: FrameContext, start: InertialStart) -> OpenedSubmap | None:
         """Begin a monocular submap in metres at this frame; None until its scale is known."""
@@ -149,6 +177,7 @@ class SubmapStage:
 
         Returns events.
         """
+        self._measure_loss(ctx)
         found = self._relocaliser.find_older_submap(ctx, self._camera.pose.T_m_c)
         if found is None:
             return []

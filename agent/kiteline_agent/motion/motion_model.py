@@ -18,6 +18,7 @@ from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
+from kiteline_agent.motion.loss_motion import LossMotionEstimator
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.motion.step_recorder import StepRecorder
 from kiteline_agent.tracking.pose_state import PoseState
@@ -29,6 +30,8 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[float64]
+
+_MOST_UP_RAD = 0.2  # deviation of a direction of gravity that is of use
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,9 @@ class MotionModel:
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
         self._steps = None if imu is None or metric else StepRecorder(imu, config.scale_filter.interval_s)
+        self.over_loss: LossMotionEstimator | None = None
+        if self.tracker is not None and imu is not None and metric:
+            self.over_loss = LossMotionEstimator(self.tracker, imu, config.loss_motion, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
         self._watch = ImuWatch(config.silent_s)
         self._events: list[str] = []
@@ -141,6 +147,13 @@ class MotionModel:
         """The steps from the keyframe before to a new one of this frame; None if the base cannot use them."""
         return None if self._steps is None or self.tracker is None else self._steps.take(keyframe, t_ns, self.tracker)
 
+    def up(self) -> tuple[F64, float] | None:
+        """Unit vector (3,) against gravity in the camera, and its deviation about an axis, rad; None if unknown."""
+        found = None if self.tracker is None else self.tracker.up()
+        if found is None or not 0.0 < found[1] < _MOST_UP_RAD:
+            return None
+        return self._T_c_b[:3, :3] @ found[0], found[1]
+
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""
         events, self._events = self._events, []
@@ -154,6 +167,8 @@ class MotionModel:
         """Process a frame without a pose from images, predicted at T_m_c (4,4)."""
         if self._steps is not None:
             self._steps.clear()
+        if self.over_loss is not None:
+            self.over_loss.clear()
         state = None if self.tracker is None else self.tracker.dead_reckon(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
             cov = self.odometer.dead_reckon(predicted, t_ns)

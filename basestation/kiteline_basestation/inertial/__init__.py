@@ -1,1 +1,1 @@
-"""In: keyframe poses of a monocular map in metres, and the agent's inertial steps. Out: how long its metre is."""
+"""In: keyframe poses of maps, and what the agents know by their IMUs. Out: how long a metre is, and what is level."""

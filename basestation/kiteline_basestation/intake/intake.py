@@ -22,6 +22,7 @@ from kiteline_codec.schema import (
     Record,
     StereoAlignment,
     SubmapScale,
+    SubmapTie,
 )
 from kiteline_core.ids import (
     NO_KEYFRAME,
@@ -63,6 +64,8 @@ class Intake:
         self.last_pose: dict[SubmapId, LivePose] = {}  # newest live pose in each submap
         self.tracked_ns: dict[SubmapId, int] = {}  # time stamp of the newest pose in each submap that images support
         self.gravity: dict[SubmapId, GravityAlignment] = {}
+        self.loss_ties: dict[SubmapId, SubmapTie] = {}  # how a submap lies to the one before it, over a loss
+        self.fresh_ties: set[SubmapId] = set()  # of those, the ones that no placement follows yet
         self.metres_per_unit: dict[SubmapId, float] = {}  # of submaps whose agent knows it
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
@@ -95,6 +98,9 @@ class Intake:
                 self.metres_per_unit[record.submap] = self._map.told_metres[record.submap] = record.metres
                 if record.metres == 1.0:
                     self._map.metric_submaps.add(record.submap)
+            elif isinstance(record, SubmapTie):
+                self.loss_ties[record.submap] = record
+                self.fresh_ties.add(record.submap)
             elif isinstance(record, InertialSteps):
                 self._map.inertial_steps[record.keyframe] = record
                 self.ties.add(record)
@@ -148,6 +154,7 @@ class Intake:
         unused = set(state.unused)
         self._waiting = {k: t for k, t in self._waiting.items() if k in unused}
         self.ties.clear()  # they were used, or undone
+        self.fresh_ties.clear()
         self.deleted.update(state.deleted)
 
     def _is_usable(self, keyframe: KeyframeId) -> bool:
@@ -162,6 +169,8 @@ class Intake:
         except ValueError:
             self.refused += 1
             return
+        if header.up is not None:
+            self._map.up[header.keyframe] = header.up, header.up_rad
         if fresh:
             self._waiting[header.keyframe] = now_ns
         sections = self._pending.pop(header.keyframe, {})
@@ -201,4 +210,4 @@ def _order(live: LivePose) -> tuple[int, int]:
 def _submap_of(record: Record) -> SubmapId | None:
     if isinstance(record, KeyframeHeader | NewLandmarks | Observations | InertialSteps | LivePose):
         return submap_of_keyframe(record.keyframe)
-    return record.submap if isinstance(record, GravityAlignment | SubmapScale) else None
+    return record.submap if isinstance(record, GravityAlignment | SubmapScale | SubmapTie) else None

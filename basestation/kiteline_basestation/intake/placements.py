@@ -18,7 +18,7 @@ from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class SubmapPlacements:
     def place_new(self, keyframe: KeyframeId) -> None:
         """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left."""
         submap = submap_of_keyframe(keyframe)
-        if submap in self.S_w_m:
+        if submap in self.S_w_m or self._place_by_tie(submap):
             return
         if not self.S_w_m:
             gravity = self._intake.gravity.get(submap)
@@ -97,6 +97,29 @@ class SubmapPlacements:
             S_w_m = sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first))
         self.unmerged[submap] = S_w_m
         self._set(submap, S_w_m)
+
+    def follow_ties(self) -> bool:
+        """Place submaps that are not recognised where their agents' motion over a loss says. True if one moved."""
+        fresh, self._intake.fresh_ties = sorted(self._intake.fresh_ties), set()
+        return sum(self._place_by_tie(submap) for submap in fresh) > 0
+
+    def _place_by_tie(self, submap: SubmapId) -> bool:
+        """Place a submap by its agent's motion over a loss; False if that is too uncertain, or not known yet."""
+        tie, config = self._intake.loss_ties.get(submap), self._config
+        if tie is None or submap == self.first or tie.sigma_m > config.tie_m or tie.sigma_rad > config.tie_rad:
+            return False
+        before, alone = submap_of_keyframe(tie.since), self._map.submaps_of_map(submap) == [submap]
+        S_w_before, T_before_k = self.S_w_m.get(before), self._map.pose(tie.since)
+        keyframes = self._map.submaps.get(submap)
+        T_m_first = self._map.pose(keyframes[0]) if keyframes else None
+        if S_w_before is None or T_before_k is None or T_m_first is None or not alone or before == submap:
+            return False
+        if agent_of_submap(before) != agent_of_submap(submap):
+            return False
+        T_w_first = sim3.place(S_w_before, T_before_k @ tie.T_k_f)
+        self.unmerged[submap] = S_w_m = se3.orthonormalise(T_w_first @ se3.inverse(T_m_first))
+        self._set(submap, S_w_m)
+        return True
 
     def rescale(self, factors: Mapping[SubmapId, float]) -> None:
         """Scale placements of submaps whose units grew in their maps, about their first keyframes."""

@@ -44,6 +44,9 @@ class MapView:
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.metric_submaps: set[SubmapId] = set()  # monocular submaps of known metric scale
         self.inertial_steps: dict[KeyframeId, InertialSteps] = {}  # from the keyframe before to this one
+        self.up: dict[
+            KeyframeId, tuple[F64, float]
+        ] = {}  # (3,) against gravity in its camera, and its deviation in rad
         self.told_metres: dict[SubmapId, float] = {}  # of a monocular submap's unit, as its agent knows them
         self.measures_depth: set[AgentId] = set()  # agents that measure depth in each observation (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # (5,) by agent, see disparity_calibration

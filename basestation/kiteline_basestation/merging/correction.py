@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, GraphConfig, PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
+from kiteline_basestation.inertial.level import level_of
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
@@ -72,6 +73,7 @@ def essential_graph_of(
         np.array(keyframes, np.int64), poses, held, np.concatenate([edges, loop_pairs]),
         np.concatenate([between, measured]), np.concatenate([np.round(sigma, 4), np.round(loop_sigma, 4)]),
         np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(loop_pairs), np.bool_)]), config, scaled,
+        level_of(sparse_map, keyframes),
     )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Pose graph optimisation over the essential graph: spanning tree, strong covisibility and loop edges.
 
+Where level is known, roll and pitch stay, and four degrees of freedom are left: T. Qin et al., "VINS-Mono", 2018.
+
 Source: H. Strasdat et al., "Double window optimisation for constant time visual SLAM", and the essential graph of
 ORB-SLAM2; solved by Gauss-Newton in gtsam, with a Huber kernel on loop edges.
 """
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
+from kiteline_basestation.inertial.level import Level
 from kiteline_core.geometry import se3
 
 if TYPE_CHECKING:
@@ -28,7 +31,7 @@ class GraphInputs:
     """A pose graph. keyframes: (n,) ids. T_w_k: (n,4,4) initial poses. held: (n,) True for fixed keyframes.
 
     edges: (m,2) rows a, b. T_a_b: (m,4,4). sigma: (m,2) m and rad. loop: (m,) True for loop edges. scaled: None unless
-    scale may drift.
+    scale may drift. level: keyframes that keep roll and pitch, as far as their agents know gravity.
     """
 
     keyframes: I64
@@ -40,6 +43,7 @@ class GraphInputs:
     loop: Bools
     config: GraphConfig
     scaled: Scaled | None = None
+    level: Level | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +97,12 @@ def _rigid(inputs: GraphInputs) -> GraphResult:
     keys = np.column_stack([inputs.sigma, inputs.loop]).tolist()
     for (a, b), T, key in zip(inputs.edges.tolist(), inputs.T_a_b, keys):
         graph.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T), noises[tuple(key)]))
+    if inputs.level is not None:
+        up_w = gtsam.Unit3(inputs.level.up_w)
+        for i, sigma in zip(inputs.level.rows.tolist(), inputs.level.sigma.tolist()):
+            kept = gtsam.Unit3(inputs.T_w_k[i, :3, :3].T @ inputs.level.up_w)
+            known: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, inputs.config.level_inflation * sigma)
+            graph.add(gtsam.AttitudeFactorPose3(i, up_w, known, kept))
     params = gtsam.GaussNewtonParams()
     params.setMaxIterations(inputs.config.iterations)
     params.setRelativeErrorTol(inputs.config.stop)

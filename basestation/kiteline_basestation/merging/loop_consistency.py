@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.inertial.level import tilt_between
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, correction_of, depth_of
 from kiteline_core.geometry import se3, sim3
@@ -53,6 +54,13 @@ def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> b
         and _rotation_between(np.eye(4), X) <= config.drift_rad + config.drift_rad_m * path
         and abs(float(np.log(sim3.scale_of(X)))) <= config.max_scale_drift
     )
+
+
+def keeps_level(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:
+    """False if the correction would tilt one map against the other, as far as both agents know gravity."""
+    new, old = submap_of_keyframe(edge.new), submap_of_keyframe(edge.old)
+    found = tilt_between(sparse_map, new, old, correction_of(sparse_map, edge))
+    return found is None or found[0] <= config.tilt_rad + config.tilt_deviations * found[1]
 
 
 def path_length(sparse_map: SparseMap, a: KeyframeId, b: KeyframeId) -> float:

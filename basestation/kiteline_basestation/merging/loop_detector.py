@@ -196,6 +196,9 @@ class LoopDetector:
         matches.append(match)
         self._matches[key] = matches
         same_map = self._map.map_id(new) == self._map.map_id(old)
+        if not same_map and not consistency.keeps_level(self._map, match, config):
+            self.rejected += 1
+            return None
         chosen = [m for m in matches if consistency.agree(self._map, m, match, config)]
         supporters = {m.new for m in chosen}
         best = max(chosen, key=lambda m: (m.inliers, m.new))

@@ -30,6 +30,7 @@ from kiteline_codec.schema import (
     RemovedObservations,
     SubmapPlacement,
     SubmapScale,
+    SubmapTie,
     WireError,
     messages,
 )
@@ -84,7 +85,7 @@ def check(saved: SavedMap) -> Checked:
                 if (why := _wrong_section(record, headers)) is not None:
                     faults.append(f"{_name(key)} of agent {agent} {why}: left out")
                     del received[key]
-            elif isinstance(record, GravityAlignment | SubmapScale):
+            elif isinstance(record, GravityAlignment | SubmapScale | SubmapTie):
                 awaited += record.submap not in submaps
         for key, record in list(own.items()):
             if (why := _wrong_own(record, agent, headers, submaps)) is not None:

@@ -41,6 +41,7 @@ _ROTATION_LIMIT = (1 << 38) - (1 << 12)  # squared length kept below that of hal
 MIN_SCALE, MAX_SCALE = 2.0**-20, 2.0**20  # of one unit of length over another; an IEEE single: error <= 6e-8 of it
 
 DEVIATION_CODES = 1 << 7  # of a relative standard deviation: 8.6e-6 to 0.47, error <= 6 percent
+DIRECTION_STEPS = 8191  # per unit of the stereographic coordinates: error <= 2 sqrt(2) / 2 / 8191 = 1.8e-4 rad
 
 OCCUPANCY_STEPS = 14  # over 0..100 percent: error <= 3.6 percent
 
@@ -125,6 +126,31 @@ def pose(codes: tuple[int, ...]) -> F64:
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
+
+
+def direction_codes(direction: F64) -> tuple[int, int, int]:
+    """Three integers of a unit vector (3,): 1 where its y is positive, else 0; x and z over 1 + |y|.
+
+    The latter are a stereographic map of the half of the sphere. Raises ValueError for another length.
+    """
+    x, y, z = (float(c) for c in direction)
+    if not abs(x * x + y * y + z * z - 1.0) < 1e-3:
+        raise ValueError(f"a unit vector is expected, found {direction}")
+    mapped = [round(c / (1.0 + abs(y)) * DIRECTION_STEPS) for c in (x, z)]
+    while mapped[0] ** 2 + mapped[1] ** 2 >= DIRECTION_STEPS**2:  # where the halves meet: each keeps codes of its own
+        i = int(abs(mapped[1]) > abs(mapped[0]))
+        mapped[i] -= 1 if mapped[i] > 0 else -1
+    return int(y > 0.0), mapped[0], mapped[1]
+
+
+def direction(half: int, a: int, b: int) -> F64:
+    """The unit vector (3,) of three integers. Raises ValueError when they are too large."""
+    if a * a + b * b >= DIRECTION_STEPS**2:
+        raise ValueError("a direction within half of the sphere is expected")
+    p, q = a / DIRECTION_STEPS, b / DIRECTION_STEPS
+    s = p * p + q * q
+    y = (1.0 - s) / (1.0 + s)
+    return np.array([2.0 * p / (1.0 + s), y if half else -y, 2.0 * q / (1.0 + s)])
 
 
 def occupancy_codes(cells: NDArray[np.int8]) -> NDArray[np.uint8]:

@@ -13,6 +13,7 @@ from kiteline_codec.schema.agent.new_landmarks import NewLandmarks as NewLandmar
 from kiteline_codec.schema.agent.observations import Observations as Observations
 from kiteline_codec.schema.agent.stereo_alignment import StereoAlignment as StereoAlignment
 from kiteline_codec.schema.agent.submap_scale import SubmapScale as SubmapScale
+from kiteline_codec.schema.agent.submap_tie import SubmapTie as SubmapTie
 from kiteline_codec.schema.base.cached_keyframe import CachedKeyframe as CachedKeyframe
 from kiteline_codec.schema.base.cached_landmarks import CachedLandmarks as CachedLandmarks
 from kiteline_codec.schema.base.correction_batch import CorrectionBatch as CorrectionBatch

@@ -157,3 +157,26 @@ def test_occupancy_bounds() -> None:
     assert np.array_equal(quantise.occupancy_codes(quantise.occupancy(codes)), codes)
     with pytest.raises(ValueError, match="occupancy"):
         quantise.occupancy_codes(np.array([101], np.int8))
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: float(np.linalg.norm(v)) > 0.01))
+@example((1.0, 1e-9, 0.0))
+@example((0.6, -1e-12, 0.8))
+@example((0.0, 1.0, 0.0))
+@example((0.0, -1.0, 0.0))
+def test_direction_bounds(v: tuple[float, float, float]) -> None:
+    unit = np.array(v) / np.linalg.norm(v)
+    codes = quantise.direction_codes(unit)
+    got = quantise.direction(*codes)
+    assert abs(float(np.linalg.norm(got)) - 1.0) < 1e-12
+    assert float(np.linalg.norm(got - unit)) <= 1.8e-4
+    assert quantise.direction_codes(got) == codes
+
+
+def test_directions_without_a_code_are_refused() -> None:
+    with pytest.raises(ValueError, match="unit vector"):
+        quantise.direction_codes(np.array([1.0, 1.0, 0.0]))
+    with pytest.raises(ValueError, match="unit vector"):
+        quantise.direction_codes(np.full(3, np.nan))
+    with pytest.raises(ValueError, match="half of the sphere"):
+        quantise.direction(1, quantise.DIRECTION_STEPS, 0)

@@ -39,6 +39,7 @@ from kiteline_codec.schema import (
     StereoAlignment,
     SubmapPlacement,
     SubmapScale,
+    SubmapTie,
     WireError,
     messages,
 )
@@ -109,6 +110,10 @@ def some_records(seed: int, n: int) -> list[Record]:
         DisparityCalibration(AgentId(4), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0, 0.5, 5),
         SubmapPlacement(SubmapId(submap ^ 3), sim3.of(1.0 + 0.37 * n, pose), False, 0, 0.5**7),
         SubmapPlacement(SubmapId(submap ^ 4), sim3.of(1.0, pose), True, 5, 13.0 / 1024.0),
+        KeyframeHeader(
+            KeyframeId(keyframe - 1), 7 * n, KeyframeId(keyframe - 2), pose, n, pose[1, :3].copy(), 0.0015 + 0.0007 * n
+        ),
+        SubmapTie(submap, KeyframeId(keyframe - 9), pose, 0.0123 * (n + 1), 0.0021),
     ]  # fmt: skip
 
 

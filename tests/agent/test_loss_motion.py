@@ -1,0 +1,101 @@
+"""The motion over a loss: the velocity after it corrects the IMU's error, and the deviations tell how far."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.fixed_lag import StartDeviations
+from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator
+from kiteline_core.frame import ImuBatch, ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+F64 = NDArray[np.float64]
+
+CALIBRATION = ImuCalibration()
+CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
+CONFIG = InertialConfig()
+PERIOD_NS = 50_000_000
+UP = np.array([0.0, 0.0, 9.81])
+VELOCITY = np.array([0.8, -0.3, 0.1])
+
+
+def flown(accel_error: F64, gap: int, seen: int) -> tuple[list[LossMotion], F64]:
+    """A straight flight: `gap` frames without images, then `seen` frames in a new submap. Returns the motions told, and
+    by how much dead reckoning was off.
+
+    accel_error: (3,) m/s^2, from the begin of the loss on.
+    """
+    tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
+    estimator = LossMotionEstimator(tracker, CALIBRATION, CONFIG.loss_motion, CONFIG.gravity_m_s2)
+    tracker._smoother.start(np.eye(4), VELOCITY, np.zeros(6), -UP, StartDeviations(1e-3, 1e-3, 0.01, 1e-4, 0.1, 5e-3))
+    tracker._set_last(0, np.eye(4))
+    told, off = [], np.zeros(3)
+    for k in range(1, gap + seen + 1):
+        stamps = np.arange((k - 1) * PERIOD_NS, k * PERIOD_NS + 1, 5_000_000)
+        accel = np.tile(UP + accel_error, (len(stamps), 1))
+        tracker.predict(ImuBatch(stamps[1:], np.zeros((len(stamps) - 1, 3)), accel[1:]), k * PERIOD_NS)
+        true = VELOCITY * k * PERIOD_NS * 1e-9
+        if k <= gap:
+            state = tracker.dead_reckon(k * PERIOD_NS)
+            assert state is not None
+            off = true - state.T_m_b[:3, 3]
+        if k == gap:
+            first = estimator.begin(k * PERIOD_NS, state.T_m_b, np.eye(3))
+            assert first is not None
+            told.append(first)
+            tracker.begin_map(k * PERIOD_NS, state.T_m_b)
+        elif k > gap:
+            T_m_b = se3.from_rt(np.eye(3), true - off)  # the new submap lies where dead reckoning put it
+            again = estimator.update(k * PERIOD_NS, T_m_b)
+            told += [] if again is None else [again]
+            tracker._set_last(k * PERIOD_NS, T_m_b)
+    return told, off
+
+
+@pytest.mark.parametrize("gap", [10, 30, 60])
+def test_the_velocity_after_a_loss_tells_most_of_the_error(gap: int) -> None:
+    (first, second), off = flown(np.array([0.15, -0.1, 0.05]), gap, 6)
+    assert np.array_equal(first.shift, np.zeros(3))
+    assert float(np.linalg.norm(off)) > 0.02
+    assert float(np.linalg.norm(off - second.shift)) < 0.35 * float(np.linalg.norm(off))
+    assert second.sigma_m < 0.6 * first.sigma_m
+    assert second.sigma_rad == first.sigma_rad
+    for motion in (first, second):
+        assert float(np.linalg.norm(off - motion.shift)) < 3.0 * np.sqrt(3.0) * motion.sigma_m
+
+
+def test_a_true_dead_reckoning_stays() -> None:
+    (first, second), off = flown(np.zeros(3), 30, 6)
+    assert float(np.linalg.norm(off)) < 1e-3
+    assert float(np.linalg.norm(second.shift)) < 5e-3
+    assert second.sigma_m < first.sigma_m
+
+
+def test_a_loss_is_measured_once_and_not_from_too_few_frames() -> None:
+    assert len(flown(np.zeros(3), 30, 3)[0]) == 1
+    assert len(flown(np.zeros(3), 30, 12)[0]) == 2
+
+
+def test_without_dead_reckoning_there_is_no_motion() -> None:
+    tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
+    estimator = LossMotionEstimator(tracker, CALIBRATION, CONFIG.loss_motion, CONFIG.gravity_m_s2)
+    assert estimator.begin(0, np.eye(4), np.eye(3)) is None
+    assert estimator.update(10**9, np.eye(4)) is None
+
+
+def test_up_is_that_of_the_state_and_as_certain() -> None:
+    tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
+    assert tracker.up() is None
+    T_m_b = se3.exp(np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.9]))
+    gravity = -9.81 * np.array([0.05, -0.02, 1.0]) / np.linalg.norm([0.05, -0.02, 1.0])
+    deviations = StartDeviations(turn_rad=0.01, tilt_rad=0.02)
+    tracker._smoother.start(T_m_b, VELOCITY, np.zeros(6), gravity, deviations)
+    found = tracker.up()
+    assert found is not None
+    assert np.allclose(found[0], -T_m_b[:3, :3].T @ gravity / 9.81, atol=1e-9)
+    assert found[1] == pytest.approx(np.hypot(0.01, 0.02), rel=0.01)
