@@ -204,12 +204,13 @@ class DisparityConfig:
     inflation: float = 2.0  # of variance: templates and lens errors are common to neighbouring points
     iterations: int = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
-    known_px: float = 0.1  # px; standard deviation of each number that an earlier flight found
+    known_px: float = 0.1  # px; by which each number changes between two flights: mounts and temperature
     prior_px: float = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
     prior_slope_px: float = 0.5  # px where x or y is 1; of the other terms
     good_px: float = 0.1  # px; standard deviation of all terms of a good calibration
     worn_share: float = 0.2  # probability of a worn rig before the flight
     sure: float = 0.95  # the same, above which the offset is applied
+    refuted: float = 5.0  # log likelihood without earlier flights over that with them, from which those are dropped
     least_px: float = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
     least_change_px: float = 0.04  # px, rms over the image; of a later change that is applied
     min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such

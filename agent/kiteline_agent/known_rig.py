@@ -29,6 +29,9 @@ class KnownRigConfig:
     rows_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x y, y^2 by which the right image is too low
     rows_read: bool = False  # disparities were measured in a right image that was read there
     disparity_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x^2, x y by which disparities are too large
+    # px, rms over the image; standard deviation of disparity_px; 0: it rests on the prior of a good calibration, and is
+    # where the next flight begins, no knowledge
+    disparity_sigma_px: float = 0.0
     imu: KnownImuConfig = field(default_factory=KnownImuConfig)
 
     def __post_init__(self) -> None:
@@ -39,6 +42,8 @@ class KnownRigConfig:
                 raise ValueError(f"{name} has {len(values)} numbers: expected {size} finite ones, or none")
         if any(abs(v) > _MAX_PX for v in (*self.rows_px, *self.disparity_px)):
             raise ValueError(f"rows_px and disparity_px are px: expected at most {_MAX_PX:g}")
+        if not 0.0 <= self.disparity_sigma_px <= _MAX_PX:
+            raise ValueError(f"disparity_sigma_px is {self.disparity_sigma_px:g}: expected px from 0 to {_MAX_PX:g}")
 
     def is_of(self, camera: RectifiedCamera) -> bool:
         """True if it was found with the calibration that gives this rectified camera."""
@@ -87,9 +92,12 @@ def _extrinsics_of(camera: RectifiedCamera) -> tuple[float, ...]:
     return tuple(round(float(v), 9) for v in camera.T_b_c.ravel())
 
 
-def known_rig(camera: RectifiedCamera, rows_px: F64, disparity_px: F64, *, rows_read: bool) -> KnownRigConfig:
-    """What a flight found of the right camera, rounded to what the next one can use."""
+def known_rig(
+    camera: RectifiedCamera, rows_px: F64, disparity_px: F64, sigma_px: float | None = None, *, rows_read: bool
+) -> KnownRigConfig:
+    """What a flight found of the right camera, rounded to what the next one can use. sigma_px: of disparity_px."""
     rows, disparity = (tuple(round(float(v), 3) for v in values) for values in (rows_px, disparity_px))
-    return KnownRigConfig(
-        numbers_of(camera), _extrinsics_of(camera), rows, rows_read, disparity if any(disparity) else ()
-    )  # fmt: skip
+    known = KnownRigConfig(numbers_of(camera), _extrinsics_of(camera), rows, rows_read)
+    if not any(disparity):
+        return known
+    return replace(known, disparity_px=disparity, disparity_sigma_px=0.0 if sigma_px is None else round(sigma_px, 4))

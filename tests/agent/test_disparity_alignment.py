@@ -188,16 +188,41 @@ def test_the_base_s_map_is_left_to_the_base() -> None:
 def test_what_earlier_flights_found_is_where_it_begins() -> None:
     fresh, known = Flight(WORN, 2, SIDEWAYS), Flight(WORN, 2, SIDEWAYS)
     known.map.set_disparity_offset(WORN)
-    known.alignment.begin_with(WORN)
+    known.alignment.begin_with(WORN, 0.03)
     assert np.trace(known.alignment.expected_cov) < 0.1 * np.trace(fresh.alignment.cov)  # of a rig known to be worn
     known.fly(12)
     grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
     assert np.sqrt(np.mean((grid @ (WORN - known.map.disparity_offset)) ** 2)) < 0.1
-    bent = Flight(0.3 * WORN, 2, SIDEWAYS)  # it was repaired since
-    bent.map.set_disparity_offset(WORN)
-    bent.alignment.begin_with(WORN)
+
+
+def begun(offset: F64, seed: int, way: F64) -> Flight:
+    """A flight of a rig with this offset, with a rig file of a worn one."""
+    flight = Flight(offset, seed, way)
+    flight.map.set_disparity_offset(WORN)
+    flight.alignment.begin_with(WORN, 0.03)
+    return flight
+
+
+def test_a_rig_that_was_repaired_is_found_anew() -> None:
+    good = begun(NOTHING, 2, SIDEWAYS)
+    good.fly(80)
+    assert not good.map.disparity_offset.any()
+    assert good.alignment.applied_sigma_px is None
+    assert good.alignment.worn < 0.2
+    bent = begun(-WORN, 2, SIDEWAYS)
     bent.fly(80)
-    assert np.sqrt(np.mean((grid @ (0.3 * WORN - bent.map.disparity_offset)) ** 2)) < 0.35
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    assert np.sqrt(np.mean((grid @ (-WORN - bent.map.disparity_offset)) ** 2)) < 0.15
+    ahead = begun(NOTHING, 2, AHEAD)  # forward motion alone does not tell
+    assert ahead.fly(60) == []
+    assert np.array_equal(ahead.map.disparity_offset, WORN)
+
+
+def test_an_offset_of_the_same_rig_is_not_refuted() -> None:
+    for seed in range(4):
+        flight = begun(WORN + np.random.default_rng(seed).normal(0.0, 0.1, 5), seed, SIDEWAYS)
+        flight.fly(80)
+        assert not any("rig file" in event for event in flight.alignment.take_events())
 
 
 def test_it_is_deterministic() -> None:

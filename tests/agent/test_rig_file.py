@@ -69,14 +69,16 @@ def test_a_file_holds_what_was_known(rows: np.ndarray, disparity: np.ndarray) ->
 
 
 def test_an_agent_begins_with_it_and_tells_the_base() -> None:
-    agent, told = flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True))
+    agent, told = flown(known_rig(CAMERA, ROWS, DISPARITY, 0.03, rows_read=True))
     said = [r for r in told.records if isinstance(r, StereoAlignment)]
     assert len(said) == 1
     assert said[0].agent == 2
     assert np.allclose(said[0].rows_px, ROWS)
     assert np.allclose(said[0].disparity_px, DISPARITY)
     assert np.allclose(agent.map.disparity_offset, DISPARITY)
-    assert agent.known_rig() == known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
+    known = agent.known_rig()
+    assert known is not None
+    assert replace(known, disparity_sigma_px=0.0) == known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
     as_they_came, _ = flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=False))
     assert as_they_came.known_rig() == known_rig(CAMERA, ROWS, DISPARITY, rows_read=False)
 
@@ -84,10 +86,21 @@ def test_an_agent_begins_with_it_and_tells_the_base() -> None:
 def test_an_offset_that_was_not_found_is_not_known_to_be_zero() -> None:
     known = known_rig(CAMERA, ROWS, np.zeros(5), rows_read=True)
     assert known.disparity_px == ()
-    found = known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
-    again, fresh, begun = (disparities(flown(rig)[0]) for rig in (known, KnownRigConfig(), found))
+    found, vague = (known_rig(CAMERA, ROWS, DISPARITY, sigma, rows_read=True) for sigma in (0.03, 0.3))
+    # within a good calibration's, as a base said: no knowledge, but where the flight begins
+    small = known_rig(CAMERA, ROWS, 0.1 * DISPARITY, None, rows_read=True)
+    rigs = (known, KnownRigConfig(), small, vague, found)
+    again, fresh, started, held, begun = (disparities(flown(rig)[0]) for rig in rigs)
     assert np.array_equal(again.cov, fresh.cov)
-    assert not np.array_equal(begun.cov, fresh.cov)
+    assert np.array_equal(started.cov, fresh.cov)
+    assert begun.sigma_px < held.sigma_px < fresh.sigma_px
+    assert np.allclose(flown(small)[0].map.disparity_offset, 0.1 * DISPARITY, atol=6e-4)
+    kept = flown(small)[0].known_rig()
+    assert kept == small
+    for rig, sigma_px in ((found, begun.sigma_px), (vague, held.sigma_px)):
+        kept = flown(rig)[0].known_rig()
+        assert kept is not None
+        assert kept.disparity_sigma_px == pytest.approx(sigma_px, abs=1e-4)
 
 
 def disparities(agent: Agent) -> DisparityAlignment:
@@ -168,6 +181,7 @@ def test_one_eye_keeps_its_imu() -> None:
         ("[known_rig]\nrows_px = [1.0]\n", "rows_px has 1 numbers"),
         ("[known_rig]\nrows_px = [nan, 0.0, 0.0, 0.0, 0.0]\n", "finite"),
         ("[known_rig]\ndisparity_px = [0.0, 0.0, 0.0, 0.0, 9.5]\n", "at most 8"),
+        ("[known_rig]\ndisparity_sigma_px = -0.1\n", "from 0 to 8"),
         ("[known_rig.imu]\noffset_s = [0.004]\n", "offset_s has 1 numbers"),
         ("[known_rig.imu]\noffset_s = [0.004, 0.0]\n", "not positive"),
         (f"[known_rig.imu]\ngyro = {UNIT}\n", "belong together"),

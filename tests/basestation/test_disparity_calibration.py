@@ -127,6 +127,20 @@ def test_what_an_agent_found_counts_until_the_base_knows_more(make_flight: MakeF
     assert not np.array_equal(mapper.map.disparity_offset_px[flight.agent], close)
 
 
+def test_a_rig_that_was_repaired_is_not_held_to_earlier_flights(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=4, points=200, memory=4, drift_m=0.001, noise_px=0.2)
+    known = np.array([-0.6, 0.1, -0.2, -0.5, 0.8])
+    for found, holds in ((known + 0.1, True), (NONE, False), (-known, False)):
+        mapper = Mapper(BaseConfig(), words)
+        mapper.map.set_camera(flight.agent, flight.camera)
+        mapper.map.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, known))  # of a rig file
+        mapper.map.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, found, 0.1))  # of this flight
+        mean = prior_mean(mapper.map, flight.agent, BaseConfig().disparity)
+        assert np.allclose(mean, known if holds else found)
+        if not holds:
+            assert np.allclose(mapper.map.disparity_offset_px[flight.agent], found)
+
+
 def test_an_offset_of_a_worn_rig_is_found_early(make_flight: MakeFlight, words: Any) -> None:
     worn = np.array([1.2, 0.1, -0.2, 0.6, 0.2])
     flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)

@@ -36,6 +36,8 @@ class DisparityAlignment:
         self._moved = np.zeros((slots, 3))  # m, translation of the best pair in the camera, squared
         self._pair_h, self._pair_b = np.zeros((slots, TERMS, TERMS)), np.zeros((slots, TERMS))
         self._old_h, self._old_b, self._old_moved = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(3)
+        self._kept_h, self._kept_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)  # of earlier flights
+        self._refuted = False  # they were of another rig; the map still has their offset
         self._prior = np.diag(np.array([config.prior_px, *[config.prior_slope_px] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
@@ -47,11 +49,14 @@ class DisparityAlignment:
         self.expected_cov = self._expected_cov()  # beside the error of a good calibration
         self._events: list[str] = []
 
-    def begin_with(self, offset: F64) -> None:
-        """Begin with the offset (5,) that earlier flights found, which the map has already."""
-        information = np.eye(TERMS) / self._config.known_px**2
-        self._old_h += information
-        self._old_b += information @ offset
+    def begin_with(self, offset: F64, sigma_px: float) -> None:
+        """Begin with the offset (5,) that earlier flights found, which the map has already.
+
+        sigma_px: its standard deviation, rms over the image.
+        """
+        of_each = sigma_px / float(np.sqrt(np.mean(np.sum(self._grid**2, axis=1))))  # number, if all have the same
+        self._kept_h = np.eye(TERMS) / (self._config.known_px**2 + of_each**2)
+        self._kept_b = self._kept_h @ offset
         self._solve()
         self.applied = bool(offset.any())
         self.expected_cov = self._expected_cov()
@@ -84,6 +89,14 @@ class DisparityAlignment:
     def sigma_px(self) -> float:
         """Standard deviation of the estimate, rms over the image."""
         return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", self._grid, self.cov, self._grid))))
+
+    @property
+    def applied_sigma_px(self) -> float | None:
+        """Standard deviation of the map's offset, rms over the image; None if it may be a good calibration's."""
+        base = self._base_sigma_px
+        if base is not None:
+            return base if np.isfinite(base) else None
+        return self.sigma_px if self.applied else None
 
     def take_base(self, offset: F64, sigma_px: float | None) -> bool:
         """Set the map's offset to the base's (5,), unless more is known here. Returns whether it was set.
@@ -165,16 +178,30 @@ class DisparityAlignment:
         return True
 
     def _solve(self) -> None:
-        """Estimate the offset, and the probability that the rig is worn, by the Bayes factor."""
+        """Estimate the offset, and the probability that the rig is worn, by the Bayes factor.
+
+        What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
+        """
+        config, good = self._config, np.eye(TERMS) / self._config.good_px**2
         h, b = self._old_h + self._pair_h.sum(0), self._old_b + self._pair_b.sum(0)
+        odds = np.log(config.worn_share / (1.0 - config.worn_share))
+        if self._kept_h.any() and self._moves_sideways():
+            worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
+            unknown = np.logaddexp(odds + worn, usual) - np.logaddexp(odds, 0.0)
+            if unknown - _log_evidence(h, b, self._prior + self._kept_h, self._kept_b) > config.refuted:
+                self._kept_h, self._kept_b = np.zeros_like(self._kept_h), none()
+                self._refuted, self.applied = True, False
+                self._events.append("disparities are not those of the rig file: estimated anew")
+        h, b = h + self._kept_h, b + self._kept_b
         self.cov = np.linalg.inv(h + self._prior)
         self._estimate = self.cov @ b
-        good = np.linalg.inv(h + np.eye(TERMS) / self._config.good_px**2)
-        log_odds = np.log(self._config.worn_share / (1.0 - self._config.worn_share))
-        log_odds += 0.5 * float(b @ (self.cov - good) @ b)
-        log_odds += 0.5 * float(np.linalg.slogdet(self.cov @ self._prior)[1])
-        log_odds -= 0.5 * float(np.linalg.slogdet(good)[1]) - TERMS * float(np.log(self._config.good_px))
-        self.worn = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+        odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
+        self.worn = float(1.0 / (1.0 + np.exp(-np.clip(odds, -50.0, 50.0))))
+
+    def _moves_sideways(self) -> bool:
+        """True if enough of the motion was across the optical axis for the estimate to be believed."""
+        moved = self._old_moved + self._moved.sum(0)
+        return bool(moved[:2].sum() >= self._config.min_sideways * moved.sum())
 
     def _expected_cov(self) -> F64:
         """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
@@ -187,16 +214,28 @@ class DisparityAlignment:
         """Change the offset of the map's disparities where the rig is worn, unless the base knows better."""
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
-        config, change = self._config, self._estimate - self._map.disparity_offset
-        moved = self._old_moved + self._moved.sum(0)
-        if moved[:2].sum() < config.min_sideways * moved.sum():
+        config, offset = self._config, self._estimate
+        if not self._moves_sideways():
             return None
         if not self.applied and self.worn < config.sure:
-            return None
-        least = config.least_change_px if self.applied else config.least_px
+            if not self._refuted:
+                return None
+            offset = none()
+        change = offset - self._map.disparity_offset
+        least = config.least_change_px if self.applied or self._refuted else config.least_px
         if float(np.sqrt(np.mean((self._grid @ change) ** 2))) < least:
             return None
-        self.applied, self._base_sigma_px = True, None
-        self._map.set_disparity_offset(self._estimate)
-        self._events.append(f"disparities in the middle are {self._estimate[0]:+.2f} px too large, by parallax")
+        self.applied, self._refuted, self._base_sigma_px = bool(offset.any()), False, None
+        self._map.set_disparity_offset(offset)
+        self._events.append(f"disparities in the middle are {offset[0]:+.2f} px too large, by parallax")
         return np.asarray(change)
+
+
+def _log_evidence(h: F64, b: F64, prior: F64, side: F64 | None = None) -> float:
+    """Logarithm, up to a constant of the data, of the likelihood of data with information h (5,5) and its side b (5,).
+
+    prior: (5,5) information; side: (5,) of it, prior @ mean; None: about zero.
+    """
+    side = none() if side is None else side
+    fit = float((b + side) @ np.linalg.solve(h + prior, b + side) - side @ np.linalg.solve(prior, side))
+    return 0.5 * (fit + float(np.linalg.slogdet(prior)[1]) - float(np.linalg.slogdet(h + prior)[1]))

@@ -43,8 +43,8 @@ class RightCamera:
             return
         self.rows.begin_with(known.rows, read=known.rows_read)
         self._map.set_disparity_offset(known.disparity)
-        if self.disparities is not None and known.disparity.any():  # zero: not found yet
-            self.disparities.begin_with(known.disparity)
+        if self.disparities is not None and known.disparity_sigma_px > 0.0:
+            self.disparities.begin_with(known.disparity, known.disparity_sigma_px)
         self._found_px = known.disparity
         self._put(known.rows)
 
@@ -83,6 +83,6 @@ class RightCamera:
         """What is known now, for the next flight; None before anything was measured."""
         if not self.rows.known:
             return None
-        return known_rig(
-            self._map.camera, self.rows.estimate_px, self._map.disparity_offset, rows_read=self.rows.read
-        )  # fmt: skip
+        sigma_px = None if self.disparities is None else self.disparities.applied_sigma_px
+        offset_px = self._map.disparity_offset
+        return known_rig(self._map.camera, self.rows.estimate_px, offset_px, sigma_px, rows_read=self.rows.read)

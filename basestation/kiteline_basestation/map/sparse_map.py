@@ -47,6 +47,8 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
+_REPAIRED_PX = 0.5  # difference of a number of a disparity offset; flights of one rig differ by a tenth
+
 
 class SparseMap(MapView):
     """Keyframes, keypoints and landmarks of all agents. Row and slot numbers never change."""
@@ -75,19 +77,25 @@ class SparseMap(MapView):
 
     def set_stereo_alignment(self, record: StereoAlignment) -> None:
         """Set what an agent knows of its right camera. A disparity offset of earlier flights that was estimated here
-        counts more; one that the agent finds in this flight counts until the offset is better known here.
+        counts more, unless the rig was repaired since; one that the agent finds in this flight counts until the offset
+        is better known here.
         """
         agent = record.agent
         self.rows_px[agent] = record.rows_px
         self.rows_read.discard(agent)
         if record.rows_read:
             self.rows_read.add(agent)
-        if not np.any(record.disparity_px != 0.0):
+        if record.sigma_px is None and not np.any(record.disparity_px != 0.0):
             return
         if agent not in self.disparity_offset_px and record.sigma_px is None:
             self.disparity_offset_px[agent] = self.known_offset_px[agent] = record.disparity_px
-        if record.sigma_px is None or (agent in self.known_offset_px and agent not in self.told_sigma_px):
+        if record.sigma_px is None:
             return
+        known = self.known_offset_px.get(agent) if agent not in self.told_sigma_px else None
+        if known is not None and np.abs(record.disparity_px - known).max() < _REPAIRED_PX:
+            return
+        if known is not None:
+            self.disparity_sigma_px.pop(agent, None)
         self.known_offset_px[agent], self.told_sigma_px[agent] = record.disparity_px, record.sigma_px
         if self.disparity_sigma_px.get(agent, np.inf) > record.sigma_px:
             self.disparity_offset_px[agent], self.disparity_sigma_px[agent] = record.disparity_px, record.sigma_px

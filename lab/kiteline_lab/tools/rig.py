@@ -77,6 +77,7 @@ class KnownCameras:
         self.rows_px: dict[AgentId, F64] = {}
         self.rows_read: set[AgentId] = set()
         self.calibrated: set[AgentId] = set()
+        self.sigma_px: dict[AgentId, float] = {}  # of disparity_px, where the rig is not a good calibration's
         self.imu = KnownImuConfig()  # of a rig file
 
     @classmethod
@@ -85,6 +86,7 @@ class KnownCameras:
         out = cls()
         out.cameras.update(mapper.map.cameras)
         out.disparity_px.update(mapper.map.disparity_offset_px)
+        out.sigma_px.update(mapper.map.disparity_sigma_px)
         out.rows_px.update(mapper.map.rows_px)
         out.rows_read.update(mapper.map.rows_read)
         out.calibrated.update(mapper.map.disparity_calibrated)
@@ -100,6 +102,8 @@ class KnownCameras:
             if known.rows_px:
                 out.rows_px[agent] = known.rows
             out.rows_read.update([agent] if known.rows_read else [])
+            if known.disparity_sigma_px > 0.0:
+                out.sigma_px[agent] = known.disparity_sigma_px
             out.imu = known.imu
         return out
 
@@ -130,7 +134,8 @@ def summary(known: KnownCameras) -> dict[str, Any]:
             "baseline_m": camera.baseline_m if camera.stereo else None,
             "disparity_offset_px": known.offset_px(agent).tolist(),
             "rows_px": None if rows is None else rows.tolist(),
-            "calibrated": agent in known.calibrated,
+            "disparity_sigma_px": known.sigma_px.get(agent),
+            "calibrated": agent in known.calibrated or agent in known.sigma_px,
             "right_camera_turned_deg": np.degrees(turned).tolist(),
             "imu": {name: list(values) for name, values in dataclasses.asdict(known.imu).items()},
         }
@@ -192,8 +197,8 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
     if kind == "kiteline":
         rows = known.rows_px.get(chosen, np.zeros(row_alignment.TERMS))
         read = chosen in known.rows_read
-        rig_known = known_rig(camera, rows, known.offset_px(chosen), rows_read=read)
-        return {"rig.toml": rig_file.text_of(dataclasses.replace(rig_known, imu=known.imu))}
+        found = known_rig(camera, rows, known.offset_px(chosen), known.sigma_px.get(chosen), rows_read=read)
+        return {"rig.toml": rig_file.text_of(dataclasses.replace(found, imu=known.imu))}
     rig = known.rig(chosen)
     pair = [(rig.left, rig.T_b_c)]
     if camera.stereo and rig.right is not None and rig.T_c_r is not None:
