@@ -110,7 +110,7 @@ def _said(text: str) -> list[Bar]:
     for name, word, wanted in (
         ("cameras unplugged", "was unplugged", 2),
         ("cameras back", "images again after", 2),
-        ("controller unplugged", "flight controller: the device", 1),
+        ("controller unplugged", "the device is missing", 1),
         ("controller back", "is open", 1),
         ("garbage: controller silent", "flight controller: silent", 1),
         ("garbage over: controller back", "flight controller: is back", 1),

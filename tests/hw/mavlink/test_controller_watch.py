@@ -286,6 +286,25 @@ def test_a_missing_device_is_said_and_its_return() -> None:
     assert [f.topic for _, f in bench.found][1:3] == ["device", "controller"]
 
 
+def test_a_device_that_goes_in_flight_is_said_once_not_its_silence_too() -> None:
+    bench = Bench(ModelledAutopilot("ardupilot"), url="serial:/dev/ttyACM0:921600")
+    bench.run(8.0)
+    before = len(bench.found)
+    bench.controller.faults.silent, bench.device_fault = True, "the device is missing"
+    bench.run(12.0)
+    bench.device_fault = ""
+    bench.run(4.0)
+    bench.controller.faults.silent = False
+    bench.run(4.0)
+    assert [f.topic for _, f in bench.found[before:]] == ["device", "device"]
+    bench.controller.faults.silent, bench.device_fault = True, "the device is missing"
+    bench.run(12.0)
+    bench.device_fault = ""
+    bench.run(8.0)  # it is there, but says nothing
+    assert [f.topic for _, f in bench.found[before + 2 :]] == ["device", "device", "controller"]
+    assert "silent for" in bench.found[-1][1].text
+
+
 def test_signatures_without_a_key_are_said() -> None:
     bench = Bench(ModelledAutopilot("ardupilot"))
     bench.controller.codec._mav.signing.secret_key = b"k" * 32

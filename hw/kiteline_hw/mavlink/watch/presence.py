@@ -56,6 +56,7 @@ class PresenceWatch:
         self._start_ns: int | None = None
         self.heartbeat: Heartbeat | None = None  # the last one of the controller
         self.heard_ns: int | None = None
+        self._fault_ns = 0  # when the device was last not open
         self._others: set[int] = set()  # systems that sent a heartbeat and are no flight controller
         self._version = ""
         self._requests = 0
@@ -100,7 +101,10 @@ class PresenceWatch:
             if now_ns - self._start_ns >= self.config.absent_ns and not link.device_fault:
                 self._say_absent(link)
             return []
-        if now_ns - heard_ns >= self.config.absent_ns:
+        if link.device_fault:  # said already: its silence is no news
+            self._fault_ns = now_ns
+            return []
+        if now_ns - max(heard_ns, self._fault_ns) >= self.config.absent_ns:
             self._log.say(
                 TOPIC, "silent", Level.ERROR,
                 f"flight controller: silent for {(now_ns - heard_ns) / 1e9:.0f} s", "kiteline: controller is silent",
