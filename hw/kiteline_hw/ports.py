@@ -176,6 +176,17 @@ class ControllerFinding(Protocol):
 class ControllerLink(PoseSink, Protocol):
     """A flight controller that receives poses and may send its own velocity and inertial samples."""
 
+    def push_obstacles(self, distance_m: Sequence[float], reach_m: float, now_ns: int) -> None:
+        """Send distances to obstacles around the vehicle, the first ahead, clockwise; inf: none up to reach_m, nan:
+        unknown. Never blocks.
+        """
+        ...
+
+    @property
+    def T_b_f(self) -> NDArray[np.float64]:
+        """(4,4) flight controller (forward, right, down) in the body."""
+        ...
+
     def tunnel_link(self) -> ByteLink | None:
         """The tunnel to the base on the same connection; None if the link to the base is another one."""
         ...

@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from kiteline_agent.agent import Agent
+from kiteline_agent.exchange.obstacles import REACH_M, obstacle_distances
 from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
@@ -15,6 +16,8 @@ from kiteline_hw.ports import ControllerLink, FrameSource, LinkError, PoseSample
 from kiteline_hw.sources.overrides import with_other_imu
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
+
+OBSTACLES_HZ = 5.0  # of distances around the vehicle; ArduPilot drops those older than half a second
 
 
 def controller_link(
@@ -73,3 +76,13 @@ def pose_sample(agent: Agent, output: StepOutput, t_ns: int, epoch: int) -> Pose
     if isinstance(pose, PredictedPose):
         return PoseSample(t_ns, pose.T_l_b, pose.tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)
     return PoseSample(t_ns, pose.T_l_b, pose.tracked, agent.odometry_quality(pose), epoch, pose.cov_l)
+
+
+def push_obstacles(controller: ControllerLink, agent: Agent, output: StepOutput | None, now_ns: int) -> None:
+    """Send what the base's grid has around the vehicle, while the vehicle is tracked in it."""
+    estimate = None if output is None else output.estimate
+    if estimate is None or not estimate.tracked or estimate.T_w_b is None:
+        return
+    distances = obstacle_distances(agent.tiles, estimate.T_w_b @ controller.T_b_f)
+    if distances is not None:
+        controller.push_obstacles(distances.tolist(), REACH_M, now_ns)

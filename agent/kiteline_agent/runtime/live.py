@@ -10,7 +10,14 @@ from pathlib import Path
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
-from kiteline_agent.runtime.controller import controller_link, pose_rate_hz, pose_sample, with_controller_imu
+from kiteline_agent.runtime.controller import (
+    OBSTACLES_HZ,
+    controller_link,
+    pose_rate_hz,
+    pose_sample,
+    push_obstacles,
+    with_controller_imu,
+)
 from kiteline_agent.runtime.options import (
     AgentOptions,
 )
@@ -68,6 +75,7 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         if controller is not None:
             controller.take_imu(begin_ns)  # drop what was measured before the flight
         schedule = PoseSchedule(0.0 if controller is None else pose_rate_hz(options), begin_ns)
+        around = PoseSchedule(OBSTACLES_HZ if controller is not None and options.obstacles else 0.0, begin_ns)
         shift_ns = runtime.options.start_ns - begin_ns
         while not stop and not runtime.over:
             told = _wait(runtime, begin_ns, schedule.next_ns, clock, stop)
@@ -97,6 +105,8 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                 push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
             for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push):
                 link.send(packet)
+            if controller is not None and frame is not None and around.take_due(now_ns):
+                push_obstacles(controller, runtime.agent, runtime.output, now_ns)
             process.notify("WATCHDOG=1")
             if parent is None:
                 found = [] if controller is None else [f.line for f in controller.take_findings()]

@@ -51,6 +51,7 @@ class AgentOptions:
     heading: str = "start"  # of the poses sent: start (0 at the start), controller (as it has it)
     pose_messages: str = "odometry"  # odometry, or vision: the older messages
     origin: str = ""  # LAT,LON,ALT to set in the flight controller; "": none
+    obstacles: bool = False  # send OBSTACLE_DISTANCE from the base's grid
     mavlink_key: str = ""  # a file with the key of MAVLink's signatures; "": none
     imu_of: str = ""  # whose IMU is used: controller; "": the source's, if it has one
     kill_at_s: float | None = None  # end like a crash at this flight time
@@ -66,7 +67,7 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
         up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
-        origin=a.origin, mavlink_key=a.mavlink_key,
+        origin=a.origin, mavlink_key=a.mavlink_key, obstacles=a.obstacles,
     )  # fmt: skip
 
 
@@ -148,6 +149,10 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument(
         "--origin", metavar="LAT,LON,ALT", default="",
         help="set this origin in a flight controller without GPS, while it is disarmed (degrees, metres)",
+    )  # fmt: skip
+    p.add_argument(
+        "--obstacles", action="store_true",
+        help="send distances to obstacles around the vehicle (OBSTACLE_DISTANCE) from the base's grid",
     )  # fmt: skip
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")

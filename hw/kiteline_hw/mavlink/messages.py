@@ -17,6 +17,7 @@ _ACCEL_AND_GYRO = 0x3F  # bits of HIGHRES_IMU's fields_updated
 _MG = 9.80665e-3  # m/s^2 in a thousandth of standard gravity
 _ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 _TUNNEL_BYTES = 128  # of TUNNEL's payload field
+_NEAREST_CM = 20  # of an obstacle that is told; controllers ignore what is nearer
 
 Vector = tuple[float, float, float]
 
@@ -348,6 +349,30 @@ class ComputerStatus(MavlinkMessage):
         return (
             self.t_us, self.uptime_ms % 2**32, 0, cores, combined, [unknown] * 4, [unknown] * 10, 127,
             [degrees, *[127] * 7], [2**15 - 1] * 4, ram, total, no_disk, no_disk, no_disk, *[[2**32 - 1] * 6] * 5,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ObstacleDistance(MavlinkMessage):
+    """Distances around the vehicle, the first one ahead, then clockwise. Only built.
+
+    distance_m: at most 72; inf: nothing up to reach_m; nan: unknown.
+    """
+
+    NAMES = ("OBSTACLE_DISTANCE",)
+    t_us: int
+    distance_m: Sequence[float]
+    reach_m: float
+
+    def values(self) -> Sequence[Any]:
+        n, reach_cm, unknown = len(self.distance_m), round(100 * self.reach_m), 2**16 - 1
+        cm = [unknown if d != d else min(reach_cm + 1, max(_NEAREST_CM, round(100 * min(d, 600.0))))
+              for d in self.distance_m]  # fmt: skip
+        width = 360.0 / n
+        sensor = 4  # MAV_DISTANCE_SENSOR_UNKNOWN: a map
+        return (
+            self.t_us, sensor, [*cm, *[unknown] * (72 - n)], round(width), _NEAREST_CM, reach_cm, width, 0.0,
+            int(common.MAV_FRAME_BODY_FRD),
         )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kiteline_core.frame import ImuBatch, OdometryBatch
@@ -11,7 +12,7 @@ from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
 from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryConfig, OdometryCounters
-from kiteline_hw.mavlink.messages import ComputerStatus, Heartbeat, RadioStatus, Tunnel
+from kiteline_hw.mavlink.messages import ComputerStatus, Heartbeat, ObstacleDistance, RadioStatus, Tunnel
 from kiteline_hw.mavlink.pose_memory import PoseMemory
 from kiteline_hw.mavlink.start_frame import StartFrame
 from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
@@ -59,6 +60,7 @@ class MavlinkPoseSink(Closing):
         options: SinkOptions | None = None,
     ) -> None:  # fmt: skip
         address, self._options = parse_mavlink_url(url), options or SinkOptions()
+        self.T_b_f = T_b_f
         self._clock = clock
         self._lock = threading.Lock()
         self._watch = ControllerWatch(T_b_f, url, address.port if address.kind == "serial" else 0)
@@ -81,6 +83,11 @@ class MavlinkPoseSink(Closing):
         """Send a pose if the rate allows it. Never blocks."""
         with self._lock:
             self._send(self._session.step(pose, now_ns))
+
+    def push_obstacles(self, distance_m: Sequence[float], reach_m: float, now_ns: int) -> None:
+        """Send distances to obstacles around the vehicle; see ObstacleDistance. Never blocks."""
+        with self._lock:
+            self._send([self._session.codec.encode(ObstacleDistance(now_ns // 1000, distance_m, reach_m))])
 
     def _send(self, messages: list[bytes]) -> None:
         for message in messages:

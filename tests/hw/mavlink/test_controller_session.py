@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import cos, sin
+from math import cos, inf, nan, sin
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common
 
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import mounting
-from kiteline_hw.mavlink.messages import Heartbeat, Odometry, TimeSync
+from kiteline_hw.mavlink.messages import Heartbeat, ObstacleDistance, Odometry, TimeSync
 from kiteline_hw.ports import PoseSample
 from kiteline_hw.sim.flight_controller import FlightController
 
@@ -258,3 +259,13 @@ def test_velocity_without_a_sensor_is_of_the_instant_of_the_pose(rate_hz: float)
         message = stream._pose_message(PoseSample(round(t_s * S), T_o_b, True, 90), round(t_s * S))
         if message is not None and t_s > 0.25:
             assert message.velocity_m_s[0] == pytest.approx(3.0 * t_s, abs=1e-3)
+
+
+def test_distances_around_the_vehicle_as_the_dialect_builds_them() -> None:
+    """Ahead first, clockwise, in cm: 20 cm at least, beyond the reach free, unknown told as unknown."""
+    distance_m = [1.5, 0.05, inf, nan, *[9.0] * 68]
+    sent = common.MAVLink(None).parse_buffer(MavlinkCodec().encode(ObstacleDistance(7, distance_m, 10.0)))[0]
+    assert sent.get_type() == "OBSTACLE_DISTANCE" and sent.time_usec == 7
+    assert list(sent.distances[:5]) == [150, 20, 1001, 65535, 900]
+    assert (sent.increment, sent.increment_f, sent.angle_offset, sent.frame) == (5, 5.0, 0.0, 12)
+    assert (sent.min_distance, sent.max_distance) == (20, 1000)

@@ -73,6 +73,7 @@ class Onboard(Closing):
         )
         self._schedule = PoseSchedule(config.prediction.rate_hz, clock.now_ns())
         self._frame: Frame | None = None
+        self.sends = True  # packets for the base
         self.said: list[tuple[float, Finding]] = []
         self.frames = self.tracked = self.imu_samples = self.packets_up = self.packets_down = 0
 
@@ -101,7 +102,7 @@ class Onboard(Closing):
         packets = [] if self.link is None else self.link.receive()
         self.packets_down += len(packets)
         output = self.agent.step(StepInput(frame, imu, tuple(packets), 0, None, predict_ns), self._clock.now_ns())
-        if self.link is not None:
+        if self.link is not None and self.sends:
             for packet in output.packets:
                 self.packets_up += self.link.send(packet)
         return output
