@@ -266,7 +266,8 @@ def test_a_moved_map_and_a_new_one() -> None:
             step.points.inlier,
         )  # fmt: skip
         ahead = tracker.predict(step.imu, step.t_ns)
-        if 40 <= k < 60 and ahead is not None:
+        if 40 <= k < 60:
+            assert ahead is not None
             assert np.linalg.norm(ahead.T_m_b[:3, 3] - (T @ step.truth)[:3, 3]) < 0.006
         tracker.update(step.t_ns, T @ step.visual, points)
     assert tracker.running and tracker.state is not None

@@ -71,6 +71,7 @@ def test_the_base_hears_of_shared_keyframes_alone(room: Recording) -> None:
             assert {int(point) >> KEYPOINT_BITS for point in record.point} <= shared
         elif isinstance(record, LivePose):
             assert int(record.keyframe) in shared
+    assert {KeyframeHeader, NewLandmarks, Observations, LivePose} <= {type(record) for record in channel.records}
     assert sorted(k & 0xFFFFF for k in shared) == list(range(len(shared)))  # their numbers have no gaps
     assert {int(e.keyframe) for e in agent.run.found} <= shared
     assert any("not shared" in event for events in agent.run.events for event in events)

@@ -252,6 +252,7 @@ def test_a_pose_with_velocity_and_rate_is_sent_at_once_and_as_of_its_time() -> N
 def test_velocity_without_a_sensor_is_of_the_instant_of_the_pose(rate_hz: float) -> None:
     """Starting with 3 m/s^2 forward, half a frame late would be 7.5 cm/s too slow at 20 Hz."""
     stream = ControllerSession(mounting("flu"))
+    compared = 0
     for i in range(round(rate_hz)):
         t_s = i / rate_hz
         T_o_b = np.eye(4)
@@ -259,6 +260,8 @@ def test_velocity_without_a_sensor_is_of_the_instant_of_the_pose(rate_hz: float)
         message = stream._pose_message(PoseSample(round(t_s * S), T_o_b, True, 90), round(t_s * S))
         if message is not None and t_s > 0.25:
             assert message.velocity_m_s[0] == pytest.approx(3.0 * t_s, abs=1e-3)
+            compared += 1
+    assert compared >= 7
 
 
 def test_distances_around_the_vehicle_as_the_dialect_builds_them() -> None:
