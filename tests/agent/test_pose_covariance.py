@@ -68,9 +68,7 @@ def tracked(local_map: LocalMap, observed: F64, guess: F64, sigma_px: float = 0.
     X = np.column_stack([b, np.ones(n)]) / rho[:, None] @ T_m_k[:3, :3].T + T_m_k[:3, 3]
     T, inlier = guess.copy(), np.ones(n, np.bool_)
     sigma, ray = np.full(n, sigma_px), np.full((n, 3), 1e-4)
-    inliers, rms = pose_kernels.optimise_pose(
-        T, X, ray, observed, sigma, local_map.intrinsics, guess, np.zeros(6), 2, 8, 1e6, inlier, np.zeros((6, 6))
-    )
+    inliers, rms = pose_kernels.optimise_pose(T, X, ray, observed, sigma, local_map.intrinsics, 2, 8, 1e6, inlier)
     return Track(
         T, np.arange(n), observed, sigma, np.ones(n), inlier, int(inliers), float(rms), n, X, ray
     )  # fmt: skip

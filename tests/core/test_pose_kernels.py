@@ -32,15 +32,15 @@ def project(T: F64, points: F64) -> F64:
 
 
 def optimise(
-    T: F64, points: F64, observed: F64, ray: F64 | None = None, prior_weight: F64 | None = None, chi2: float = 9.21
-) -> tuple[F64, NDArray[np.bool_], int, F64]:
+    T: F64, points: F64, observed: F64, ray: F64 | None = None, chi2: float = 9.21
+) -> tuple[F64, NDArray[np.bool_], int]:
     n = len(points)
-    out, inlier, information = T.copy(), np.ones(n, np.bool_), np.zeros((6, 6))
+    out, inlier = T.copy(), np.ones(n, np.bool_)
     count, _ = pose_kernels.optimise_pose(
-        out, points, np.zeros((n, 3)) if ray is None else ray, observed, np.full(n, 0.3), CAMERA, T.copy(),
-        np.zeros(6) if prior_weight is None else prior_weight, 3, 6, chi2, inlier, information,
+        out, points, np.zeros((n, 3)) if ray is None else ray, observed, np.full(n, 0.3), CAMERA, 3, 6, chi2,
+        inlier,
     )  # fmt: skip
-    return out, inlier, count, information
+    return out, inlier, count
 
 
 def distance(a: F64, b: F64) -> float:
@@ -54,7 +54,7 @@ def test_exact_observations_give_the_exact_pose(seed: int, mono: bool) -> None:
     if mono:
         observed[:, 2] = -1.0
     start = se3.exp(np.array([0.05, -0.04, 0.06, 0.02, -0.03, 0.01])) @ T
-    out, inlier, count, _ = optimise(start, points, observed)
+    out, inlier, count = optimise(start, points, observed)
     assert distance(out, T) < 1e-5
     assert count == 60 and inlier.all()
 
@@ -64,7 +64,7 @@ def test_outliers_leave() -> None:
     T, points, observed = scene(3, 120)
     noisy = observed + rng.normal(0, 0.3, observed.shape)
     noisy[:30, :2] += rng.uniform(15, 60, (30, 2))
-    out, inlier, count, _ = optimise(se3.exp(np.full(6, 0.01)) @ T, points, noisy)
+    out, inlier, count = optimise(se3.exp(np.full(6, 0.01)) @ T, points, noisy)
     assert not inlier[:30].any()
     assert count > 80
     assert distance(out, T) < 0.01
@@ -75,7 +75,7 @@ def test_same_answer_as_an_independent_solver() -> None:
     T, points, observed = scene(4, 50)
     noisy = observed + rng.normal(0, 0.2, observed.shape)
     rays = rng.normal(0, 0.02, points.shape)
-    out, _, _, information = optimise(T, points, noisy, rays, chi2=1e6)
+    out, *_ = optimise(T, points, noisy, rays, chi2=1e6)
 
     def residuals(xi: F64) -> F64:
         pose = se3.exp(xi) @ out
@@ -91,7 +91,6 @@ def test_same_answer_as_an_independent_solver() -> None:
     best = least_squares(residuals, np.zeros(6), x_scale=0.01, ftol=1e-15, xtol=1e-15, gtol=1e-15)
     ours = 0.5 * float(residuals(np.zeros(6)) @ residuals(np.zeros(6)))
     assert ours == pytest.approx(best.cost, rel=1e-3)  # weights are held fixed within a step: not the very same minimum
-    np.testing.assert_allclose(information, best.jac.T @ best.jac, rtol=0.05, atol=0.02 * np.abs(information).max())
 
 
 def test_badly_known_points_hardly_count() -> None:
@@ -107,12 +106,3 @@ def test_badly_known_points_hardly_count() -> None:
     told, *_ = optimise(moved, wrong, seen, ray, chi2=1e6)
     untold, *_ = optimise(moved, wrong, seen, chi2=1e6)
     assert distance(told, moved) < 0.2 * distance(untold, moved)
-
-
-def test_a_strong_prior_holds_the_pose() -> None:
-    T, points, observed = scene(6, 30)
-    start = se3.exp(np.full(6, 0.02)) @ T
-    held, *_ = optimise(start, points, observed, prior_weight=np.full(6, 1e12), chi2=1e6)
-    free, *_ = optimise(start, points, observed, chi2=1e6)
-    assert distance(held, start) < 1e-4
-    assert distance(free, T) < 1e-4

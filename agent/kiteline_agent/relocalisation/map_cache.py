@@ -179,10 +179,7 @@ class MapCache:
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         sigma_px = self._config.corner_px * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
         T, inlier = T_c_m.copy(), np.ones(len(found.a), np.bool_)
-        inliers, _ = optimise_pose(
-            T, xyz, ray, observed, sigma_px, self._intrinsics, T_c_m.copy(), np.zeros(6), 3, 4, self._ransac.chi2,
-            inlier, np.zeros((6, 6)),
-        )  # fmt: skip
+        inliers, _ = optimise_pose(T, xyz, ray, observed, sigma_px, self._intrinsics, 3, 4, self._ransac.chi2, inlier)
         if inliers < self._config.min_matches or not np.isfinite(T).all():
             return None
         T = se3.orthonormalise(T)

@@ -51,6 +51,6 @@ class MapAnchor:
         inlier = np.ones(len(xyz), np.bool_)
         pose_kernels.optimise_pose(
             T, xyz, self._ray[left], track.observed[track.inlier][left], track.sigma_px[track.inlier][left],
-            self._map.intrinsics, track.T_c_m, np.zeros(6), 1, config.iterations, config.chi2, inlier, np.zeros((6, 6)),
+            self._map.intrinsics, 1, config.iterations, config.chi2, inlier,
         )  # fmt: skip
         return se3.orthonormalise(T)

@@ -29,7 +29,6 @@ class Tracker:
     def __init__(self, local_map: LocalMap, work: Work) -> None:
         self._map = local_map
         self._work = work
-        self._no_prior = np.zeros(6)
 
     def track(self, ctx: FrameContext, predicted_T_c_m: F64) -> Track:
         """Measure the pose of a frame from a prediction (4,4) that is good to some 28 px."""
@@ -113,9 +112,8 @@ class Tracker:
         T, inlier = T_c_m.copy(), np.ones(n, np.bool_)
         xyz, ray = candidates.xyz.take(chosen, 0), candidates.ray.take(chosen, 0)
         inliers, rms = pose_kernels.optimise_pose(
-            T, xyz, ray, observed, sigma_px, self._map.intrinsics, T_c_m, self._no_prior, pose.rounds, pose.iterations,
-            pose.chi2, inlier, np.empty((6, 6)),
-        )  # fmt: skip
+            T, xyz, ray, observed, sigma_px, self._map.intrinsics, pose.rounds, pose.iterations, pose.chi2, inlier
+        )
         return Track(
             T_c_m=se3.orthonormalise(T), rows=candidates.rows[chosen], observed=observed, sigma_px=sigma_px,
             depth_m=candidates.depth[chosen], inlier=inlier, inliers=int(inliers),

@@ -245,8 +245,8 @@ def _match_neighbours(
         T = T.copy()
         sigma = config.ransac.sigma_px * np.ldexp(1.0, mine.octave[a].astype(np.int32))
         optimise_pose(
-            T, xyz, _depth_rays(sparse_map, b, xyz, config), np.ascontiguousarray(observed[a]), sigma, camera, T.copy(),
-            np.zeros(6), 3, 5, config.ransac.chi2, inlier, np.zeros((6, 6)),
+            T, xyz, _depth_rays(sparse_map, b, xyz, config), np.ascontiguousarray(observed[a]), sigma, camera, 3, 5,
+            config.ransac.chi2, inlier,
         )  # fmt: skip
         if not np.isfinite(T).all():
             return None

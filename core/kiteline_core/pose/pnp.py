@@ -57,9 +57,8 @@ def solve_pnp(
     if count < 4:
         return None
     inliers, _ = optimise_pose(
-        T, points, depth_ray, observed, config.sigma_px * scale, camera, T.copy(), np.zeros(6), 3, 4, config.chi2,
-        inlier, np.zeros((6, 6)),
-    )  # fmt: skip
+        T, points, depth_ray, observed, config.sigma_px * scale, camera, 3, 4, config.chi2, inlier
+    )
     if not np.isfinite(T).all():
         return None
     return PoseFit(se3.orthonormalise(T), inlier, int(inliers))

@@ -69,16 +69,15 @@ def _solve6(h, g, x):  # type: ignore[no-untyped-def]
 
 @njit
 def optimise_pose(  # type: ignore[no-untyped-def]
-    T_c_m, points, depth_ray, observed, sigma_px, camera, prior, prior_weight, rounds, iterations, chi2, inlier, h_out
+    T_c_m, points, depth_ray, observed, sigma_px, camera, rounds, iterations, chi2, inlier
 ):
     """Gauss-Newton with Huber weights; after each round outliers leave (or come back), as in ORB-SLAM2 section V.
 
     T_c_m: (4,4) pose, start in, result out. points: (n,3) m. depth_ray: (n,3) one standard deviation of the point along
     the ray on which it hangs, in m; zeros for well-known points. observed: (n,3) u, v, disparity px (< 0: none).
-    sigma_px: (n,) of one coordinate. camera: fx, fy, cx, cy, bf. prior: (4,4) predicted T_c_m; prior_weight: (6,)
-    information of its error [translation 1/m^2, rotation 1/rad^2], zeros for none. chi2: threshold of squared whitened
-    error for 2 measurements; 3 measurements use chi2 * 1.3. inlier: (n,) bool, in and out.
-    h_out: (6,6) information of the result, out. Returns (number of inliers, rms of their whitened error).
+    sigma_px: (n,) of one coordinate. camera: fx, fy, cx, cy, bf. chi2: threshold of squared whitened error for 2
+    measurements; 3 measurements use chi2 * 1.3. inlier: (n,) bool, in and out. Returns (number of inliers, rms of their
+    whitened error).
     """
     fx, fy, cx, cy, bf = camera[0], camera[1], camera[2], camera[3], camera[4]
     n = points.shape[0]
@@ -192,31 +191,7 @@ def optimise_pose(  # type: ignore[no-untyped-def]
                 h[5, 5] += x * n12 - y * n02
             if final:
                 break
-            # prior on the pose: error of T_c_m * prior^-1, first order
-            if prior_weight[0] > 0.0 or prior_weight[3] > 0.0:
-                for a in range(3):
-                    s = T_c_m[a, 3]
-                    for b in range(3):
-                        rot = 0.0
-                        for k in range(3):
-                            rot += T_c_m[a, k] * prior[b, k]
-                        dr[a, b] = rot
-                        s -= rot * prior[b, 3]
-                    dt[a] = s
-                g[0] -= prior_weight[0] * dt[0]
-                g[1] -= prior_weight[1] * dt[1]
-                g[2] -= prior_weight[2] * dt[2]
-                g[3] -= prior_weight[3] * 0.5 * (dr[2, 1] - dr[1, 2])
-                g[4] -= prior_weight[4] * 0.5 * (dr[0, 2] - dr[2, 0])
-                g[5] -= prior_weight[5] * 0.5 * (dr[1, 0] - dr[0, 1])
-                for a in range(6):
-                    h[a, a] += prior_weight[a]
             for a in range(6):
-                for b in range(a):
-                    h[b, a] = h[a, b]
-            for a in range(6):
-                for b in range(6):
-                    h_out[a, b] = h[a, b]
                 h[a, a] += 1e-6
             if not _solve6(h, g, step):
                 break

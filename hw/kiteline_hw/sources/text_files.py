@@ -83,17 +83,6 @@ def read_yaml(path: Path, what: str) -> Yaml:
     return out
 
 
-def yaml_numbers(table: Yaml, key: str, path: Path, count: int) -> list[float]:
-    """The list of `count` finite numbers under a key. Raises SourceError."""
-    value = table.get(key)
-    if not isinstance(value, list) or len(value) != count:
-        found = "nothing" if value is None else value
-        raise SourceError(f"{path}: expected {key} with {count} numbers, found {found}")
-    if not np.isfinite(value).all():
-        raise SourceError(f"{path}: {key} is not finite: {value}")
-    return value
-
-
 def yaml_number(table: Yaml, key: str, path: Path, default: float | None = None) -> float:
     """The finite number under a key, or the default. Raises SourceError."""
     value = table.get(key)
