@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
 from zlib import crc32
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
@@ -29,19 +27,6 @@ def read_batch(source: Reader) -> int:
     if not batch:
         raise WireError("the number of a batch is above 0")
     return batch
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """The code of the field `batch`, the last one of its record."""
-
-    def write(self, out: Writer, record: Any) -> None:
-        """Append the number. Raises ValueError."""
-        write_batch(out, record.batch)
-
-    def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
-        """The number by name. Raises WireError."""
-        return {"batch": read_batch(source)}
 
 
 def checksum_of_keys(keys: list[Key]) -> int:

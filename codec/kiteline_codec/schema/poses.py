@@ -1,9 +1,6 @@
-"""Poses and scales in codes."""
+"""Poses, scales and standard deviations in codes."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +40,17 @@ def read_scale(source: Reader) -> float:
     return scale
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """The code of a field that is a rigid motion (4,4)."""
+def write_deviation(out: Writer, sigma: float) -> None:
+    """Append a standard deviation. Raises ValueError where none is known."""
+    code = quantise.deviation_code(sigma)
+    if code == 0:
+        raise ValueError(f"found a deviation of {sigma}, expected one above 0")
+    out.u8(code)
 
-    field: str
 
-    def write(self, out: Writer, record: Any) -> None:
-        """Append the pose. Raises ValueError."""
-        write_pose(out, getattr(record, self.field))
-
-    def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
-        """The pose by name. Raises WireError."""
-        return {self.field: read_pose(source)}
+def read_deviation(source: Reader) -> float:
+    """A standard deviation above 0. Raises WireError."""
+    code = source.u8()
+    if not 0 < code < quantise.DEVIATION_CODES:
+        raise WireError(f"found the code {code} of a deviation, expected 1..{quantise.DEVIATION_CODES - 1}")
+    return quantise.deviation(code)

@@ -7,10 +7,11 @@ Pixels are those of the rectified left camera. Inverse depth is along the optica
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum, IntEnum
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
-from kiteline_codec.coding.packing import Reader, Writer
+from kiteline_codec.coding.packing import Reader, WireError, Writer
 
 MAX_AGENT_ID = 63
 MAX_SUBMAP_ID = (1 << 32) - 1
@@ -64,6 +65,29 @@ class FieldCodec(Protocol):
     def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
         """The fields by name. values: the fields read before. Raises WireError."""
         ...
+
+
+class Field:
+    """The code of one field: write(out, value) and read(source), as FieldCodec has them for records."""
+
+    def __init__(self, name: str, write: Callable[[Writer, Any], object], read: Callable[[Reader], Any]) -> None:
+        self._name, self._write, self._read = name, write, read
+
+    def write(self, out: Writer, record: Any) -> None:
+        """Append the field."""
+        self._write(out, getattr(record, self._name))
+
+    def read(self, source: Reader, values: dict[str, Any]) -> dict[str, Any]:
+        """The field by name."""
+        return {self._name: self._read(source)}
+
+
+def read_flag(source: Reader) -> int:
+    """0 or 1. Raises WireError."""
+    flag = source.u8()
+    if flag > 1:
+        raise WireError(f"a flag is 0 or 1, found {flag}")
+    return flag
 
 
 class Record:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.schema.poses import Pose
-from kiteline_codec.schema.record import IdOf, Priority, Record, register
+from kiteline_codec.schema.poses import read_pose, write_pose
+from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
 from kiteline_core.ids import SubmapId
 
 
@@ -23,7 +23,7 @@ class GravityAlignment(Record):
     KIND = 6
     ID = IdOf.SUBMAP
     PRIORITY = Priority.POSE
-    CODE = (Pose("T_l_m"),)
+    CODE = (Field("T_l_m", write_pose, read_pose),)
 
     submap: SubmapId
     T_l_m: NDArray[np.float64]

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import quantise
-from kiteline_codec.coding.packing import Reader, WireError, Writer
-from kiteline_codec.schema.calibration_sigma import read_sigma, write_sigma
-from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_codec.coding.packing import Writer
+from kiteline_codec.schema.calibration_sigma import read_factors, read_sigma, write_factors, write_sigma
+from kiteline_codec.schema.record import Field, IdOf, Priority, Record, read_flag, register
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.ids import AgentId
 
-_LIMIT = quantise.CALIBRATION_CODES // 2
 _ROW_TERMS = 5
 
 
@@ -32,26 +30,15 @@ class StereoAlignment(Record):
     KIND = 9
     ID = IdOf.AGENT
     PRIORITY = Priority.CORRECTION
+    CODE = (
+        Field("rows_read", Writer.u8, lambda source: read_flag(source) == 1),
+        Field("rows_px", write_factors, partial(read_factors, _ROW_TERMS)),
+        Field("disparity_px", write_factors, partial(read_factors, disparity_offset.TERMS)),
+        Field("sigma_px", write_sigma, read_sigma),
+    )
 
     agent: AgentId
     rows_px: NDArray[np.float64]
     rows_read: bool
     disparity_px: NDArray[np.float64]
     sigma_px: float | None = None
-
-    def write(self, out: Writer) -> None:
-        """Append whether rows are read, the factors, clipped, and the deviation."""
-        out.u8(int(self.rows_read))
-        for value in (*self.rows_px.tolist(), *self.disparity_px.tolist()):
-            out.signed(min(max(round(value * quantise.CALIBRATION_STEPS), -_LIMIT), _LIMIT))
-        write_sigma(out, self.sigma_px)
-
-    @classmethod
-    def read(cls, source: Reader, key: Key) -> Self:
-        """The record of a key and a code."""
-        read = source.u8()
-        if read > 1:
-            raise WireError(f"rows_read is {read}: expected 0 or 1")
-        codes = [source.signed(_LIMIT) for _ in range(_ROW_TERMS + disparity_offset.TERMS)]
-        px = np.array(codes, np.float64) / quantise.CALIBRATION_STEPS
-        return cls(AgentId(key.id), px[:_ROW_TERMS], read == 1, px[_ROW_TERMS:], read_sigma(source))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
-from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.schema.poses import read_scale, write_scale
-from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
 from kiteline_core.ids import SubmapId
 
 
@@ -21,15 +19,7 @@ class SubmapScale(Record):
     KIND = 7
     ID = IdOf.SUBMAP
     PRIORITY = Priority.POSE
+    CODE = (Field("metres", write_scale, read_scale),)
 
     submap: SubmapId
     metres: float
-
-    def write(self, out: Writer) -> None:
-        """Append the scale."""
-        write_scale(out, self.metres)
-
-    @classmethod
-    def read(cls, source: Reader, key: Key) -> Self:
-        """The record of a key and a code."""
-        return cls(SubmapId(key.id), read_scale(source))

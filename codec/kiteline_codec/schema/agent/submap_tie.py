@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import quantise
-from kiteline_codec.coding.packing import Reader, WireError, Writer
-from kiteline_codec.schema.poses import read_pose, write_pose
-from kiteline_codec.schema.record import MAX_KEYFRAME_ID, IdOf, Key, Priority, Record, register
+from kiteline_codec.coding.packing import Writer
+from kiteline_codec.schema.poses import read_deviation, read_pose, write_deviation, write_pose
+from kiteline_codec.schema.record import MAX_KEYFRAME_ID, Field, IdOf, Priority, Record, register
 from kiteline_core.ids import KeyframeId, SubmapId
 
 
@@ -27,29 +25,15 @@ class SubmapTie(Record):
     KIND = 10
     ID = IdOf.SUBMAP
     PRIORITY = Priority.POSE
+    CODE = (
+        Field("since", Writer.varint, lambda source: KeyframeId(source.varint(MAX_KEYFRAME_ID))),
+        Field("T_k_f", write_pose, read_pose),
+        Field("sigma_m", write_deviation, read_deviation),
+        Field("sigma_rad", write_deviation, read_deviation),
+    )
 
     submap: SubmapId
     since: KeyframeId
     T_k_f: NDArray[np.float64]
     sigma_m: float
     sigma_rad: float
-
-    def write(self, out: Writer) -> None:
-        """Append the keyframe, the motion and its deviations. Raises ValueError."""
-        codes = quantise.deviation_code(self.sigma_m), quantise.deviation_code(self.sigma_rad)
-        if 0 in codes:
-            raise ValueError(f"found deviations of {self.sigma_m} m and {self.sigma_rad} rad, expected some above 0")
-        out.varint(self.since)
-        write_pose(out, self.T_k_f)
-        for code in codes:
-            out.u8(code)
-
-    @classmethod
-    def read(cls, source: Reader, key: Key) -> Self:
-        """The record of a key and a code."""
-        since = KeyframeId(source.varint(MAX_KEYFRAME_ID))
-        T_k_f = read_pose(source)
-        m, rad = source.u8(), source.u8()
-        if not (0 < m < quantise.DEVIATION_CODES and 0 < rad < quantise.DEVIATION_CODES):
-            raise WireError("a motion has two deviations above 0")
-        return cls(SubmapId(key.id), since, T_k_f, quantise.deviation(m), quantise.deviation(rad))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.schema.batches import Batch
-from kiteline_codec.schema.poses import Pose
-from kiteline_codec.schema.record import IdOf, Priority, Record, register
+from kiteline_codec.schema.batches import read_batch, write_batch
+from kiteline_codec.schema.poses import read_pose, write_pose
+from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
 from kiteline_core.ids import KeyframeId
 
 
@@ -21,7 +21,7 @@ class KeyframePose(Record):
     KIND = 16
     ID = IdOf.KEYFRAME
     PRIORITY = Priority.CORRECTION
-    CODE = (Pose("T_m_k"), Batch())
+    CODE = (Field("T_m_k", write_pose, read_pose), Field("batch", write_batch, read_batch))
 
     keyframe: KeyframeId
     T_m_k: NDArray[np.float64]

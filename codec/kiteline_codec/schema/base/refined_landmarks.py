@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.schema.batches import Batch
+from kiteline_codec.schema.batches import read_batch, write_batch
 from kiteline_codec.schema.columns import Columns
-from kiteline_codec.schema.record import IdOf, Priority, Record, register
+from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
 from kiteline_core.ids import KeyframeId
 
 
@@ -25,7 +25,7 @@ class RefinedLandmarks(Record):
     ID = IdOf.KEYFRAME
     PRIORITY = Priority.CORRECTION
     COLUMNS: ClassVar = Columns("index", "inv_depth", "offset")
-    CODE = (COLUMNS, Batch())
+    CODE = (COLUMNS, Field("batch", write_batch, read_batch))
 
     keyframe: KeyframeId
     index: NDArray[np.uint16]
