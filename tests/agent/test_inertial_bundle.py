@@ -15,7 +15,7 @@ from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
-from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
@@ -113,13 +113,35 @@ def test_noise_of_the_accelerometer_is_found_from_more_than_there_is(factor: flo
     rng = np.random.default_rng(3)
     sigma = factor * CONFIG.imu_inflation * CALIBRATION.accel_noise * np.sqrt(CALIBRATION.rate_hz)
     shaken = [replace(s, accel=s.accel + sigma * rng.standard_normal(s.accel.shape)) for s in samples]
-    noise, config = WindowNoise(accel=20.0), replace(CONFIG, sigma_px=0.5, huber=1.5)  # corners are as good as said
+    noise, config = WindowNoise(accel=20.0), replace(CONFIG, sigma_px=0.5, huber_px=0.75)  # corners are as good as said
     for _ in range(4):
         found = InertialBundle(corners, shaken, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, config, noise).solve()
         assert found is not None
         noise = found.evidence.updated(noise, 6.0)
     assert 0.5 * factor < noise.accel < 2.0 * factor
     assert noise.gyro < 3.0
+
+
+def test_noise_of_the_accelerometer_is_not_believed_below_its_least() -> None:
+    """A window whose path follows the vibration leaves few errors to show it."""
+    few = NoiseEvidence(chi2=np.array([1.0, 1.0, 1.0]), expected=np.array([30.0, 30.0, 3.0]))
+    before = WindowNoise(1.0, 4.0, 1.0)
+    assert few.updated(before, 6.0).accel < 1.0
+    assert few.updated(before, 6.0, 3.0).accel == 3.0
+    many = NoiseEvidence(chi2=np.array([30.0, 40.0, 3.0]), expected=np.array([30.0, 30.0, 3.0]))
+    assert many.updated(before, 6.0, 3.0) == many.updated(before, 6.0)
+
+
+def test_aligned_corners_know_the_scale_better_than_followed_ones() -> None:
+    corners, samples, _ = window(1)
+    followed, aligned = (
+        InertialBundle(corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, sigma_px=px).solve()
+        for px in (None, CONFIG.aligned_px)
+    )
+    assert followed is not None and aligned is not None
+    assert aligned.scale_sigma < followed.scale_sigma
+    # a reprojection error is in px, whatever is expected of it
+    assert aligned.reprojection_px == pytest.approx(followed.reprojection_px, rel=0.1)
 
 
 def test_a_still_camera_tells_no_scale() -> None:
