@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig, InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
 from kiteline_basestation.inertial.chain import Segment, path_along, segments_of
-from kiteline_basestation.inertial.map_scale import in_metres, map_scale
+from kiteline_basestation.inertial.map_scale import in_metres, map_scale, tells_scale
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -78,11 +78,12 @@ def a_map(scale: float, lively: float = 1.0, seed: int = 0, seconds: float = 20.
     T_w_c = np.array([body(t, lively) @ T_B_C for t in times])
     T_w_c[:, :3, 3] *= scale
     bias = np.array([0.05, -0.1, 0.08])
-    segments = tuple(
-        Segment(i, i + 1, se3.inverse(T_B_C), 3.0, 1.0, 2e-3, **steps(a, b, 6, lively, scale, rng, bias))
-        for i, (a, b) in enumerate(pairwise(times))
-    )
-    return segments, T_w_c
+    segments = []
+    for i, (a, b) in enumerate(pairwise(times)):
+        seen = steps(a, b, 6, lively, scale, rng, bias)
+        record = InertialSteps(KeyframeId(i + 1), KeyframeId(i), 2e-3, **seen)
+        segments.append(Segment(i, i + 1, se3.inverse(T_B_C), 3.0, 1.0, record))
+    return tuple(segments), T_w_c
 
 
 @given(st.integers(0, 1 << 30), st.integers(2, 12), st.integers(1, 5), st.integers(1, 3))
@@ -145,7 +146,7 @@ def test_the_path_ends_where_the_keyframes_are() -> None:
     moved[1:, :3, 3] += np.array([0.05, -0.02, 0.03])
     moved[3] = moved[3] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, -0.02, 0.01]))
     path = path_along(segments, moved)
-    ends = np.concatenate([[0], np.cumsum([len(s.dt_s) for s in segments])])
+    ends = np.concatenate([[0], np.cumsum([len(s.steps.dt_s) for s in segments])])
     assert np.allclose(path.camera[ends], moved[:, :3, 3], atol=1e-9)
     assert np.allclose(path.R_w_b[ends] @ T_B_C[:3, :3], moved[:, :3, :3], atol=1e-6)
     assert path.fresh.sum() == 1
@@ -163,7 +164,8 @@ def test_a_gap_in_the_chain_costs_little() -> None:
 
 def test_few_or_mad_steps_tell_nothing() -> None:
     segments, T_w_c = a_map(0.95)
-    assert map_scale(segments[:2], T_w_c, CONFIG) is None
+    assert tells_scale(segments, CONFIG) and not tells_scale(segments[:2], CONFIG)
+    assert map_scale((), T_w_c, CONFIG) is None
     T_w_c[3, 0, 3] = np.nan
     assert map_scale(segments, T_w_c, CONFIG) is None
 
@@ -217,7 +219,7 @@ def a_sparse_map(culled: set[int]) -> tuple[SparseMap, BundleWindow, list[Keyfra
 def test_steps_over_culled_keyframes_are_joined() -> None:
     sparse_map, window, _ = a_sparse_map({2})
     found = segments_of(sparse_map, window.rows, window.problem)
-    assert [(s.first, s.last, len(s.dt_s)) for s in found] == [(0, 1, 3), (1, 2, 6), (2, 3, 3)]
+    assert [(s.first, s.last, len(s.steps.dt_s)) for s in found] == [(0, 1, 3), (1, 2, 6), (2, 3, 3)]
 
 
 def test_a_lost_record_breaks_the_chain_and_another_unit_has_none() -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _FOLLOW = (0.7, 1.4)  # factors by which it may
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """Steps (n,…) between keyframes `first` and `last` of a window, which number its poses; see InertialSteps.
+    """Steps between keyframes `first` and `last` of a window, which number its poses.
 
     T_c_b: (4,4). depth_m: median distance of what the camera sees. unit: metres that the agent told in one of w.
     """
@@ -34,12 +35,7 @@ class Segment:
     T_c_b: F64
     depth_m: float
     unit: float
-    noise: float
-    dt_s: F64
-    turn: F64
-    moved: F64
-    velocity: F64
-    position: F64
+    steps: InertialSteps
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,18 +79,19 @@ def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tup
         if not records or at not in number:
             continue
         records.reverse()
-        fields = (np.concatenate([getattr(r, name) for r in records]) for name in _STEPS)
+        fields: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in records]) for name in _STEPS}
         submap = submap_of_keyframe(KeyframeId(keyframe))
         out.append(
             Segment(
                 number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depths[i]),
-                sparse_map.told_metres.get(submap, 1.0) / sparse_map.scale(submap), records[-1].noise, *fields,
+                sparse_map.told_metres.get(submap, 1.0) / sparse_map.scale(submap),
+                replace(records[-1], since=at, **fields),
             )
         )  # fmt: skip
     out.sort(key=lambda s: int(table.t_ns[rows[s.last]]))
     kept, n = len(out), 0
-    while kept > 0 and n + len(out[kept - 1].dt_s) <= _MAX_STEPS:
-        kept, n = kept - 1, n + len(out[kept - 1].dt_s)
+    while kept > 0 and n + len(out[kept - 1].steps.dt_s) <= _MAX_STEPS:
+        kept, n = kept - 1, n + len(out[kept - 1].steps.dt_s)
     return tuple(out[kept:])
 
 
@@ -125,15 +122,16 @@ def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
         R_w_b = R_k @ s.T_c_b[:3, :3]
         joined = s.first == end
         drop = 1 if joined else 0  # its first node is the last one of the segment before
-        begin.append(sum(map(len, R)) - drop + np.arange(len(s.dt_s)))
+        begin.append(sum(map(len, R)) - drop + np.arange(len(s.steps.dt_s)))
         R.append(R_w_b[drop:])
         camera.append(p_k[drop:])
         lever.append(-(R_k @ s.T_c_b[:3, 3])[drop:])
         fresh.append((np.arange(len(R_k)) == 0)[drop:])
         end = s.last
-    sizes = [len(s.dt_s) for s in segments]
-    dt_s, velocity, position = (np.concatenate([getattr(s, name) for s in segments]) for name in _BY_IMU)
-    noise, depth_m, unit = (np.repeat([getattr(s, name) for s in segments], sizes) for name in _OF_SEGMENT)
+    sizes = [len(s.steps.dt_s) for s in segments]
+    dt_s, velocity, position = (np.concatenate([getattr(s.steps, name) for s in segments]) for name in _BY_IMU)
+    of_segment = zip(*((s.steps.noise, s.depth_m, s.unit) for s in segments), strict=True)
+    noise, depth_m, unit = (np.repeat(values, sizes) for values in of_segment)
     return Path(
         np.concatenate(begin), np.concatenate(R), np.concatenate(camera), np.concatenate(lever),
         np.concatenate(fresh), dt_s, velocity, position, np.concatenate([_by_bias(s) for s in segments]), noise,
@@ -142,7 +140,6 @@ def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
 
 
 _BY_IMU = ("dt_s", "velocity", "position")
-_OF_SEGMENT = ("noise", "depth_m", "unit")
 
 
 def _by_bias(s: Segment) -> F64:
@@ -150,7 +147,7 @@ def _by_bias(s: Segment) -> F64:
     return np.array(
         [
             [dt * se3.so3_exp(0.5 * turn), 0.5 * dt * dt * se3.so3_exp(turn / 3.0)]
-            for dt, turn in zip(s.dt_s.tolist(), s.turn, strict=True)
+            for dt, turn in zip(s.steps.dt_s.tolist(), s.steps.turn, strict=True)
         ]
     )
 
@@ -160,12 +157,12 @@ def _shape(s: Segment, T_w_first: F64, T_w_last: F64) -> tuple[F64, F64]:
     T_b_c = se3.inverse(s.T_c_b)
     T = np.eye(4)
     relative = [np.eye(4)]
-    for turn, moved in zip(s.turn, s.moved, strict=True):
+    for turn, moved in zip(s.steps.turn, s.steps.moved, strict=True):
         T = T @ se3.from_rt(se3.so3_exp(turn), moved)
         relative.append(s.T_c_b @ T @ T_b_c)
     chain = np.array(relative)
     target = se3.inverse(T_w_first) @ T_w_last
-    share = np.concatenate([[0.0], np.cumsum(s.dt_s)]) / float(np.sum(s.dt_s))
+    share = np.concatenate([[0.0], np.cumsum(s.steps.dt_s)]) / float(np.sum(s.steps.dt_s))
     apart, seen = float(np.linalg.norm(target[:3, 3])), float(np.linalg.norm(chain[-1, :3, 3]))
     ratio = apart / seen if min(apart, seen) > _LEAST_M else 1.0
     ratio = ratio if _FOLLOW[0] < ratio < _FOLLOW[1] else 1.0

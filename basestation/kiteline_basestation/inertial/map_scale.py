@@ -64,12 +64,12 @@ def in_metres(
 
 def tells_scale(segments: tuple[Segment, ...], config: InertialScaleConfig) -> bool:
     """True if the segments are long enough."""
-    return sum(float(s.dt_s.sum()) for s in segments) >= config.least_s
+    return sum(float(s.steps.dt_s.sum()) for s in segments) >= config.least_s
 
 
 def map_scale(segments: tuple[Segment, ...], T_w_c: F64, config: InertialScaleConfig) -> MapScale | None:
-    """The scale of keyframes at T_w_c (k,4,4); None with too few steps, and if they do not fit."""
-    if not tells_scale(segments, config) or not np.isfinite(T_w_c).all():
+    """The scale of keyframes at T_w_c (k,4,4); None without steps, and if they do not fit."""
+    if not segments or not np.isfinite(T_w_c).all():
         return None
     path = path_along(segments, T_w_c)
     state, weight = _start(path, config), np.ones(len(path.begin))

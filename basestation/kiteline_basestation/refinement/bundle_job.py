@@ -28,7 +28,7 @@ def _run(inputs: BundleInputs) -> BundleResult:
     result = bundle(inputs.problem, inputs.config)
     if not inputs.chain:
         return result
-    steps = sum(len(segment.dt_s) for segment in inputs.chain)
+    steps = sum(len(segment.steps.dt_s) for segment in inputs.chain)
     result = replace(result, cost_ops=result.cost_ops + _STEP_OPS * steps)
     return in_metres(result, inputs.chain, inputs.held, inputs.inertial_scale)
 
