@@ -45,7 +45,7 @@ def _fly(bench: Bench, kind: Literal["ardupilot", "px4"]) -> list[Bar]:
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.ExitStack() as stack:
         favour(0)  # the model must not wait for the machine
-        controller = stack.enter_context(UdpFlightController(model, clock_offset_ns=-3 * _S))
+        controller = stack.enter_context(UdpFlightController(model))
         options = ["--mavlink", f"udp:127.0.0.1:{controller.port}", "--no-imu", "--axes", "urf"]
         agent = start(stack, command(bench.source("room_flight.mcap"), "", options), folder / "agent.txt")
         end_s = time.monotonic() + _LIMIT_S
