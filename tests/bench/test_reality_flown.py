@@ -14,9 +14,10 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.frame_counts import live_pose
 from kiteline_bench.agent.consistency import nees_band
 from kiteline_bench.harness.bars import Bench
-from kiteline_bench.harness.recording import load
+from kiteline_bench.harness.recording import Item, Recording, load
 from kiteline_bench.reality.flown import Flown, flown, spread
-from kiteline_bench.reality.worn import unfound
+from kiteline_bench.reality.worn import as_measured_by, unfound
+from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.source import open_sim
 
@@ -100,6 +101,22 @@ def test_what_a_calibration_leaves_is_measured_against_the_true_rig() -> None:
         found = unfound(cast(Agent, Box(share)), truth)
         assert set(found) == {"axes of the gyro", "axes of the accel", "time offset"}
         assert all(left == pytest.approx(1.0 - share, abs=1e-9) for left in found.values())
+
+
+def test_a_flight_is_measured_by_the_imu_of_another_rig() -> None:
+    """What the other IMU measures and when, so that its own truth undoes it."""
+    rigs = [open_sim("room", rig="worn", rig_seed=s, seconds=1.0, scale=0.2, texture_bits=6).worn for s in (1, 2)]
+    truth, other = (json.loads(json.dumps(rig.to_json())) for rig in rigs)
+    samples = np.random.default_rng(0).normal(size=(4, 3))
+    turn = {k: np.array(t["true"]["T_b_c"])[:3, :3] @ np.array(t["told"]["T_b_c"])[:3, :3].T
+            for k, t in (("one", truth), ("other", other))}  # fmt: skip
+    seen = ImuBatch(np.arange(4), samples @ (np.array(truth["gyro_matrix"]) @ turn["one"]).T, samples)
+    flight = Recording(rigs[0].told, None, (Item(Frame(0, np.zeros((4, 4), np.uint8)), seen),))
+    there = as_measured_by(flight, truth, other).items[0].imu
+    assert there is not None
+    np.testing.assert_allclose(there.gyro, samples @ (np.array(other["gyro_matrix"]) @ turn["other"]).T, atol=1e-12)
+    late_s = other["frame_stamps_late_s"] - truth["frame_stamps_late_s"]
+    np.testing.assert_allclose(there.t_ns, np.arange(4) - round(1e9 * late_s))
 
 
 def test_the_band_of_the_nees_narrows_with_the_number_of_flights() -> None:

@@ -18,7 +18,7 @@ from kiteline_basestation.station import Station
 from kiteline_bench.harness.bars import Bar, Bench, at_most
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.result import AgentRun
-from kiteline_bench.harness.run import fly_alone, fly_recording
+from kiteline_bench.harness.run import FlyingAgent, fly_recording
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
@@ -37,7 +37,7 @@ _LEAST_PATH_M = 1.0  # in a window: from less the scale is not known
 class Flown:
     """A flight and how long it took. refined: the base's path of the agent, T_w_b; empty without a base.
 
-    box, station: agent and base at the end; None in a flight without a base.
+    box, station: agent and base at the end; no station in a flight without a base.
     """
 
     run: AgentRun
@@ -150,7 +150,10 @@ def flown(
         refined = refined_path(flight.agent.found, keyframes, Rectifier(recording.rig).camera.T_b_c)
         result = Flown(flight.agent, refined, time.perf_counter() - begin_s, flight.box, flight.station)
     else:
-        result = Flown(fly_alone(recording, config), [], time.perf_counter() - begin_s)
+        agent = FlyingAgent(recording.rig, recording.imu, config)
+        for item in recording.items:
+            agent.step(item)
+        result = Flown(agent.run, [], time.perf_counter() - begin_s, agent.box)
     bench.say(f"{what}: {len(recording.items)} frames in {result.seconds:.0f} s")
     return result
 

@@ -1,6 +1,7 @@
 """Worn rigs: the same simulated flights by a true rig and by one that has changed since its calibration.
 
-Seven seeds of world, path and wear for each scene. The seeds are held out: options are tuned on others.
+Then the IMU of each rig flies twice more, with what its rig file keeps of it. Seven seeds of world, path and wear for
+each scene. The seeds are held out: options are tuned on others.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
@@ -18,6 +20,7 @@ from kiteline_bench.harness.bars import Bar, Bench
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.simulated import render
 from kiteline_bench.reality.flown import Flown, flown, spread, table
+from kiteline_core.frame import ImuBatch
 from kiteline_hw.logs.rig_json import rig_from_json
 
 SEEDS = tuple(range(901, 908))  # of world and wear
@@ -32,13 +35,17 @@ _UNHURT = 1.05
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A flight by a true rig, also without self-calibration, and the same one by a worn rig."""
+    """A flight by a true rig, also without self-calibration, and the same one by a worn rig.
+
+    found: `unfound` after it. kept: after the last of three flights with the rig file's IMU.
+    """
 
     seed: int
     clean: Flown
     plain: Flown
     worn: Flown
     found: dict[str, float]
+    kept: dict[str, float]
 
     def over_bound(self, path: str, times: float, least_m: float) -> float:
         """Error of the worn rig over what it may be."""
@@ -67,14 +74,15 @@ def hall(bench: Bench) -> list[Bar]:
 
 
 def _bars(bench: Bench, scene: str) -> list[Bar]:
-    pairs = []
-    for seed in bench.chosen(SEEDS):
+    pairs, seeds = [], bench.chosen(SEEDS)
+    for k, seed in enumerate(seeds):
         true_rig = recording(bench, scene, seed, "true")
         clean = flown(bench, f"{scene} {seed}, true rig", true_rig)
         plain = flown(bench, f"{scene} {seed}, true rig, no self-calibration", true_rig, config=_uncalibrated())
         worn = flown(bench, f"{scene} {seed}, worn rig", recording(bench, scene, seed, "worn"))
-        truth = json.loads((bench.folder / f"{scene}_{seed}_worn.rig_truth.json").read_text())
-        pairs.append(_Pair(seed, clean, plain, worn, unfound(worn.box, truth)))
+        found = unfound(worn.box, _truth(bench, scene, seed))
+        later = [seeds[(k + n) % len(seeds)] for n in (1, 2)]
+        pairs.append(_Pair(seed, clean, plain, worn, found, _kept(bench, scene, seed, later, worn)))
         bench.say(
             f"  clean live {clean.ate_m('live'):.4f} base {clean.ate_m('base'):.4f} m; "
             f"worn live {worn.ate_m('live'):.4f} base {worn.ate_m('base'):.4f} m, jump {_jump_mm(worn):.1f} mm, "
@@ -91,10 +99,46 @@ def _bars(bench: Bench, scene: str) -> list[Bar]:
         *(bar for name in pairs[0].found
           for bar in spread(f"worn {scene}: {name}, error that is left over that of the calibration",
                             [pair.found.get(name, 1.0) for pair in pairs], _LEFT, "", 2)),
+        *(bar for name in pairs[0].kept
+          for bar in spread(f"worn {scene}: {name}, the same after three flights with the rig file",
+                            [pair.kept.get(name, 1.0) for pair in pairs], _LEFT, "", 2)),
         *spread(f"true {scene}: ATE live over that without self-calibration",
                 [pair.clean.ate_m("live") / pair.plain.ate_m("live") for pair in pairs], _UNHURT, "", 2),
         *spread(f"worn {scene}: frames without a pose", [float(pair.worn.run.lost) for pair in pairs], 0.0, "", 0),
     ]  # fmt: skip
+
+
+def _truth(bench: Bench, scene: str, seed: int) -> Any:
+    return json.loads((bench.folder / f"{scene}_{seed}_worn.rig_truth.json").read_text())
+
+
+def _kept(bench: Bench, scene: str, seed: int, later: Sequence[int], first: Flown) -> dict[str, float]:
+    """What is unfound of the IMU of a rig after two more flights along other paths, without a base."""
+    truth, flight = _truth(bench, scene, seed), first
+    for other in later:
+        known = None if flight.box is None else flight.box.known_rig()
+        assert known is not None
+        config = AgentConfig(known_rig=replace(known, rows_px=(), rows_read=False, disparity_px=()))  # other cameras
+        there = as_measured_by(recording(bench, scene, other, "worn"), _truth(bench, scene, other), truth)
+        flight = flown(bench, f"{scene} {other}, IMU of {seed}", there, base=False, config=config)
+    return unfound(flight.box, truth)
+
+
+def as_measured_by(flight: Recording, truth: dict[str, Any], other: dict[str, Any]) -> Recording:
+    """A flight as the IMU of another rig measures it, with frames as late as there. truth, other: rig_truth.json."""
+    gyro, accel = (_axes(other, name) @ np.linalg.inv(_axes(truth, name)) for name in ("gyro", "accel"))
+    earlier_ns = round(1e9 * (other["frame_stamps_late_s"] - truth["frame_stamps_late_s"]))
+
+    def measured(imu: ImuBatch | None) -> ImuBatch | None:
+        return None if imu is None else ImuBatch(imu.t_ns - earlier_ns, imu.gyro @ gyro.T, imu.accel @ accel.T)
+
+    return replace(flight, items=tuple(replace(item, imu=measured(item.imu)) for item in flight.items))
+
+
+def _axes(truth: dict[str, Any], name: str) -> NDArray[np.float64]:
+    """(3,3) of measured = axes @ true, of "gyro" or "accel", in the axes of the body by the camera."""
+    told, true = (rig_from_json(truth[key])[0].T_b_c[:3, :3] for key in ("told", "true"))
+    return np.asarray(np.array(truth[f"{name}_matrix"]) @ true @ told.T)
 
 
 def _uncalibrated() -> AgentConfig:
@@ -114,10 +158,9 @@ def unfound(box: Agent | None, truth: dict[str, Any]) -> dict[str, float]:
     found, offset = reports.get("imu_calibration"), reports.get("time_offset")
     if found is None or offset is None:
         return {}
-    told, true = (rig_from_json(truth[name])[0].T_b_c[:3, :3] for name in ("told", "true"))
     shares = {}
     for name in ("gyro", "accel"):
-        wanted = np.array(truth[f"{name}_matrix"]) @ true @ told.T
+        wanted = _axes(truth, name)
         off = np.linalg.norm(np.array(found[name]["matrix"]) - wanted)
         shares[f"axes of the {name}"] = float(off / np.linalg.norm(wanted - np.eye(3)))
     late_ms = 1000.0 * truth["frame_stamps_late_s"]
