@@ -381,7 +381,7 @@ def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
     """
     both = 1.0
     for block, limit in ((cov[:3, :3], good_m), (cov[3:, 3:], good_rad)):
-        mean, square = float(np.trace(block)), float(np.sum(block * block))
+        mean, square = float(block.trace()), float((block * block).sum())
         if mean > 1e-18:
             k = mean * mean / square
             z = ((limit * limit / mean) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * k)) / math.sqrt(2.0 / (9.0 * k))

@@ -118,6 +118,9 @@ class FixedLagSmoother:
         self._config = config
         self._calibration = calibration
         self._gravity = gravity_m_s2
+        floor = np.repeat([config.turn_floor_rad, config.velocity_floor_m_s, config.position_floor_m], 3)
+        self._floor = np.diag(floor**2)  # of the covariance of an interval
+        self._walk_square = np.array([calibration.gyro_walk, calibration.accel_walk]) ** 2
         T_c_b = se3.inverse(camera.T_b_c)
         self._r_cb, self._t_cb = np.ascontiguousarray(T_c_b[:3, :3]), T_c_b[:3, 3].copy()
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
@@ -319,13 +322,10 @@ class FixedLagSmoother:
         self._ray[:n] = self._ray[:n] @ r.T
 
     def _put_interval(self, k: int, motion: Preintegrated) -> None:
-        c = self._config
         self._imu_dt[k], self._imu_turn[k], self._imu_vp[k] = motion.dt_s, motion.turn, motion.vp
         self._imu_jac[k], self._imu_bias[k] = motion.jac, motion.bias
-        floor = np.repeat([c.turn_floor_rad, c.velocity_floor_m_s, c.position_floor_m], 3) ** 2
-        self._imu_info[k] = np.linalg.inv(motion.cov + np.diag(floor))
-        walk = np.array([self._calibration.gyro_walk, self._calibration.accel_walk])
-        self._imu_walk[k] = 1.0 / (walk * walk * motion.dt_s)
+        self._imu_info[k] = np.linalg.inv(motion.cov + self._floor)
+        self._imu_walk[k] = 1.0 / (self._walk_square * motion.dt_s)
 
     def _put_points(self, k: int, points: VisualPoints | None) -> None:
         self._vis_h[k], self._vis_b[k] = 0.0, 0.0

@@ -91,7 +91,8 @@ class DepthFromMotion:
     def _rays(self, T_c_m: F64, rows: I64, bearing: F64) -> tuple[F64, F64]:
         """Directions (n,3) of the seeds, and centres (n,3) of their keyframes, in the camera."""
         T_c_k = T_c_m @ self._map.T_m_k[rows // self._map.slot_size]
-        ray = np.column_stack([bearing, np.ones(len(rows))])
+        ray = np.empty((len(rows), 3))
+        ray[:, :2], ray[:, 2] = bearing, 1.0
         return np.einsum("nij,nj->ni", T_c_k[:, :3, :3], ray), T_c_k[:, :3, 3]
 
     def _pixels(self, direction: F64, centre: F64, rho: F64) -> F64:
@@ -110,7 +111,7 @@ class DepthFromMotion:
             images.sampled, images.grid, self._map.templates, rows, octave, warp, start, end, config.step_px,
             config.max_steps, config.min_search_ncc, config.distinct, uv, found,
         )  # fmt: skip
-        seen = np.flatnonzero(found == 1)
+        seen = (found == 1).nonzero()[0]
         place, aligned, ncc = uv[seen], np.zeros(len(seen), np.bool_), np.zeros(len(seen))
         alignment_kernels.align(
             images.sampled, images.grid, self._map.templates, rows[seen], octave[seen], warp[seen], place, 1, 0,

@@ -87,6 +87,7 @@ class LocalMap:
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
         self._new_poses: dict[KeyframeId, F64] = {}  # sent by the base, and not taken over yet
         self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
+        self._has_new_seeds = False  # some may not be initialised
         self._due = False  # some of these differ by more than both maps' errors
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
@@ -145,6 +146,7 @@ class LocalMap:
         self.disparity[slot, :n] = np.where(rho[:n] > 0.0, rho[:n] * self.camera.bf + self.offset_px(uv[:n]), 0.0)
         self.seed[slot] = False
         self.seed[slot, :n] = rho[:n] <= 0.0
+        self._has_new_seeds = True
         self.octave[rows] = octave[:n]
         self.angle[rows], self.descriptor[rows] = angle[:n], descriptor[:n]
         self.templates[rows] = templates[:n]
@@ -225,8 +227,10 @@ class LocalMap:
 
     def initialise_seeds(self, rho: float, sigma_rho: float) -> None:
         """Give new seeds an inverse depth and its deviation in 1/m, which bound the search."""
-        new = self.seed & (self.sigma_rho == 0.0)
-        self.rho[new], self.sigma_rho[new] = rho, sigma_rho
+        if self._has_new_seeds:
+            new = self.seed & (self.sigma_rho == 0.0)
+            self.rho[new], self.sigma_rho[new] = rho, sigma_rho
+            self._has_new_seeds = False
 
     def promote(self, rows: I64) -> None:
         """Make landmarks of seeds, rows (n,), whose depth is known now."""

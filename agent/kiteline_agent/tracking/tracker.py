@@ -75,8 +75,9 @@ class Tracker:
         step = align.coarse_step_px if coarse_only else align.fine_step_px
         first = 2 if coarse_only else align.fine_from
         # Templates from a finer level than this frame has are aligned one level up.
-        raised = np.maximum(octave, 0 if coarse_only else images.first) - octave
-        parts = (last, last + 1) if raised.any() else (last,)
+        least = 0 if coarse_only else images.first
+        raised = np.maximum(octave, least) - octave if least else np.zeros_like(octave)
+        parts = (last, last + 1) if least and raised.any() else (last,)
         for finest in parts:
             some = slice(None) if len(parts) == 1 else np.flatnonzero(raised == finest - last)
             place, aligned = uv[some], found[some]  # views, or copies that are written back
