@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial.fixed_lag import StartDeviations
+from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator
@@ -90,12 +91,12 @@ def test_without_dead_reckoning_there_is_no_motion() -> None:
 
 def test_up_is_that_of_the_state_and_as_certain() -> None:
     tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
-    assert tracker.up() is None
+    assert tracker.state is None
     T_m_b = se3.exp(np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.9]))
     gravity = -9.81 * np.array([0.05, -0.02, 1.0]) / np.linalg.norm([0.05, -0.02, 1.0])
     deviations = StartDeviations(turn_rad=0.01, tilt_rad=0.02)
     tracker._smoother.start(T_m_b, VELOCITY, np.zeros(6), gravity, deviations)
-    found = tracker.up()
-    assert found is not None
+    assert tracker.state is not None
+    found = up_of(tracker.state)
     assert np.allclose(found[0], -T_m_b[:3, :3].T @ gravity / 9.81, atol=1e-9)
     assert found[1] == pytest.approx(np.hypot(0.01, 0.02), rel=0.01)

@@ -22,8 +22,6 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
-
 
 @dataclass(frozen=True, slots=True)
 class FixedLagConfig:
@@ -152,17 +150,6 @@ class FixedLagSmoother:
         down, jac = np.empty(3), np.empty((3, 2))
         inertial_kernels.down_of_tilt(self._tilt, down, jac)
         return self._gravity * down
-
-    @property
-    def up(self) -> tuple[F64, float]:
-        """Unit vector (3,) against gravity in the body, at the newest state, and its deviation about an axis, rad."""
-        down, jac = np.empty(3), np.empty((3, 2))
-        inertial_kernels.down_of_tilt(self._tilt, down, jac)
-        r = self._rot[self._n - 1]
-        up = r.T @ -down
-        by_state = np.concatenate([se3.skew(up), r.T @ -jac], axis=1)  # of the attitude, of the vertical
-        cov = by_state @ self._cov[np.ix_(_ATTITUDE_TILT, _ATTITUDE_TILT)] @ by_state.T
-        return up, float(np.sqrt(max(0.5 * np.trace(cov), 0.0)))
 
     @property
     def state(self) -> InertialState:

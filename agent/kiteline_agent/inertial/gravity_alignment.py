@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial import inertial_kernels
+from kiteline_agent.inertial.fixed_lag import InertialState
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_codec.schema import GravityAlignment
 from kiteline_core.frame import ImuBatch
@@ -19,6 +21,7 @@ from kiteline_core.ids import SubmapId
 
 F64 = NDArray[np.float64]
 
+_ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
 
 
@@ -31,6 +34,17 @@ def level_rotation(accel: F64) -> F64:
     if s < 1e-9:
         return np.eye(3) if c > 0 else np.diag([1.0, -1.0, -1.0])
     return se3.so3_exp(axis / s * np.arctan2(s, c))
+
+
+def up_of(state: InertialState) -> tuple[F64, float]:
+    """Unit vector (3,) against gravity in the body, and its deviation about an axis across it, rad."""
+    down, jac = np.empty(3), np.empty((3, 2))
+    inertial_kernels.down_of_tilt(state.tilt, down, jac)
+    R_b_m = state.T_m_b[:3, :3].T
+    up = R_b_m @ -down
+    by_state = np.concatenate([se3.skew(up), R_b_m @ -jac], axis=1)  # of the attitude, of the vertical
+    cov = by_state @ state.cov[np.ix_(_ATTITUDE_TILT, _ATTITUDE_TILT)] @ by_state.T
+    return up, float(np.sqrt(max(0.5 * float(np.trace(cov)), 0.0)))
 
 
 class GravityAligner:

@@ -122,10 +122,6 @@ class InertialTracker:
             tilt = tilt_of(gravity)
         return se3.so3_exp(np.array([-tilt[0], -tilt[1], 0.0]))
 
-    def up(self) -> tuple[F64, float] | None:
-        """FixedLagSmoother.up; None before gravity is known."""
-        return self._smoother.up if self._smoother.running else None
-
     @property
     def time_offset_s(self) -> tuple[float, float]:
         """Camera stamp + offset = IMU time, and its standard deviation, s."""

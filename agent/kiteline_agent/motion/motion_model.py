@@ -13,6 +13,7 @@ from kiteline_agent.config import OdometerConfig
 from kiteline_agent.covariance.pose_covariance import adjoint
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.fixed_lag import VisualPoints
+from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
@@ -149,10 +150,11 @@ class MotionModel:
 
     def up(self) -> tuple[F64, float] | None:
         """Unit vector (3,) against gravity in the camera, and its deviation about an axis, rad; None if unknown."""
-        found = None if self.tracker is None else self.tracker.up()
-        if found is None or not 0.0 < found[1] < _MOST_UP_RAD:
+        state = None if self.tracker is None else self.tracker.state
+        if state is None:
             return None
-        return self._T_c_b[:3, :3] @ found[0], found[1]
+        up, sigma = up_of(state)
+        return (self._T_c_b[:3, :3] @ up, sigma) if 0.0 < sigma < _MOST_UP_RAD else None
 
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""
