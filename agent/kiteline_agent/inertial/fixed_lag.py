@@ -91,6 +91,7 @@ class InertialState:
 
     T_m_b: (4,4). velocity: (3,) m/s in m. bias: (6,) gyro rad/s, accel m/s^2. tilt: (2,) rad, rotation of the vertical
     from z of m about x and y. cov: (17,17) of [rotation (right), position, velocity, gyro bias, accel bias, tilt].
+    What it knows of gravity in the body: gravity_alignment.up_of.
     """
 
     T_m_b: F64
