@@ -23,7 +23,6 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.ids import AgentId
 
-Member = KeyframePose | RefinedLandmarks | SubmapPlacement | DisparityCalibration
 MEMBERS = (KeyframePose, RefinedLandmarks, SubmapPlacement, DisparityCalibration)  # what moves the agent's map
 
 

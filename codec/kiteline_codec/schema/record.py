@@ -100,7 +100,6 @@ class Record:
     PARTS: ClassVar[int] = 1  # how many records may share an id; with more than one there is a field `part`
     FIRST_PARTS: ClassVar[int] = 1  # parts that go at PRIORITY; the others wait until REST
     PREDICTS: ClassVar[bool] = False  # whether residual codes are predicted from it
-    IN_WORLD: ClassVar[bool] = False  # whether it is in the world frame of the base that wrote it
     CODE: ClassVar[tuple[FieldCodec, ...]]  # all but the key, in order; needed where `write` and `read` are not defined
 
     @classmethod

@@ -30,7 +30,6 @@ class GridTile(Record):
     KIND = 22
     ID = IdOf.TILE
     PRIORITY = Priority.GRID
-    IN_WORLD = True
 
     column: int
     row: int

@@ -30,7 +30,6 @@ class SubmapPlacement(Record):
     KIND = 21
     ID = IdOf.SUBMAP
     PRIORITY = Priority.POSE  # few bytes, and the whole error of a pose in the world
-    IN_WORLD = True
 
     submap: SubmapId
     S_w_m: NDArray[np.float64]

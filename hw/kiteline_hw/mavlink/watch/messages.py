@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common
 
 from kiteline_hw.mavlink.messages import MavlinkMessage
 
-ATTITUDE, LOCAL_POSITION, AUTOPILOT_VERSION, EKF_STATUS_REPORT, ESTIMATOR_STATUS = 30, 32, 148, 193, 230  # ids
+ATTITUDE, AUTOPILOT_VERSION, EKF_STATUS_REPORT, ESTIMATOR_STATUS = 30, 148, 193, 230  # ids
 REQUEST_MESSAGE, SET_MESSAGE_INTERVAL = 512, 511  # commands
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT
 POSITION_FLAGS = 8 | 16  # the estimator knows its horizontal position: relative, absolute
