@@ -148,14 +148,11 @@ class InertialTracker:
     def take_calibration_events(self) -> list[str]:
         """Lines for the log: the applied offset has changed by a millisecond, a correction of axes began."""
         events = self._self_calibration.take_events()
-        if abs(self._self_calibration.offset_s - self._reported_s) < 1e-3:
-            return events
-        self._reported_s = self._self_calibration.offset_s
-        offset_s, sigma_s = self.time_offset_s
-        return [
-            *events,
-            f"camera stamps + {1e3 * offset_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)",
-        ]
+        if abs(self.applied_offset_s - self._reported_s) >= 1e-3:
+            self._reported_s = self.applied_offset_s
+            found, sigma = (1e3 * value for value in self.time_offset_s)
+            events.append(f"camera stamps + {found:.1f} ms are the IMU's time (deviation {sigma:.1f} ms)")
+        return events
 
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found of the IMU."""
