@@ -283,11 +283,12 @@ class Agent:
 
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame stays. Returns events."""
-        anchor = MapAnchor(self.map, self._last_track) if records and self._last_track is not None else None
-        moved, events = self._corrections.take(records, self._channel.take_removed())
+        last = self._last_track
+        anchor = MapAnchor(self.map, last, self._config) if records and last is not None else None
+        moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)
         if moved and anchor is not None:
             self.work.posed_points += anchor.landmarks
-            self._camera.follow_corrections(anchor.T_new_old(self._config.pose))
+            self._camera.follow_corrections(anchor.T_new_old())
         elif moved:
             self._camera.follow_corrections(None)
         return events

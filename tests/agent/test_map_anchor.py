@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.tracking.map_anchor import MapAnchor
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import CulledLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
@@ -62,20 +64,20 @@ def pose_record(local_map: LocalMap, k: int, motion: F64) -> KeyframePose:
 @given(st.integers(0, 1000))
 def test_a_map_that_moves_as_a_whole_takes_the_camera_along(seed: int) -> None:
     local_map, track = scene(seed)
-    anchor = MapAnchor(local_map, track)
+    anchor = MapAnchor(local_map, track, CONFIG)
     motion = se3.exp(np.random.default_rng(seed + 1).normal(0.0, 0.02, 6))
     for k in range(3):
         move(local_map, k, motion)
-    T_new_old = anchor.T_new_old(CONFIG.pose)
+    T_new_old = anchor.T_new_old()
     assert T_new_old is not None
     assert np.allclose(T_new_old, motion, atol=1e-5)
 
 
 def test_a_keyframe_out_of_view_moves_nothing() -> None:
     local_map, track = scene()
-    anchor = MapAnchor(local_map, track)
+    anchor = MapAnchor(local_map, track, CONFIG)
     move(local_map, 2, se3.exp(np.array([0.3, 0.1, 0.0, 0.0, 0.1, 0.0])))
-    T_new_old = anchor.T_new_old(CONFIG.pose)
+    T_new_old = anchor.T_new_old()
     assert T_new_old is not None
     assert np.allclose(T_new_old, np.eye(4), atol=1e-7)
 
@@ -83,7 +85,7 @@ def test_a_keyframe_out_of_view_moves_nothing() -> None:
 def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
     """The base moves the keyframes, and refines their landmarks so that these stay where they are."""
     local_map, track = scene()
-    anchor = MapAnchor(local_map, track)
+    anchor = MapAnchor(local_map, track, CONFIG)
     index = np.arange(LANDMARKS)
     for k in range(2):
         xyz, _ = local_map.positions(k * local_map.slot_size + index)
@@ -94,7 +96,7 @@ def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
         inverse = (1.0 / p[:, 2]).astype(np.float32)
         local_map.refine(RefinedLandmarks(KeyframeId(k), index.astype(np.uint16), inverse, offset))
     assert local_map.apply_corrections()
-    T_new_old = anchor.T_new_old(CONFIG.pose)
+    T_new_old = anchor.T_new_old()
     assert T_new_old is not None
     assert np.allclose(T_new_old, np.eye(4), atol=1e-5)
 
@@ -102,11 +104,11 @@ def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
 @pytest.mark.parametrize("left", [10, 40])
 def test_culled_landmarks_do_not_count(left: int) -> None:
     local_map, track = scene()
-    anchor = MapAnchor(local_map, track)
+    anchor = MapAnchor(local_map, track, CONFIG)
     move(local_map, 0, se3.exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])))
     local_map.remove(CulledLandmarks(KeyframeId(0), np.arange(LANDMARKS, dtype=np.uint16), 0))
     local_map.remove(CulledLandmarks(KeyframeId(1), np.arange(left, LANDMARKS, dtype=np.uint16), 0))
-    T_new_old = anchor.T_new_old(CONFIG.pose)
+    T_new_old = anchor.T_new_old()
     if left < CONFIG.pose.min_inliers:
         assert T_new_old is None
     else:
@@ -116,6 +118,60 @@ def test_culled_landmarks_do_not_count(left: int) -> None:
 
 def test_an_evicted_keyframe_does_not_count() -> None:
     local_map, track = scene()
-    anchor = MapAnchor(local_map, replace(track, inlier=track.rows < local_map.slot_size))
+    anchor = MapAnchor(local_map, replace(track, inlier=track.rows < local_map.slot_size), CONFIG)
     local_map.keyframe[0] = 77
-    assert anchor.T_new_old(CONFIG.pose) is None
+    assert anchor.T_new_old() is None
+
+
+def corrected(local_map: LocalMap, moved: dict[int, F64], anchor: MapAnchor) -> bool:
+    """Whether the map moves when the base sends these motions of keyframes."""
+    cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
+    corrections = Corrections(local_map, cache, CONFIG.smoothing)
+    return corrections.take([pose_record(local_map, k, motion) for k, motion in moved.items()], [], anchor)[0]
+
+
+def sideways(px: float) -> F64:
+    """A motion that moves landmarks five metres away, the typical ones, by so many pixels."""
+    return se3.from_rt(np.eye(3), np.array([5.0 * px / CAMERA.fx, 0.0, 0.0]))
+
+
+def test_corrections_wait_while_the_camera_hardly_moves() -> None:
+    """One keyframe is off by three pixels, but not in view: all wait, and nothing has changed."""
+    local_map, track = scene()
+    before = local_map.save()
+    assert not corrected(local_map, {0: sideways(0.1), 2: sideways(3.0)}, MapAnchor(local_map, track, CONFIG))
+    for array, was in zip(local_map.save().arrays, before.arrays, strict=True):
+        assert np.array_equal(array, was)
+
+
+def test_corrections_that_waited_come_with_those_that_matter() -> None:
+    local_map, track = scene()
+    assert not corrected(local_map, {2: sideways(3.0)}, MapAnchor(local_map, track, CONFIG))
+    goal = pose_record(local_map, 2, sideways(3.0)).T_m_k
+    assert corrected(local_map, {0: sideways(2.0), 1: sideways(2.0)}, MapAnchor(local_map, track, CONFIG))
+    assert np.allclose(local_map.T_m_k[2], goal)
+    assert local_map.from_base[:3].all()
+
+
+def test_a_frame_that_tracked_nothing_holds_no_correction_back() -> None:
+    local_map, track = scene()
+    lost = replace(track, inlier=np.zeros(len(track.rows), np.bool_))
+    assert corrected(local_map, {2: sideways(3.0)}, MapAnchor(local_map, lost, CONFIG))
+
+
+def test_an_undone_correction_is_the_same_as_none() -> None:
+    local_map, _ = scene()
+    saved = local_map.save()
+    index = np.arange(LANDMARKS, dtype=np.uint16)
+    local_map.set_pose(pose_record(local_map, 1, sideways(3.0)))
+    local_map.refine(
+        RefinedLandmarks(KeyframeId(1), index, np.full(LANDMARKS, 0.3, np.float32), np.ones((LANDMARKS, 2), np.float32))
+    )
+    waiting = local_map.save()
+    assert local_map.apply_corrections()
+    assert not np.array_equal(local_map.rho, saved.arrays[2])
+    local_map.restore(waiting)
+    for array, was in zip(local_map.save().arrays, saved.arrays, strict=True):
+        assert np.array_equal(array, was)
+    assert local_map.apply_corrections()  # they still wait
+    assert np.allclose(local_map.rho[1, :LANDMARKS], 0.3)

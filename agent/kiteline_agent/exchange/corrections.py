@@ -14,6 +14,7 @@ from kiteline_agent.exchange.correction_filter import CorrectionFilter
 from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
+from kiteline_agent.tracking.map_anchor import MapAnchor
 from kiteline_codec.schema import (
     CachedKeyframe,
     CachedLandmarks,
@@ -74,15 +75,20 @@ class Corrections:
         }
         self._events: list[str] = []  # of the records that are being applied
 
-    def take(self, records: Sequence[Record], removed: Sequence[Key]) -> tuple[bool, list[str]]:
-        """Apply records, and drop what the base removed. Returns whether the local map moved, and events."""
+    def take(
+        self, records: Sequence[Record], removed: Sequence[Key], anchor: MapAnchor | None = None
+    ) -> tuple[bool, list[str]]:
+        """Apply records, and drop what the base removed. Returns whether the local map moved, and events.
+
+        anchor: what the last frame tracked, if it did. Corrections that move less than both maps' errors there wait.
+        """
         self._events = []
         moved = False
         for record in self._batches.take(records, removed):
             handler = self._handlers.get(type(record))
             if handler is not None:
                 moved |= handler(record)
-        moved |= self._map.apply_corrections()
+        moved |= self._apply_corrections(anchor)
         self._cache.remove(removed)
         for key in removed:
             if key.kind == SubmapPlacement.KIND:  # its merge was undone, and its place is not known yet
@@ -91,6 +97,18 @@ class Corrections:
         if moved:
             self._map.compose_unplaced()
         return moved, self._events
+
+    def _apply_corrections(self, anchor: MapAnchor | None) -> bool:
+        """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
+        if not self._map.due:
+            return False
+        before = self._map.save()
+        self._map.apply_corrections()
+        self._map.compose_unplaced()
+        if anchor is not None and self._map.camera.stereo and not anchor.matters():
+            self._map.restore(before)
+            return False
+        return True
 
     def _place(self, record: SubmapPlacement) -> bool:
         if not record.recognised and self._contradicts_gravity(record.submap, record.S_w_m):

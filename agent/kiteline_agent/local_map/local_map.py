@@ -8,6 +8,7 @@ landmarks. Keyframes of several submaps are stored; only those of the active one
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,15 @@ class Candidates:
     xyz: F64
     ray: F64
     depth: F64
+
+
+@dataclass(frozen=True, slots=True)
+class SavedMap:
+    """A local map before corrections of the base, and these."""
+
+    arrays: tuple[NDArray[Any], ...]
+    poses: dict[KeyframeId, F64]
+    landmarks: dict[KeyframeId, tuple[I64, F64, F64]]
 
 
 class LocalMap:
@@ -88,7 +98,7 @@ class LocalMap:
         self._new_poses: dict[KeyframeId, F64] = {}  # sent by the base, and not taken over yet
         self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
         self._has_new_seeds = False  # some may not be initialised
-        self._due = False  # some of these differ by more than both maps' errors
+        self.due = False  # some of these differ by more than both maps' errors
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
@@ -257,7 +267,7 @@ class LocalMap:
         slot = self.slot_of(record.keyframe)
         if slot >= 0:
             self._new_poses[record.keyframe] = record.T_m_k
-            self._due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
+            self.due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
         return False
 
     def apply_corrections(self) -> bool:
@@ -266,7 +276,7 @@ class LocalMap:
         Smaller differences are within the errors of both maps; taken over one by one, they disturb a map that the
         frames of this agent keep consistent. Returns True if the map moved.
         """
-        if not self._due:
+        if not self.due:
             return False
         for keyframe, T_m_k in self._new_poses.items():
             slot = self.slot_of(keyframe)
@@ -279,8 +289,23 @@ class LocalMap:
                 self._set_landmarks(slot, index, rho, bearing)
         self._new_poses.clear()
         self._new_landmarks.clear()
-        self._due = False
+        self.due = False
         return True
+
+    def _corrected(self) -> tuple[NDArray[Any], ...]:
+        """What `apply_corrections` changes."""
+        return self.T_m_k, self.from_base, self.rho, self.bearing, self.measured, self.sigma_rho
+
+    def save(self) -> SavedMap:
+        """The map before `apply_corrections`."""
+        return SavedMap(tuple(a.copy() for a in self._corrected()), dict(self._new_poses), dict(self._new_landmarks))
+
+    def restore(self, saved: SavedMap) -> None:
+        """Undo `apply_corrections`: what the base sent waits again."""
+        self.due = True
+        for array, before in zip(self._corrected(), saved.arrays, strict=True):
+            array[...] = before
+        self._new_poses, self._new_landmarks = saved.poses, saved.landmarks
 
     def _shift_px(self, slot: int, T_m_k: F64) -> float:
         """By how much landmarks at the keyframe's typical depth move in its image if its pose is set to T_m_k (4,4)."""
@@ -324,7 +349,7 @@ class LocalMap:
             self._new_landmarks[record.keyframe] = index[known], rho[known], bearing[known]
             turned = np.linalg.norm(bearing[known] - self.bearing[slot, index[known]], axis=1) * self.camera.fx
             nearer = np.abs(rho[known] - self.rho[slot, index[known]]) * self.camera.bf
-            self._due |= median(np.maximum(turned, nearer)) >= self._config.moved_px
+            self.due |= median(np.maximum(turned, nearer)) >= self._config.moved_px
         return bool(at_once.any())
 
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:

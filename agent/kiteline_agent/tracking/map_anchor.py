@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import PoseConfig
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
@@ -21,8 +21,9 @@ F64 = NDArray[np.float64]
 class MapAnchor:
     """The landmarks of a frame before corrections are applied; compare them with `T_new_old` afterwards."""
 
-    def __init__(self, local_map: LocalMap, track: Track) -> None:
+    def __init__(self, local_map: LocalMap, track: Track, config: AgentConfig) -> None:
         self._map = local_map
+        self._config = config
         self._track = track
         self._rows = track.rows[track.inlier]
         self._keyframes = local_map.keyframe[self._rows // local_map.slot_size]
@@ -33,20 +34,32 @@ class MapAnchor:
         """Number of landmarks that are compared."""
         return len(self._rows)
 
-    def T_new_old(self, config: PoseConfig) -> F64 | None:
+    def matters(self) -> bool:
+        """True if the map moved the camera by enough pixels, or if too few landmarks tell."""
+        T_new_old = self.T_new_old()
+        if T_new_old is None:
+            return True
+        T_c_m = self._track.T_c_m
+        change = T_c_m @ T_new_old @ se3.inverse(T_c_m)
+        depth = float(np.median(self._track.depth_m[self._track.inlier]))
+        turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
+        moved_px = self._map.camera.fx * (float(np.linalg.norm(change[:3, 3])) / depth + turn)
+        return moved_px >= self._config.local_map.camera_px
+
+    def T_new_old(self) -> F64 | None:
         """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""
         m = self._map
         left = m.usable.reshape(-1)[self._rows] & (m.keyframe[self._rows // m.slot_size] == self._keyframes)
-        if np.count_nonzero(left) < config.min_inliers:
+        if np.count_nonzero(left) < self._config.pose.min_inliers:
             return None
         after, _ = m.positions(self._rows[left])
-        T_c_old = self._pose(self._xyz[left], left, config)
-        T_c_new = self._pose(after, left, config)
+        T_c_old = self._pose(self._xyz[left], left)
+        T_c_new = self._pose(after, left)
         return se3.orthonormalise(se3.inverse(T_c_new) @ T_c_old)
 
-    def _pose(self, xyz: F64, left: NDArray[np.bool_], config: PoseConfig) -> F64:
+    def _pose(self, xyz: F64, left: NDArray[np.bool_]) -> F64:
         """T_c_m (4,4) from the frame's observations of landmarks at xyz (n,3)."""
-        track = self._track
+        track, config = self._track, self._config.pose
         T = track.T_c_m.copy()
         inlier = np.ones(len(xyz), np.bool_)
         pose_kernels.optimise_pose(
