@@ -283,14 +283,13 @@ class Agent:
 
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame stays. Returns events."""
-        last = self._last_track
-        anchor = MapAnchor(self.map, last, self._config) if records and last is not None else None
+        last, anchor = self._last_track, None
+        if records and last is not None:
+            anchor = MapAnchor(self.map, last, self._config, inertial=self._camera.motion.running)
         moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)
-        if moved and anchor is not None:
-            self.work.posed_points += anchor.landmarks
-            self._camera.follow_corrections(anchor.T_new_old())
-        elif moved:
-            self._camera.follow_corrections(None)
+        if moved:
+            self._camera.follow_corrections(None if anchor is None else anchor.T_new_old())
+        self.work.posed_points += 0 if anchor is None else anchor.posed_points
         return events
 
     def _count_images(self, frame: Frame) -> None:

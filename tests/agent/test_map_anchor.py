@@ -64,7 +64,7 @@ def pose_record(local_map: LocalMap, k: int, motion: F64) -> KeyframePose:
 @given(st.integers(0, 1000))
 def test_a_map_that_moves_as_a_whole_takes_the_camera_along(seed: int) -> None:
     local_map, track = scene(seed)
-    anchor = MapAnchor(local_map, track, CONFIG)
+    anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
     motion = se3.exp(np.random.default_rng(seed + 1).normal(0.0, 0.02, 6))
     for k in range(3):
         move(local_map, k, motion)
@@ -75,7 +75,7 @@ def test_a_map_that_moves_as_a_whole_takes_the_camera_along(seed: int) -> None:
 
 def test_a_keyframe_out_of_view_moves_nothing() -> None:
     local_map, track = scene()
-    anchor = MapAnchor(local_map, track, CONFIG)
+    anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
     move(local_map, 2, se3.exp(np.array([0.3, 0.1, 0.0, 0.0, 0.1, 0.0])))
     T_new_old = anchor.T_new_old()
     assert T_new_old is not None
@@ -85,7 +85,7 @@ def test_a_keyframe_out_of_view_moves_nothing() -> None:
 def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
     """The base moves the keyframes, and refines their landmarks so that these stay where they are."""
     local_map, track = scene()
-    anchor = MapAnchor(local_map, track, CONFIG)
+    anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
     index = np.arange(LANDMARKS)
     for k in range(2):
         xyz, _ = local_map.positions(k * local_map.slot_size + index)
@@ -104,7 +104,7 @@ def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
 @pytest.mark.parametrize("left", [10, 40])
 def test_culled_landmarks_do_not_count(left: int) -> None:
     local_map, track = scene()
-    anchor = MapAnchor(local_map, track, CONFIG)
+    anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
     move(local_map, 0, se3.exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])))
     local_map.remove(CulledLandmarks(KeyframeId(0), np.arange(LANDMARKS, dtype=np.uint16), 0))
     local_map.remove(CulledLandmarks(KeyframeId(1), np.arange(left, LANDMARKS, dtype=np.uint16), 0))
@@ -118,7 +118,7 @@ def test_culled_landmarks_do_not_count(left: int) -> None:
 
 def test_an_evicted_keyframe_does_not_count() -> None:
     local_map, track = scene()
-    anchor = MapAnchor(local_map, replace(track, inlier=track.rows < local_map.slot_size), CONFIG)
+    anchor = MapAnchor(local_map, replace(track, inlier=track.rows < local_map.slot_size), CONFIG, inertial=False)
     local_map.keyframe[0] = 77
     assert anchor.T_new_old() is None
 
@@ -139,16 +139,30 @@ def test_corrections_wait_while_the_camera_hardly_moves() -> None:
     """One keyframe is off by three pixels, but not in view: all wait, and nothing has changed."""
     local_map, track = scene()
     before = local_map.save()
-    assert not corrected(local_map, {0: sideways(0.1), 2: sideways(3.0)}, MapAnchor(local_map, track, CONFIG))
+    assert not corrected(
+        local_map, {0: sideways(0.1), 2: sideways(3.0)}, MapAnchor(local_map, track, CONFIG, inertial=False)
+    )
     for array, was in zip(local_map.save().arrays, before.arrays, strict=True):
         assert np.array_equal(array, was)
 
 
+def test_what_waits_is_not_applied_by_a_step_without_records() -> None:
+    local_map, track = scene()
+    cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
+    corrections = Corrections(local_map, cache, CONFIG.smoothing)
+    held = corrections.take(
+        [pose_record(local_map, 2, sideways(3.0))], [], MapAnchor(local_map, track, CONFIG, inertial=False)
+    )
+    assert not held[0] and not corrections.take([], [], None)[0]
+
+
 def test_corrections_that_waited_come_with_those_that_matter() -> None:
     local_map, track = scene()
-    assert not corrected(local_map, {2: sideways(3.0)}, MapAnchor(local_map, track, CONFIG))
+    assert not corrected(local_map, {2: sideways(3.0)}, MapAnchor(local_map, track, CONFIG, inertial=False))
     goal = pose_record(local_map, 2, sideways(3.0)).T_m_k
-    assert corrected(local_map, {0: sideways(2.0), 1: sideways(2.0)}, MapAnchor(local_map, track, CONFIG))
+    assert corrected(
+        local_map, {0: sideways(2.0), 1: sideways(2.0)}, MapAnchor(local_map, track, CONFIG, inertial=False)
+    )
     assert np.allclose(local_map.T_m_k[2], goal)
     assert local_map.from_base[:3].all()
 
@@ -156,7 +170,7 @@ def test_corrections_that_waited_come_with_those_that_matter() -> None:
 def test_a_frame_that_tracked_nothing_holds_no_correction_back() -> None:
     local_map, track = scene()
     lost = replace(track, inlier=np.zeros(len(track.rows), np.bool_))
-    assert corrected(local_map, {2: sideways(3.0)}, MapAnchor(local_map, lost, CONFIG))
+    assert corrected(local_map, {2: sideways(3.0)}, MapAnchor(local_map, lost, CONFIG, inertial=False))
 
 
 def test_an_undone_correction_is_the_same_as_none() -> None:
@@ -175,3 +189,11 @@ def test_an_undone_correction_is_the_same_as_none() -> None:
         assert np.array_equal(array, was)
     assert local_map.apply_corrections()  # they still wait
     assert np.allclose(local_map.rho[1, :LANDMARKS], 0.3)
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_an_agent_with_an_imu_moves_for_larger_corrections_only(inertial: bool) -> None:
+    local_map, track = scene()
+    anchor = MapAnchor(local_map, track, CONFIG, inertial=inertial)
+    between = 0.5 * (CONFIG.local_map.camera_px + CONFIG.local_map.inertial_px)
+    assert corrected(local_map, {k: sideways(between) for k in range(3)}, anchor) is not inertial

@@ -88,7 +88,8 @@ class Corrections:
             handler = self._handlers.get(type(record))
             if handler is not None:
                 moved |= handler(record)
-        moved |= self._apply_corrections(anchor)
+        if records:
+            moved |= self._apply_corrections(anchor)
         self._cache.remove(removed)
         for key in removed:
             if key.kind == SubmapPlacement.KIND:  # its merge was undone, and its place is not known yet

@@ -21,18 +21,16 @@ F64 = NDArray[np.float64]
 class MapAnchor:
     """The landmarks of a frame before corrections are applied; compare them with `T_new_old` afterwards."""
 
-    def __init__(self, local_map: LocalMap, track: Track, config: AgentConfig) -> None:
+    def __init__(self, local_map: LocalMap, track: Track, config: AgentConfig, *, inertial: bool) -> None:
+        """inertial: the track was fused with an IMU."""
         self._map = local_map
+        self._least_px = config.local_map.inertial_px if inertial else config.local_map.camera_px
         self._config = config
         self._track = track
         self._rows = track.rows[track.inlier]
         self._keyframes = local_map.keyframe[self._rows // local_map.slot_size]
         self._xyz, self._ray = local_map.positions(self._rows)
-
-    @property
-    def landmarks(self) -> int:
-        """Number of landmarks that are compared."""
-        return len(self._rows)
+        self.posed_points = 0  # landmarks that were compared, for the cost model
 
     def matters(self) -> bool:
         """True if the map moved the camera by enough pixels, or if too few landmarks tell."""
@@ -44,7 +42,7 @@ class MapAnchor:
         depth = float(np.median(self._track.depth_m[self._track.inlier]))
         turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
         moved_px = self._map.camera.fx * (float(np.linalg.norm(change[:3, 3])) / depth + turn)
-        return moved_px >= self._config.local_map.camera_px
+        return moved_px >= self._least_px
 
     def T_new_old(self) -> F64 | None:
         """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""
@@ -53,6 +51,7 @@ class MapAnchor:
         if np.count_nonzero(left) < self._config.pose.min_inliers:
             return None
         after, _ = m.positions(self._rows[left])
+        self.posed_points += len(after)
         T_c_old = self._pose(self._xyz[left], left)
         T_c_new = self._pose(after, left)
         return se3.orthonormalise(se3.inverse(T_c_new) @ T_c_old)
