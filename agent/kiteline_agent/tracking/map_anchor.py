@@ -42,7 +42,7 @@ class MapAnchor:
         depth = float(np.median(self._track.depth_m[self._track.inlier]))
         turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
         moved_px = self._map.camera.fx * (float(np.linalg.norm(change[:3, 3])) / depth + turn)
-        return moved_px >= self._least_px
+        return bool(moved_px >= self._least_px)
 
     def T_new_old(self) -> F64 | None:
         """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""
