@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.inertial.calibration.robust_update import robust_update, significance
+from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.geometry import se3
 
@@ -16,12 +16,14 @@ _BIAS_M_S2, _TILT_RAD = 0.1, 0.03  # standard deviations at the start
 _TILT_WALK_RAD = 2e-4  # per sqrt(s): the map bends while it grows
 
 
-class AccelCalibration:
+class AccelCalibration(AxesFilter):
     """Kalman filter over [axes (9), bias (3), tilt (3), scale]: force = (1 + axes) @ accel - bias.
 
     Two windows one after the other give the change of the mean velocity by images, which is the integral of the
     specific force, weighted by a hat over both, and of gravity: the velocity between them is not needed.
     """
+
+    BIAS = _BIAS
 
     def __init__(self, axes_sigma: F64, scale_sigma: float, walk_m_s3: float, gravity_m_s2: float) -> None:
         """axes_sigma (9,), scale_sigma: of the calibration. walk_m_s3: of the bias, per sqrt(s)."""
@@ -39,28 +41,9 @@ class AccelCalibration:
         self._cov[_AXES, _AXES] = np.diag(np.minimum(axes_sigma.ravel() ** 2, np.diag(self.axes_cov)))
 
     @property
-    def matrix(self) -> F64:
-        """(3,3) of force = matrix @ accel - bias."""
-        return np.asarray(np.eye(3) + self._x[_AXES].reshape(3, 3))
-
-    @property
-    def bias(self) -> F64:
-        """(3,) m/s^2."""
-        return self._x[_BIAS].copy()
-
-    @property
     def scale(self) -> tuple[float, float]:
         """Metres per metre of the images, and its standard deviation."""
         return 1.0 + float(self._x[_SCALE]), float(np.sqrt(self._cov[_SCALE, _SCALE]))
-
-    @property
-    def axes_cov(self) -> F64:
-        """(9,9) covariance of the elements of `matrix`."""
-        return self._cov[_AXES, _AXES]
-
-    def significance(self) -> float:
-        """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
-        return significance(self._x[_AXES], self.axes_cov, self.excess)
 
     def set_vertical(self, gravity: F64 | None) -> None:
         """Begin in a map in which gravity points along (3,); None: unknown as yet."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.inertial.calibration.robust_update import robust_update, significance
+from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.geometry import se3
 
@@ -15,13 +15,15 @@ _AXES, _OFFSET, _BIAS = slice(0, 9), 9, slice(10, 13)
 _BIAS_RAD_S = 0.1  # standard deviation of an unknown bias
 
 
-class GyroCalibration:
+class GyroCalibration(AxesFilter):
     """Kalman filter over [axes (9), time offset s, bias (3)]: rate = (1 + axes) @ gyro - bias.
 
     Axes are those of the body as the camera's extrinsics define them, so a rotation of the camera against the IMU is
     the antisymmetric part of `axes`. Shifting a window by d rotates the gyro's rotation by d (rate at its end - rotated
     rate at its start), after M. Li, A. Mourikis, "Online temporal calibration for camera-IMU systems", 2014.
     """
+
+    BIAS = _BIAS
 
     def __init__(self, axes_sigma: F64, offset_sigma_s: float, offset_s: float, walk_rad_s2: float) -> None:
         """axes_sigma (9,), offset_sigma_s: of the calibration. offset_s: calibrated. walk_rad_s2: of the bias."""
@@ -39,16 +41,6 @@ class GyroCalibration:
         self._cov[:10, :10] = np.diag(np.minimum(sigma**2, np.diag(self._cov)[:10]))
 
     @property
-    def matrix(self) -> F64:
-        """(3,3) of rate = matrix @ gyro - bias."""
-        return np.asarray(np.eye(3) + self._x[_AXES].reshape(3, 3))
-
-    @property
-    def bias(self) -> F64:
-        """(3,) rad/s."""
-        return self._x[_BIAS].copy()
-
-    @property
     def offset_s(self) -> float:
         """Camera stamp + offset = IMU time."""
         return float(self._x[_OFFSET])
@@ -57,15 +49,6 @@ class GyroCalibration:
     def offset_sigma_s(self) -> float:
         """Standard deviation of the offset."""
         return float(np.sqrt(self._cov[_OFFSET, _OFFSET]))
-
-    @property
-    def axes_cov(self) -> F64:
-        """(9,9) covariance of the elements of `matrix`."""
-        return self._cov[_AXES, _AXES]
-
-    def significance(self) -> float:
-        """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
-        return significance(self._x[_AXES], self.axes_cov, self.excess)
 
     def add(self, window: Window, R_b0_b1: F64, turn_variance: float, offset_s: float) -> float:
         """Add a window over which the images rotated by R_b0_b1 (3,3).

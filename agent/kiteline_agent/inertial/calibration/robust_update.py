@@ -1,8 +1,9 @@
-"""Gain of a Kalman update in which an outlier weighs less: what both calibrations do with a window."""
+"""What the filters of gyro and accelerometer share: their axes and bias, and an update in which outliers weigh less."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,29 @@ def robust_update(j: F64, cov: F64, error: F64, variance: float) -> RobustUpdate
     return RobustUpdate(np.asarray(np.linalg.solve(s, j @ cov).T), s, predicted, square, log_likelihood)
 
 
-def significance(axes: F64, cov: F64, excess: float) -> float:
-    """Squared deviations of axes (9,) from a true IMU; less where errors are larger than expected."""
-    return float(axes @ np.linalg.solve(cov, axes)) / max(excess, 1.0)
+class AxesFilter:
+    """What both calibrations know of their sensor: the state begins with `matrix` - 1, and has the bias at BIAS."""
+
+    BIAS: ClassVar[slice]
+    _x: F64
+    _cov: F64
+    excess: float  # mean squared error over what was expected
+
+    @property
+    def matrix(self) -> F64:
+        """(3,3) of true = matrix @ measured - bias."""
+        return np.asarray(np.eye(3) + self._x[:9].reshape(3, 3))
+
+    @property
+    def bias(self) -> F64:
+        """(3,) rad/s or m/s^2."""
+        return self._x[self.BIAS].copy()
+
+    @property
+    def axes_cov(self) -> F64:
+        """(9,9) covariance of the elements of `matrix`."""
+        return self._cov[:9, :9]
+
+    def significance(self) -> float:
+        """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
+        return float(self._x[:9] @ np.linalg.solve(self.axes_cov, self._x[:9])) / max(self.excess, 1.0)
