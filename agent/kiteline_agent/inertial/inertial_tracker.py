@@ -112,10 +112,7 @@ class InertialTracker:
         return self._image_loss_s
 
     def gravity_rotation(self) -> F64 | None:
-        """R_l_m (3,3) that gravity-aligns the map; None until gravity is known, a few frames after the start.
-
-        Before the smoother runs, it is the initialiser's, without a deviation: keyframes carry the smoother's only.
-        """
+        """R_l_m (3,3) that gravity-aligns the map, by smoother or initialiser; None until it is known."""
         if self._smoother.running:
             tilt = self._smoother.state.tilt
         else:
