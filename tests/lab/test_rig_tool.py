@@ -157,3 +157,12 @@ def test_an_imu_of_a_rig_file_is_shown_and_exported(tmp_path: Path, capsys: pyte
     known_cameras = KnownCameras.of_file(rig_file.load(str(path)))
     assert "timeshift_cam_imu: -0.004" in exported(known_cameras, None, "kalibr")["camchain-imucam.yaml"]
     assert "[known_rig.imu]" in exported(known_cameras, None, "kiteline")["rig.toml"]
+
+
+def test_a_store_s_rig_file_says_how_well_an_offset_is_known() -> None:
+    mapper = known()
+    for calibrated, sigma_px in ((False, 0.0), (True, 0.03)):
+        if calibrated:
+            mapper.map.disparity_calibrated.add(AgentId(0))
+        text = exported(KnownCameras.of_base(mapper), None, "kiteline")["rig.toml"]
+        assert f"disparity_sigma_px = {sigma_px}" in text
