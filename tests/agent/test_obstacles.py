@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_agent.exchange.obstacles import REACH_M, SECTORS, obstacle_distances
+from kiteline_agent.runtime.controller import push_obstacles
 from kiteline_codec.schema import GridTile
 from kiteline_core.geometry import se3
 
@@ -63,3 +67,29 @@ def test_without_a_grid_or_a_heading_nothing_is_told() -> None:
     assert obstacle_distances({}, vehicle(0.0, 0.0, 0.0)) is None
     nose_up = vehicle(0.0, 0.0, 0.0) @ se3.from_rt(se3.so3_exp(np.array([0.0, np.pi / 2, 0.0])), np.zeros(3))
     assert obstacle_distances(room(), nose_up) is None
+
+
+class Heard:
+    """Stands for the flight controller's link."""
+
+    T_b_f = np.eye(4)
+
+    def __init__(self) -> None:
+        self.sent: list[list[float]] = []
+
+    def push_obstacles(self, distance_m: list[float], reach_m: float, now_ns: int) -> None:
+        self.sent.append(distance_m)
+
+
+def test_only_a_vehicle_that_is_tracked_in_the_world_tells_its_obstacles() -> None:
+    agent, heard = SimpleNamespace(tiles=room()), Heard()
+
+    def push(*, tracked: bool, placed: bool) -> int:
+        estimate = SimpleNamespace(tracked=tracked, T_w_b=vehicle(0.0, 0.0, 0.0) if placed else None)
+        push_obstacles(cast(Any, heard), cast(Any, agent), cast(Any, SimpleNamespace(estimate=estimate)), 5)
+        return len(heard.sent)
+
+    assert push(tracked=False, placed=True) == 0
+    assert push(tracked=True, placed=False) == 0
+    assert push(tracked=True, placed=True) == 1
+    assert heard.sent[0][0] == pytest.approx(EAST, abs=0.15)

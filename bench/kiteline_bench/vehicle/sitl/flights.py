@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.vehicle.sitl import arducopter, lines
-from kiteline_bench.vehicle.sitl.ground_station import GUIDED, LAND
+from kiteline_bench.vehicle.sitl.ground_station import GUIDED, HAS_POSITION, LAND, USES
 from kiteline_bench.vehicle.sitl.loop import Loop
 
 F64 = NDArray[np.float64]
@@ -20,7 +20,6 @@ _SPAN_S = 60.0  # of each measurement
 _READY_S, _ARM_S, _CLIMB_S = 60.0, 40.0, 20.0  # s until it gives up
 _RADIUS_M, _LAP_S, _SWAY_RAD = 0.7, 24.0, 0.5  # of the course
 _RESTART_S, _AFTER_S = 3.0, 25.0  # s without an agent; s that are watched after its return
-_USES = "using external nav data"
 
 
 class FlightFailedInLoop(Exception):
@@ -52,9 +51,9 @@ def _take_off(bench: Bench, loop: Loop) -> None:
     pilot = loop.pilot
     loop.fly(3.0)
     loop.start_agent()
-    if not loop.fly(_READY_S, lambda: pilot.heard(_USES) is not None and bool(pilot.flags & 16)):
+    if not loop.fly(_READY_S, lambda: pilot.heard(USES) is not None and bool(pilot.flags & HAS_POSITION)):
         raise FlightFailedInLoop(f"no position after {_READY_S:.0f} s: {_last(loop)}")
-    bench.say(f"SITL: {_USES} at {loop.t_s:.1f} s")
+    bench.say(f"SITL: {USES} at {loop.t_s:.1f} s")
     pilot.set_mode(GUIDED)
     due = [loop.t_s]
 
@@ -163,9 +162,9 @@ def _reboot(bench: Bench, loop: Loop) -> list[Bar]:
     if not loop.fly(30.0, lambda: pilot.beats_s[-1] > down_s):
         raise FlightFailedInLoop("no heartbeat after the reboot")
     up_s = pilot.beats_s[-1]
-    used = loop.fly(40.0, lambda: pilot.heard(_USES, down_s) is not None)
+    used = loop.fly(40.0, lambda: pilot.heard(USES, down_s) is not None)
     bench.say("SITL: controller rebooted")
-    heard = pilot.heard(_USES, down_s)
+    heard = pilot.heard(USES, down_s)
     first_s = next((t for t, f in loop.onboard.said if t * 1.0 - 1000.0 >= down_s and "restarted" in f.text), None)
     return [
         is_true("controller rebooted: said by the agent", "once", first_s is not None,

@@ -13,6 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from kiteline_hw.system.closing import Closing
 
 GUIDED, LAND = 4, 9  # modes of ArduCopter
+USES = "using external nav data"  # it says so when its EKF begins to live on poses
+HAS_POSITION = 16  # flag of EKF_STATUS_REPORT
 _ARM, _TAKEOFF, _REBOOT, _INTERVAL = 400, 22, 246, 511  # commands
 _POSITION_AND_YAW = 0x9F8  # of a target, what does not count
 _ARMED = 128

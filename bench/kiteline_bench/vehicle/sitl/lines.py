@@ -9,6 +9,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.runtime.worker import LockstepJobs
 from kiteline_basestation.station import Station
 from kiteline_bench.harness.bars import Bar, Bench, is_true
+from kiteline_bench.vehicle.sitl.ground_station import HAS_POSITION
 from kiteline_bench.vehicle.sitl.loop import Loop
 from kiteline_bench.vehicle.sitl.onboard import Onboard
 from kiteline_codec.channel import coded_channel
@@ -22,8 +23,6 @@ _SETTLE_S, _SPAN_S, _ARRIVE_S = 8.0, 20.0, 8.0
 _SIGNED_S, _REFUSED_S, _FORGETS_S = 30.0, 12.0, 20.0  # the EKF gives up its position after 15 s without poses
 _DOWN_BYTES_S = 900
 _STAMPS_S = 1420070400  # s: 1 January 2015
-_USES = "using external nav data"
-_HAS_POSITION = 16  # flag of EKF_STATUS_REPORT
 
 
 def run(bench: Bench, program: Path) -> list[Bar]:
@@ -98,10 +97,10 @@ def _signed(loop: Loop, key: Path) -> list[Bar]:
     said = [f.text for t, f in loop.onboard.said if f.topic in ("signing", "answers")]
     loop.kill_agent()
     loop.fly(_FORGETS_S)
-    blind = not loop.pilot.flags & _HAS_POSITION
+    blind = not loop.pilot.flags & HAS_POSITION
     loop.sign(key)
     signed = loop.start_agent()
-    used = loop.fly(_SIGNED_S, lambda: bool(loop.pilot.flags & _HAS_POSITION))
+    used = loop.fly(_SIGNED_S, lambda: bool(loop.pilot.flags & HAS_POSITION))
     refused = [f.text for _, f in signed.said if f.topic == "signing"]
     return [
         is_true("signing on: an agent without the key", "says so", bool(said), said[0] if said else "said nothing"),
