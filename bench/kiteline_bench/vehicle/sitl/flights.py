@@ -88,9 +88,8 @@ def _course(bench: Bench, loop: Loop) -> list[Bar]:
     rate = (loop.onboard.sink.counters.odometry - sent) / (loop.t_s - begin_s)
     samples_hz = (loop.onboard.imu_samples - taken) / (loop.t_s - begin_s)
     bench.say("SITL: course flown")
-    rms = float(np.sqrt(np.mean(np.sum(position_m**2, 1)))) if len(position_m) else math.inf
     return [
-        at_most("the EKF on kiteline alone, 60 s of course: off the truth, rms", 100 * rms, 3.0, "cm", 1),
+        at_most("the EKF on kiteline alone, 60 s of course: off the truth, rms", 100 * _rms(position_m), 3.0, "cm", 1),
         at_most("yaw off the truth, rms", float(np.sqrt(np.mean(yaw_deg**2))), 1.0, "degrees", 2),
         Bar("ODOMETRY", ">= 30 Hz", f"{rate:.1f} Hz", round(rate, 1) >= 30.0),
         Bar(
@@ -112,9 +111,11 @@ def _hold(bench: Bench, loop: Loop) -> list[Bar]:
     t = np.array(loop.truth.t_s)
     p = np.array(loop.truth.position_m)[t >= begin_s]
     away = np.linalg.norm(p - p[:20].mean(0), axis=1)
+    off_m, _ = _errors(loop, begin_s)
     bench.say("SITL: place held")
     return [
         at_most("closed loop: farthest from its place in 60 s", 100 * float(away.max()), 10.0, "cm", 1),
+        Bar("hold: the EKF off the truth, rms", "told", f"{100 * _rms(off_m):.1f} cm", True),
         _no_failsafe("hold: no failsafe", loop, begin_s),
     ]
 
@@ -184,6 +185,10 @@ def _errors(loop: Loop, since_s: float) -> tuple[F64, F64]:
     _, true_rad = loop.truth.at(np.array([t for t, _ in yaw]))
     off = np.array([y for _, y in yaw]) - true_rad
     return np.array([p for _, p in position]) - true_m, np.degrees(np.arctan2(np.sin(off), np.cos(off)))
+
+
+def _rms(errors_m: F64) -> float:
+    return float(np.sqrt(np.mean(np.sum(errors_m**2, 1)))) if len(errors_m) else math.inf
 
 
 def _no_failsafe(name: str, loop: Loop, since_s: float) -> Bar:

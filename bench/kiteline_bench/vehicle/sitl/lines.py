@@ -11,7 +11,7 @@ from kiteline_basestation.station import Station
 from kiteline_bench.harness.bars import Bar, Bench, is_true
 from kiteline_bench.vehicle.sitl.ground_station import HAS_POSITION
 from kiteline_bench.vehicle.sitl.loop import Loop
-from kiteline_bench.vehicle.sitl.onboard import Onboard
+from kiteline_bench.vehicle.sitl.onboard import Onboard, SimulatedClock
 from kiteline_codec.channel import coded_channel
 from kiteline_core.ids import AgentId
 from kiteline_hw.mavlink.transport.signing import read_key
@@ -40,8 +40,8 @@ def run(bench: Bench, program: Path) -> list[Bar]:
 class _Base:
     """A base at another line of the autopilot, in simulated time."""
 
-    def __init__(self, url: str) -> None:
-        self.link = MavlinkTunnelLink(url, BASE_END)
+    def __init__(self, url: str, clock: SimulatedClock) -> None:
+        self.link = MavlinkTunnelLink(url, BASE_END, clock=clock.now_ns)
         self._station = Station(
             BaseConfig(), lambda _: coded_channel(1, _DOWN_BYTES_S, "radio"), shipped_vocabulary()
         )  # fmt: skip
@@ -59,7 +59,7 @@ class _Base:
 
 
 def _shared(loop: Loop, onboard: Onboard) -> list[Bar]:
-    base = _Base(loop.autopilot.url(2))
+    base = _Base(loop.autopilot.url(2), loop.clock)
 
     def fly(seconds: float, *, sends: bool) -> None:
         onboard.sends = base.sends = sends

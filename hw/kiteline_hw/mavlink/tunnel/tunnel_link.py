@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from kiteline_hw.links.ends import LinkOptions
@@ -44,7 +44,10 @@ class TunnelQueue:
 class MavlinkTunnelLink(TunnelQueue, Closing):
     """A ByteLink. url: see MAVLINK_FORMS; its system id, if it has one, is ours. Raises LinkError."""
 
-    def __init__(self, url: str, config: TunnelConfig, *, required: bool = True) -> None:
+    def __init__(
+        self, url: str, config: TunnelConfig, *, required: bool = True, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:  # fmt: skip
+        self._clock = clock
         address = parse_mavlink_url(url)
         if address.system is not None:
             config = replace(config, system=address.system, learns_system=False)
@@ -72,20 +75,20 @@ class MavlinkTunnelLink(TunnelQueue, Closing):
     @property
     def alive(self) -> bool:
         """True if anything came from the other end lately."""
-        return self._end.heard_within(_ALIVE_NS, time.monotonic_ns())
+        return self._end.heard_within(_ALIVE_NS, self._clock())
 
     def _on_data(self, data: bytes, datagram: bool, adopt: Adopt | None) -> None:
         with self._lock:
             messages = self._end.codec.receive(data, datagram=datagram)
             if adopt is not None and messages:
                 adopt()
-            now_ns = time.monotonic_ns()
+            now_ns = self._clock()
             taken = [self._end.take(message, now_ns) for message in messages]
             self._inbox.extend(packet for packet in taken if packet is not None)
 
     def _on_tick(self) -> None:
         with self._lock:
-            messages = self._end.poll(time.monotonic_ns())
+            messages = self._end.poll(self._clock())
         for message in messages:
             self._connection.send(message)
 
