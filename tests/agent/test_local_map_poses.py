@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
+from kiteline_codec.schema import FusedLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
@@ -31,10 +31,10 @@ def local_map(keyframes: int = 4, slots: int = 8, camera: RectifiedCamera = CAME
     return out
 
 
-def add(held: LocalMap, k: int) -> None:
+def add(held: LocalMap, k: int, parent: int = NO_KEYFRAME) -> None:
     n = 30
     held.add(
-        KeyframeHeader(KeyframeId(k), k, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0),
+        KeyframeHeader(KeyframeId(k), k, KeyframeId(parent), np.eye(4), n), np.eye(4), np.full((n, 2), 200.0),
         np.full(n, 1.0 / DEPTH_M), np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
         np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), k,
     )  # fmt: skip
@@ -160,3 +160,19 @@ def test_refined_landmarks_of_evicted_keyframes_are_forgotten() -> None:
     told(held, 4, 2.0 * LEAST_M)
     assert held.apply_corrections()
     assert np.array_equal(held.bearing[held.slot_of(0)], before)
+
+
+def test_a_fused_landmark_is_dropped_once_the_base_has_set_both_poses() -> None:
+    held = local_map(2)
+    add(held, 2, parent=1)
+    held.share(KeyframeId(1), 30)
+    held.share(KeyframeId(2), 30)
+    slot, roots = held.slot_of(2), np.array([1 << KEYPOINT_BITS | 7, 9 << KEYPOINT_BITS | 3])
+    held.fuse(FusedLandmarks(KeyframeId(2), np.array([4, 5], np.uint16), roots))
+    assert held.usable[slot, :30].all()  # drift lies between the keyframes
+    told(held, 2, 1.1 * LEAST_M)
+    assert held.apply_corrections()
+    assert np.flatnonzero(~held.usable[slot, :30]).tolist() == [4]  # the other root is not stored here
+    later = FusedLandmarks(KeyframeId(2), np.array([4, 6], np.uint16), roots[[0, 0]])
+    assert held.fuse(later)
+    assert not held.usable[slot, 6]
