@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.local_map.fused_landmarks import FusedInMap
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import FusedLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3
@@ -168,11 +169,13 @@ def test_a_fused_landmark_is_dropped_once_the_base_has_set_both_poses() -> None:
     held.share(KeyframeId(1), 30)
     held.share(KeyframeId(2), 30)
     slot, roots = held.slot_of(2), np.array([1 << KEYPOINT_BITS | 7, 9 << KEYPOINT_BITS | 3])
-    held.fuse(FusedLandmarks(KeyframeId(2), np.array([4, 5], np.uint16), roots))
+    fused = FusedInMap(held)
+    assert not fused.take(FusedLandmarks(KeyframeId(2), np.array([4, 5], np.uint16), roots))
     assert held.usable[slot, :30].all()  # drift lies between the keyframes
     told(held, 2, 1.1 * LEAST_M)
     assert held.apply_corrections()
+    fused.corrected()
     assert np.flatnonzero(~held.usable[slot, :30]).tolist() == [4]  # the other root is not stored here
     later = FusedLandmarks(KeyframeId(2), np.array([4, 6], np.uint16), roots[[0, 0]])
-    assert held.fuse(later)
+    assert fused.take(later)
     assert not held.usable[slot, 6]

@@ -12,6 +12,7 @@ from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.exchange.correction_batches import CorrectionBatches
 from kiteline_agent.exchange.correction_filter import CorrectionFilter
 from kiteline_agent.exchange.smoothing import Smoothing
+from kiteline_agent.local_map.fused_landmarks import FusedInMap
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.tracking.map_anchor import MapAnchor
@@ -55,6 +56,7 @@ class Corrections:
         self._filter = CorrectionFilter(smoothing)
         self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths in w, by submap
         self._batches = CorrectionBatches()
+        self._fused = FusedInMap(local_map)
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self._continued: SubmapId | None = None  # submap that began in a tracked frame
@@ -64,7 +66,7 @@ class Corrections:
         self._handlers: Mapping[type[Record], Callable[[Any], bool]] = {
             KeyframePose: local_map.set_pose,
             RefinedLandmarks: local_map.refine,
-            FusedLandmarks: local_map.fuse,
+            FusedLandmarks: self._fused.take,
             RemovedObservations: local_map.remove,
             CulledLandmarks: local_map.remove,
             SubmapPlacement: self._place,
@@ -109,6 +111,7 @@ class Corrections:
         if anchor is not None and self._map.camera.stereo and not anchor.matters():
             self._map.restore(before)
             return False
+        self._fused.corrected()
         return True
 
     def _place(self, record: SubmapPlacement) -> bool:

@@ -18,7 +18,6 @@ from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_codec.schema import (
     CulledLandmarks,
-    FusedLandmarks,
     KeyframeHeader,
     KeyframePose,
     RefinedLandmarks,
@@ -26,7 +25,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId, point_id
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
@@ -97,7 +96,6 @@ class LocalMap:
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
         self._new_poses: dict[KeyframeId, F64] = {}  # sent by the base, and not taken over yet
         self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
-        self._fused: dict[KeyframeId, FusedLandmarks] = {}  # as the base wrote them, for keyframes stored here
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
         self.active = SubmapId(0)  # the submap that is tracked
@@ -262,7 +260,6 @@ class LocalMap:
     def _forget_corrections(self, keyframe: int) -> None:
         self._new_poses.pop(KeyframeId(keyframe), None)
         self._new_landmarks.pop(KeyframeId(keyframe), None)
-        self._fused.pop(KeyframeId(keyframe), None)
 
     def set_pose(self, record: KeyframePose) -> bool:
         """Hold a keyframe's pose ready for `apply_corrections`. False: nothing moves yet."""
@@ -292,15 +289,11 @@ class LocalMap:
         self._new_poses.clear()
         self._new_landmarks.clear()
         self.due = False
-        for fused in self._fused.values():
-            self._drop_fused(fused)
         return True
 
     def _corrected(self) -> tuple[NDArray[Any], ...]:
         """What `apply_corrections` changes."""
-        return (
-            self.T_m_k, self.from_base, self.rho, self.bearing, self.measured, self.sigma_rho, self.usable, self.seed,
-        )  # fmt: skip
+        return self.T_m_k, self.from_base, self.rho, self.bearing, self.measured, self.sigma_rho
 
     def save(self) -> SavedMap:
         """The map before `apply_corrections`."""
@@ -381,30 +374,6 @@ class LocalMap:
             parent = self.slot_of(int(self.parent[slot]))
             if parent >= 0:
                 self.T_p_k[slot] = se3.inverse(self.T_m_k[parent]) @ self.T_m_k[slot]
-
-    def fuse(self, record: FusedLandmarks) -> bool:
-        """Stop searching for landmarks whose root landmark is stored here, too, once the base has set both poses.
-
-        Until then the two lie apart by the drift between their keyframes: the newer one is where the camera sees it.
-        """
-        if self.slot_of(record.keyframe) < 0:
-            return False
-        self._fused[record.keyframe] = record
-        return self._drop_fused(record)
-
-    def _drop_fused(self, record: FusedLandmarks) -> bool:
-        slot = self.slot_of(record.keyframe)
-        if not self._is_placed(slot):
-            return False
-        for index, point in zip(record.index.tolist(), record.point.tolist()):
-            if index < self.shared[slot] and self._is_placed(self.slot_of(point >> KEYPOINT_BITS)):
-                self.usable[slot, index] = point == point_id(KeyframeId(int(self.keyframe[slot])), index)
-                self.seed[slot, index] &= self.usable[slot, index]
-        return True
-
-    def _is_placed(self, slot: int) -> bool:
-        """True if the base has set the pose of the keyframe in a slot, or it is the first of its submap."""
-        return slot >= 0 and bool(self.from_base[slot] or self.parent[slot] == NO_KEYFRAME)
 
     def compose_unplaced(self) -> None:
         """Compose the poses of keyframes that the base has not set from those of their parents, oldest first."""

@@ -1,0 +1,45 @@
+"""Landmarks of the local map that the base found to be one with another one, their root."""
+
+from __future__ import annotations
+
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_codec.schema import FusedLandmarks
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId
+
+
+class FusedInMap:
+    """Stops the search for landmarks whose root is stored, too, once the base has set the poses of both keyframes.
+
+    Until then the two lie apart by the drift between their keyframes: the newer one is where the camera sees it.
+    """
+
+    def __init__(self, local_map: LocalMap) -> None:
+        self._map = local_map
+        self._told: dict[KeyframeId, FusedLandmarks] = {}  # of keyframes that are stored
+
+    def take(self, record: FusedLandmarks) -> bool:
+        """Take in what the base found. Returns whether a landmark is not searched for any more."""
+        self._told[record.keyframe] = record
+        return self._drop(record)
+
+    def corrected(self) -> None:
+        """The base has set poses of the map."""
+        self._told = {k: record for k, record in self._told.items() if self._map.slot_of(k) >= 0}
+        for record in self._told.values():
+            self._drop(record)
+
+    def _drop(self, record: FusedLandmarks) -> bool:
+        m, slot = self._map, self._map.slot_of(record.keyframe)
+        if not self._is_placed(slot):
+            return False
+        fused = [
+            index
+            for index, point in zip(record.index.tolist(), record.point.tolist())
+            if index < m.shared[slot] and self._is_placed(m.slot_of(point >> KEYPOINT_BITS))
+        ]
+        m.usable[slot, fused] = m.seed[slot, fused] = False
+        return bool(fused)
+
+    def _is_placed(self, slot: int) -> bool:
+        """True if the base has set the pose of the keyframe in a slot, or it is the first of its submap."""
+        return slot >= 0 and bool(self._map.from_base[slot] or self._map.parent[slot] == NO_KEYFRAME)
