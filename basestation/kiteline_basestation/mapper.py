@@ -172,6 +172,8 @@ class Mapper:
         self._intake.last_contact_ns.pop(agent, None)  # it was in contact with the earlier process
         for record in own:
             self.adopt(record)
+            if isinstance(record, SubmapPlacement):
+                self._placements.restore_scale_sigma(record)
 
     def restore_state(self, state: MapperState) -> None:
         """Continue from a saved state, after `restore` for all agents."""

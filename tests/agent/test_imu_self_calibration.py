@@ -249,3 +249,27 @@ def test_what_a_flight_cannot_tell_is_kept() -> None:
     assert resting is not None
     np.testing.assert_allclose(resting.gyro, known.gyro, atol=5e-4)
     assert np.all(np.array(resting.gyro_sigma) > 0.9 * np.array(known.gyro_sigma))
+
+
+def test_a_refuted_imu_leaves_nothing_behind() -> None:
+    """One eye, whose flights do not calibrate the accelerometer: what the file said of it was of another IMU."""
+    known = calibrated(flight(25.0, 0, GYRO, ACCEL, 4_000_000)).known()
+    assert known is not None and known.accel
+    replaced = calibrated(flight(25.0, 1, np.linalg.inv(GYRO), late_ns=-3_000_000), known=known, metric=False)
+    assert any("calibrated anew" in event for event in replaced.take_events())
+    found = replaced.known()
+    assert found is not None and found.accel == ()
+
+
+def test_what_no_imu_can_be_is_not_kept() -> None:
+    """Axes that are a quarter turn off, or a filter that has diverged: nothing is known, and nothing is raised."""
+    calibration = calibrated(flight(6.0, 4, GYRO, ACCEL))
+    known = calibration.known()
+    assert known is not None
+    calibration.accel._x[0] = 0.5
+    found = calibration.known()
+    assert found is not None and found.accel == () and found.gyro == known.gyro
+    for index, value in ((0, 0.3), (9, -0.7), (4, np.nan)):
+        calibration.gyro._x[:] = 0.0
+        calibration.gyro._x[index] = value
+        assert calibration.known() is None

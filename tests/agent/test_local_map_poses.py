@@ -179,3 +179,15 @@ def test_a_fused_landmark_is_dropped_once_the_base_has_set_both_poses() -> None:
     later = FusedLandmarks(KeyframeId(2), np.array([4, 6], np.uint16), roots[[0, 0]])
     assert fused.take(later)
     assert not held.usable[slot, 6]
+
+
+def test_what_is_told_of_keyframes_that_are_gone_is_forgotten() -> None:
+    """Corrections that never matter are not applied: even so no more is held than the map has slots."""
+    held = local_map(0, slots=4)
+    fused = FusedInMap(held)
+    roots = np.array([99 << KEYPOINT_BITS | 7])
+    for k in range(1, 40):
+        add(held, k)
+        fused.take(FusedLandmarks(KeyframeId(k), np.array([4], np.uint16), roots))
+        fused.take(FusedLandmarks(KeyframeId(1000 + k), np.array([4], np.uint16), roots))  # never stored
+    assert 0 < len(fused._told) <= 4

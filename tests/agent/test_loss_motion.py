@@ -10,7 +10,7 @@ from kiteline_agent.inertial.fixed_lag import StartDeviations
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
-from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator
+from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator, _largest
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -100,3 +100,8 @@ def test_up_is_that_of_the_state_and_as_certain() -> None:
     found = up_of(tracker.state)
     assert np.allclose(found[0], -T_m_b[:3, :3].T @ gravity / 9.81, atol=1e-9)
     assert found[1] == pytest.approx(np.hypot(0.01, 0.02), rel=0.01)
+
+
+def test_a_deviation_is_never_none_at_all() -> None:
+    """A record cannot tell a deviation of 0."""
+    assert 0.0 < _largest(np.zeros((3, 3))) < 1e-5

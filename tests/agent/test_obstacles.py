@@ -69,6 +69,17 @@ def test_without_a_grid_or_a_heading_nothing_is_told() -> None:
     assert obstacle_distances(room(), nose_up) is None
 
 
+@pytest.mark.parametrize("cell_m", [1e-30, 1e-4, 25.0, 1e30])
+def test_any_size_of_cells_costs_little(cell_m: float) -> None:
+    """A tile is a record from the link."""
+    tiles = {(0, 0): GridTile(0, 0, cell_m, np.full((32, 32), 90, np.int8))}
+    with np.errstate(invalid="ignore", over="ignore"):
+        distances = obstacle_distances(tiles, vehicle(0.5, 0.5, 0.0))
+    assert distances is not None and distances.shape == (SECTORS,)
+    if cell_m > REACH_M:
+        assert distances[SECTORS // 4] == 0.5 or np.isnan(distances).any()  # the cell around the vehicle
+
+
 class Heard:
     """Stands for the flight controller's link."""
 

@@ -195,3 +195,14 @@ def test_another_file_is_refused(tmp_path: Path, text: str, why: str) -> None:
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(ConfigError, match=why):
         rig_file.load(str(path))
+
+
+def test_an_imu_is_kept_with_the_place_of_the_camera_that_it_was_compared_with() -> None:
+    """The rig file is of another mounting, and the right camera was not measured."""
+    known = replace(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), imu=IMU)
+    moved = replace(CAMERA, T_b_c=se3.from_rt(se3.so3_exp(np.array([0.0, 0.01, 0.0])), np.zeros(3)))
+    found = replace(IMU, offset_s=(0.002, 0.0003))
+    updated = known.updated(moved, None, found)
+    assert updated is not None and updated.imu == found and updated.knows_imu_of(moved)
+    assert not updated.knows_imu_of(CAMERA)
+    assert updated.rows_px == known.rows_px

@@ -141,6 +141,22 @@ def test_a_rig_that_was_repaired_is_not_held_to_earlier_flights(make_flight: Mak
             assert np.allclose(mapper.map.disparity_offset_px[flight.agent], found)
 
 
+def test_a_restarted_base_tells_an_offset_that_it_knows_better(make_flight: MakeFlight, words: Any) -> None:
+    """Its own estimate is no prior of itself, and not the agent's."""
+    flight = make_flight(keyframes=4, points=200, memory=4, drift_m=0.001, noise_px=0.2)
+    found, better = np.array([-0.6, 0.1, -0.2, -0.5, 0.8]), np.array([-0.55, 0.1, -0.2, -0.45, 0.8])
+    received = (CameraIntrinsics(flight.agent, flight.camera), StereoAlignment(flight.agent, NONE, False, found, 0.1))
+    first, second = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
+    first.restore(flight.agent, received, (), 0)
+    first.map.disparity_offset_px[flight.agent] = better
+    second.restore(flight.agent, received, (), 0)
+    second.restore_state(first.state())
+    assert np.array_equal(prior_mean(second.map, flight.agent, BaseConfig().disparity), found)
+    output = second.step(MapperInput(()), 0)
+    sent = [r for _, records in output.publish for r in records if isinstance(r, DisparityCalibration)]
+    assert [r.disparity_px.tolist() for r in sent] == [better.tolist()]
+
+
 def test_an_offset_of_a_worn_rig_is_found_early(make_flight: MakeFlight, words: Any) -> None:
     worn = np.array([1.2, 0.1, -0.2, 0.6, 0.2])
     flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)

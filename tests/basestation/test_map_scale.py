@@ -24,7 +24,7 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_basestation.store.integrity import contradictions
-from kiteline_codec.schema import CameraIntrinsics, InertialSteps, Record, SubmapScale
+from kiteline_codec.schema import CameraIntrinsics, InertialSteps, Record, SubmapPlacement, SubmapScale
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
@@ -301,8 +301,11 @@ def test_the_world_is_in_metres_by_all_accelerations_and_the_agents_map_stays(
     assert length_ratio(own[:, :3, 3], told) == pytest.approx(UNIT, abs=0.01)
     assert sim3.scale_of(other.placements[submap]) == 1.0
     again = Mapper(BaseConfig(), words)
-    again.restore(told.agent, tuple(told.all_records()), (), 0)
+    sigma = mapper._placements._scale_sigma[submap]
+    placement = SubmapPlacement(submap, S_w_m, scale_sigma=sigma)
+    again.restore(told.agent, tuple(told.all_records()), (placement,), 0)
     again.restore_state(mapper.state())
+    assert again._placements._scale_sigma == {submap: sigma} and sigma > 0.0  # goes on being told
     assert again.map.inertial_steps.keys() == mapper.map.inertial_steps.keys()
     assert again.map.scale(submap) == mapper.map.scale(submap) != 1.0
     assert length_ratio(np.array([other.map.pose(k) for k in untold.keyframes])[:, :3, 3], untold) < 0.975

@@ -38,7 +38,7 @@ class CorrectionFilter:
         """
         before, self._told = self._told, T_w_o
         if before is None or scale_sigma <= 0.0:
-            self._take_over(scale_sigma)
+            self._take_over()
         elif not np.array_equal(before, T_w_o):
             self._fuse(before, T_w_o, here_o, scale_sigma)
         if not self._kept.any():
@@ -47,7 +47,7 @@ class CorrectionFilter:
         out[:3, 3] -= self._kept
         return out
 
-    def _take_over(self, scale_sigma: float) -> None:
+    def _take_over(self) -> None:
         self._kept = np.zeros(3)
         self._variance, self._place = 0.0, np.zeros(3)
         self._scale_sigma = self._config.scale_sigma
@@ -56,7 +56,7 @@ class CorrectionFilter:
         old, new = (se3.transform(T, here_o[None])[0] for T in (before, T_w_o))
         moved = new - old + self._kept  # from where it was reported
         if float(np.linalg.norm(moved)) > self._config.snap_m:
-            self._take_over(scale_sigma)
+            self._take_over()
             return
         reported = self._variance + (self._scale_sigma * float(np.linalg.norm(new - self._place))) ** 2
         told = (scale_sigma * float(np.linalg.norm(new))) ** 2

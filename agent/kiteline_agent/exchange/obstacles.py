@@ -15,6 +15,7 @@ F64 = NDArray[np.float64]
 SECTORS = 72  # of 5 degrees
 REACH_M = 10.0  # m; farther cells do not count
 _OCCUPIED = 60  # percent from which a cell is an obstacle
+_STEP_M = (0.02, 0.5)  # m; between points of a ray, whatever size of cells a tile names
 _RAYS = 3  # in each sector: at 10 m a sector is 0.9 m wide
 
 
@@ -30,7 +31,8 @@ def obstacle_distances(tiles: Mapping[tuple[int, int], GridTile], T_w_f: F64) ->
     heading = np.arctan2(T_w_f[1, 0], T_w_f[0, 0])
     offsets = (np.arange(_RAYS) - 0.5 * (_RAYS - 1)) / _RAYS
     angles = heading - (np.arange(SECTORS)[:, None] + offsets) * (2 * np.pi / SECTORS)  # (s, r)
-    along = np.arange(0.5 * cell_m, REACH_M, 0.5 * cell_m)
+    step_m = float(np.clip(0.5 * cell_m, *_STEP_M))
+    along = np.arange(step_m, REACH_M, step_m)
     directions = np.stack([np.cos(angles), np.sin(angles)], -1)
     points = T_w_f[:2, 3] + along[:, None] * directions[:, :, None, :]  # (s, r, d, 2)
     found = _percent(tiles, np.floor(points / cell_m).astype(np.int64))

@@ -20,11 +20,11 @@ class FusedInMap:
     def take(self, record: FusedLandmarks) -> bool:
         """Take in what the base found. Returns whether a landmark is not searched for any more."""
         self._told[record.keyframe] = record
+        self._told = {k: held for k, held in self._told.items() if self._map.slot_of(k) >= 0}
         return self._drop(record)
 
     def corrected(self) -> None:
         """The base has set poses of the map."""
-        self._told = {k: record for k, record in self._told.items() if self._map.slot_of(k) >= 0}
         for record in self._told.values():
             self._drop(record)
 

@@ -19,6 +19,8 @@ from kiteline_core.frame import ImuCalibration
 
 F64 = NDArray[np.float64]
 
+_LEAST_VARIANCE = 1e-12  # a record holds no deviation of 0
+
 
 @dataclass(frozen=True, slots=True)
 class LossMotion:
@@ -100,4 +102,4 @@ class LossMotionEstimator:
 
 
 def _largest(cov: F64) -> float:
-    return float(np.sqrt(max(float(np.linalg.eigvalsh(0.5 * (cov + cov.T))[-1]), 0.0)))
+    return float(np.sqrt(max(float(np.linalg.eigvalsh(0.5 * (cov + cov.T))[-1]), _LEAST_VARIANCE)))

@@ -17,6 +17,7 @@ from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_codec.schema import SubmapPlacement
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
@@ -189,6 +190,11 @@ class SubmapPlacements:
         self.S_w_m.update(state.S_w_m)
         self.unmerged = dict(state.unmerged)
         self._recognised = set(state.recognised)
+
+    def restore_scale_sigma(self, record: SubmapPlacement) -> None:
+        """Continue with the deviation of lengths that an earlier process told."""
+        if record.scale_sigma > 0.0:
+            self._scale_sigma[record.submap] = record.scale_sigma
 
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
         self.S_w_m[submap] = S_w_m

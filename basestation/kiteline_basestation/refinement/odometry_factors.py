@@ -5,8 +5,8 @@ carries. A relative pose is added as synthetic points that both keyframes observ
 a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the
 agent measures best (0.1 to 0.2 mrad an axis between keyframes). A disparity offset biases the agent's translations and,
 all in one direction, its rotations: the weight decreases where rotations differ, and for rigs that are known to be
-worn. Images of a monocular submap in metres
-tell no scale: there weak points nearby hold the agent's, which rests on its IMU.
+worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
+its IMU.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
         if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
             continue
-        gap_s = float(table.t_ns[row] - table.t_ns[window.rows[p]]) * 1e-9
+        gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
         worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
         rotation_sigma = max(config.rotation_sigma_px, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)

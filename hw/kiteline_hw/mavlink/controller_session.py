@@ -156,7 +156,10 @@ class ControllerSession:
         if watch is None:
             return False
         armed = self._autopilot is not None and self._autopilot[0].armed
-        self._axes_hold = watch.axes_are_wrong and (self._axes_hold or not armed)
+        if watch.axes_are_wrong:
+            self._axes_hold |= not armed
+        elif watch.axes_fit:  # not if nothing is known of them: the controller may have restarted
+            self._axes_hold = False
         watch.axes(held=self._axes_hold)
         if self._axes_hold:
             self.counters.held += 1

@@ -133,6 +133,19 @@ def test_wrong_axes_hold_poses_back_until_they_fit_and_arming_does_not_change_th
     assert [f.level for f in bench.topic("held")] == [Level.ERROR, Level.INFO]
 
 
+def test_a_controller_that_restarts_does_not_release_poses_by_wrong_axes() -> None:
+    """What was known of the axes is forgotten then; that they fit is not known."""
+    bench = Bench(ModelledAutopilot("ardupilot"), used="flu", true="lbu")
+    bench.run(12.0)
+    sent = bench.session.counters.odometry
+    bench.controller.reboot()
+    bench.motion = still
+    bench.run(10.0)
+    assert len(bench.topic("restart")) == 1
+    assert bench.session.counters.odometry == sent
+    assert [f.level for f in bench.topic("held")] == [Level.ERROR]
+
+
 def test_a_vehicle_that_flies_goes_on_getting_poses_by_wrong_axes() -> None:
     """Poses that end in flight are a failsafe, too: the pilot is told, and decides."""
     bench = Bench(ModelledAutopilot("ardupilot", armed=True), used="flu", true="lbu")

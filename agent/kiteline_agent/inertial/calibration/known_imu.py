@@ -38,8 +38,13 @@ class KnownImuConfig:
         if any(abs(v) > _MAX_OFFSET_S for v in self.offset_s):
             raise ValueError(f"offset_s is in s: expected at most {_MAX_OFFSET_S:g}")
         for axes in (self.gyro, self.accel):
-            if axes and np.abs(np.reshape(axes, (3, 3)) - np.eye(3)).max() > _MAX_AXES:
+            if axes and not is_plausible(np.reshape(axes, (3, 3))):
                 raise ValueError(f"axes differ from those of a true IMU by more than {_MAX_AXES:g}")
+
+
+def is_plausible(matrix: F64, offset_s: float = 0.0) -> bool:
+    """True if axes (3,3) and a time offset are of an IMU as KnownImuConfig may hold it."""
+    return bool(np.abs(matrix - np.eye(3)).max() <= _MAX_AXES and abs(offset_s) <= _MAX_OFFSET_S)
 
 
 def known_axes(matrix: F64, cov: F64) -> tuple[tuple[float, ...], tuple[float, ...]]:

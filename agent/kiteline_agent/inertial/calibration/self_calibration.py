@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
-from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, known_axes
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
 from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples
@@ -107,13 +107,13 @@ class SelfCalibration:
         self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
 
     def known(self) -> KnownImuConfig | None:
-        """What is known now, for the next flight; None before a rotation was measured."""
+        """What is known now, for the next flight; None before a rotation was measured, and if no IMU is like that."""
         gyro, accel = self.gyro, self.accel
-        if gyro.log_likelihood == 0.0:
+        if gyro.log_likelihood == 0.0 or not is_plausible(gyro.matrix, gyro.offset_s):
             return None
         offset = (round(gyro.offset_s, 6), max(round(gyro.offset_sigma_s, 6), 1e-6))
         out = KnownImuConfig(offset, *known_axes(gyro.matrix, gyro.axes_cov * max(gyro.excess, 1.0)))
-        if not self._metric:
+        if not self._metric or not is_plausible(accel.matrix):
             return replace(out, accel=self._kept.accel, accel_sigma=self._kept.accel_sigma)
         axes, sigma = known_axes(accel.matrix, accel.axes_cov * max(accel.excess, 1.0))
         return replace(out, accel=axes, accel_sigma=sigma)
@@ -196,7 +196,7 @@ class SelfCalibration:
         """Drop what earlier flights found if rotations are likelier without it. Applied axes follow the new ones."""
         doubt = self._doubt
         if doubt is not None and doubt.log_likelihood - self.gyro.log_likelihood > self._config.refuted:
-            self.gyro, self._doubt = doubt, None
+            self.gyro, self._doubt, self._kept = doubt, None, KnownImuConfig()
             accel, self.accel = self.accel, self._unknown_accel()
             self.accel.continue_map(accel)
             self._events.append("the IMU is not the one of the rig file: calibrated anew")

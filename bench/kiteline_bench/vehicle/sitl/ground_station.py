@@ -102,11 +102,11 @@ class GroundStation(Closing):
             self.flags = m.flags
 
     def command(self, command: int, *parameters: float) -> None:
-        """Send a command."""
+        """Send COMMAND_LONG; parameters that are not given are 0."""
         self._mav.command_long_send(1, 1, command, 0, *[*parameters, *[0.0] * 7][:7])
 
     def set_mode(self, mode: int) -> None:
-        """Choose a mode."""
+        """Ask for a mode of ArduCopter, by its number."""
         self._mav.set_mode_send(1, 1, mode)
 
     def arm(self) -> None:

@@ -80,6 +80,10 @@ class Loop(Closing):
         """Simulated time."""
         return self.copter.t_s
 
+    def simulated_s(self, clock_s: float) -> float:
+        """Simulated time at a time of the agent's clock."""
+        return clock_s - _START_NS * 1e-9
+
     def start_agent(self) -> Onboard:
         """Start an agent, another one each time."""
         self.onboard = self._files.enter_context(Onboard(self.setting, self.clock, self.boots))

@@ -90,6 +90,11 @@ class ControllerWatch:
         """True if the flight controller's attitude contradicts the axes in use, and fits others."""
         return isinstance(self._log.state(AXES), tuple)
 
+    @property
+    def axes_fit(self) -> bool:
+        """True if the axes in use fit the flight controller's attitude, but for a tilt."""
+        return self._log.state(AXES) in ("good", "tilt")
+
     def axes(self, *, held: bool) -> None:
         """Say that poses are held back because the axes are wrong, and that they no longer are."""
         if held:
