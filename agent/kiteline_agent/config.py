@@ -198,7 +198,7 @@ class DepthFromMotionConfig:
 class DisparityConfig:
     """Estimation of a worn stereo rig's disparity offset on board."""
 
-    on: bool = True
+    on: bool = True  # False: only the base estimates it
     every: int = 4  # frames between two pairs: each costs a quarter of a millisecond
     min_points: int = 30  # landmarks of a pair; eleven numbers are estimated from them
     points: int = 120  # most of them that are used

@@ -199,7 +199,7 @@ class InertialScaleConfig:
 
     least_s: float = 8.0  # time of all steps below which the agent's scale stands: it rests on as much
     iterations: int = 5  # of Gauss-Newton
-    gravity_m_s2: float = 9.81
+    gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     noise_inflation: float = 3.0  # of the accelerometer's noise: vibration
     floor_m_s: float = 2e-4  # m/s; of a step by the IMU: the code's quanta
     floor_m: float = 3e-5  # m; the same
@@ -230,7 +230,7 @@ class CullConfig:
 class PublishConfig:
     """Smallest corrections that are sent and kept, and how often the grid is built."""
 
-    pose_m: float = 0.0005  # m
+    pose_m: float = 0.0005  # m; a tenth of a pixel at 2.5 m and 500 px of focal length
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long

@@ -55,7 +55,7 @@ class ImuCalibration:
     gyro_walk: float = 1.9e-5  # rad/s^2/sqrt(Hz)
     accel_noise: float = 2.0e-3  # m/s^2/sqrt(Hz)
     accel_walk: float = 3.0e-3  # m/s^3/sqrt(Hz)
-    rate_hz: float = 200.0
+    rate_hz: float = 200.0  # samples a second that the IMU delivers
 
 
 UNMEASURED = 1e6  # variance, (m/s)^2 or (rad/s)^2, of a direction that an odometer does not measure

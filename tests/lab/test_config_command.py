@@ -29,14 +29,14 @@ def test_the_printed_configuration_is_the_default_and_complete() -> None:
     assert len({o.name for o in options}) == len(options) == count(AgentConfig()) + count(BaseConfig())
 
 
-def test_options_have_units_and_nearly_all_a_reason() -> None:
+def test_options_have_units_and_all_a_reason() -> None:
     by_name = {o.name: o for s in sections() for o in s.options}
     assert by_name["agent.smoothing.max_m_s"].unit == "m/s"
     assert by_name["agent.keyframe.max_gap_s"].unit == "s"
     assert by_name["base.grid.cell_m"].reason.startswith("finer cells")
     assert all(s.purpose for s in sections())
-    without = [o.name for o in by_name.values() if not o.reason]
-    assert len(without) < 0.05 * len(by_name), without
+    assert by_name["base.measurement.sigma_disparity_px"].reason.startswith("px at octave 0")  # in brackets
+    assert [o.name for o in by_name.values() if not o.reason] == []
 
 
 def test_the_reference_page_is_up_to_date() -> None:

@@ -26,7 +26,7 @@ _ROUNDS = 4  # of robust weighting
 class RowConfig:
     """Estimation of how far the right image lies off the rows of the left one, from the points of keyframes."""
 
-    on: bool = True
+    on: bool = True  # False: the right image is read where the calibration says
     min_points: int = 40  # points of a keyframe with a measured offset; five numbers are estimated from them
     sigma_px: float = 0.5  # px at octave 0; of a measured offset, with what points of a keyframe have in common
     prior_px: float = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's

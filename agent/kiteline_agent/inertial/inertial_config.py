@@ -13,10 +13,10 @@ class ScaleFilterConfig:
     """How the scale of a monocular map is watched after its start."""
 
     interval_s: float = 0.39  # between two poses that are compared: acceleration moves much more than images err
-    start_scale: float = 0.022  # relative deviations and deviations of the start: those of a first window
-    start_gravity_m_s2: float = 0.1
-    start_velocity_m_s: float = 0.1
-    start_bias_m_s2: float = 0.1
+    start_scale: float = 0.022  # relative deviation of the start's scale: that of a first window, as those below
+    start_gravity_m_s2: float = 0.1  # deviation of gravity at the start
+    start_velocity_m_s: float = 0.1  # deviation of the velocity at the start
+    start_bias_m_s2: float = 0.1  # deviation of the accelerometer's bias at the start
     accel_walk: float = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
     scale_walk: float = 0.006  # per sqrt(s): the map's own scale drifts while it grows
     image_rad: float = 7e-4  # error of a position by images, over the depth that they see

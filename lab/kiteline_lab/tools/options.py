@@ -95,7 +95,7 @@ def _comments(cls: type) -> dict[str, str]:
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             line = node.end_lineno or node.lineno
-            parts = []
+            parts = [at_line[n] for n in range(node.lineno, line) if n in at_line]  # a long one is in brackets
             while line in at_line:
                 parts.append(at_line[line])
                 line += 1
