@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import FusedLandmarks
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId
@@ -30,16 +32,11 @@ class FusedInMap:
 
     def _drop(self, record: FusedLandmarks) -> bool:
         m, slot = self._map, self._map.slot_of(record.keyframe)
-        if not self._is_placed(slot):
+        # where the base has set the pose, or that defines the submap
+        placed = (m.keyframe != NO_KEYFRAME) & (m.from_base | (m.parent == NO_KEYFRAME))
+        if slot < 0 or not placed[slot]:
             return False
-        fused = [
-            index
-            for index, point in zip(record.index.tolist(), record.point.tolist())
-            if index < m.shared[slot] and self._is_placed(m.slot_of(point >> KEYPOINT_BITS))
-        ]
+        has_root = np.isin(record.point >> KEYPOINT_BITS, m.keyframe[placed])
+        fused = record.index[(record.index < m.shared[slot]) & has_root]
         m.usable[slot, fused] = m.seed[slot, fused] = False
-        return bool(fused)
-
-    def _is_placed(self, slot: int) -> bool:
-        """True if the base has set the pose of the keyframe in a slot, or it is the first of its submap."""
-        return slot >= 0 and bool(self._map.from_base[slot] or self._map.parent[slot] == NO_KEYFRAME)
+        return bool(len(fused))
