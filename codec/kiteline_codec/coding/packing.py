@@ -161,10 +161,11 @@ class Reader:
 
     def raw(self, n: int) -> bytes:
         """The next n bytes."""
-        if n > self.left:
+        at, stop = self._at, self._at + n
+        if stop > len(self._data):
             raise WireError(f"the bytes end before the value does: {self.left} left, {n} expected")
-        self._at += n
-        return self._data[self._at - n : self._at]
+        self._at = stop
+        return self._data[at:stop]
 
     def columns(self, c: int, n: int) -> I64:
         """Columns (c, n) of integers."""

@@ -17,7 +17,8 @@ TILE_CELLS = 32  # along each side
 _BITS = 24  # of a column or row number
 _OFFSET = 1 << _BITS - 1
 _BYTES = np.arange(256, dtype=np.uint8)
-_PAIRS = quantise.occupancy(np.stack([_BYTES & 15, _BYTES >> 4], axis=1))  # (256,2): the two cells of a byte
+_CELLS = quantise.occupancy(np.stack([_BYTES & 15, _BYTES >> 4], axis=1))  # (256,2): the two cells of a byte
+_PAIRS = np.ascontiguousarray(_CELLS).view(np.int16)[:, 0]  # (256,): both in one number, which is faster to look up
 
 
 @register
@@ -66,6 +67,6 @@ class GridTile(Record):
             raise WireError(f"tile: {e}") from None
         if len(data) != expected or not inflate.eof or inflate.unused_data or inflate.unconsumed_tail:
             raise WireError(f"a tile holds {expected} bytes, found {len(data)}")
-        cells = _PAIRS[np.frombuffer(data, np.uint8)].reshape(TILE_CELLS, TILE_CELLS)
+        cells = _PAIRS.take(np.frombuffer(data, np.uint8)).view(np.int8).reshape(TILE_CELLS, TILE_CELLS)
         column, row = key.id >> _BITS, key.id & (1 << _BITS) - 1
         return cls(column - _OFFSET, row - _OFFSET, cell_m, cells)
