@@ -191,6 +191,40 @@ def test_an_undone_correction_is_the_same_as_none() -> None:
     assert np.allclose(local_map.rho[1, :LANDMARKS], 0.3)
 
 
+@given(st.integers(0, 1000))
+def test_a_trial_moves_what_is_in_view_as_taking_over_all_does(seed: int) -> None:
+    """Landmarks out of view wait meanwhile; those in view, and the verdict, are the same to the last bit."""
+    rng = np.random.default_rng(seed)
+    index = np.arange(LANDMARKS, dtype=np.uint16)
+    records = [
+        RefinedLandmarks(
+            KeyframeId(k), index, rng.uniform(0.1, 0.5, LANDMARKS).astype(np.float32),
+            rng.normal(0.0, 1.0, (LANDMARKS, 2)).astype(np.float32),
+        )
+        for k in range(3)
+    ]  # fmt: skip
+    maps = []
+    for trial in (True, False):
+        local_map, track = scene(seed)
+        anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
+        for k in range(3):
+            local_map.set_pose(pose_record(local_map, k, sideways(2.0)))
+            local_map.refine(records[k])
+        out_of_view = local_map.rho[2].copy()
+        if trial:
+            local_map.try_corrections(anchor.keyframes)
+            assert np.array_equal(local_map.rho[2], out_of_view) and local_map.due
+        else:
+            assert local_map.apply_corrections()
+            assert not np.array_equal(local_map.rho[2], out_of_view)
+        maps.append((local_map, anchor.T_new_old(), anchor.matters()))
+    (tried, moved, matters), (applied, T_new_old, all_matter) = maps
+    assert moved is not None and T_new_old is not None and np.array_equal(moved, T_new_old) and matters == all_matter
+    assert tried.apply_corrections()
+    for array, other in zip(tried.save().arrays, applied.save().arrays, strict=True):
+        assert np.array_equal(array, other)
+
+
 @pytest.mark.parametrize("inertial", [False, True])
 def test_an_agent_with_an_imu_moves_for_larger_corrections_only(inertial: bool) -> None:
     local_map, track = scene()

@@ -29,13 +29,14 @@ class CorrectionBatches:
             if isinstance(record, CorrectionBatch):
                 self._hear(record)
                 continue
-            number = getattr(record, "batch", 0)
-            key = messages.key(record)
-            self._held.pop(key, None)
-            if number <= self._applied:
-                ready.append(record)
-            else:
+            waits = getattr(record, "batch", 0) > self._applied
+            if waits or self._held:
+                key = messages.key(record)
+                self._held.pop(key, None)
+            if waits:
                 self._held[key] = record
+            else:
+                ready.append(record)
         for key in removed:
             self._held.pop(key, None)
         return ready + self._complete()

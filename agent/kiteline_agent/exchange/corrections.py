@@ -105,12 +105,15 @@ class Corrections:
         """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
         if not self._map.due:
             return False
-        before = self._map.save()
+        if anchor is not None and self._map.camera.stereo:
+            before = self._map.save()
+            self._map.try_corrections(anchor.keyframes)
+            self._map.compose_unplaced()
+            if not anchor.matters():
+                self._map.restore(before)
+                return False
         self._map.apply_corrections()
         self._map.compose_unplaced()
-        if anchor is not None and self._map.camera.stereo and not anchor.matters():
-            self._map.restore(before)
-            return False
         self._fused.corrected()
         return True
 

@@ -7,6 +7,7 @@ landmarks. Keyframes of several submaps are stored; only those of the active one
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -277,19 +278,26 @@ class LocalMap:
         """
         if not self.due:
             return False
-        for keyframe, T_m_k in self._new_poses.items():
-            slot = self.slot_of(keyframe)
-            if slot >= 0:
-                self.T_m_k[slot] = T_m_k
-                self.from_base[slot] = True
-        for keyframe, (index, rho, bearing) in self._new_landmarks.items():
-            slot = self.slot_of(keyframe)
-            if slot >= 0:
-                self._set_landmarks(slot, index, rho, bearing)
+        self.try_corrections(self._new_landmarks.keys())
         self._new_poses.clear()
         self._new_landmarks.clear()
         self.due = False
         return True
+
+    def try_corrections(self, keyframes: Collection[KeyframeId]) -> None:
+        """Take over the poses that the base sent, and landmarks of some keyframes alone; all of them still wait."""
+        slots = self._slots()
+        for keyframe, T_m_k in self._new_poses.items():
+            if keyframe in slots:
+                self.T_m_k[slots[keyframe]] = T_m_k
+                self.from_base[slots[keyframe]] = True
+        for keyframe, landmarks in self._new_landmarks.items():
+            if keyframe in keyframes and keyframe in slots:
+                self._set_landmarks(slots[keyframe], *landmarks)
+
+    def _slots(self) -> dict[int, int]:
+        """Slots by keyframe."""
+        return {keyframe: slot for slot, keyframe in enumerate(self.keyframe.tolist())}
 
     def _corrected(self) -> tuple[NDArray[Any], ...]:
         """What `apply_corrections` changes."""
@@ -377,9 +385,10 @@ class LocalMap:
 
     def compose_unplaced(self) -> None:
         """Compose the poses of keyframes that the base has not set from those of their parents, oldest first."""
-        for slot in np.argsort(self.keyframe, kind="stable"):
-            if self.keyframe[slot] == NO_KEYFRAME or self.from_base[slot] or self.parent[slot] == NO_KEYFRAME:
-                continue
-            parent = self.slot_of(int(self.parent[slot]))
-            if parent >= 0:
+        slots = self._slots()
+        slots.pop(NO_KEYFRAME, None)
+        parents, from_base = self.parent.tolist(), self.from_base.tolist()
+        for _, slot in sorted(slots.items()):
+            parent = None if from_base[slot] else slots.get(parents[slot])
+            if parent is not None:
                 self.T_m_k[slot] = self.T_m_k[parent] @ self.T_p_k[slot]

@@ -13,6 +13,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
+from kiteline_core.ids import KeyframeId
 from kiteline_core.pose import pose_kernels
 
 F64 = NDArray[np.float64]
@@ -31,6 +32,11 @@ class MapAnchor:
         self._keyframes = local_map.keyframe[self._rows // local_map.slot_size]
         self._xyz, self._ray = local_map.positions(self._rows)
         self.posed_points = 0  # landmarks that were compared, for the cost model
+
+    @property
+    def keyframes(self) -> set[KeyframeId]:
+        """The keyframes of the landmarks."""
+        return set(self._keyframes.tolist())
 
     def matters(self) -> bool:
         """True if the map moved the camera by enough pixels, or if too few landmarks tell."""
