@@ -57,7 +57,8 @@ class Smoothing:
             return T_w_o
         held = self._T_w_o
         left = _shift(held, T_w_o, here_o)
-        rotation = se3.so3_log(sim3.rigid(T_w_o)[:3, :3] @ sim3.rigid(held)[:3, :3].T)
+        R_held = sim3.rigid(held)[:3, :3]
+        rotation = se3.so3_log(sim3.rigid(T_w_o)[:3, :3] @ R_held.T)
         distance, angle = float(np.linalg.norm(left)), float(np.linalg.norm(rotation))
         shift_share = turn_share = 1.0  # of what is left of the correction, applied in this time
         if limits.max_m_s > 0.0 and distance > 0.0:
@@ -67,7 +68,7 @@ class Smoothing:
         if shift_share >= 1.0 and turn_share >= 1.0:
             self._T_w_o = T_w_o
             return T_w_o
-        R = se3.so3_exp(turn_share * rotation) @ sim3.rigid(held)[:3, :3]
+        R = se3.so3_exp(turn_share * rotation) @ R_held
         at = se3.transform(held, here_o[None])[0] + shift_share * left
         scale = sim3.scale_of(T_w_o)
         self._T_w_o = sim3.normalise(sim3.of(scale, se3.from_rt(R, at - scale * R @ here_o)))

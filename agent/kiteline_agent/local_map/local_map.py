@@ -207,10 +207,9 @@ class LocalMap:
 
     def positions(self, rows: I64) -> tuple[F64, F64]:
         """Positions (n,3) m in the submap of landmarks in rows (n,), and one deviation of depth as a vector (n,3) m."""
-        slots, index = np.divmod(rows, self.slot_size)
-        T, rho = self.T_m_k[slots], self.rho[slots, index]
-        ray = np.einsum("nij,nj->ni", T[:, :3, :2], self.bearing[slots, index]) + T[:, :3, 2]
-        far = self.sigma_rho[slots, index] / rho**2  # d(1/rho) = d(rho) / rho^2
+        T, rho = self.T_m_k.take(rows // self.slot_size, 0), self.rho.take(rows)
+        ray = np.einsum("nij,nj->ni", T[:, :3, :2], self.bearing.reshape(-1, 2).take(rows, 0)) + T[:, :3, 2]
+        far = self.sigma_rho.take(rows) / rho**2  # d(1/rho) = d(rho) / rho^2
         return T[:, :3, 3] + ray / rho[:, None], ray * far[:, None]
 
     def update_depths(
@@ -349,15 +348,17 @@ class LocalMap:
             self._bearings(self.uv[slot, index] + record.offset[keep]),
         )
         at_once = fresh | (not self.camera.stereo)
-        self._set_landmarks(slot, index[at_once], rho[at_once], bearing[at_once])
-        self.promote(slot * self.slot_size + index[fresh])
-        known = ~at_once
-        if known.any():
-            self._new_landmarks[record.keyframe] = index[known], rho[known], bearing[known]
-            turned = np.linalg.norm(bearing[known] - self.bearing[slot, index[known]], axis=1) * self.camera.fx
-            nearer = np.abs(rho[known] - self.rho[slot, index[known]]) * self.camera.bf
+        any_at_once = bool(at_once.any())
+        if any_at_once:
+            self._set_landmarks(slot, index[at_once], rho[at_once], bearing[at_once])
+            self.promote(slot * self.slot_size + index[fresh])
+            index, rho, bearing = index[~at_once], rho[~at_once], bearing[~at_once]
+        if len(index):
+            self._new_landmarks[record.keyframe] = index, rho, bearing
+            turned = np.linalg.norm(bearing - self.bearing[slot, index], axis=1) * self.camera.fx
+            nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
             self.due |= median(np.maximum(turned, nearer)) >= self._config.moved_px
-        return bool(at_once.any())
+        return any_at_once
 
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
         self.rho[slot, index], self.bearing[slot, index] = rho, bearing
