@@ -8,7 +8,7 @@ from typing import Protocol
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, PROFILES, Profile
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Record, WireError, messages
+from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Observations, Record, WireError, messages
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import SyncConfig, SyncStats
 from kiteline_codec.sync.endpoint import Endpoint
@@ -38,7 +38,7 @@ class RecordChannel(Protocol):
     def put(self, record: Record) -> Record:
         """Share a record. Returns it as the other side will hold it: compute on with that.
 
-        A live pose, with which nobody computes, is returned as it is.
+        A live pose and observations, with which nobody computes, are returned as they are.
         """
         ...
 
@@ -183,7 +183,7 @@ class CodedChannel:
             return record
         if self.noting:
             self._noted[key] = code
-        return messages.decode(key, code)
+        return record if isinstance(record, Observations) else messages.decode(key, code)
 
     def take_noted(self) -> dict[Key, bytes]:
         """The codes that were put since the last call, without live poses: for a log, while `noting`."""

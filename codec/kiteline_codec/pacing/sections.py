@@ -29,7 +29,7 @@ def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> l
     may_grow = True
     while start < len(best):
         chosen = best[start : start + rows]
-        part = replace(take(record, chosen[np.argsort(record.index[chosen], kind="stable")]), part=len(parts))
+        part = take(record, chosen[np.argsort(record.index[chosen], kind="stable")], len(parts))
         size = messages.length(part)
         if size > section_bytes:
             if len(chosen) == 1:
@@ -47,7 +47,8 @@ def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> l
     return parts
 
 
-def take(record: _Section, rows: NDArray[np.int64]) -> _Section:
-    """Some rows of a record."""
-    arrays = {f.name: getattr(record, f.name)[rows] for f in fields(record) if f.name not in ("keyframe", "part")}
-    return replace(record, **arrays)
+def take(record: _Section, rows: NDArray[np.int64], part: int | None = None) -> _Section:
+    """Some rows of a record, as this part; None for its own."""
+    names = (f.name for f in fields(record) if f.name not in ("keyframe", "part"))
+    arrays = {name: getattr(record, name).take(rows, 0) for name in names}
+    return replace(record, **arrays, part=record.part if part is None else part)
