@@ -71,7 +71,7 @@ class DepthFromMotion:
         scale = (1 << self._map.octave[rows]).astype(np.float64)
         hit = (found == 1) & agree & (off_line < config.off_line_px * scale) & np.isfinite(variance)
         self._count(rows, hit, failed=(found == 0) | ((found == 1) & ~hit))
-        return self._fuse(rows[hit], measured[hit], variance[hit], typical)
+        return self._fuse(rows[hit], measured[hit], variance[hit], typical) if hit.any() else 0
 
     def _choose(self, seeds: Candidates, first: int) -> I64:
         """The seeds to search in this frame: most hits first, then the newest. first: finest pyramid level."""
@@ -80,17 +80,20 @@ class DepthFromMotion:
             if self._map.camera.stereo
             else self._config.depth_from_motion.per_frame
         )
-        order = np.lexsort((-seeds.rows, self._map.tried[seeds.rows], -self._map.hits[seeds.rows]))
-        order = order[self._map.octave[seeds.rows[order]] >= first]
-        return np.sort(order[:limit])
+        fine = (self._map.octave.take(seeds.rows) >= first).nonzero()[0]
+        if len(fine) <= limit:
+            return fine
+        rows = seeds.rows.take(fine)
+        order = np.lexsort((-rows, self._map.tried.take(rows), -self._map.hits.take(rows)))
+        return np.sort(fine[order[:limit]])
 
     def _state(self, rows: I64) -> tuple[F64, F64, F64]:
-        flat = self._map.bearing.reshape(-1, 2), self._map.rho.reshape(-1), self._map.sigma_rho.reshape(-1)
-        return flat[0][rows], flat[1][rows], flat[2][rows]
+        m = self._map
+        return m.bearing.reshape(-1, 2).take(rows, 0), m.rho.take(rows), m.sigma_rho.take(rows)
 
     def _rays(self, T_c_m: F64, rows: I64, bearing: F64) -> tuple[F64, F64]:
         """Directions (n,3) of the seeds, and centres (n,3) of their keyframes, in the camera."""
-        T_c_k = T_c_m @ self._map.T_m_k[rows // self._map.slot_size]
+        T_c_k = T_c_m @ self._map.T_m_k.take(rows // self._map.slot_size, 0)
         ray = np.empty((len(rows), 3))
         ray[:, :2], ray[:, 2] = bearing, 1.0
         return np.einsum("nij,nj->ni", T_c_k[:, :3, :3], ray), T_c_k[:, :3, 3]
