@@ -11,6 +11,7 @@ from kiteline_codec.schema import (
     GridTile,
     Key,
     KeyframePose,
+    Observations,
     Record,
     RemovedObservations,
     SubmapPlacement,
@@ -31,6 +32,19 @@ def cross(a: RecordChannel, b: RecordChannel, ticks: int = 10) -> tuple[list[Rec
         records += b.receive(a.poll(now_ns), now_ns)
         a.receive(b.poll(now_ns), now_ns)
     return records, b.take_removed()
+
+
+def test_observations_are_not_decoded_for_their_writer_but_shared_and_noted() -> None:
+    a, b = CodedChannel(SyncConfig(), 1), CodedChannel(SyncConfig(), 1)
+    a.noting = True
+    index, uv = np.arange(2, dtype=np.uint16), np.array([[10.01, 20.0], [30.0, 40.0]], np.float32)
+    seen = Observations(KeyframeId(9), 0, index, uv, np.zeros(2, np.float32), np.zeros(2, np.uint8), np.array([5, 6]))
+    assert a.put(seen) is seen
+    assert a.take_noted() == {messages.key(seen): messages.encode(seen)}
+    (got,), _ = cross(a, b)
+    assert isinstance(got, Observations)
+    assert 0 < np.abs(got.uv - uv).max() <= 1 / 32  # quantised
+    assert np.array_equal(got.point, seen.point)
 
 
 def test_coded_records_arrive_as_the_writer_was_told() -> None:
