@@ -22,9 +22,8 @@ class CornerTracksConfig:
 class InertialBundleConfig:
     """Error models of the window, and effort of the solver."""
 
-    sigma_px: float = 1.0  # px of a corner that was followed: its drift is alike in all keyframes
-    aligned_px: float = 0.5  # px of a corner that was aligned with its first image again
-    huber_px: float = 0.5  # px beyond which an observation counts linearly: many corners drift
+    sigma_px: float = 1.0  # px of an observation; the drift of a corner is alike in all keyframes
+    huber: float = 0.5  # deviations beyond which an observation counts linearly: many corners drift
     imu_inflation: float = 3.0  # of the calibration's noise densities: vibration
     accel_walk: float = 0.015  # m/s^2 per sqrt(s), beside the calibration's: errors of scale and axes, vibration
     gyro_bias_rad_s: float = 0.1  # deviation of an unknown gyro bias
@@ -48,7 +47,6 @@ class InertialStartConfig:
     landmarks_each: int = 70  # in each keyframe: in fast turns no track is long
     min_flow: float = 0.02  # of the focal length, median: with less the camera has not moved
     scale_sigma: float = 0.02  # relative deviation of the scale below which it is metric
-    align_from: float = 2.0  # times that deviation: below it landmarks are aligned with their first image again
     sigma_inflation: float = 1.0  # of that deviation: errors of corners are correlated over keyframes
     agreement: float = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
     max_reprojection_px: float = 0.9  # rms of a solution's inliers

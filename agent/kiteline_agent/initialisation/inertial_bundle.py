@@ -27,7 +27,6 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _MAX_DAMPING = 1e4
-_INLIER_PX = 3.0
 _PLACE_ITERATIONS = 4  # of landmarks alone
 
 
@@ -57,18 +56,12 @@ class InertialBundle:
         prior: BiasPrior,
         config: InertialBundleConfig,
         noise: WindowNoise | None = None,
-        *,
-        sigma_px: float | None = None,
     ) -> None:
-        """intervals: K - 1, between the keyframes. noise: factors on the inertial error model.
-
-        sigma_px: deviation of an observation; None for that of corners that were followed.
-        """
+        """intervals: K - 1, between the keyframes. noise: factors on the inertial error model."""
         self._obs = observations
         self._terms = InertialTerms(intervals, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
         self._r_bc, self._t_bc = T_b_c[:3, :3], T_b_c[:3, 3]
-        self._sigma_px = config.sigma_px if sigma_px is None else sigma_px
-        self._sigma, self._knee = self._sigma_px / focal_px, config.huber_px / self._sigma_px
+        self._sigma = config.sigma_px / focal_px
         self._length = gravity_m_s2
         self._prior = prior
         self._config = config
@@ -219,9 +212,8 @@ class InertialBundle:
         camera = state.p[-1] + state.R[-1] @ self._t_bc
         scaled = (self._rays(state) + state.rho[:, None] * (self._origin - camera)) @ (state.R[-1] @ self._r_bc)
         fits = self._error[self._obs.seen]
-        fits = self._sigma_px * fits
-        fits = fits[fits < _INLIER_PX]
-        reprojection_px = float(np.sqrt(np.mean(fits**2))) if len(fits) else np.inf
+        fits = fits[fits < 3.0]
+        reprojection_px = float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf
         return WindowSolution(
             state, se3.from_rt(state.R[-1], state.p[-1]), state.v[-1],
             np.concatenate([state.gyro_bias, state.accel_bias[-1]]), state.gravity, cov[np.ix_(order, order)],
@@ -244,7 +236,7 @@ class InertialBundle:
 
     def _visual_cost(self, error: F64) -> tuple[float, F64]:
         """Robust cost, and weights (K,P) of the observations."""
-        k = self._knee
+        k = self._config.huber
         norm = np.where(self._obs.seen, np.linalg.norm(error, axis=2), 0.0)
         self._error = norm
         weight = np.where(norm < k, 1.0, k / np.maximum(norm, 1e-9)) * self._obs.seen

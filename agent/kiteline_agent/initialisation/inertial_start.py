@@ -135,17 +135,15 @@ class InertialStart:
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
-        if sigma < config.align_from * config.scale_sigma:
+        if sigma < 1.3 * config.scale_sigma:
             self._noise = noise
             aligned = realigned(
                 keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
             )
             keep = aligned.seen.sum(axis=0) >= 3
-            again = self._bundle(aligned.part(keep), intervals, prior, config.bundle.aligned_px)
-            aligned_solution = again.solve(WarmStart(solution.state, found.xyz[keep]))
-            if aligned_solution is not None:
-                # Errors that all corners of a keyframe share would be taken for noise of the IMU here.
-                solution, sigma = aligned_solution, self._sigma(aligned_solution)
+            again = self._bundle(aligned.part(keep), intervals, prior)
+            solution = again.solve(WarmStart(solution.state, found.xyz[keep])) or solution
+            noise, sigma = self._seen_noise(solution)
         self._before = _Window(stamps, observations.ids, found.xyz, solution)
         known = solution.converged and self._fits(solution) and sigma < config.scale_sigma
         agrees = before is not None and self._agrees(before, self._before)
@@ -196,8 +194,7 @@ class InertialStart:
     def _measured_noise(self) -> WindowNoise:
         """The noise of single samples: more than that of intervals, since much of it is vibration and motion.
 
-        From too much noise its true size is found, which from too little is taken for motion. Even so a few seconds
-        may show much too little; hence the least share of it that is believed.
+        From too much noise its true size is found, which from too little is taken for motion.
         """
         bundle, calibration = self._config.inertial_start.bundle, self._calibration
         gyro, accel = self._buffer.density / bundle.imu_inflation
@@ -236,14 +233,12 @@ class InertialStart:
         octave = np.zeros(len(uv), np.uint8)
         return metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
 
-    def _bundle(
-        self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, sigma_px: float | None = None
-    ) -> InertialBundle:
+    def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
         self._work.window_keyframes += len(intervals) + 1
         return InertialBundle(
             corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
-            self._noise, sigma_px=sigma_px,
+            self._noise,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:
