@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.fused_landmarks import FusedInMap
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import FusedLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
@@ -191,3 +192,23 @@ def test_what_is_told_of_keyframes_that_are_gone_is_forgotten() -> None:
         fused.take(FusedLandmarks(KeyframeId(k), np.array([4], np.uint16), roots))
         fused.take(FusedLandmarks(KeyframeId(1000 + k), np.array([4], np.uint16), roots))  # never stored
     assert 0 < len(fused._told) <= 4
+
+
+def test_rotations_stay_orthonormal_along_a_long_chain_of_keyframes() -> None:
+    """Each keyframe's pose follows from its parent's, and its children's poses relative to it follow from that."""
+    held = local_map(0, slots=6)
+    reference = ReferenceKeyframe(held)
+    step = se3.exp(np.array([0.1, 0.02, 0.05, 0.1, 0.2, -0.05]))
+    add(held, 0)
+    reference.set_new(KeyframeId(0), SubmapId(0), np.eye(4), 0, 0)
+    for k in range(1, 80):
+        newest = held.T_m_k[held.slot_of(k - 1)]
+        reference.T_k_c = se3.inverse(newest) @ se3.orthonormalise(newest @ step)
+        keyframe, parent, T_p_k = reference.next_keyframe(SubmapId(0), np.eye(4))
+        add(held, k, parent)
+        slot = held.slot_of(k)
+        held.T_p_k[slot], held.T_m_k[slot] = T_p_k, newest @ T_p_k
+        held.compose_unplaced()
+        reference.set_new(keyframe, SubmapId(0), np.eye(4), k, k)
+    R = held.T_m_k[held.slot_of(79)][:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)

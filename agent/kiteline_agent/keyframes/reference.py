@@ -90,10 +90,13 @@ class ReferenceKeyframe:
         return t_ns - self._shared.t_ns
 
     def next_keyframe(self, submap: SubmapId, T_m_c: F64) -> tuple[KeyframeId, KeyframeId, F64]:
-        """Id, parent and T_p_k (4,4) of the next keyframe; a submap's first one has no parent, its pose is T_m_c."""
+        """Id, parent and T_p_k (4,4) of the next keyframe; a submap's first one has no parent, its pose is T_m_c.
+
+        T_p_k is made orthonormal: poses composed along the parents would double what it is off with each keyframe.
+        """
         if submap not in self._last_sequence:
             return keyframe_id(submap, 0), NO_KEYFRAME, T_m_c
-        return keyframe_id(submap, self._last_sequence[submap] + 1), self.keyframe, self.T_k_c
+        return keyframe_id(submap, self._last_sequence[submap] + 1), self.keyframe, se3.orthonormalise(self.T_k_c)
 
     def next_unshared(self, submap: SubmapId) -> KeyframeId:
         """Id of the next keyframe that is not shared: from the end of the sequence numbers, where no other ones are."""

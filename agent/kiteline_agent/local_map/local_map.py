@@ -382,7 +382,7 @@ class LocalMap:
         for slot in np.flatnonzero((self.keyframe != NO_KEYFRAME) & (self.parent != NO_KEYFRAME)):
             parent = self.slot_of(int(self.parent[slot]))
             if parent >= 0:
-                self.T_p_k[slot] = se3.inverse(self.T_m_k[parent]) @ self.T_m_k[slot]
+                self.T_p_k[slot] = se3.orthonormalise(se3.inverse(self.T_m_k[parent]) @ self.T_m_k[slot])
 
     def compose_unplaced(self) -> None:
         """Compose the poses of keyframes that the base has not set from those of their parents, oldest first."""
