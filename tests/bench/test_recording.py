@@ -128,6 +128,13 @@ def test_errors_of_a_flight_are_small_and_counted_from_its_start(flight: Recordi
     assert run.drift_m(1, n) == pytest.approx(float(np.linalg.norm(errors[-1].odometry[:3])), abs=1e-6)
 
 
+def test_errors_are_counted_from_the_first_pose(flight: Recording) -> None:
+    errors = fly_alone(changed(flight, 0, 3, black), vocabulary=False).errors()
+    assert len(errors) == len(flight.items) - 3 and not errors[0].odometry.any()
+    assert errors[0].estimate.t_ns == flight.items[3].frame.t_ns
+    assert max(error.position_m for error in errors) < 0.05
+
+
 def test_table_and_figure_of_flights(flight: Recording, tmp_path: Path) -> None:
     free = fly_limited(flight, 0.0, governor=False, real=False)
     rows: list[tuple[float, LimitedFlight]] = [(1.0, free)]

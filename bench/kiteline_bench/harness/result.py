@@ -144,11 +144,13 @@ class AgentRun:
         )
 
     def errors(self) -> list[PoseError]:
-        """Errors of all frames against the truth, relative to the first frame."""
+        """Errors of all frames from the first one with a pose on against the truth, relative to that frame."""
         out: list[PoseError] = []
         start: tuple[F64, F64] | None = None
         for e, true in zip(self.estimates, self.truth, strict=True):
             assert e is not None and true is not None
+            if e.initialising:
+                continue
             start = start or (e.T_o_b, true)
             odometry = pose_error(start, e.T_o_b, true)
             claimed = odometry if e.T_m_b is None else pose_error(start, e.T_m_b, true)
