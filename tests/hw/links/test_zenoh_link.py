@@ -87,10 +87,10 @@ def test_packets_stay_in_order_and_whole() -> None:
             received.extend(hub.links()[3].receive())
             return len(received) >= count
 
-        for begin in range(0, len(packets), 20):  # more at once, and a busy machine may drop some: so it is meant
-            for packet in packets[begin : begin + 20]:
+        for begin in range(0, len(packets), 5):  # more at once, and a busy machine may drop some: so it is meant
+            for packet in packets[begin : begin + 5]:
                 assert link.send(packet)
-            wait_for(lambda: collect(begin + 20))  # noqa: B023
+            wait_for(lambda: collect(begin + 5))  # noqa: B023
         assert received == packets
 
 
