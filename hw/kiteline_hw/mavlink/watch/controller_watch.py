@@ -21,6 +21,7 @@ from kiteline_hw.mavlink.watch.messages import (
     CommandAck,
     EkfStatusReport,
     EstimatorStatus,
+    FilterStatus,
     StatusText,
 )
 from kiteline_hw.mavlink.watch.presence import LinkState, PresenceWatch
@@ -165,7 +166,7 @@ class ControllerWatch:
             self._log.forget(AXES)
         self.attitude.receive(m, now_ns)
 
-    def _on_report(self, m: EkfStatusReport | EstimatorStatus, now_ns: int) -> None:
+    def _on_report(self, m: FilterStatus, now_ns: int) -> None:
         message = wire.EKF_STATUS_REPORT if isinstance(m, EkfStatusReport) else wire.ESTIMATOR_STATUS
         self._seen_ns[message] = now_ns
         self.estimator.report(m, now_ns)

@@ -10,7 +10,7 @@ from kiteline_hw.mavlink.watch.messages import (
     NO_AIDING_FLAG,
     POSITION_FLAGS,
     EkfStatusReport,
-    EstimatorStatus,
+    FilterStatus,
     StatusText,
 )
 
@@ -71,7 +71,7 @@ class EstimatorWatch:
                 "kiteline: EKF stopped using poses",
             )  # fmt: skip
 
-    def report(self, m: EkfStatusReport | EstimatorStatus, now_ns: int) -> None:
+    def report(self, m: FilterStatus, now_ns: int) -> None:
         """A report of the estimator."""
         self._report_ns = now_ns
         has_position = bool(m.flags & POSITION_FLAGS) and not m.flags & NO_AIDING_FLAG
@@ -92,7 +92,7 @@ class EstimatorWatch:
             self._since.pop("ignored", None)
         self._judge(m, now_ns)
 
-    def _judge(self, m: EkfStatusReport | EstimatorStatus, now_ns: int) -> None:
+    def _judge(self, m: FilterStatus, now_ns: int) -> None:
         c = self.config
         ardupilot = isinstance(m, EkfStatusReport)
 

@@ -59,15 +59,21 @@ if not hasattr(common, "MAVLink_ekf_status_report_message"):
 
 
 @dataclass(frozen=True, slots=True)
-class EstimatorStatus(MavlinkMessage):
-    """State of PX4's filter (ESTIMATOR_STATUS). Ratios of innovation to limit: above 1 measurements are rejected."""
+class FilterStatus(MavlinkMessage):
+    """State of an autopilot's filter. Ratios of innovation to limit: above 1 measurements are rejected."""
 
-    NAMES = ("ESTIMATOR_STATUS",)
     flags: int
     velocity_ratio: float = 0.0
     position_ratio: float = 0.0
     height_ratio: float = 0.0
     system: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorStatus(FilterStatus):
+    """State of PX4's filter (ESTIMATOR_STATUS)."""
+
+    NAMES = ("ESTIMATOR_STATUS",)
 
     @classmethod
     def parse(cls, m: Any) -> Self:
@@ -78,15 +84,10 @@ class EstimatorStatus(MavlinkMessage):
 
 
 @dataclass(frozen=True, slots=True)
-class EkfStatusReport(MavlinkMessage):
-    """State of ArduPilot's filter, with the meaning of EstimatorStatus: what it calls variances are test ratios."""
+class EkfStatusReport(FilterStatus):
+    """State of ArduPilot's filter: what it calls variances are test ratios."""
 
     NAMES = ("EKF_STATUS_REPORT",)
-    flags: int
-    velocity_ratio: float = 0.0
-    position_ratio: float = 0.0
-    height_ratio: float = 0.0
-    system: int = 0
 
     @classmethod
     def parse(cls, m: Any) -> Self:

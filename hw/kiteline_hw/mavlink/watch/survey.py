@@ -28,6 +28,7 @@ from kiteline_hw.mavlink.watch.messages import (
     CommandAck,
     EkfStatusReport,
     EstimatorStatus,
+    FilterStatus,
     ParamRequest,
     ParamValue,
     StatusText,
@@ -83,7 +84,7 @@ class ControllerSurvey:
         self._sync_requests = 0  # of the controller
         self._radio: RadioStatus | None = None
         self._texts: dict[str, int] = {}  # texts of the controller: severity
-        self._report: EkfStatusReport | EstimatorStatus | None = None
+        self._report: FilterStatus | None = None
         self._handlers: dict[type[MavlinkMessage], Callable[[Any], None]] = {
             AutopilotVersion: self.presence.receive_version,
             CommandAck: self._on_ack,
@@ -217,7 +218,7 @@ class ControllerSurvey:
     def _on_radio(self, m: RadioStatus) -> None:
         self._radio = m
 
-    def _on_report(self, m: EkfStatusReport | EstimatorStatus) -> None:
+    def _on_report(self, m: FilterStatus) -> None:
         self._report = m
         self._count(m.NAMES[0])
 
