@@ -83,6 +83,75 @@ class Source:
         return [[float(v) for v in row] for row in se3.from_quaternion(np.array([w, x, y, z]), np.array(t))]
 
 
+def residual_columns(s: Source, c: int, n: int) -> list[list[int]]:
+    if not n:
+        return [[] for _ in range(c)]
+    heads = []
+    for _ in range(c):
+        first, start = s.u8(), s.u8()
+        heads.append((first >> 3, first & 7, start, 0 if first >> 3 == 3 else s.signed()))
+    bits = 8 * s.at
+
+    def bit() -> int:
+        nonlocal bits
+        bits += 1
+        return s.data[(bits - 1) >> 3] >> ((bits - 1) & 7) & 1
+
+    def number(width: int) -> int:
+        return sum(bit() << i for i in range(width))
+
+    out = []
+    for mode, shift, start, first in heads:
+        total, count, column = 1 << start, 1, []
+        for j in range(n):
+            if mode == 2 and j == 0:
+                column.append(first)
+                continue
+            if mode == 0:
+                column.append(first + number(start))
+                continue
+            k = next((k for k in range(15) if count << k >= total), 15)
+            q = 0
+            while q < 20 and bit():
+                q += 1
+            v = (q << k) + number(k) if q < 20 else number(32)
+            total, count = total + v, count + 1
+            if count == 16:
+                total, count = total // 2, 8
+            z = -(v + 1) // 2 if v % 2 else v // 2
+            column.append({1: first + v, 2: column[-1] + z if column else 0, 3: z}[mode])
+        out.append([v << shift for v in column])
+    s.at = (bits + 7) // 8
+    return out
+
+
+def ranges(codes: list[int]) -> list[float]:
+    return [2 * ((1 + code % 128 / 128) * 2 ** (code // 128) - 1) for code in codes]
+
+
+def direction(half: int, p: float, q: float) -> list[float]:
+    ss = p * p + q * q
+    return [2 * p / (1 + ss), (1 if half else -1) * (1 - ss) / (1 + ss), 2 * q / (1 + ss)]
+
+
+def scan(s: Source, n: int) -> list[list[int]]:
+    """Codes of obstacle, free, from, clear, and bands."""
+    codes = residual_columns(s, 5, n)
+    out: list[list[int]] = [[], [], [], []]
+    last = [0] * 4
+    for i in range(n):
+        for j in range(4):
+            z, here = codes[j][i] - 1, [column[i] for column in out if len(column) > i]
+            guess = last[j]
+            if j == 1:
+                guess = here[0] or last[1]
+            if j == 3:
+                guess = here[0] or here[1] or last[3]
+            out[j].append(0 if z < 0 else guess + (-(z + 1) // 2 if z % 2 else z // 2))
+            last[j] = out[j][i] or last[j]
+    return [*out, codes[4]]
+
+
 def inverse_depth(code: int) -> float:
     e, m = divmod(code, 1024)
     return float(((1 + m / 1024) * 2**e - 1) / 128)
@@ -118,9 +187,7 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["T_p_k"], out["keypoints"] = s.pose(), s.varint()
         if s.at < len(data):
             half, sigma = divmod(s.u8(), 128)
-            p, q = s.signed() / 8191, s.signed() / 8191
-            ss = p * p + q * q
-            out["up"] = [2 * p / (1 + ss), (1 if half else -1) * (1 - ss) / (1 + ss), 2 * q / (1 + ss)]
+            out["up"] = direction(half, s.signed() / 8191, s.signed() / 8191)
             out["up_rad"] = deviation(sigma)
     elif kind in (6, 16):
         out[{6: "T_l_m", 16: "T_m_k"}[kind]] = s.pose()
@@ -141,6 +208,16 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
     elif kind == 10:
         out["since"], out["T_k_f"] = s.varint(), s.pose()
         out["sigma_m"], out["sigma_rad"] = deviation(s.u8()), deviation(s.u8())
+    elif kind == 11:
+        out["up_c"] = direction(s.u8(), s.signed() / 8191, s.signed() / 8191)
+        out["azimuth0_rad"], out["azimuth_step_rad"], z = s.signed() / 2**16, s.varint() / 2**20, s.varint() - 1
+        out["camera_height_m"] = float("nan") if z < 0 else (-(z + 1) // 2 if z % 2 else z // 2) / 256
+        obstacle, free, free_from, clear, out["bands"] = scan(s, s.varint())
+        out["obstacle_m"] = [r or float("inf") for r in ranges(obstacle)]
+        out["free_m"], out["free_from_m"], out["clear_m"] = ranges(free), ranges(free_from), ranges(clear)
+        m = s.varint()
+        packed = s.raw((m + 4) // 5)
+        out["labels"] = [packed[i // 5] // 3 ** (i % 5) % 3 for i in range(m)]
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())
@@ -204,9 +281,9 @@ def assert_agree(read: dict[str, Any], record: Record) -> None:
             floats = (c.fx, c.fy, c.cx, c.cy, c.baseline_m)
             ours: Any = {"size": (c.width, c.height), "floats": floats, "stereo": c.stereo, "T_b_c": c.T_b_c[:3]}[name]
         else:
-            ours = getattr(record, name)
+            ours = getattr(record.scan if hasattr(record, "scan") and hasattr(record.scan, name) else record, name)
             ours = ours.reshape(-1) if name == "cells" else ours
-        assert ours is value is None or np.allclose(ours, value, rtol=1e-7, atol=1e-12), name
+        assert ours is value is None or np.allclose(ours, value, rtol=1e-7, atol=1e-12, equal_nan=True), name
 
 
 def test_records() -> None:

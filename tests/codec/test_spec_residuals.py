@@ -30,48 +30,7 @@ def load(name: str) -> ModuleType:
 
 SPEC, RESIDUALS = load("test_spec"), load("residuals/test_residual_coding")
 Rows = list[list[int]]
-
-
-def residual_columns(s: Any, c: int, n: int) -> Rows:
-    if not n:
-        return [[] for _ in range(c)]
-    heads = []
-    for _ in range(c):
-        first, start = s.u8(), s.u8()
-        heads.append((first >> 3, first & 7, start, 0 if first >> 3 == 3 else s.signed()))
-    bits = 8 * s.at
-
-    def bit() -> int:
-        nonlocal bits
-        bits += 1
-        return s.data[(bits - 1) >> 3] >> ((bits - 1) & 7) & 1
-
-    def number(width: int) -> int:
-        return sum(bit() << i for i in range(width))
-
-    out = []
-    for mode, shift, start, first in heads:
-        total, count, column = 1 << start, 1, []
-        for j in range(n):
-            if mode == 2 and j == 0:
-                column.append(first)
-                continue
-            if mode == 0:
-                column.append(first + number(start))
-                continue
-            k = next((k for k in range(15) if count << k >= total), 15)
-            q = 0
-            while q < 20 and bit():
-                q += 1
-            v = (q << k) + number(k) if q < 20 else number(32)
-            total, count = total + v, count + 1
-            if count == 16:
-                total, count = total // 2, 8
-            z = -(v + 1) // 2 if v % 2 else v // 2
-            column.append({1: first + v, 2: column[-1] + z if column else 0, 3: z}[mode])
-        out.append([v << shift for v in column])
-    s.at = (bits + 7) // 8
-    return out
+residual_columns: Callable[[Any, int, int], Rows] = SPEC.residual_columns
 
 
 def ungap(gaps: list[int]) -> list[int]:

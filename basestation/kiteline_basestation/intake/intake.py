@@ -16,6 +16,7 @@ from kiteline_codec.schema import (
     GravityAlignment,
     InertialSteps,
     KeyframeHeader,
+    KeyframeScan,
     LivePose,
     NewLandmarks,
     Observations,
@@ -208,6 +209,6 @@ def _order(live: LivePose) -> tuple[int, int]:
 
 
 def _submap_of(record: Record) -> SubmapId | None:
-    if isinstance(record, KeyframeHeader | NewLandmarks | Observations | InertialSteps | LivePose):
+    if isinstance(record, KeyframeHeader | NewLandmarks | Observations | InertialSteps | KeyframeScan | LivePose):
         return submap_of_keyframe(record.keyframe)
     return record.submap if isinstance(record, GravityAlignment | SubmapScale | SubmapTie) else None

@@ -8,6 +8,7 @@ from kiteline_codec.schema.agent.camera_intrinsics import CameraIntrinsics as Ca
 from kiteline_codec.schema.agent.gravity_alignment import GravityAlignment as GravityAlignment
 from kiteline_codec.schema.agent.inertial_steps import InertialSteps as InertialSteps
 from kiteline_codec.schema.agent.keyframe_header import KeyframeHeader as KeyframeHeader
+from kiteline_codec.schema.agent.keyframe_scan import KeyframeScan as KeyframeScan
 from kiteline_codec.schema.agent.live_pose import LivePose as LivePose
 from kiteline_codec.schema.agent.new_landmarks import NewLandmarks as NewLandmarks
 from kiteline_codec.schema.agent.observations import Observations as Observations

@@ -180,3 +180,27 @@ def test_directions_without_a_code_are_refused() -> None:
         quantise.direction_codes(np.full(3, np.nan))
     with pytest.raises(ValueError, match="half of the sphere"):
         quantise.direction(1, quantise.DIRECTION_STEPS, 0)
+
+
+def test_every_range_code_comes_back_and_codes_are_ordered() -> None:
+    codes = np.arange(quantise.RANGE_CODES)
+    r = quantise.ranges(codes)
+    assert np.array_equal(quantise.range_codes(r), codes)
+    assert r[0] == 0.0
+    assert (np.diff(r) > 0.0).all()
+    assert r[-1] < 254.0
+
+
+@given(st.floats(1e-6, 253.0))
+def test_range_bounds(r: float) -> None:
+    got = float(quantise.ranges(quantise.range_codes(np.array([r])))[0])
+    assert got > 0.0
+    assert abs(got - r) <= (r + 2.0) / 256.0 + 1e-12 or r < 0.0157
+
+
+def test_ranges_without_a_code() -> None:
+    assert quantise.range_codes(np.array([-1.0, 0.0, np.inf, 1e300])).tolist() == [0, 0] + 2 * [
+        quantise.RANGE_CODES - 1
+    ]
+    with pytest.raises(ValueError, match="NaN"):
+        quantise.range_codes(np.array([np.nan]))

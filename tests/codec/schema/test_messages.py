@@ -30,6 +30,7 @@ from kiteline_codec.schema import (
     Key,
     KeyframeHeader,
     KeyframePose,
+    KeyframeScan,
     LivePose,
     NewLandmarks,
     Observations,
@@ -45,9 +46,28 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "records.json"
+
+
+def a_scan(seed: int, n: int) -> ColumnScan:
+    """n columns of which some saw nothing."""
+    rng = np.random.default_rng(seed + 2)
+    seen = rng.integers(0, 2, (3, n))
+    free, bands = rng.uniform(2.0, 9.0, n) * seen[0], rng.integers(1, 256, n) * seen[1]
+    return ColumnScan(
+        se3.exp(rng.normal(0.0, 1.0, 6))[0, :3],
+        -0.7,
+        0.02,
+        0.6 * free,
+        free,
+        np.where(bands > 0, rng.uniform(0.1, 60.0, n), np.inf),
+        bands.astype(np.uint8),
+        rng.uniform(0.1, 300.0, n) * seen[2],
+        float("nan") if n % 2 else float(rng.uniform(-1.0, 90.0)),
+    )
 
 
 def some_records(seed: int, n: int) -> list[Record]:
@@ -114,6 +134,7 @@ def some_records(seed: int, n: int) -> list[Record]:
             KeyframeId(keyframe - 1), 7 * n, KeyframeId(keyframe - 2), pose, n, pose[1, :3].copy(), 0.0015 + 0.0007 * n
         ),
         SubmapTie(submap, KeyframeId(keyframe - 9), pose, 0.0123 * (n + 1), 0.0021),
+        KeyframeScan(keyframe, a_scan(seed, n + 1), steps.integers(0, 3, n).astype(np.uint8)),
     ]  # fmt: skip
 
 
@@ -124,10 +145,11 @@ def assert_same(a: Any, b: Any) -> None:
         if isinstance(x, np.ndarray):
             assert x.dtype == y.dtype
             assert np.array_equal(x, y), f.name
-        elif isinstance(x, RectifiedCamera):
+        elif isinstance(x, RectifiedCamera | ColumnScan):
             assert_same(x, y)
         else:
-            assert x == y, f.name
+            assert x == y or x != x, f.name
+            assert (x != x) == (y != y), f.name
 
 
 def test_golden_bytes() -> None:
@@ -207,6 +229,40 @@ def test_errors_say_what_was_expected() -> None:
     code = messages.encode(tile)
     with pytest.raises(WireError, match="tile"):
         messages.decode(messages.key(tile), code[:-3])
+
+
+def test_a_scan_is_rounded_by_no_more_than_the_specification_says() -> None:
+    for seed in range(20):
+        scan = a_scan(seed, 72)
+        record = KeyframeScan(KeyframeId(5), scan, np.zeros(0, np.uint8))
+        read = messages.decode(messages.key(record), messages.encode(record))
+        assert isinstance(read, KeyframeScan)
+        got = read.scan
+        assert np.abs(got.up_c - scan.up_c).max() < 2e-4
+        assert np.abs(got.azimuths_rad - scan.azimuths_rad).max() < 7e-5
+        assert np.array_equal(got.bands, scan.bands)
+        for name in ("free_m", "free_from_m", "obstacle_m", "clear_m"):
+            told, held = getattr(scan, name), getattr(got, name)
+            assert np.array_equal(told > 0.0, held > 0.0)
+            assert np.array_equal(np.isinf(told), np.isinf(held))
+            near = (told < 250.0) & (told > 0.02)
+            assert np.all(np.abs(held[near] - told[near]) <= (told[near] + 2.0) / 256.0)
+
+
+def test_a_scan_of_a_room_is_short() -> None:
+    """Walls and the floor before them, with noise of 3 cm: at most 200 bytes with the labels of 150 keypoints."""
+    rng = np.random.default_rng(3)
+    azimuth = np.linspace(-0.7, 0.7, 72)
+    wall = np.minimum(4.0 / np.cos(azimuth), 2.2 / np.maximum(np.abs(np.sin(azimuth)), 1e-3))
+    wall[30:38] = 2.4
+    obstacle = wall + rng.normal(0.0, 0.03, 72)
+    free = np.where(np.arange(72) % 9 > 0, obstacle - 0.1 + rng.normal(0.0, 0.03, 72), 0.0)
+    scan = ColumnScan(
+        np.array([0.0, -0.8, -0.6]), -0.7, 1.4 / 71, np.where(free > 0.0, 1.3 / np.cos(azimuth), 0.0), free, obstacle,
+        np.full(72, 7, np.uint8), obstacle + rng.normal(0.0, 0.03, 72), 1.5,
+    )  # fmt: skip
+    labels = rng.integers(0, 3, 150).astype(np.uint8)
+    assert len(messages.encode(KeyframeScan(KeyframeId(5), scan, labels))) <= 200
 
 
 def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:

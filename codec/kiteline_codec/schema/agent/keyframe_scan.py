@@ -1,0 +1,147 @@
+"""The column scan of a keyframe, and which of its keypoints lie on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_codec.coding import quantise
+from kiteline_codec.coding.packing import Reader, WireError, Writer, unzigzag, zigzag
+from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_core.ground.column_scan import MAX_COLUMNS, ColumnScan
+from kiteline_core.ids import MAX_KEYPOINTS, KeyframeId
+
+I64 = NDArray[np.int64]
+
+_AZIMUTH_STEPS = 1 << 16  # codes in 1 rad: 15 microrad, of the first column
+_STEP_STEPS = 1 << 20  # codes in 1 rad: over 128 columns an error of 61 microrad
+_MAX_AZIMUTH = 4 * _AZIMUTH_STEPS
+_HEIGHT_STEPS = 256  # codes in 1 m
+_MAX_HEIGHT = 1 << 18  # 1024 m
+_LABELS = 3  # unknown, ground, obstacle
+_PACKED = 5  # labels in a byte
+_POWERS = _LABELS ** np.arange(_PACKED)
+
+
+@register
+@dataclass(frozen=True, slots=True)
+class KeyframeScan(Record):
+    """Ground and obstacles that a keyframe saw.
+
+    labels: (m,) uint8 of its first m keypoints: 0 unknown, 1 ground, 2 obstacle.
+    """
+
+    KIND = 11
+    ID = IdOf.KEYFRAME
+    PRIORITY = Priority.GRID
+
+    keyframe: KeyframeId
+    scan: ColumnScan
+    labels: NDArray[np.uint8]
+
+    def write(self, out: Writer) -> None:
+        """Append direction of gravity, columns and labels. Raises ValueError for values that have no code."""
+        scan, n = self.scan, len(self.scan)
+        if not 0 < n <= MAX_COLUMNS or len(self.labels) > MAX_KEYPOINTS or self.labels.max(initial=0) >= _LABELS:
+            raise ValueError(
+                f"found {n} columns and {len(self.labels)} labels, expected 1..{MAX_COLUMNS} and known ones"
+            )
+        half, a, b = quantise.direction_codes(scan.up_c)
+        out.u8(half)
+        out.signed(a)
+        out.signed(b)
+        first, step = round(scan.azimuth0_rad * _AZIMUTH_STEPS), round(scan.azimuth_step_rad * _STEP_STEPS)
+        unknown = scan.camera_height_m != scan.camera_height_m
+        height = 0 if unknown else 1 + zigzag(round(scan.camera_height_m * _HEIGHT_STEPS))
+        if abs(first) > _MAX_AZIMUTH or not 0 < step <= _STEP_STEPS or height > _MAX_HEIGHT:
+            raise ValueError("azimuths or the height of the camera are out of range")
+        out.signed(first)
+        out.varint(step)
+        out.varint(height)
+        out.varint(n)
+        if not np.array_equal(np.isfinite(scan.obstacle_m), scan.bands > 0):
+            raise ValueError("an obstacle reaches into at least one height band, and only an obstacle does")
+        obstacle = np.where(scan.bands > 0, quantise.range_codes(np.where(scan.bands > 0, scan.obstacle_m, 0.0)), 0)
+        free_from, free, clear = (quantise.range_codes(r) for r in (scan.free_from_m, scan.free_m, scan.clear_m))
+        out.residual_columns(_predicted(np.stack([obstacle, free, free_from, clear]), scan.bands.astype(np.int64)))
+        out.varint(len(self.labels))
+        padded = np.zeros((-(-len(self.labels) // _PACKED), _PACKED), np.int64)
+        padded.reshape(-1)[: len(self.labels)] = self.labels
+        out.raw((padded @ _POWERS).astype(np.uint8).tobytes())
+
+    @classmethod
+    def read(cls, source: Reader, key: Key) -> Self:
+        """The record of a key and a code. Raises WireError."""
+        half = source.u8()
+        if half > 1:
+            raise WireError(f"a half is 0 or 1, found {half}")
+        try:
+            up_c = quantise.direction(half, *(source.signed(quantise.DIRECTION_STEPS) for _ in range(2)))
+        except ValueError as e:
+            raise WireError(str(e)) from None
+        first, step, height = source.signed(_MAX_AZIMUTH), source.varint(_STEP_STEPS), source.varint(_MAX_HEIGHT)
+        n = source.varint(MAX_COLUMNS)
+        if not step or not n:
+            raise WireError("a scan has columns, and a step between them")
+        obstacle, free, free_from, clear, bands = _ranges(source.residual_columns(5, n))
+        scan = ColumnScan(
+            up_c, first / _AZIMUTH_STEPS, step / _STEP_STEPS, quantise.ranges(free_from), quantise.ranges(free),
+            np.where(obstacle > 0, quantise.ranges(obstacle), np.inf), bands.astype(np.uint8), quantise.ranges(clear),
+            unzigzag(height - 1) / _HEIGHT_STEPS if height else float("nan"),
+        )  # fmt: skip
+        m = source.varint(MAX_KEYPOINTS)
+        packed = np.frombuffer(source.raw(-(-m // _PACKED)), np.uint8).astype(np.int64)
+        labels = (packed[:, None] // _POWERS % _LABELS).reshape(-1)
+        if (packed >= _LABELS**_PACKED).any() or labels[m:].any():
+            raise WireError("labels are 0, 1 or 2")
+        return cls(KeyframeId(key.id), scan, labels[:m].astype(np.uint8))
+
+
+def _predicted(ranges: I64, bands: I64) -> I64:
+    """Columns (5, n) to code: range codes (4, n) above 0 as 1 + zigzag of their difference from a guess; bands (n,)."""
+    out = np.zeros((5, ranges.shape[1]), np.int64)
+    last = [0, 0, 0, 0]
+    for i in range(ranges.shape[1]):
+        row = ranges[:, i].tolist()
+        for j in range(4):
+            if row[j]:
+                out[j, i] = 1 + zigzag(row[j] - _guess(j, row, last))
+                last[j] = row[j]
+    out[4] = bands
+    return out
+
+
+def _ranges(codes: I64) -> I64:
+    """The inverse of `_predicted`. Raises WireError."""
+    if codes.min() < 0 or codes.max() > 4 * quantise.RANGE_CODES or codes[4].max() > 255:
+        raise WireError("a range or band is out of range")
+    out = np.zeros_like(codes)
+    last = [0, 0, 0, 0]
+    for i in range(codes.shape[1]):
+        row = [0, 0, 0, 0]
+        for j in range(4):
+            code = int(codes[j, i])
+            if code:
+                row[j] = last[j] = unzigzag(code - 1) + _guess(j, row, last)
+                if not 0 < row[j] < quantise.RANGE_CODES:
+                    raise WireError(f"found the range code {row[j]}, expected 1..{quantise.RANGE_CODES - 1}")
+        out[:4, i] = row
+    out[4] = codes[4]
+    if not np.array_equal(out[0] > 0, out[4] > 0):
+        raise WireError("an obstacle reaches into at least one height band, and only an obstacle does")
+    return out
+
+
+def _guess(j: int, row: list[int], last: list[int]) -> int:
+    """Guess of range j of a column by the ranges before it, else by that of the columns before.
+
+    Ground is seen up to the obstacle, and the way is clear up to it or to the end of the ground.
+    """
+    if j == 1:
+        return row[0] or last[1]
+    if j == 3:
+        return row[0] or row[1] or last[3]
+    return last[j]

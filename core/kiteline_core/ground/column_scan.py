@@ -1,0 +1,62 @@
+"""What one keyframe saw of ground and obstacles, by columns of azimuth in the levelled camera frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+MAX_COLUMNS = 128
+_LEAST_FORWARD = 0.05  # horizontal part of a viewing direction, below which the image's up says what is ahead
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnScan:
+    """Ground and obstacles around a camera, in its levelled frame l (`level_rotation`); ranges are horizontal, in m.
+
+    up_c: (3,) unit vector against gravity in c. Column i of n looks to azimuth0_rad + i azimuth_step_rad,
+    counter-clockwise from x of l, seen from above.
+    free_from_m, free_m: (n,) from where and up to where ground was seen; both 0 where none was. What was not seen is
+    unknown, never free.
+    obstacle_m: (n,) to the nearest obstacle within the height bands above the ground; inf where none was seen.
+    bands: (n,) uint8, bit i set if that obstacle reaches into height band i; 0 without an obstacle.
+    clear_m: (n,) up to where nothing stands at the height of the camera; 0 if that was not seen.
+    camera_height_m: of the camera above the ground it saw; NaN if it saw none.
+    """
+
+    up_c: F64
+    azimuth0_rad: float
+    azimuth_step_rad: float
+    free_from_m: F64
+    free_m: F64
+    obstacle_m: F64
+    bands: NDArray[np.uint8]
+    clear_m: F64
+    camera_height_m: float
+
+    def __len__(self) -> int:
+        """Number of columns."""
+        return len(self.free_m)
+
+    @property
+    def azimuths_rad(self) -> F64:
+        """Azimuth (n,) of each column's middle."""
+        return self.azimuth0_rad + self.azimuth_step_rad * np.arange(len(self), dtype=np.float64)
+
+
+def level_rotation(up_c: F64) -> F64:
+    """R_c_l (3,3): the levelled frame l in the camera: z up, x along the horizontal viewing direction, y left.
+
+    up_c: (3,) unit vector against gravity in the camera. A camera that looks straight up or down has no horizontal
+    viewing direction: then that side of the image is ahead that lay ahead before the camera was tilted so far.
+    """
+    up = up_c / np.linalg.norm(up_c)
+    ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up
+    if float(np.linalg.norm(ahead)) < _LEAST_FORWARD:
+        image_up = np.array([0.0, -1.0 if up[2] < 0.0 else 1.0, 0.0])
+        ahead = image_up - float(image_up @ up) * up
+    ahead = ahead / np.linalg.norm(ahead)
+    return np.column_stack([ahead, np.cross(up, ahead), up])
