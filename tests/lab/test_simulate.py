@@ -12,6 +12,7 @@ from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sources.open import open_source
+from kiteline_lab.evaluation.grid_eval import read_grid
 from kiteline_lab.flights.simulate import main
 
 SCENE = "room?scale=0.2&texture_bits=7&seconds=0.4"
@@ -36,6 +37,15 @@ def test_the_recording_is_the_flight(tmp_path: Path) -> None:
     true, stated = recorded.ground_truth, rendered.ground_truth
     assert true is not None and stated is not None and np.allclose(true.T_w_b, stated.T_w_b, atol=1e-9)
     assert "image: flight.pgm" in (tmp_path / "flight.yaml").read_text() and (tmp_path / "flight.pgm").is_file()
+
+
+def test_what_could_be_seen_lies_beside_what_is_true(tmp_path: Path) -> None:
+    assert main([SCENE, "--out", str(tmp_path / "f.mcap")]) == 0
+    everything, seen, low = (read_grid(tmp_path / f"f{part}.yaml") for part in ("", "_seen", "_seen_0.1-0.5"))
+    known = seen.state >= 0
+    assert np.array_equal(seen.state[known], everything.state[known])
+    assert 0 < (seen.state == 0).sum() < (everything.state == 0).sum()
+    assert (low.state != seen.state).any() and (tmp_path / "f_seen_1.2-2.pgm").is_file()
 
 
 def test_the_same_command_gives_the_same_file(tmp_path: Path) -> None:

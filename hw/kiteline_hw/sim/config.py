@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from kiteline_core.geometry.cameras import Lens
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.sensors.wear import KINDS
+from kiteline_hw.sim.world.floors import FLOORS
 from kiteline_hw.sim.world.path import REST_S
 from kiteline_hw.sim.world.scenes import SCENES
 
@@ -52,6 +53,8 @@ class SimConfig:
     cars: int = 0  # that drive ahead of the camera or towards it
     repeated: float = 0.0  # share of the surfaces with a pattern that repeats every 0.3 m
     glossy: float = 0.0  # share of the surfaces that reflect lights
+    objects: bool = False  # chairs, a table, cylinders, a half-open door and pillars beside the path, indoors
+    floor: str = "flat"  # or ramp, wave, bare (without texture), indoors
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
 
@@ -71,6 +74,10 @@ def read_config(scene: str, **options: object) -> SimConfig:
     config = SimConfig(**values)  # type: ignore[arg-type]
     if config.scene not in SCENES:
         raise SourceError(f"unknown scene {config.scene!r}: expected one of {', '.join(SCENES)}")
+    if config.floor not in FLOORS:
+        raise SourceError(f"unknown floor {config.floor!r}: expected one of {', '.join(FLOORS)}")
+    if config.scene == "street" and (config.objects or config.floor != "flat"):
+        raise SourceError("objects and floors are options of indoor scenes")
     if config.lens not in [kind.value for kind in Lens]:
         raise SourceError(f"unknown lens {config.lens!r}: expected radtan, equidistant or none")
     if config.rig not in RIGS:

@@ -23,6 +23,8 @@ from kiteline_hw.sim.sensors.camera import LAMP_HZ, Shutter, SimCamera
 from kiteline_hw.sim.sensors.rig import make_rig, perturb
 from kiteline_hw.sim.world.actors import make_actors
 from kiteline_hw.sim.world.built_in_paths import built_in_path, lap_s
+from kiteline_hw.sim.world.floors import with_floor
+from kiteline_hw.sim.world.objects import with_objects
 from kiteline_hw.sim.world.path import Motion, Path, flight_s, to_trajectory
 from kiteline_hw.sim.world.path_fit import read_trajectory
 from kiteline_hw.sim.world.scenes import build_indoor
@@ -65,7 +67,9 @@ def build_world(config: SimConfig, camera_in_body: F64) -> World:
     if config.scene == "street":
         world = build_street(cloud, config.seed, config.texture_bits)
     else:
-        world = build_indoor(config.scene, cloud, config.seed, config.texture_bits)
+        world = with_floor(build_indoor(config.scene, cloud, config.seed, config.texture_bits), config.floor)
+        if config.objects:
+            world = with_objects(world, cloud, config.seed)
     return with_difficult_surfaces(world, config.seed, config.texture_bits, config.repeated, config.glossy)
 
 

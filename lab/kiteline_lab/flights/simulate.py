@@ -6,9 +6,11 @@ import argparse
 import json
 import os
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
@@ -17,12 +19,12 @@ from kiteline_hw.sensors.images import encode_depth, encode_image
 from kiteline_hw.sim.config import RIGS, SimConfig, read_config
 from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.source import SimSource
-from kiteline_hw.sim.world.world import World, occupancy, write_occupancy
+from kiteline_hw.sim.truth.occupancy import write_grid
+from kiteline_hw.sim.truth.sight import CELL_M, SeenWorld, look
+from kiteline_hw.sim.world.world import World
 from kiteline_lab.flights.out_file import whole_file
 from kiteline_lab.flights.progress import Progress
 
-GRID_LOW_M, GRID_HIGH_M = 0.1, 2.0  # above the floor: obstacles for a small vehicle
-GRID_CELL_M = 0.05
 JPEG_QUALITY = 92
 COURSE = "course"  # in place of a trajectory: the scene's own course
 
@@ -32,7 +34,8 @@ def main(argv: list[str]) -> int:
     p = argparse.ArgumentParser(
         prog="kiteline sim",
         description="Record a simulated flight: images, inertial samples and true poses as a log that flies like any "
-        "other. Beside it the true occupancy (F.yaml, F.pgm) and the true rig (F.rig_truth.json).",
+        "other. Beside it the true occupancy (F.yaml, F.pgm), what could be seen of it from the true poses "
+        "(F_seen.yaml, by height band F_seen_LOW-HIGH.yaml), and the true rig (F.rig_truth.json).",
         epilog="The same scene, seed and trajectories give the same bytes.",
     )
     p.add_argument("scene", metavar="SCENE", help="room, hall, corridor or street, perhaps with options: room?seed=3")
@@ -65,6 +68,7 @@ def main(argv: list[str]) -> int:
         options["also"] = tuple("" if name == COURSE else name for name in o.also)
     config = read_config(o.scene, **options)
     world: World | None = None
+    poses = []
     for agent in range(1 + len(config.also)):
         source = SimSource(replace(config, agent=agent), o.workers, world)
         world = source.world
@@ -75,18 +79,28 @@ def main(argv: list[str]) -> int:
         truth.write_text(
             json.dumps({"rig": config.rig, "readout_s": config.readout_s, **source.worn.to_json()}, indent=1) + "\n"
         )
+        poses.append(source.ground_truth.T_w_b @ source.worn.true.T_b_c)
         print(f"{out}: {source.frame_count} frames, {samples} imu samples, {out.stat().st_size / 1e6:.1f} MB")
     assert world is not None
-    grid = o.out.with_suffix(".yaml")
-    image, origin = occupancy(world, GRID_LOW_M, GRID_HIGH_M, cell_m(config))
-    write_occupancy(image, origin, cell_m(config), grid)
-    print(f"{grid}: true occupancy from {GRID_LOW_M:g} to {GRID_HIGH_M:g} m above the floor")
+    seen = look(world, source.worn.true.left, np.concatenate(poses), cell_m=cell_m(config))
+    for file in write_truth(seen, o.out.with_suffix("")):
+        print(f"{file}: true occupancy")
     return 0
+
+
+def write_truth(seen: SeenWorld, stem: Path) -> list[Path]:
+    """Write STEM.yaml, all that is true, STEM_seen.yaml, what was seen of it, and the latter by height band."""
+    bands = list(pairwise(seen.heights_m))
+    return [
+        write_grid(seen.grid(seen=False), stem.with_name(f"{stem.name}.yaml")),
+        write_grid(seen.grid(), stem.with_name(f"{stem.name}_seen.yaml")),
+        *(write_grid(seen.grid(a, b), stem.with_name(f"{stem.name}_seen_{a:g}-{b:g}.yaml")) for a, b in bands),
+    ]
 
 
 def cell_m(config: SimConfig) -> float:
     """Side of a cell of the true grid: a street is too large for fine ones."""
-    return 0.2 if config.scene == "street" else GRID_CELL_M
+    return 0.2 if config.scene == "street" else CELL_M
 
 
 def record(source: SimSource, path: Path, png: bool = False) -> int:

@@ -1,4 +1,4 @@
-"""Scenes that keep their distance from the paths, statistics of textures, and true occupancy."""
+"""Scenes that keep their distance from the paths, and statistics of textures."""
 
 from __future__ import annotations
 
@@ -16,16 +16,7 @@ from kiteline_hw.sim.world.scenes import SCENES
 from kiteline_hw.sim.world.street import ground_field
 from kiteline_hw.sim.world.texture_kernels import paint
 from kiteline_hw.sim.world.textures import MAKERS, make_pool, shapes
-from kiteline_hw.sim.world.world import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    World,
-    bilinear,
-    box_distances,
-    occupancy,
-    write_occupancy,
-)
+from kiteline_hw.sim.world.world import World, bilinear, box_distances
 
 T_B_C = make_rig().T_b_c
 
@@ -156,43 +147,3 @@ def test_several_agents_share_a_world(tmp_path: Path) -> None:
     for source in (first, second):
         for box in first.world.solids():
             assert box_distances(box, source.path.positions()).min() > 0.45
-
-
-@pytest.mark.parametrize("scene", ["room", "corridor"])
-def test_occupancy_matches_the_solids(scene: str) -> None:
-    world, path = world_and_path(scene)
-    cell = 0.05
-    low, high = world.floor_m + 0.1, world.floor_m + 2.0
-    image, origin = occupancy(world, 0.1, 2.0, cell)
-    grid = image[::-1]
-    rng = np.random.default_rng(0)
-    shell = world.boxes[world.shell]
-    xy = shell[:2] + rng.uniform(-1, 1, (4000, 2)) * shell[3:5]
-    inside = np.zeros(len(xy), bool)
-    distance = np.full(len(xy), np.inf)
-    for box in world.solids():
-        if box[2] - box[5] >= high or box[2] + box[5] <= low:
-            continue
-        at = np.column_stack([xy, np.full(len(xy), box[2])])
-        d = box_distances(box, at)
-        inside |= d == 0
-        distance = np.minimum(distance, d)
-    ij = ((xy - origin) / cell).astype(int)
-    value = grid[ij[:, 1], ij[:, 0]]
-    assert (value[inside] == OCCUPIED).all()
-    to_wall = (shell[3:5] - np.abs(xy - shell[:2])).min(1)
-    assert (value[(distance > 0.1) & (to_wall > 0.1)] == FREE).all()
-    assert inside.sum() > 50 and (value == FREE).sum() > 500
-    ij = ((path[:, :2] - origin) / cell).astype(int)
-    assert (grid[ij[:, 1], ij[:, 0]] == FREE).mean() > 0.8, "solids above and below the path may show"
-    assert grid[0, 0] == UNKNOWN
-
-
-def test_occupancy_files_of_map_server(tmp_path: Path) -> None:
-    world, _ = world_and_path("room")
-    image, origin = occupancy(world, 0.1, 2.0)
-    write_occupancy(image, origin, 0.05, tmp_path / "grid.yaml")
-    back = cv2.imread(str(tmp_path / "grid.pgm"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(back, image)
-    text = (tmp_path / "grid.yaml").read_text()
-    assert "image: grid.pgm" in text and f"origin: [{origin[0]:.6f}" in text and "resolution: 0.05" in text

@@ -9,8 +9,8 @@ argument atomically would take longer than the ray.
 
 Arrays shared by the kernels (see world.py for their meaning):
 boxes (n, 8) float64: centre x y z, half-extent x y z, cos yaw, sin yaw. faces (6 n, 8) float64: texels per metre
-along u and v (signed), offset u and v in texels, brightness, contrast, texture, then SWAPPED where u and v are swapped,
-plus GLOSSY where lights are reflected.
+along u and v (signed), offset u and v in texels, brightness, contrast (0: bare), texture, then SWAPPED where u and v
+are swapped, plus GLOSSY where lights are reflected.
 Faces are numbered 2 * axis + (1 where the outward normal is positive). A hit is 6 * box + face, or SKY or GROUND.
 """
 
@@ -252,7 +252,7 @@ def _surface(
         total += texture_value(atlas, table, k, us, vs, lod)
     value = 1.0 + faces[n, 5] * (total / probes - 128.0) / 128.0
     fine = np.log2(max(along, across) / detail_m)
-    if fine < 3.0:  # texture 0 adds detail below the texel size, until it blurs away
+    if fine < 3.0 and faces[n, 5] != 0.0:  # texture 0 adds detail below the texel size, until it blurs away
         d = texture_value(atlas, table, 0, u / detail_m + faces[n, 3], v / detail_m + faces[n, 2], fine)
         value += 0.10 * min(1.0, 3.0 - fine) * (d - 128.0) / 128.0
     return float(faces[n, 4] * value)

@@ -1,11 +1,9 @@
-"""A world of textured solids: its arrays, its builder, and its true occupancy grid."""
+"""A world of textured solids: its arrays and its builder."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path as FilePath
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,9 +11,7 @@ from kiteline_hw.sim.world.textures import TEXEL_M, TexturePool
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
-OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values of map_server images
 NO_GROUND = np.zeros((0, 1, 1), np.float32)
 
 
@@ -27,7 +23,9 @@ class World:
     shell: the box whose inside is the room, None outdoors.
     field (2, rows, columns) float32: ground height and distance to the path in m, empty indoors; its frame (7,): x0 y0
     cell in m, largest slope, then unused, road half-width, far side of the pavement. ground (4, 8): the surfaces of
-    road, pavement, lawn and sky, laid out as faces. floor_m: z of the floor, outdoors at the path's start.
+    road, pavement, lawn and sky, laid out as faces; a floor that is not flat is all road. floor_m: z of the floor,
+    outdoors at the path's start, the highest of a floor that is not flat. objects: kind, first box and last box + 1 of
+    each object that is made of several boxes.
     """
 
     boxes: F64
@@ -39,6 +37,7 @@ class World:
     pool: TexturePool
     far_m: float
     floor_m: float
+    objects: tuple[tuple[str, int, int], ...] = ()
 
     def solids(self) -> F64:
         """The boxes without the shell, (m, 8)."""
@@ -117,63 +116,3 @@ class Builder:
     def arrays(self) -> tuple[F64, F64]:
         """All boxes (n, 8) and faces (6 n, 8), in the order in which they were added."""
         return np.array(self._boxes).reshape(-1, 8), np.array(self._faces).reshape(-1, 8)
-
-
-def occupancy(
-    world: World, low_m: float, high_m: float, resolution_m: float = 0.05, margin_m: float = 0.3
-) -> tuple[U8, F64]:
-    """True occupancy between two heights above the floor: image (rows, columns), first row the highest y; origin (2,).
-
-    A cell is OCCUPIED where a solid or a wall reaches into it, FREE elsewhere inside the shell (outdoors: within the
-    field), UNKNOWN behind the walls. The origin is the lower left corner of the lower left cell in w.
-    """
-    if world.shell is not None:
-        extent = world.boxes[world.shell]
-        lower, upper = extent[:2] - extent[3:5] - margin_m, extent[:2] + extent[3:5] + margin_m
-    else:
-        frame = world.field_frame
-        lower = frame[:2]
-        upper = lower + frame[2] * (np.array(world.field.shape[:0:-1]) - 1)
-    lower = np.floor(lower / resolution_m) * resolution_m
-    columns, rows = (int(v) for v in np.ceil((upper - lower) / resolution_m))
-    image = np.full((rows, columns), FREE, np.uint8)
-    half = 0.5 * resolution_m
-
-    def cells_around(box: F64) -> tuple[slice, slice, F64, F64]:
-        """Rows and columns around a box, and the cells' distances from its centre along its axes."""
-        radius = float(np.hypot(box[3], box[4])) + resolution_m
-        x0, y0 = np.maximum(((box[:2] - radius - lower) / resolution_m).astype(int), 0)
-        x1, y1 = np.maximum(((box[:2] + radius - lower) / resolution_m).astype(int) + 1, 0)
-        ys, xs = slice(y0, min(y1, rows)), slice(x0, min(x1, columns))
-        y, x = np.mgrid[ys, xs]
-        dx, dy = lower[0] + (x + 0.5) * resolution_m - box[0], lower[1] + (y + 0.5) * resolution_m - box[1]
-        return ys, xs, np.abs(box[6] * dx + box[7] * dy), np.abs(box[6] * dy - box[7] * dx)
-
-    if world.shell is not None:
-        ys, xs, x, y = cells_around(world.boxes[world.shell])
-        image[:] = UNKNOWN
-        sx, sy = extent[3:5]
-        image[ys, xs][(x < sx + resolution_m) & (y < sy + resolution_m)] = OCCUPIED
-        image[ys, xs][(x < sx - half + 1e-9) & (y < sy - half + 1e-9)] = FREE
-    for box in world.solids():
-        floor = float(world.height(box[None, :2])[0])
-        if box[2] + box[5] <= floor + low_m or box[2] - box[5] >= floor + high_m:
-            continue
-        ys, xs, x, y = cells_around(box)
-        spread = half * (abs(box[6]) + abs(box[7]))  # half-width of a square cell along the box's axes
-        inside = (x < box[3] + spread) & (y < box[4] + spread)
-        view = image[ys, xs]
-        view[inside & (view != UNKNOWN)] = OCCUPIED
-    return image[::-1].copy(), lower
-
-
-def write_occupancy(image: U8, origin: F64, resolution_m: float, file: FilePath) -> None:
-    """Write `file` (.yaml) and the PGM beside it, in the format of ROS's map_server."""
-    picture = file.with_suffix(".pgm")
-    ok, data = cv2.imencode(".pgm", image)
-    assert ok
-    picture.write_bytes(data.tobytes())
-    file.write_text(
-        f"image: {picture.name}\nresolution: {resolution_m}\norigin: [{origin[0]:.6f}, {origin[1]:.6f}, 0.0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
-    )
