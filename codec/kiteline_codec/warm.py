@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_codec.channel import coded_channel
-from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, RefinedLandmarks
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    GridTile,
+    KeyframeHeader,
+    NewLandmarks,
+    Observations,
+    RefinedLandmarks,
+)
+from kiteline_codec.schema.base.grid_tile import TILE_CELLS
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
@@ -33,6 +41,7 @@ def warm() -> None:
             agent.put(KeyframeHeader(second, _TICK_NS, first, np.eye(4), n))
             agent.put(NewLandmarks(second, 0, index, uv, depth, zeros, zeros, np.zeros((n, 32), np.uint8)))
             agent.put(Observations(second, 0, index + np.uint16(n), uv + 1.0, depth, zeros, landmark))
+            base.put(GridTile(0, 0, 0, 0.05, np.full((TILE_CELLS, TILE_CELLS), 1, np.int8)))
             base.put(RefinedLandmarks(first, index, depth, np.zeros((n, 2), np.float32)))
         if tick == 6:  # landmarks of two keyframes
             both = np.where(np.arange(n) < n // 2, landmark, landmark + ((second - first) << KEYPOINT_BITS))

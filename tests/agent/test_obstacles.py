@@ -24,12 +24,14 @@ def room(known_until_m: float = 20.0) -> dict[tuple[int, int], GridTile]:
     tiles = {}
     for column in range(-4, 5):
         for row in range(-4, 5):
-            x = ((column * 32 + np.arange(32)) + 0.5)[None, :] * CELL_M
-            y = ((row * 32 + np.arange(32)) + 0.5)[:, None] * CELL_M
+            x = ((column * 64 + np.arange(64)) + 0.5)[None, :] * CELL_M
+            y = ((row * 64 + np.arange(64)) + 0.5)[:, None] * CELL_M
             inside = (x > WEST) & (x < EAST) & (y > SOUTH) & (y < NORTH)
             wall = ~inside & (x > WEST - 0.2) & (x < EAST + 0.2) & (y > SOUTH - 0.2) & (y < NORTH + 0.2)
-            cells = np.where(wall, 90, np.where(inside, 5, -1))
-            tiles[column, row] = GridTile(column, row, CELL_M, np.where(x > -known_until_m, cells, -1).astype(np.int8))
+            cells = np.where(wall, 7, np.where(inside, 0, -1))
+            tiles[column, row] = GridTile(
+                column, row, 0, CELL_M, np.where(x > -known_until_m, cells, -1).astype(np.int8)
+            )
     return tiles
 
 
@@ -55,10 +57,10 @@ def test_what_is_not_known_is_not_free() -> None:
     distances = obstacle_distances(room(known_until_m=1.0), vehicle(0.0, 0.0, 0.0))
     assert distances is not None
     assert np.isnan(distances[SECTORS // 2]) and distances[0] == pytest.approx(EAST, abs=0.15)
-    free = {(c, r): GridTile(c, r, CELL_M, np.zeros((32, 32), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
+    free = {(c, r): GridTile(c, r, 0, CELL_M, np.zeros((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
     far = obstacle_distances(free, vehicle(0.0, 0.0, 0.7))
     assert far is not None and np.isinf(far).all()
-    free[0, 0].cells[5, 20] = 90  # one cell, 2.1 m away
+    free[0, 0].cells[5, 20] = 4  # one cell, 2.1 m away
     near = obstacle_distances(free, vehicle(0.0, 0.0, np.arctan2(5.5, 20.5)))
     assert near is not None and near[0] == pytest.approx(2.12, abs=0.1) and near.min() <= near[0] < REACH_M
 
@@ -72,7 +74,7 @@ def test_without_a_grid_or_a_heading_nothing_is_told() -> None:
 @pytest.mark.parametrize("cell_m", [1e-30, 1e-4, 25.0, 1e30])
 def test_any_size_of_cells_costs_little(cell_m: float) -> None:
     """A tile is a record from the link."""
-    tiles = {(0, 0): GridTile(0, 0, cell_m, np.full((32, 32), 90, np.int8))}
+    tiles = {(0, 0): GridTile(0, 0, 0, cell_m, np.full((64, 64), 3, np.int8))}
     with np.errstate(invalid="ignore", over="ignore"):
         distances = obstacle_distances(tiles, vehicle(0.5, 0.5, 0.0))
     assert distances is not None and distances.shape == (SECTORS,)

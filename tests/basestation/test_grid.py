@@ -127,9 +127,9 @@ def test_update_returns_exactly_the_tiles_that_changed() -> None:
     grid = Grid()
     first = grid.update(cameras, points, pairs)
     assert {(t.column, t.row) for t in first} == {(int(c), int(r)) for c, r in grid.map.tiles}
-    assert all(t.cells.shape == (32, 32) and t.cells.dtype == np.int8 for t in first)
+    assert all(t.cells.shape == (64, 64) and t.cells.dtype == np.int8 for t in first)
     assert grid.update(cameras, points, pairs) == ()
-    shift = np.array([32 * grid.config.cell_m * 10, 0.0, 0.0])
+    shift = np.array([64 * grid.config.cell_m * 10, 0.0, 0.0])
     moved = grid.update(cameras + shift, points + shift, pairs)
     vanished = [t for t in moved if (t.cells == UNKNOWN).all()]
     assert {(t.column, t.row) for t in vanished} >= {(t.column, t.row) for t in first}
@@ -138,7 +138,7 @@ def test_update_returns_exactly_the_tiles_that_changed() -> None:
 def test_shift_by_whole_tiles_shifts_the_grid() -> None:
     cameras, points, pairs = room()
     config = GridConfig(cell_m=0.125)  # exact in binary
-    shift = np.array([4.0, -8.0, 0.0])  # one tile and minus two
+    shift = np.array([8.0, -16.0, 0.0])  # one tile and minus two
     a, b = build(config, cameras, points, pairs), build(config, cameras + shift, points + shift, pairs)
     assert np.array_equal(a.tiles + [1, -2], b.tiles)
     assert np.mean(a.cells == b.cells) > 0.999

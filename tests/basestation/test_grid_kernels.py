@@ -33,9 +33,9 @@ def line(c0: int, r0: int, c1: int, r1: int) -> list[tuple[int, int]]:
 
 def spread(pool: NDArray[np.generic], slots: NDArray[np.int32], fill: float) -> F64:
     """The pool's tiles laid out as one array."""
-    out = np.full((slots.shape[0] * 32, slots.shape[1] * 32), fill)
+    out = np.full((slots.shape[0] * 64, slots.shape[1] * 64), fill)
     for r, c in np.argwhere(slots >= 0):
-        out[r * 32 : r * 32 + 32, c * 32 : c * 32 + 32] = pool[slots[r, c]]
+        out[r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]]
     return out
 
 
@@ -43,7 +43,7 @@ def spread(pool: NDArray[np.generic], slots: NDArray[np.int32], fill: float) -> 
 @given(st.integers(0, 2**32 - 1))
 def test_points_and_rays_as_counted_one_by_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    size, n, m = 96, 12, 30
+    size, n, m = 192, 12, 30
     ends = rng.integers(0, size, (m, 2))
     start = rng.integers(0, size, (m, 2))
     z = rng.uniform(0, 2, (m, 2))
@@ -67,19 +67,19 @@ def test_points_and_rays_as_counted_one_by_one(seed: int) -> None:
             through[r, c] += low[r, c] - 0.05 < h < high[r, c] + 0.05
 
     slots = np.full((3, 3), -1, np.int32)
-    pool = [np.zeros((2 + n, 32, 32), np.uint16) for _ in range(3)]
-    lows = np.full((2 + n, 32, 32), np.inf, np.float32)
-    highs = np.full((2 + n, 32, 32), -np.inf, np.float32)
+    pool = [np.zeros((2 + n, 64, 64), np.uint16) for _ in range(3)]
+    lows = np.full((2 + n, 64, 64), np.inf, np.float32)
+    highs = np.full((2 + n, 64, 64), -np.inf, np.float32)
     used = kernels.mark_points(at[:, 0], at[:, 1], height, weight, slots, 0, pool[0], lows, highs)
-    assert used == len(np.unique(at // 32, axis=0))
+    assert used == len(np.unique(at // 64, axis=0))
     done, rounds = 0, 0
     while done < m:
         done, used = kernels.cast_rays(
             start, ends, z, ceiling, short, done, slots, used, 0.05, pool[1], pool[2], lows, highs
         )
-        pool = [np.concatenate([p, np.zeros((4, 32, 32), np.uint16)]) for p in pool]
-        lows = np.concatenate([lows, np.full((4, 32, 32), np.inf, np.float32)])
-        highs = np.concatenate([highs, np.full((4, 32, 32), -np.inf, np.float32)])
+        pool = [np.concatenate([p, np.zeros((4, 64, 64), np.uint16)]) for p in pool]
+        lows = np.concatenate([lows, np.full((4, 64, 64), np.inf, np.float32)])
+        highs = np.concatenate([highs, np.full((4, 64, 64), -np.inf, np.float32)])
         rounds += 1
         assert rounds < 20
     assert used == np.count_nonzero(slots >= 0)
@@ -91,8 +91,8 @@ def test_points_and_rays_as_counted_one_by_one(seed: int) -> None:
 
 def test_counts_stop_at_sixteen_bits() -> None:
     slots = np.full((1, 1), -1, np.int32)
-    hits, free, through = (np.zeros((8, 32, 32), np.uint16) for _ in range(3))
-    low, high = np.full((8, 32, 32), np.inf, np.float32), np.full((8, 32, 32), -np.inf, np.float32)
+    hits, free, through = (np.zeros((8, 64, 64), np.uint16) for _ in range(3))
+    low, high = np.full((8, 64, 64), np.inf, np.float32), np.full((8, 64, 64), -np.inf, np.float32)
     one = np.zeros(1, np.int64)
     for _ in range(3):
         kernels.mark_points(one, one, np.zeros(1), np.array([40000]), slots, 0, hits, low, high)

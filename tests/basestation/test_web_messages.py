@@ -25,7 +25,7 @@ def agent(number: int = 0, **changes: object) -> AgentStatus:
 
 
 def grid(*tiles: tuple[int, int], value: int = 10) -> GridMap:
-    cells = np.full((len(tiles), 32, 32), value, np.int8)
+    cells = np.full((len(tiles), 64, 64), value, np.int8)
     cells[:, 0, 0] = UNKNOWN
     return GridMap(
         0.5, np.array(tiles, np.int64).reshape(-1, 2), cells, np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0)
@@ -46,7 +46,7 @@ def test_status_says_what_the_snapshot_holds_in_json() -> None:
     assert out["up_s"] == 60.0
     totals = {n["label"]: (n["value"], n["unit"]) for n in out["totals"]}
     assert totals["Keyframes"] == (6, "") and totals["Landmarks"] == (80, "")
-    assert totals["Mapped"] == (round(1023 * 0.25, 1), "m²")
+    assert totals["Mapped"] == (round(4095 * 0.25, 1), "m²")
     first, second = out["agents"]
     assert first["position"] == [1.235, -2.0, 0.0] and first["heading_deg"] == 90.0
     assert (first["link"], first["silent_s"], first["rate_up"]) == ("live", 1.0, None)
@@ -104,7 +104,7 @@ def test_many_points_are_thinned_and_bad_ones_left_out() -> None:
 def tiles(message: bytes) -> dict[tuple[int, int], np.ndarray]:
     _, _, n, _ = header(message)
     places = np.frombuffer(message, "<i4", 2 * n, 16).reshape(n, 2)
-    cells = np.frombuffer(message, np.int8, n * 1024, 16 + 8 * n).reshape(n, 32, 32)
+    cells = np.frombuffer(message, np.int8, n * 4096, 16 + 8 * n).reshape(n, 64, 64)
     return {(int(c), int(r)): cells[i] for i, (c, r) in enumerate(places)}
 
 

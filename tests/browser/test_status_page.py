@@ -27,7 +27,7 @@ class Base:
 
     def __init__(self) -> None:
         self.taken = 0
-        cells = np.full((1, 32, 32), 3, np.int8)
+        cells = np.full((1, 64, 64), 3, np.int8)
         grid = GridMap(0.1, np.zeros((1, 2), np.int64), cells, np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
         agent = web.AgentStatus(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
         self.now = web.PageSnapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)

@@ -100,7 +100,7 @@ def test_a_thin_link_carries_corrections_then_cached_keyframes_then_tiles() -> N
     cross(a, b)  # greetings
     index, flat = np.arange(6, dtype=np.uint16), np.zeros(6, np.uint8)
     uv, depth = rng.uniform(0, 400, (6, 2)).astype(np.float32), np.full(6, 0.2, np.float32)
-    a.put(GridTile(0, 0, 0.1, rng.integers(0, 101, (32, 32)).astype(np.int8)))
+    a.put(GridTile(0, 0, 0, 0.1, rng.integers(0, 8, (64, 64)).astype(np.int8)))
     for k in range(3):
         a.put(CachedKeyframe(KeyframeId(k), SubmapId(0), POSE.T_m_k))
         described = rng.integers(0, 256, (6, 32), dtype=np.uint8)

@@ -170,6 +170,41 @@ def points(s: Source, n: int) -> list[int]:
     return [(table[p] << 11) + k for p, k in zip(place, keypoint, strict=True)]
 
 
+def cells(data: bytes) -> list[int]:
+    out: list[int] = []
+    p, r = [2048] * 226, [1] * 226
+    at, size, number = 4, 2**32 - 1, int.from_bytes(data[:4].ljust(4, b"\0"), "big")
+
+    def decide(context: int) -> int:
+        nonlocal at, size, number
+        bound = (size >> 12) * p[context]
+        bit = int(number >= bound)
+        number, size = (number - bound, size - bound) if bit else (number, bound)
+        p[context] += -(p[context] >> r[context]) if bit else (4096 - p[context]) >> r[context]
+        p[context] = min(max(p[context], 32), 4064)
+        r[context] = min(r[context] + 1, 5)
+        while size < 2**24:
+            number, size, at = number << 8 | (data[at] if at < len(data) else 0), size << 8, at + 1
+        return bit
+
+    for i in range(4096):
+        row, column = divmod(i, 64)
+        places = [(row, column - 1), (row - 1, column), (row - 1, column - 1), (row - 1, column + 1)]
+        near = [out[64 * a + b] if a >= 0 and 0 <= b < 64 else -1 for a, b in places]
+        w, s, sw, se = (min(max(v, -1), 1) + 1 for v in near)
+        c = 27 * w + 9 * s + 3 * sw + se
+        if not decide(c):
+            out.append(-1)
+        elif not decide(81 + c):
+            out.append(0)
+        else:
+            base, node = 162 + 8 * next((v for v in near if v > 0), 0), 1
+            for _ in range(3):
+                node = 2 * node + decide(base + node)
+            out.append(node - 8)
+    return out
+
+
 def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
     s = Source(data)
     out: dict[str, Any] = {}
@@ -239,10 +274,8 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["number"], out["members"] = s.varint(), s.varint()
         out["keys"] = int.from_bytes(s.raw(4), "little") if out["members"] else 0
     elif kind == 22:
-        out["cell_m"] = struct.unpack("<f", s.raw(4))[0]
-        inflated = zlib.decompress(s.raw(len(data) - 4), -15)
-        codes = [c for byte in inflated for c in (byte & 15, byte >> 4)]
-        out["cells"] = [-1 if c == 0 else (100 * (c - 1) + 7) // 14 for c in codes]
+        out["cell_m"] = s.varint() / 10_000
+        out["cells"] = cells(s.raw(len(data) - s.at))
     else:
         n = s.varint()
         names = {
@@ -353,7 +386,7 @@ def test_packets() -> None:
     for name, packet in wire:
         assert zlib.crc32(packet[:-4]) == int.from_bytes(packet[-4:], "little")
         s = Source(packet[:-4])
-        assert s.u8() == PROTOCOL_VERSION == 3
+        assert s.u8() == PROTOCOL_VERSION == 4
         flags = s.u8()
         assert s.varint() == {"agent": 5, "base": 700}[name]
         assert s.varint() in (0, {"agent": 700, "base": 5}[name])

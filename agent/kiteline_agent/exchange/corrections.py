@@ -97,6 +97,10 @@ class Corrections:
             if key.kind == SubmapPlacement.KIND:  # its merge was undone, and its place is not known yet
                 self._S_w_m.pop(SubmapId(key.id), None)
                 self._recognised.discard(SubmapId(key.id))
+            if key.kind == GridTile.KIND:  # far away, or of another storey
+                column, row, storey = GridTile.place(key)
+                if (held := self.tiles.get((column, row))) is not None and held.storey == storey:
+                    del self.tiles[column, row]
         if moved:
             self._map.compose_unplaced()
         return moved, self._events

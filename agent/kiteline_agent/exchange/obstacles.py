@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.schema import GridTile
-from kiteline_codec.schema.base.grid_tile import TILE_CELLS
+from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS, UNKNOWN
 
 F64 = NDArray[np.float64]
 
 SECTORS = 72  # of 5 degrees
 REACH_M = 10.0  # m; farther cells do not count
-_OCCUPIED = 60  # percent from which a cell is an obstacle
 _STEP_M = (0.02, 0.5)  # m; between points of a ray, whatever size of cells a tile names
 _RAYS = 3  # in each sector: at 10 m a sector is 0.9 m wide
 
@@ -35,17 +34,17 @@ def obstacle_distances(tiles: Mapping[tuple[int, int], GridTile], T_w_f: F64) ->
     along = np.arange(step_m, REACH_M, step_m)
     directions = np.stack([np.cos(angles), np.sin(angles)], -1)
     points = T_w_f[:2, 3] + along[:, None] * directions[:, :, None, :]  # (s, r, d, 2)
-    found = _percent(tiles, np.floor(points / cell_m).astype(np.int64))
-    solid = found >= _OCCUPIED
+    found = _cells(tiles, np.floor(points / cell_m).astype(np.int64))
+    solid = found > FREE
     nearest = np.where(solid.any(2), along[solid.argmax(2)], np.inf)  # (s, r)
-    known = np.isfinite(nearest) | (found >= 0).all(2)
+    known = np.isfinite(nearest) | (found >= FREE).all(2)
     out = nearest.min(1)
     return np.where(np.isfinite(out) | known.all(1), out, np.nan)
 
 
-def _percent(tiles: Mapping[tuple[int, int], GridTile], cells: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Percent occupied, or -1, of cells (…, 2), column and row in w."""
-    out = np.full(cells.shape[:-1], -1, np.int8)
+def _cells(tiles: Mapping[tuple[int, int], GridTile], cells: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Values of cells (…, 2), column and row in w, as tiles have them."""
+    out = np.full(cells.shape[:-1], UNKNOWN, np.int8)
     places, within = cells // TILE_CELLS, cells % TILE_CELLS
     low, high = places.reshape(-1, 2).min(0), places.reshape(-1, 2).max(0)
     for (column, row), tile in tiles.items():

@@ -44,8 +44,8 @@ UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of map points
 class GridMap:
     """A finished grid. Its arrays are never written again.
 
-    tiles: (t, 2) int64 column, row of each tile, in order of row, column. cells: (t, 32, 32) int8, 0..100 percent
-    occupied, -1 unknown, row 0 the lowest y. A tile's corner lies at (column, row) * 32 * cell_m in w.
+    tiles: (t, 2) int64 column, row of each tile, in order of row, column. cells: (t, 64, 64) int8, 0..100 percent
+    occupied, -1 unknown, row 0 the lowest y. A tile's corner lies at (column, row) * 64 * cell_m in w.
     points: (m,3) landmarks in w. labels: (m,) uint8 of the points. ground_m: (m,) z of the ground at each, NaN unknown.
     """
 
@@ -96,7 +96,7 @@ def differences(old: GridMap, new: GridMap) -> tuple[GridTile, ...]:
     for place in sorted(before.keys() | after.keys()):
         cells = after.get(place, unknown)
         if place not in before or not np.array_equal(cells, before[place]):
-            out.append(GridTile(place[1], place[0], new.cell_m, cells))
+            out.append(GridTile(place[1], place[0], 0, new.cell_m, cells))
     return tuple(out)
 
 
@@ -222,6 +222,12 @@ def percent(config: GridConfig, hits: NDArray[np.uint16], free: NDArray[np.uint1
     )
     p = 100.0 / (1.0 + np.exp(-np.clip(odds, -config.log_limit, config.log_limit)))
     return np.where((hits > 0) | (free > 0), np.rint(p), UNKNOWN).astype(np.int8)
+
+
+def states(percent: I8) -> I8:
+    """Cells as a GridTile has them, of percent occupied."""
+    solid = np.where(percent >= OCCUPIED_FROM, 7, UNKNOWN)
+    return np.where((percent >= 0) & (percent <= FREE_UP_TO), 0, solid).astype(np.int8)
 
 
 def dense(grid: GridMap) -> tuple[I8, F64]:

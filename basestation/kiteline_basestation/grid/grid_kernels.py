@@ -1,7 +1,7 @@
 """Kernels that cast rays into a pool of grid tiles and propagate the ground height.
 
 The pool holds the tiles in use; `slots` (rows, columns) int32 maps a tile of the box to its index, -1 none. Cells are
-numbered from the lower left corner of the box; a tile has 32x32 cells.
+numbered from the lower left corner of the box; a tile has 64x64 cells.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ U16 = NDArray[np.uint16]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-TILE = 32  # cells along a side of a tile: the shape of a Tile record
-SHIFT, MASK = 5, TILE - 1  # quotient and remainder by TILE, the main cost of the inner loop as a division
+TILE = 64  # cells along a side of a tile: the shape of a Tile record
+SHIFT, MASK = 6, TILE - 1  # quotient and remainder by TILE, the main cost of the inner loop as a division
 COUNT_MAX = 65535  # counts are uint16 and saturate
 
 
@@ -27,7 +27,7 @@ COUNT_MAX = 65535  # counts are uint16 and saturate
 def mark_points(
     column: I64, row: I64, z: F64, weight: I64, slots: I32, used: int, hits: U16, low: F32, high: F32
 ) -> int:
-    """Add obstacle points to their cells. column, row, z, weight: (n,). hits, low, high: (capacity, 32, 32).
+    """Add obstacle points to their cells. column, row, z, weight: (n,). hits, low, high: (capacity, 64, 64).
 
     `low` and `high` (initially +inf, -inf) receive the height range of obstacles in each cell. The pool must have room
     for one new tile per point. Returns the number of tiles in use.

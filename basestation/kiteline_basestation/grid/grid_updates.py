@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Publisher
-from kiteline_basestation.grid.grid import Grid
+from kiteline_basestation.grid.grid import Grid, states
 from kiteline_basestation.grid.grid_job import GRID, GridInputs
 from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.jobs import Job, JobDone
@@ -65,5 +66,5 @@ class GridUpdates:
         tiles = self.grid.adopt(done.result)
         for agent in sorted({agent_of_submap(s) for s in self._placements}):
             for tile in tiles:
-                self._publisher.send(agent, tile)
+                self._publisher.send(agent, replace(tile, cells=states(tile.cells)))
         return True

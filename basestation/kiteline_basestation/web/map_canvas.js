@@ -1,6 +1,6 @@
 // The map from above on a canvas: grid tiles, landmarks, paths and agents, with pan and zoom. Metres in w, y up.
 
-const TILE = 32; // cells along a side of a tile
+const TILE = 64; // cells along a side of a tile
 const POINTS = 1, TILES = 2, PATH = 3; // kinds of binary messages, see messages.py
 const LIGHT = ["#2a78d6", "#c2417c", "#6a4fc9", "#0f8b8d", "#b5730a", "#7d5a3c", "#4a7a12", "#8b2fa8"];
 const DARK = ["#5a9cec", "#e46fa4", "#9a86ee", "#3fbfc0", "#e0a33c", "#c09a78", "#8dc04c", "#c77be0"];

@@ -2,7 +2,7 @@
 
 A binary message starts with 16 bytes, little endian: kind u8, agent u8, 0 u16, n u32, scale f32, 0 u32. Then by kind:
 1 points: int16 (n,3) times scale = metres in w, uint8 (n) labels.
-2 tiles: int32 (n,2) column, row; int8 (n,32,32) percent; scale is the side of a cell in m.
+2 tiles: int32 (n,2) column, row; int8 (n,64,64) percent; scale is the side of a cell in m.
 3 path of an agent's keyframes: int16 (n,3) times scale = metres in w.
 """
 

@@ -47,8 +47,6 @@ RANGE_SCALE = 2.0  # m: nearly linear below, nearly logarithmic above
 RANGE_MANTISSA = 1 << 7  # steps an octave: error <= 2^-8 (x + 2) m: 8 mm near the camera, 2 cm at 3 m
 RANGE_CODES = 7 * RANGE_MANTISSA  # up to 253 m
 
-OCCUPANCY_STEPS = 14  # over 0..100 percent: error <= 3.6 percent
-
 
 def pixel_codes(uv: F32) -> I64:
     """Codes (2, n) of pixels (n, 2). Raises ValueError outside [-64, 4031.9] px."""
@@ -174,20 +172,6 @@ def ranges(codes: I64) -> F64:
     """Ranges (n,) in m of codes (n,); 0 for 0."""
     octave, step = np.divmod(np.asarray(codes, np.int64), RANGE_MANTISSA)
     return np.asarray(RANGE_SCALE * (np.ldexp(1.0 + step / RANGE_MANTISSA, octave) - 1.0))
-
-
-def occupancy_codes(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """Codes 0..15 of occupancy in percent; 0 means unknown (-1). Raises ValueError outside -1..100."""
-    if cells.min() < -1 or cells.max() > 100:
-        raise ValueError(f"occupancy is -1 or 0..100, found {cells.min()}..{cells.max()}")
-    levels = (cells.astype(np.int64) * OCCUPANCY_STEPS + 50) // 100 + 1
-    return np.where(cells < 0, 0, levels).astype(np.uint8)
-
-
-def occupancy(codes: NDArray[np.uint8]) -> NDArray[np.int8]:
-    """Occupancy in percent of codes 0..15; -1 unknown."""
-    percent = ((codes.astype(np.int64) - 1) * 100 + OCCUPANCY_STEPS // 2) // OCCUPANCY_STEPS
-    return np.where(codes == 0, -1, percent).astype(np.int8)
 
 
 def _checked(codes: F64, low: int, high: int, what: str) -> I64:

@@ -145,20 +145,6 @@ def test_every_code_of_a_deviation_has_its_own_value() -> None:
     assert quantise.deviation_code(1e-9) == 1
 
 
-def test_occupancy_bounds() -> None:
-    cells = np.arange(-1, 101, dtype=np.int8)
-    got = quantise.occupancy(quantise.occupancy_codes(cells))
-    assert (got[1:] >= 0).all()
-    assert got[0] == -1
-    assert np.abs(got[1:].astype(int) - cells[1:]).max() <= 4
-    assert got[1] == 0
-    assert got[-1] == 100
-    codes = np.arange(16, dtype=np.uint8)
-    assert np.array_equal(quantise.occupancy_codes(quantise.occupancy(codes)), codes)
-    with pytest.raises(ValueError, match="occupancy"):
-        quantise.occupancy_codes(np.array([101], np.int8))
-
-
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: float(np.linalg.norm(v)) > 0.01))
 @example((1.0, 1e-9, 0.0))
 @example((0.6, -1e-12, 0.8))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from kiteline_codec.pacing import sections
 from kiteline_codec.schema import (
@@ -112,7 +113,7 @@ def some_records(seed: int, n: int) -> list[Record]:
         CulledLandmarks(keyframe, index, int(rng.integers(2))),
         SubmapPlacement(submap, sim3.of(1.0 + 0.37 * n, pose)),
         DisparityCalibration(AgentId(3), np.array([-72.0, 3.0, 0.0, -450.0, 1.0]) / 1024.0),
-        GridTile(-7, 12, 0.1, rng.integers(-1, 101, (32, 32)).astype(np.int8)),
+        GridTile(-7, 12, -2, 0.05, some_cells(rng, 8 + n)),
         CachedKeyframe(keyframe, submap_id(2, 1, 7), pose),
         CachedLandmarks(
             keyframe, 3, index, uv, inv_depth, octave, rng.integers(0, 256, n).astype(np.uint8),
@@ -136,6 +137,12 @@ def some_records(seed: int, n: int) -> list[Record]:
         SubmapTie(submap, KeyframeId(keyframe - 9), pose, 0.0123 * (n + 1), 0.0021),
         KeyframeScan(keyframe, a_scan(seed, n + 1), steps.integers(0, 3, n).astype(np.uint8)),
     ]  # fmt: skip
+
+
+def some_cells(rng: np.random.Generator, patch: int) -> NDArray[np.int8]:
+    """Cells (64,64) of a tile in patches of equal ones."""
+    small = rng.integers(-1, 8, (64 // patch + 1, 64 // patch + 1))
+    return np.repeat(np.repeat(small, patch, 0), patch, 1)[:64, :64].astype(np.int8)
 
 
 def assert_same(a: Any, b: Any) -> None:
@@ -227,8 +234,39 @@ def test_errors_say_what_was_expected() -> None:
         messages.encode(replace(landmarks, descriptor=landmarks.descriptor[:2]))
     tile = next(r for r in some_records(0, 1) if isinstance(r, GridTile))
     code = messages.encode(tile)
-    with pytest.raises(WireError, match="tile"):
-        messages.decode(messages.key(tile), code[:-3])
+    with pytest.raises(WireError, match="shortest code"):
+        messages.decode(messages.key(tile), code + b"\0")
+    with pytest.raises(WireError, match="has a size"):
+        messages.decode(messages.key(tile), b"\0" + code[2:])
+    for wrong in (
+        replace(tile, cells=tile.cells[:32]),
+        replace(tile, cells=tile.cells + np.int8(3)),
+        replace(tile, cell_m=0.0),
+    ):
+        with pytest.raises(ValueError, match=r"a tile is|cells are|a cell has"):
+            messages.encode(wrong)
+    with pytest.raises(ValueError, match="storey"):
+        messages.key(replace(tile, storey=128))
+
+
+@given(st.integers(0, 1 << 30), st.integers(1, 64), st.sampled_from([0.0, 0.01, 0.3, 1.0]))
+def test_tiles_of_any_cells_pass_and_plain_ones_are_short(seed: int, patch: int, noise: float) -> None:
+    rng = np.random.default_rng(seed)
+    cells = some_cells(rng, patch)
+    wild = rng.random((64, 64)) < noise
+    cells[wild] = rng.integers(-1, 8, int(wild.sum()))
+    tile = GridTile(int(rng.integers(-(1 << 23), 1 << 23)), 5, int(rng.integers(-128, 128)), 0.0001, cells)
+    code = messages.encode(tile)
+    assert_same(messages.decode(messages.key(tile), code), tile)
+    assert len(code) <= 40 if patch == 64 and noise == 0.0 else len(code) < 2500
+
+
+def test_a_tile_of_walls_and_frontiers_takes_a_hundred_bytes() -> None:
+    x, y = np.arange(64)[None, :], np.arange(64)[:, None]
+    cells = np.where(np.hypot(x - 20, y - 10) < 45, 0, -1).astype(np.int8)
+    cells[np.abs(x + 0.3 * y - 40) < 1] = 7
+    cells[30:34, 10:14] = 2
+    assert len(messages.encode(GridTile(0, 0, 0, 0.05, cells))) < 100
 
 
 def test_a_scan_is_rounded_by_no_more_than_the_specification_says() -> None:

@@ -2,71 +2,99 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.coding import quantise
+from kiteline_codec.coding import tile_kernels as kernels
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
 
-TILE_CELLS = 32  # along each side
+TILE_CELLS = kernels.SIDE  # along each side
+UNKNOWN, FREE = -1, 0  # values of cells; others are masks of occupied height bands
+MAX_STOREY = 127
 _BITS = 24  # of a column or row number
 _OFFSET = 1 << _BITS - 1
-_BYTES = np.arange(256, dtype=np.uint8)
-_CELLS = quantise.occupancy(np.stack([_BYTES & 15, _BYTES >> 4], axis=1))  # (256,2): the two cells of a byte
-_PAIRS = np.ascontiguousarray(_CELLS).view(np.int16)[:, 0]  # (256,): both in one number, which is faster to look up
+_CELL_STEPS = 10_000  # per m, of the side of a cell
+_MAX_CELL = 1 << 20
 
 
 @register
 @dataclass(frozen=True, slots=True)
 class GridTile(Record):
-    """A square of the occupancy grid. cells: (32,32) int8, 0..100 occupied percent, -1 unknown; row 0 is the lowest y.
-    column, row: tile numbers; the tile's corner lies at (column, row) * 32 * cell_m in w.
+    """A square of the occupancy grid of a storey.
+
+    cells: (64,64) int8, -1 unknown, 0 free, else the mask of the height bands that are occupied (bit i: band i of
+    `ColumnScan`); row 0 is the lowest y. column, row: tile numbers; the tile's corner lies at
+    (column, row) * 64 * cell_m in w. storey: -128..127, the number of the storey whose ground lies there.
     """
 
     KIND = 22
     ID = IdOf.TILE
     PRIORITY = Priority.GRID
+    PARTS = 1 << 8
+    FIRST_PARTS = PARTS
 
     column: int
     row: int
+    storey: int
     cell_m: float
     cells: NDArray[np.int8]
 
+    @property
+    def part(self) -> int:
+        """The storey, as the key has it."""
+        return self.storey + MAX_STOREY + 1
+
     def key(self) -> Key:
-        """Column and row, packed. Raises ValueError when out of range."""
+        """Column and row, packed, and the storey. Raises ValueError when out of range."""
         column, row = self.column + _OFFSET, self.row + _OFFSET
         if not (0 <= column < 1 << _BITS and 0 <= row < 1 << _BITS):
             raise ValueError(f"tile ({self.column}, {self.row}) lies beyond +-{_OFFSET}")
-        return Key(self.KIND, column << _BITS | row)
+        if not 0 <= self.part < self.PARTS:
+            raise ValueError(f"storey {self.storey} lies beyond +-{MAX_STOREY}")
+        return Key(self.KIND, column << _BITS | row, self.part)
+
+    @staticmethod
+    def place(key: Key) -> tuple[int, int, int]:
+        """Column, row and storey of a key."""
+        return (key.id >> _BITS) - _OFFSET, (key.id & (1 << _BITS) - 1) - _OFFSET, key.part - MAX_STOREY - 1
 
     def write(self, out: Writer) -> None:
-        """Append the size of a cell and the deflated cells, two to a byte."""
+        """Append the size of a cell and the cells."""
         if self.cells.shape != (TILE_CELLS, TILE_CELLS):
             raise ValueError(f"a tile is {TILE_CELLS}x{TILE_CELLS} cells, found {self.cells.shape}")
-        out.f32(self.cell_m)
-        levels = quantise.occupancy_codes(self.cells).reshape(-1)
-        deflate = zlib.compressobj(9, zlib.DEFLATED, -10)
-        out.raw(deflate.compress((levels[0::2] | levels[1::2] << 4).tobytes()) + deflate.flush())
+        if self.cells.min() < UNKNOWN or self.cells.max() > kernels.MAX_MASK:
+            raise ValueError(f"cells are -1..{kernels.MAX_MASK}, found {self.cells.min()}..{self.cells.max()}")
+        cell = round(self.cell_m * _CELL_STEPS)
+        if not 0 < cell <= _MAX_CELL:
+            raise ValueError(
+                f"a cell has a side of {1 / _CELL_STEPS}..{_MAX_CELL / _CELL_STEPS} m, found {self.cell_m}"
+            )
+        out.varint(cell)
+        out.raw(_packed(self.cells))
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
         """The record of a key and a code."""
-        cell_m = source.f32()
-        if cell_m <= 0:
-            raise WireError(f"a cell has a size, found {cell_m} m")
-        inflate = zlib.decompressobj(-15)
-        expected = TILE_CELLS * TILE_CELLS // 2
-        try:
-            data = inflate.decompress(source.raw(source.left), expected + 1)
-        except zlib.error as e:
-            raise WireError(f"tile: {e}") from None
-        if len(data) != expected or not inflate.eof or inflate.unused_data or inflate.unconsumed_tail:
-            raise WireError(f"a tile holds {expected} bytes, found {len(data)}")
-        cells = _PAIRS.take(np.frombuffer(data, np.uint8)).view(np.int8).reshape(TILE_CELLS, TILE_CELLS)
-        column, row = key.id >> _BITS, key.id & (1 << _BITS) - 1
-        return cls(column - _OFFSET, row - _OFFSET, cell_m, cells)
+        cell = source.varint(_MAX_CELL)
+        if cell == 0:
+            raise WireError("a cell has a size, found 0")
+        data = source.raw(source.left)
+        cells = np.empty((TILE_CELLS, TILE_CELLS), np.int8)
+        if len(data) > kernels.MAX_CODE or not kernels.unpack_cells(np.frombuffer(data, np.uint8), _model(), cells):
+            raise WireError("a tile of cells is expected")
+        if _packed(cells) != data:
+            raise WireError("a tile in its shortest code is expected")
+        return cls(*cls.place(key), cell / _CELL_STEPS, cells)
+
+
+def _packed(cells: NDArray[np.int8]) -> bytes:
+    out = np.empty(kernels.MAX_CODE, np.uint8)
+    return out[: kernels.pack_cells(np.ascontiguousarray(cells), _model(), out)].tobytes()
+
+
+def _model() -> NDArray[np.int64]:
+    return np.empty((2, kernels.CONTEXTS), np.int64)
