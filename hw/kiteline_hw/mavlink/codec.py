@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import common
 
 from kiteline_hw.mavlink import messages
 from kiteline_hw.mavlink.messages import COMPONENT_VIO, MavlinkMessage
+from kiteline_hw.mavlink.sample_frames import is_sample_frame, parse_sample_frame
 from kiteline_hw.mavlink.transport.signing import Signing, SigningMavlink
 from kiteline_hw.mavlink.watch.messages import MESSAGES as STATUS_MESSAGES
 
@@ -71,8 +72,14 @@ class MavlinkCodec:
         """
         if datagram:
             self._drop_buffer()
+        if self.holds_sample_alone(data) and (parsed := parse_sample_frame(data)) is not None:
+            system, sample = parsed
+            if self.only_system not in (None, system):
+                self.other_systems += 1
+                return []
+            return [] if sample is None else [sample]
         self._mav.buf.extend(data)
-        received = []
+        received: list[MavlinkMessage] = []
         while (frame := self._next_frame()) is not None:
             message = self._convert(frame)
             if message is not None:
@@ -81,6 +88,10 @@ class MavlinkCodec:
             self._mav.buf = self._mav.buf[self._mav.buf_index :]
             self._mav.buf_index = 0
         return received
+
+    def holds_sample_alone(self, data: bytes) -> bool:
+        """True if the bytes look like one inertial sample, and `receive` would parse them without what came before."""
+        return is_sample_frame(data) and self._signing is None and self._mav.buf_index == len(self._mav.buf)
 
     def _next_frame(self) -> Any:
         """The next frame in the buffer, or None.

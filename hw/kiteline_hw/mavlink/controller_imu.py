@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.controller_odometry import StampClock
@@ -70,9 +68,11 @@ class ControllerImu:
             self._chosen, self._clock = (m.message, m.unit), StampClock()
         self._received_ns = now_ns
         if len(self._stream) < self.config.max_samples:
-            row = np.concatenate([self._R_b_f @ m.gyro, self._R_b_f @ m.accel])
-            self._stream.add(self._clock.to_ours(m.t_us * 1000, now_ns), tuple(row.tolist()))
+            self._stream.add(self._clock.to_ours(m.t_us * 1000, now_ns), m.gyro + m.accel)
 
     def take_until(self, t_ns: int) -> ImuBatch | None:
         """The samples up to a time on our clock, in the body frame."""
-        return self._stream.take_until(t_ns)
+        batch = self._stream.take_until(t_ns)
+        if batch is None:
+            return None
+        return ImuBatch(batch.t_ns, batch.gyro @ self._R_b_f.T, batch.accel @ self._R_b_f.T)

@@ -85,6 +85,11 @@ class TimeSync(MavlinkMessage):
         return self.tc1_ns, self.ts1_ns
 
 
+def is_complete_sample(fields_updated: int) -> bool:
+    """True if a HIGHRES_IMU holds acceleration and angular rate."""
+    return fields_updated & _ACCEL_AND_GYRO == _ACCEL_AND_GYRO
+
+
 @dataclass(frozen=True, slots=True)
 class VehicleImu(MavlinkMessage):
     """An inertial sample of the flight controller, in its body frame (FRD), on its clock.
@@ -105,7 +110,7 @@ class VehicleImu(MavlinkMessage):
     def parse(cls, m: Any) -> Self | None:
         accel, gyro, message = (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro), m.get_msgId()
         if message == HIGHRES_IMU:
-            if m.fields_updated & _ACCEL_AND_GYRO != _ACCEL_AND_GYRO:
+            if not is_complete_sample(m.fields_updated):
                 return None
             return cls(m.time_usec, accel, gyro, HIGHRES_IMU, m.id, m.get_srcComponent())
         accel, gyro = tuple(_MG * a for a in accel), tuple(1e-3 * g for g in gyro)

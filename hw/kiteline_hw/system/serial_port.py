@@ -128,8 +128,10 @@ class SerialPort:
         if self._wake_read in readable:
             os.read(self._wake_read, _READ_BYTES)
         if fd in readable:
-            data = port.read(_READ_BYTES)
-            if data:
+            with contextlib.suppress(BlockingIOError):
+                data = os.read(fd, _READ_BYTES)  # pyserial's own read waits for the port once more
+                if not data:
+                    raise OSError(errno.ENODEV, _UNPLUGGED)
                 self._hand_over(data)
         if fd in writable:
             try:

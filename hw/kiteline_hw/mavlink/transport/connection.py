@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import select
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +22,7 @@ class MavlinkConnection:
     """Sends messages, and calls back from a thread: `on_data` for received bytes, `on_tick` every `tick_s`.
 
     on_data: gets bytes, whether they are one whole datagram or the first after a gap, and, of a sender that is not
-    served yet, a function that serves it from now on. on_tick: is also called after each datagram. Both are called
+    served yet, a function that serves it from now on. Both are called
     without any lock held. max_queued: messages waiting for a slow serial port, the oldest are dropped; 0: no limit.
     """
 
@@ -50,7 +50,7 @@ class MavlinkConnection:
         elif url.kind == "tcp":
             self._tcp = MavlinkTcp(url, required=self._required)
         else:
-            self._udp = MavlinkUdp(url)
+            self._udp = MavlinkUdp(url, self._tick_s)
         self._thread.start()
 
     def send(self, message: bytes) -> bool:
@@ -75,6 +75,7 @@ class MavlinkConnection:
         return self._outbox.popleft() if self._outbox else b""
 
     def _run(self) -> None:
+        due_s = time.monotonic()
         while not self._closed.is_set():
             with contextlib.suppress(OSError, ValueError):  # closed by another thread
                 if self._udp is not None:
@@ -83,18 +84,18 @@ class MavlinkConnection:
                     self._serve_tcp(self._tcp)
                 else:
                     self._closed.wait(self._tick_s)
-            if not self._closed.is_set():
+            now_s = time.monotonic()
+            if now_s >= due_s and not self._closed.is_set():
+                due_s = now_s + self._tick_s
                 self._on_tick()
 
     def _serve_udp(self, udp: MavlinkUdp) -> None:
-        select.select([udp.socket], [], [], self._tick_s)
-        for _ in range(_MAX_READS):
-            received = None if self._closed.is_set() else udp.receive()
-            if received is None:
-                return
-            data, stranger = received
-            if data:
-                self._on_data(data, True, None if stranger is None else partial(udp.adopt, stranger))
+        received = udp.receive()
+        if received is None or self._closed.is_set():
+            return
+        data, stranger = received
+        if data:
+            self._on_data(data, True, None if stranger is None else partial(udp.adopt, stranger))
 
     def _serve_tcp(self, tcp: MavlinkTcp) -> None:
         if tcp.wait(self._tick_s):

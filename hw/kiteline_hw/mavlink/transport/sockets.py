@@ -1,4 +1,4 @@
-"""UDP and TCP sockets of a flight controller that never block."""
+"""UDP and TCP sockets of a flight controller. Sending never blocks; receiving waits for a while at most."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import errno
 import select
 import socket
+import struct
 import threading
 import time
 from typing import Any
@@ -22,15 +23,20 @@ _FIRST_RETRY_S, _MAX_RETRY_S = 0.1, 2.0  # s between attempts to connect
 
 
 class MavlinkUdp:
-    """A UDP socket. It exchanges datagrams with one peer: the configured address or, listening, the one adopted."""
+    """A UDP socket. It exchanges datagrams with one peer: the configured address or, listening, the one adopted.
 
-    def __init__(self, url: MavlinkUrl) -> None:
+    wait_s: how long `receive` waits. The kernel waits, in the call that reads: at 200 datagrams a second a second call
+    for each would cost as much again.
+    """
+
+    def __init__(self, url: MavlinkUrl, wait_s: float) -> None:
         try:
             info = socket.getaddrinfo(url.address, url.port, type=socket.SOCK_DGRAM)[0]
             self.socket = socket.socket(info[0], socket.SOCK_DGRAM)
         except OSError as error:
             raise LinkError(f"flight controller at {url.address}:{url.port}: {error}") from error
-        self.socket.setblocking(False)
+        wait_us = max(1, round(wait_s * 1e6))
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", *divmod(wait_us, 1_000_000)))
         self._listens = url.kind == "udpin"
         self._peer: Any = None if self._listens else info[4]
         self._heard_s = 0.0
@@ -49,13 +55,13 @@ class MavlinkUdp:
         if self._peer is None:
             return False
         try:
-            self.socket.sendto(message, self._peer)
+            self.socket.sendto(message, socket.MSG_DONTWAIT, self._peer)
         except OSError:  # no route, no listener or a full buffer: loss, not an error
             return False
         return True
 
     def receive(self) -> tuple[bytes, Any] | None:
-        """A datagram with None, or with the address of a sender that may be adopted; None if there is no datagram.
+        """A datagram with None, or with the address of a sender that may be adopted; None if none came in time.
 
         A datagram of any other sender is returned empty.
         """
