@@ -11,8 +11,11 @@ def test_grid_without_eval_says_how(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["grid", "--help"]) == 0
 
 
-def test_grid_eval_reaches_the_evaluation(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("action", "word"), [("eval", "EST.yaml"), ("path", "--through-unknown"), ("truth", "--boxes")]
+)
+def test_grid_reaches_its_actions(action: str, word: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        cli.main(["grid", "eval", "--help"])
+        cli.main(["grid", action, "--help"])
     assert left.value.code == 0
-    assert "EST.yaml" in capsys.readouterr().out
+    assert word in capsys.readouterr().out

@@ -19,7 +19,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_lab.evaluation import trajectories
-from kiteline_lab.evaluation.grid_eval import read_grid
+from kiteline_lab.grids.files import read_grid
 from kiteline_lab.tools.export import ExportError, files, main
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x

@@ -12,8 +12,8 @@ from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.evaluation.grid_eval import read_grid
 from kiteline_lab.flights.simulate import main
+from kiteline_lab.grids.files import read_grid
 
 SCENE = "room?scale=0.2&texture_bits=7&seconds=0.4"
 

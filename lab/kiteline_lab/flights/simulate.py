@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -19,11 +18,11 @@ from kiteline_hw.sensors.images import encode_depth, encode_image
 from kiteline_hw.sim.config import RIGS, SimConfig, read_config
 from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.source import SimSource
-from kiteline_hw.sim.truth.occupancy import write_grid
-from kiteline_hw.sim.truth.sight import CELL_M, SeenWorld, look
+from kiteline_hw.sim.truth.sight import CELL_M, look
 from kiteline_hw.sim.world.world import World
 from kiteline_lab.flights.out_file import whole_file
 from kiteline_lab.flights.progress import Progress
+from kiteline_lab.grids.truth import write_truth
 
 JPEG_QUALITY = 92
 COURSE = "course"  # in place of a trajectory: the scene's own course
@@ -86,16 +85,6 @@ def main(argv: list[str]) -> int:
     for file in write_truth(seen, o.out.with_suffix("")):
         print(f"{file}: true occupancy")
     return 0
-
-
-def write_truth(seen: SeenWorld, stem: Path) -> list[Path]:
-    """Write STEM.yaml, all that is true, STEM_seen.yaml, what was seen of it, and the latter by height band."""
-    bands = list(pairwise(seen.heights_m))
-    return [
-        write_grid(seen.grid(seen=False), stem.with_name(f"{stem.name}.yaml")),
-        write_grid(seen.grid(), stem.with_name(f"{stem.name}_seen.yaml")),
-        *(write_grid(seen.grid(a, b), stem.with_name(f"{stem.name}_seen_{a:g}-{b:g}.yaml")) for a, b in bands),
-    ]
 
 
 def cell_m(config: SimConfig) -> float:

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 
-SUMMARY = "compare an occupancy grid with ground truth: precision and recall of roads drawn on it"
-EXAMPLES = ("kiteline grid eval out/base/grid.yaml true.yaml",)
+SUMMARY = "judge an occupancy grid, plan on it, or write the true one of a simulated flight"
+EXAMPLES = (
+    "kiteline grid eval out/base/grid.yaml true_seen.yaml --plot difference.png",
+    "kiteline grid path out/base/grid.yaml 0,0 3.5,-1 --radius 0.3 --plot path.png",
+    "kiteline grid truth 'sim:room?objects=1' --out true.yaml",
+)
+_ACTIONS = {
+    "eval": ("EST.yaml TRUE.yaml", "kiteline_lab.grids.evaluate"),
+    "path": ("GRID.yaml FROM TO", "kiteline_lab.grids.path"),
+    "truth": ("SOURCE --out F.yaml", "kiteline_lab.grids.truth"),
+}  # name -> arguments, module
 
 
 def run(argv: list[str]) -> int | None:
     """Run the command with the arguments after `kiteline grid`; the exit status."""
-    if argv[:1] != ["eval"]:
+    if not argv or argv[0] not in _ACTIONS:
         wants_help = argv[:1] in (["-h"], ["--help"])
         stream = sys.stdout if wants_help else sys.stderr
-        print("usage: kiteline grid eval EST.yaml TRUE.yaml [options]; see kiteline grid eval --help", file=stream)
+        for name, (arguments, _) in _ACTIONS.items():
+            print(f"usage: kiteline grid {name} {arguments} [options]; see kiteline grid {name} --help", file=stream)
         return 0 if wants_help else 2
-    from kiteline_lab.evaluation.grid_eval import main
-
-    return main(argv[1:])
+    status: int = importlib.import_module(_ACTIONS[argv[0]][1]).main(argv[1:])
+    return status

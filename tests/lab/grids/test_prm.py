@@ -11,18 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_lab.evaluation.grid_eval import (
-    GridEvalConfig,
-    GridFile,
-    GridFileError,
-    draw_nodes,
-    free_cells,
-    main,
-    planar,
-    read_grid,
-    score,
-)
-from kiteline_lab.evaluation.grid_eval_kernels import roads_free
+from kiteline_lab.grids.evaluate import main
+from kiteline_lab.grids.files import GridFile, GridFileError, planar, read_grid
+from kiteline_lab.grids.prm import GridEvalConfig, draw_nodes, free_cells, score
+from kiteline_lab.grids.prm_kernels import roads_free
 
 FEW = GridEvalConfig(draws=5, nodes=40)
 
