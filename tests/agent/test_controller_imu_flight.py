@@ -16,7 +16,7 @@ from kiteline_core.ids import AgentId
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.messages import VehicleImu
 from kiteline_hw.ports import SourceReport
-from kiteline_hw.sim.source import SimSource, open_sim
+from tests.agent.room_flight import RoomFlight
 
 F64 = np.ndarray
 BOOT_NS = 400_000_000_000  # our clock at the controller's zero
@@ -24,23 +24,22 @@ DARK = range(60, 75)
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[SimSource, list[Frame]]:
-    source = open_sim("room", seconds=4.0, seed=5, scale=0.5, texture_bits=9, rest=0.0)
-    return source, [item for item in source if isinstance(item, Frame)]
+def flight(room_flight: RoomFlight) -> RoomFlight:
+    """4 s in full motion through a room, at half the usual size."""
+    return room_flight.first(4.0)
 
 
-def fly(room: tuple[SimSource, list[Frame]], latency_ns: int, jitter_ns: int) -> list[Estimate]:
+def fly(flight: RoomFlight, latency_ns: int, jitter_ns: int) -> list[Estimate]:
     """EuRoC's body (x up, y right, z forward) holds a controller that speaks FRD."""
-    source, frames = room
-    felt = source.imu_samples()
+    felt = flight.samples
     late = latency_ns + np.random.default_rng(3).integers(0, jitter_ns + 1, len(felt.t_ns))
     arrives = np.maximum.accumulate(felt.t_ns + late)
     R_b_f = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     imu = ControllerImu(R_b_f, 200.0, SourceReport())
     noise = ControllerImuConfig().noise
-    agent = Agent(source.rig, noise, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+    agent = Agent(flight.rig, noise, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out, done = [], 0
-    for k, frame in enumerate(frames):
+    for k, frame in enumerate(flight.frames):
         now_ns = frame.t_ns + 2_000_000  # the camera is quicker than the controller
         while done < len(arrives) and arrives[done] <= now_ns:
             g, a = felt.gyro[done], felt.accel[done]
@@ -60,15 +59,13 @@ def fly(room: tuple[SimSource, list[Frame]], latency_ns: int, jitter_ns: int) ->
 
 @pytest.mark.parametrize(("latency_ms", "jitter_ms"), [(0, 0), (12, 10), (30, 15)])
 def test_samples_that_come_late_carry_the_pose_all_the_same(
-    room: tuple[SimSource, list[Frame]], latency_ms: int, jitter_ms: int
+    flight: RoomFlight, latency_ms: int, jitter_ms: int
 ) -> None:
-    found = fly(room, latency_ms * 1_000_000, jitter_ms * 1_000_000)
-    truth = room[0].ground_truth
-    assert truth is not None
+    found = fly(flight, latency_ms * 1_000_000, jitter_ms * 1_000_000)
 
     def off_m(begin: int, end: int) -> float:
         flown = se3.inverse(found[begin].T_o_b) @ found[end].T_o_b
-        true = se3.inverse(truth.T_w_b[begin]) @ truth.T_w_b[end]
+        true = se3.inverse(flight.truth[begin]) @ flight.truth[end]
         return float(np.linalg.norm(flown[:3, 3] - true[:3, 3]))
 
     assert all(e.tracked for e in found)
@@ -77,5 +74,5 @@ def test_samples_that_come_late_carry_the_pose_all_the_same(
     assert off_m(DARK.start - 1, DARK.stop - 1) < 0.05  # 0.75 s without images
     level = found[59].R_l_o
     assert level is not None
-    up = level @ found[59].T_o_b[:3, :3] @ truth.T_w_b[59, :3, :3].T @ [0.0, 0.0, 1.0]
+    up = level @ found[59].T_o_b[:3, :3] @ flight.truth[59, :3, :3].T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=0.05)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,41 +12,22 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core import odometry
-from kiteline_core.frame import Frame, OdometryBatch
+from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import AgentId
-from kiteline_hw.sim.source import open_sim
+from tests.agent.room_flight import RoomFlight
 
 F64 = np.ndarray
 DARK = range(70, 110)  # 2 s
 
 
-@dataclass
-class Flight:
-    rig: CameraRig
-    frames: list[Frame]
-    truth: F64
-    driven: OdometryBatch
-
-
-@pytest.fixture(scope="module")
-def flight() -> Flight:
-    """6.5 s in full motion along the room's own course, at half the usual size."""
-    source = open_sim("room", seconds=6.5, seed=5, scale=0.5, texture_bits=9, imu=False, rest=0.0, odometry=50.0)
-    truth, driven = source.ground_truth, source.odometry()
-    assert truth is not None
-    assert driven is not None
-    return Flight(source.rig, [item for item in source if isinstance(item, Frame)], truth.T_w_b, driven)
-
-
 def fly(
-    flight: Flight, driven: OdometryBatch | None, dark: range = range(0), *, one_eye: bool = False
+    room_flight: RoomFlight, driven: OdometryBatch | None, dark: range = range(0), *, one_eye: bool = False
 ) -> tuple[Agent, list[Estimate], list[str]]:
-    rig = replace(flight.rig, right=None, T_c_r=None) if one_eye else flight.rig
+    rig = replace(room_flight.rig, right=None, T_c_r=None) if one_eye else room_flight.rig
     agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out, events, done = [], [], 0
-    for k, shown in enumerate(flight.frames):
+    for k, shown in enumerate(room_flight.frames):
         frame = replace(shown, right=None) if one_eye else shown
         if k in dark:
             frame = replace(frame, left=np.full_like(shown.left, 8), right=np.full_like(shown.left, 8))
@@ -61,17 +42,17 @@ def fly(
     return agent, out, events
 
 
-def drift(flight: Flight, found: list[Estimate], begin: int, end: int) -> F64:
+def drift(room_flight: RoomFlight, found: list[Estimate], begin: int, end: int) -> F64:
     """(6,) by which the odometry frame's pose is off at the end of frames begin..end, [translation, rotation]."""
     flown = se3.inverse(found[begin - 1].T_o_b) @ found[end - 1].T_o_b
-    true = se3.inverse(flight.truth[begin - 1]) @ flight.truth[end - 1]
+    true = se3.inverse(room_flight.truth[begin - 1]) @ room_flight.truth[end - 1]
     return np.concatenate([flown[:3, 3] - true[:3, 3], se3.so3_log(true[:3, :3].T @ flown[:3, :3])])
 
 
-def test_two_seconds_of_black_are_bridged(flight: Flight) -> None:
-    _, found, events = fly(flight, flight.driven, DARK)
-    _, without, _ = fly(flight, None, DARK)
-    off, plain = (np.linalg.norm(drift(flight, f, DARK.start, DARK.stop)[:3]) for f in (found, without))
+def test_two_seconds_of_black_are_bridged(room_flight: RoomFlight) -> None:
+    _, found, events = fly(room_flight, room_flight.driven, DARK)
+    _, without, _ = fly(room_flight, None, DARK)
+    off, plain = (np.linalg.norm(drift(room_flight, f, DARK.start, DARK.stop)[:3]) for f in (found, without))
     assert off < 0.08
     assert off < 0.25 * plain
     assert any(event.startswith("odometer: agrees") for event in events)
@@ -88,9 +69,17 @@ def test_two_seconds_of_black_are_bridged(flight: Flight) -> None:
     assert len({e.submap for e in found}) == 1
 
 
+@pytest.fixture(scope="module")
+def without_odometer(room_flight: RoomFlight) -> list[Estimate]:
+    """The whole flight without an odometer, in sight all the time."""
+    return fly(room_flight, None)[1]
+
+
 @pytest.mark.parametrize("kind", ["slip", "dead", "axes"])
-def test_a_bad_odometer_costs_nothing_in_sight(flight: Flight, kind: str) -> None:
-    good = flight.driven
+def test_a_bad_odometer_costs_nothing_in_sight(
+    room_flight: RoomFlight, without_odometer: list[Estimate], kind: str
+) -> None:
+    good = room_flight.driven
     velocity, rate = good.velocity.copy(), good.rate.copy()
     if kind == "slip":
         velocity[(good.t_ns // 1_000_000_000) % 2 == 1] *= 2.0
@@ -98,28 +87,27 @@ def test_a_bad_odometer_costs_nothing_in_sight(flight: Flight, kind: str) -> Non
         velocity[:], rate[:] = 0.0, 0.0
     else:
         velocity, rate = velocity[:, [2, 0, 1]], rate[:, [2, 0, 1]]
-    _, found, _ = fly(flight, replace(good, velocity=velocity, rate=rate))
-    _, without, _ = fly(flight, None)
-    off, plain = (_ate(flight, f) for f in (found, without))
+    _, found, _ = fly(room_flight, replace(good, velocity=velocity, rate=rate))
+    off, plain = (_ate(room_flight, f) for f in (found, without_odometer))
     assert all(e.tracked for e in found)
     assert off < 1.1 * plain + 1e-4
 
 
-def test_a_monocular_map_gets_its_metre(flight: Flight) -> None:
-    agent, found, events = fly(flight, flight.driven, one_eye=True)
+def test_a_monocular_map_gets_its_metre(room_flight: RoomFlight) -> None:
+    agent, found, events = fly(room_flight, room_flight.driven, one_eye=True)
     assert agent.metric
     assert any(event.startswith("mono: metric") for event in events)
     metric = [k for k, e in enumerate(found) if e.submap == agent.submap and e.T_m_b is not None]
     a, b = metric[0], metric[-1]
     flown = se3.inverse(found[a].T_m_b) @ found[b].T_m_b  # type: ignore[arg-type, operator]
-    true = se3.inverse(flight.truth[a]) @ flight.truth[b]
+    true = se3.inverse(room_flight.truth[a]) @ room_flight.truth[b]
     assert np.linalg.norm(true[:3, 3]) > 0.3
     assert np.linalg.norm(flown[:3, 3]) == pytest.approx(np.linalg.norm(true[:3, 3]), rel=0.05)
-    plain, _, _ = fly(flight, None, one_eye=True)
+    plain, _, _ = fly(room_flight, None, one_eye=True)
     assert not plain.metric
 
 
-def _ate(flight: Flight, found: list[Estimate]) -> float:
+def _ate(room_flight: RoomFlight, found: list[Estimate]) -> float:
     flown = np.array([(se3.inverse(found[0].T_o_b) @ e.T_o_b)[:3, 3] for e in found])
-    true = np.array([(se3.inverse(flight.truth[0]) @ T)[:3, 3] for T in flight.truth])
+    true = np.array([(se3.inverse(room_flight.truth[0]) @ T)[:3, 3] for T in room_flight.truth])
     return float(np.sqrt(np.mean(np.sum((flown - true) ** 2, axis=1))))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,61 +18,46 @@ from kiteline_agent.runtime.frame_reader import FrameReader
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.step import Identity, PredictedPose, StepInput, StepOutput
 from kiteline_core import odometry
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch
+from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import AgentId
-from kiteline_hw.sim.source import open_sim
+from tests.agent.room_flight import RoomFlight
 
 F64 = NDArray[np.float64]
 S = 1_000_000_000
 BEGIN = 20  # frames until all is initialised
 
 
-@dataclass
-class Flight:
-    rig: CameraRig
-    imu: ImuCalibration | None
-    frames: list[Frame]
-    samples: list[ImuBatch]
-    truth: F64
-    driven: OdometryBatch
-
-
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight(room_flight: RoomFlight) -> RoomFlight:
     """3.5 s in full motion through a room, at half the usual size."""
-    source = open_sim("room", seconds=3.5, seed=5, scale=0.5, texture_bits=9, rest=0.0, odometry=50.0)
-    frames, samples = [], []
-    for item in source:
-        if isinstance(item, Frame):
-            frames.append(item)
-        elif isinstance(item, ImuBatch):
-            samples.append(item)
-    truth, driven = source.ground_truth, source.odometry()
-    assert truth is not None
-    assert driven is not None
-    return Flight(source.rig, source.imu, frames, samples, truth.T_w_b, driven)
+    return room_flight.first(3.5)
 
 
-def between(flight: Flight, from_ns: int, to_ns: int) -> ImuBatch | None:
-    t, gyro, accel = (np.concatenate([getattr(b, name) for b in flight.samples]) for name in ("t_ns", "gyro", "accel"))
-    some = (t > from_ns) & (t <= to_ns)
-    return ImuBatch(t[some], gyro[some], accel[some]) if some.any() else None
+def between(flight: RoomFlight, from_ns: int, to_ns: int) -> ImuBatch | None:
+    felt = flight.samples
+    some = (felt.t_ns > from_ns) & (felt.t_ns <= to_ns)
+    return ImuBatch(felt.t_ns[some], felt.gyro[some], felt.accel[some]) if some.any() else None
 
 
-def driven_between(flight: Flight, from_ns: int, to_ns: int) -> OdometryBatch:
+def driven_between(flight: RoomFlight, from_ns: int, to_ns: int) -> OdometryBatch:
     t = flight.driven.t_ns
     return odometry.chosen(flight.driven, (t > from_ns) & (t <= to_ns))
 
 
-def agent_of(flight: Flight, sensor: str, config: AgentConfig | None = None) -> Agent:
+def agent_of(flight: RoomFlight, sensor: str, config: AgentConfig | None = None) -> Agent:
     imu = flight.imu if sensor == "imu" else None
     return Agent(flight.rig, imu, config or AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
 
 
 def fly(
-    flight: Flight, sensor: str, every: int, *, ask: bool = True, config: AgentConfig | None = None, busy_ns: int = 0
+    flight: RoomFlight,
+    sensor: str,
+    every: int,
+    *,
+    ask: bool = True,
+    config: AgentConfig | None = None,
+    busy_ns: int = 0,
 ) -> list[StepOutput]:
     """From BEGIN on only every n-th frame is given; for the others a pose is asked for. busy_ns: of a frame."""
     agent = agent_of(flight, sensor, config)
@@ -90,7 +75,7 @@ def fly(
     return out
 
 
-def errors(flight: Flight, out: list[StepOutput]) -> tuple[F64, F64]:
+def errors(flight: RoomFlight, out: list[StepOutput]) -> tuple[F64, F64]:
     """Position error in m of predicted poses, from the tracked one before, and normalised squares of the six errors."""
     off, squares = [], []
     for k in range(BEGIN, len(out)):
@@ -112,7 +97,7 @@ def errors(flight: Flight, out: list[StepOutput]) -> tuple[F64, F64]:
 @pytest.mark.parametrize(("sensor", "source", "most_m"), [
     ("imu", "imu", 0.0015), ("odometer", "odometer", 0.008), ("none", "velocity", 0.015),
 ])  # fmt: skip
-def test_a_skipped_frame_gets_the_true_pose(flight: Flight, sensor: str, source: str, most_m: float) -> None:
+def test_a_skipped_frame_gets_the_true_pose(flight: RoomFlight, sensor: str, source: str, most_m: float) -> None:
     out = fly(flight, sensor, 2)
     predicted = [o.predicted for o in out[BEGIN:] if o.estimate is None]
     assert len(predicted) > 20
@@ -124,7 +109,7 @@ def test_a_skipped_frame_gets_the_true_pose(flight: Flight, sensor: str, source:
 
 
 @pytest.mark.parametrize("sensor", ["imu", "odometer", "none"])
-def test_predicting_changes_nothing(flight: Flight, sensor: str) -> None:
+def test_predicting_changes_nothing(flight: RoomFlight, sensor: str) -> None:
     asked, unasked = fly(flight, sensor, 3), fly(flight, sensor, 3, ask=False)
     for a, b in zip(asked, unasked, strict=True):
         assert (a.estimate is None) == (b.estimate is None)
@@ -136,7 +121,7 @@ def test_predicting_changes_nothing(flight: Flight, sensor: str) -> None:
     assert poses[0] == poses[1] and len(poses[0]) > 20
 
 
-def test_frames_that_the_governor_skips_get_a_pose(flight: Flight) -> None:
+def test_frames_that_the_governor_skips_get_a_pose(flight: RoomFlight) -> None:
     governor = replace(AgentConfig().governor, cpu_percent=30.0, grace_s=0.5)
     out = fly(flight, "imu", 1, config=replace(AgentConfig(), governor=governor), busy_ns=30_000_000)
     counts = FrameCounts()
@@ -151,7 +136,7 @@ def test_frames_that_the_governor_skips_get_a_pose(flight: Flight) -> None:
     assert counts.as_report()["predicted"] == counts.dropped > 10
 
 
-def test_between_frames_velocity_and_rate_are_those_of_the_instant(flight: Flight) -> None:
+def test_between_frames_velocity_and_rate_are_those_of_the_instant(flight: RoomFlight) -> None:
     agent = agent_of(flight, "imu")
     last_ns, off = flight.frames[0].t_ns - S, []
     for k, frame in enumerate(flight.frames[:-1]):
@@ -175,7 +160,7 @@ def test_between_frames_velocity_and_rate_are_those_of_the_instant(flight: Fligh
     assert np.median(off) < 0.05
 
 
-def test_no_pose_without_a_map_before_the_last_frame_or_long_after(flight: Flight) -> None:
+def test_no_pose_without_a_map_before_the_last_frame_or_long_after(flight: RoomFlight) -> None:
     agent, frame = agent_of(flight, "none"), flight.frames[0]
     assert agent.predict(frame.t_ns) is None
     agent.step(StepInput(frame), frame.t_ns)
@@ -201,7 +186,7 @@ def test_poses_are_sent_at_their_rate_whatever_the_steps() -> None:
     assert not PoseSchedule(0.0, 0).take_due(S)
 
 
-def test_samples_before_a_frame_are_taken_once(flight: Flight) -> None:
+def test_samples_before_a_frame_are_taken_once(flight: RoomFlight) -> None:
     first = flight.frames[0]
     samples = ImuBatch(first.t_ns + np.arange(10, dtype=np.int64), np.ones((10, 3)), np.ones((10, 3)))
     reader = FrameReader([samples, first], None, lambda: 0)

@@ -11,16 +11,15 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.ids import AgentId
-from kiteline_hw.sim.source import open_sim
+from tests.agent.room_flight import RoomFlight
 
 BEGIN = 50  # the first dark frame, at 20 Hz, without an IMU
 
 
-def fly(dark: int) -> tuple[Agent, list[Estimate]]:
-    source = open_sim("room", seconds=5.0, seed=5, scale=0.5, texture_bits=9, rest=0.0)
-    agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+def fly(flight: RoomFlight, dark: int) -> tuple[Agent, list[Estimate]]:
+    agent = Agent(flight.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out = []
-    for k, frame in enumerate(item for item in source if isinstance(item, Frame)):
+    for k, frame in enumerate(flight.frames):
         if BEGIN <= k < BEGIN + dark:
             frame = Frame(frame.t_ns, np.full_like(frame.left, 8), np.full_like(frame.left, 8))
         estimate = agent.step(StepInput(frame), frame.t_ns).estimate
@@ -30,8 +29,8 @@ def fly(dark: int) -> tuple[Agent, list[Estimate]]:
 
 
 @pytest.mark.parametrize("dark", [12, 16])
-def test_quality_comes_back_as_the_map_says(dark: int) -> None:
-    agent, found = fly(dark)
+def test_quality_comes_back_as_the_map_says(room_flight: RoomFlight, dark: int) -> None:
+    agent, found = fly(room_flight.first(5.0), dark)
     before, last = found[BEGIN - 1], found[-1]
     assert agent.odometry_quality(before) > 80
     assert last.tracked and not last.bridged and last.submap == before.submap

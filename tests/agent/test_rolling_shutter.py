@@ -14,7 +14,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
-from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import AgentId
@@ -60,19 +60,24 @@ def test_rows_are_those_of_the_raw_image_and_the_middle_one_stays() -> None:
     assert shutter(np.zeros(6)).largest_px() == pytest.approx(0.0, abs=1e-9)
 
 
+Rolled = tuple[SimSource, list[Frame | ImuBatch | OdometryBatch]]
+
+
 @pytest.fixture(scope="module")
-def rolled() -> SimSource:
-    """4 s at half size, in full motion after 2 s at rest."""
-    return open_sim("room", seconds=5.0, seed=5, scale=0.5, texture_bits=9, readout_s=READOUT_S)
+def rolled() -> Rolled:
+    """4 s at half size, in full motion after 2 s at rest: the source, and all that it yields."""
+    source = open_sim("room", seconds=5.0, seed=5, scale=0.5, texture_bits=9, readout_s=READOUT_S)
+    return source, list(source)
 
 
-def step_error_m(source: SimSource, readout_s: float, begin: int) -> float:
+def step_error_m(rolled: Rolled, readout_s: float, begin: int) -> float:
     """Error rms of the motion between frames, from frame `begin` on. readout_s: as the calibration tells it."""
+    source, items = rolled
     rig = replace(source.rig, left=replace(source.rig.left, readout_s=readout_s))
     agent = Agent(rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     found, imu, frames, truth = [], None, 0, source.ground_truth
     assert truth is not None
-    for item in source:
+    for item in items:
         if isinstance(item, ImuBatch):
             imu = item
         elif isinstance(item, Frame):
@@ -89,9 +94,9 @@ def step_error_m(source: SimSource, readout_s: float, begin: int) -> float:
 
 
 @pytest.mark.parametrize("begins", [(0,), (40, 50, 60)])
-def test_a_calibrated_read_out_makes_the_motion_truer(rolled: SimSource, begins: tuple[int, ...]) -> None:
+def test_a_calibrated_read_out_makes_the_motion_truer(rolled: Rolled, begins: tuple[int, ...]) -> None:
     """From rest, and from starts in motion together: there depths err too, and single starts differ by chance."""
-    assert rolled.rig.left.readout_s == READOUT_S
+    assert rolled[0].rig.left.readout_s == READOUT_S
 
     def error_m(readout_s: float) -> float:
         return float(np.hypot.reduce([step_error_m(rolled, readout_s, begin) for begin in begins]))

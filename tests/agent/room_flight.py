@@ -1,0 +1,49 @@
+"""A rendered flight that many tests fly: whole, or its first seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core import odometry
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch
+from kiteline_core.geometry.cameras import CameraRig
+from kiteline_hw.sim.source import FRAME_NS, START_NS, open_sim
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RoomFlight:
+    """A flight at 20 Hz with all samples of its IMU and odometer. truth: (n,4,4) T_w_b at the n frames."""
+
+    rig: CameraRig
+    imu: ImuCalibration
+    frames: list[Frame]
+    samples: ImuBatch
+    driven: OdometryBatch
+    truth: F64
+
+    def first(self, seconds: float) -> RoomFlight:
+        """The first seconds of the flight."""
+        frames = self.frames[: round(seconds * 1e9) // FRAME_NS]
+        felt, driven = (batch.t_ns <= frames[-1].t_ns for batch in (self.samples, self.driven))
+        s = self.samples
+        return replace(
+            self, frames=frames, samples=ImuBatch(s.t_ns[felt], s.gyro[felt], s.accel[felt]),
+            driven=odometry.chosen(self.driven, driven), truth=self.truth[: len(frames)],
+        )  # fmt: skip
+
+
+def render() -> RoomFlight:
+    """6.5 s in full motion along the room's own course, at half the usual size."""
+    source = open_sim("room", seconds=6.5, seed=5, scale=0.5, texture_bits=9, rest=0.0, odometry=50.0)
+    truth, driven = source.ground_truth, source.odometry()
+    assert truth is not None
+    assert driven is not None
+    assert source.imu is not None
+    frames = [item for item in source if isinstance(item, Frame)]
+    assert frames[0].t_ns == START_NS
+    return RoomFlight(source.rig, source.imu, frames, source.imu_samples(), driven, truth.T_w_b)
