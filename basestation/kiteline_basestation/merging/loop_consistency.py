@@ -19,22 +19,34 @@ F64 = NDArray[np.float64]
 _PLANE_ROUNDS = 4  # plane fits, each to the points near the last one
 
 
-def agree(sparse_map: SparseMap, a: LoopEdge, b: LoopEdge, config: LoopConfig) -> bool:
-    """True if two matches imply the same correction, up to the drift between their keyframes."""
-    Xa, Xb = correction_of(sparse_map, a), correction_of(sparse_map, b)
-    same_submap = submap_of_keyframe(a.new) == submap_of_keyframe(b.new)
-    if not same_submap:
-        Xa = sim3.inverse(Xa)
-    if abs(np.log(sim3.scale_of(Xa) / sim3.scale_of(Xb))) > config.agree_scale:
-        return False
-    T_w_a, T_w_b = sparse_map.world_pose(a.new), sparse_map.world_pose(b.new)
-    assert T_w_a is not None and T_w_b is not None
-    at = T_w_b[:3, 3]
-    apart = float(np.linalg.norm(se3.transform(Xa, at[None])[0] - se3.transform(Xb, at[None])[0]))
-    path = float(np.linalg.norm(T_w_a[:3, 3] - at)) if same_submap else 0
-    depth = max(depth_of(sparse_map, a), depth_of(sparse_map, b))
-    limit = config.agree_m + config.agree_depth * depth + config.agree_path * path
-    return apart <= limit and _rotation_between(Xa, Xb) <= config.agree_rad
+def agreeing(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> list[LoopMatch]:
+    """Matches that imply the same correction as the last one, up to the drift between their keyframes."""
+    table, rows = sparse_map.keyframes, sparse_map.rows
+    new, old = (np.array([rows[k] for k in ks]) for ks in ([m.new for m in matches], [m.old for m in matches]))
+    T_old_new, T_w_new, T_w_old = np.stack([m.T_old_new for m in matches]), table.T_w_k[new], table.T_w_k[old]
+    # The correction maps p to scale R p + t, all in w.
+    scale = table.scale[old] * np.array([m.scale for m in matches]) / table.scale[new]
+    R_w_old, at_new = T_w_old[:, :3, :3], T_w_new[:, :3, 3]
+    R = R_w_old @ T_old_new[:, :3, :3] @ np.swapaxes(T_w_new[:, :3, :3], 1, 2)
+    moved = np.einsum("nij,nj->ni", R_w_old, T_old_new[:, :3, 3] * table.scale[old][:, None]) + T_w_old[:, :3, 3]
+    t = moved - scale[:, None] * np.einsum("nij,nj->ni", R, at_new)
+    submap = submap_of_keyframe(matches[-1].new)
+    same = np.array([submap_of_keyframe(m.new) == submap for m in matches])
+    back = ~same  # these lead from the other submap to this one: their inverse counts
+    R[back] = np.swapaxes(R[back], 1, 2)
+    scale[back] = 1.0 / scale[back]
+    t[back] = -scale[back, None] * np.einsum("nij,nj->ni", R[back], t[back])
+
+    at = at_new[-1]
+    there = scale[:, None] * (R @ at) + t
+    apart = np.linalg.norm(there - there[-1], axis=1)
+    path = np.where(same, np.linalg.norm(at_new - at, axis=1), 0.0)
+    depth = np.array([m.depth_m for m in matches]) * table.scale[old]
+    limit = config.agree_m + config.agree_depth * np.maximum(depth, depth[-1]) + config.agree_path * path
+    chord = np.linalg.norm(R - R[-1], axis=(1, 2)) / np.sqrt(8.0)
+    turn = 2.0 * np.arcsin(np.minimum(chord, 1.0))
+    fits = (apart <= limit) & (turn <= config.agree_rad) & (np.abs(np.log(scale / scale[-1])) <= config.agree_scale)
+    return [match for match, fit in zip(matches, fits.tolist()) if fit]
 
 
 def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:

@@ -199,7 +199,7 @@ class LoopDetector:
         if not same_map and not consistency.keeps_level(self._map, match, config):
             self.rejected += 1
             return None
-        chosen = [m for m in matches if consistency.agree(self._map, m, match, config)]
+        chosen = consistency.agreeing(self._map, matches, config)
         supporters = {m.new for m in chosen}
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):

@@ -1,0 +1,70 @@
+"""Which matches agree on one correction, against plain similarities."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_basestation.config import LoopConfig
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.loop_consistency import agreeing
+from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of, depth_of
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
+
+A, B = submap_id(0, 1, 0), submap_id(1, 1, 0)
+
+
+def agree(sparse_map: SparseMap, a: LoopMatch, b: LoopMatch, config: LoopConfig) -> bool:
+    """The reference: matrix by matrix."""
+    Xa, Xb = correction_of(sparse_map, a), correction_of(sparse_map, b)
+    same_submap = submap_of_keyframe(a.new) == submap_of_keyframe(b.new)
+    if not same_submap:
+        Xa = sim3.inverse(Xa)
+    if abs(np.log(sim3.scale_of(Xa) / sim3.scale_of(Xb))) > config.agree_scale:
+        return False
+    T_w_a, T_w_b = sparse_map.world_pose(a.new), sparse_map.world_pose(b.new)
+    assert T_w_a is not None and T_w_b is not None
+    at = T_w_b[:3, 3]
+    apart = float(np.linalg.norm(se3.transform(Xa, at[None])[0] - se3.transform(Xb, at[None])[0]))
+    path = float(np.linalg.norm(T_w_a[:3, 3] - at)) if same_submap else 0.0
+    depth = max(depth_of(sparse_map, a), depth_of(sparse_map, b))
+    turn = se3.so3_log(sim3.rigid(sim3.inverse(Xa) @ Xb)[:3, :3])
+    limit = config.agree_m + config.agree_depth * depth + config.agree_path * path
+    return apart <= limit and float(np.linalg.norm(turn)) <= config.agree_rad
+
+
+def test_those_agree_that_imply_one_correction() -> None:
+    rng, config, counted = np.random.default_rng(0), LoopConfig(), []
+    for unit in (1.0, 0.6):
+        sparse_map = SparseMap()
+        for submap in (A, B):
+            for k in range(12):
+                T = se3.exp(np.concatenate([rng.normal(0.0, 2.0, 3), rng.normal(0.0, 1.0, 3)]))
+                sparse_map.add_keyframe(keyframe_id(submap, k), k, NO_KEYFRAME, T, 0)
+        sparse_map.scale_submap(B, unit)
+        X = sim3.of(1.3, se3.exp(np.array([3.0, -1.0, 0.5, 0.1, -0.2, 2.0])))
+
+        def match(
+            new: KeyframeId, old: KeyframeId, X_here: np.ndarray, sparse_map: SparseMap = sparse_map
+        ) -> LoopMatch:
+            """One that implies the correction X_here up to noise, now within the limits and now beyond."""
+            S_w_old, S_w_new = (
+                sim3.of(float(sparse_map.keyframes.scale[sparse_map.rows[k]]), sparse_map.world_pose(k))  # type: ignore[arg-type]
+                for k in (old, new)
+            )
+            size = rng.choice([0.01, 0.1, 0.3])
+            noise = sim3.of(
+                float(np.exp(rng.normal(0.0, 0.3 * size))), se3.exp(rng.normal(0.0, size, 6) * [1, 1, 1, 0.2, 0.2, 0.2])
+            )
+            S = noise @ sim3.inverse(S_w_old) @ X_here @ S_w_new
+            return LoopMatch(new, old, sim3.rigid(S), 50, float(rng.uniform(1.0, 5.0)), sim3.scale_of(S))
+
+        matches = [match(keyframe_id(A, k), keyframe_id(B, k), X) for k in range(12)]
+        matches += [match(keyframe_id(B, k), keyframe_id(A, 11 - k), sim3.inverse(X)) for k in range(12)]
+        for last in range(len(matches)):
+            listed = [*matches[:last], *matches[last + 1 :], matches[last]]
+            expected = [m for m in listed if agree(sparse_map, m, matches[last], config)]
+            assert [(m.new, m.old) for m in agreeing(sparse_map, listed, config)] == [(m.new, m.old) for m in expected]
+            assert expected[-1] is matches[last]
+            counted.append(len(expected))
+    assert min(counted) < 6 < max(counted) < 24  # some agree, some do not
