@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from kiteline_bench.harness.bars import Run, in_turn
-from kiteline_bench.vehicle import camera, controllers, costs, faults, units
+from kiteline_bench.vehicle import camera, controllers, costs, faults, raw_images, units
 from kiteline_bench.vehicle.sitl import flights
 
 PARTS: dict[str, tuple[str, Run]] = {
     "sitl": ("Vehicle: ArduCopter in the loop", flights.run),
     "controllers": ("Vehicle: modelled ArduPilot and PX4", controllers.run),
     "faults": ("Vehicle: faults of cameras and lines", faults.run),
-    "camera": ("Vehicle: a live camera at 20 Hz beside link, MAVLink and log", in_turn(camera.run, costs.run)),
+    "camera": ("Vehicle: a live camera at 20 Hz beside link, MAVLink and log", in_turn(camera.run, costs.run, raw_images.run)),
     "units": ("Vehicle: services", units.run),
 }

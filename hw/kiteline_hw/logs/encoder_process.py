@@ -59,7 +59,8 @@ class EncoderProcess:
 
     def submit(self, pixels: U8) -> Future[EncodedImage] | None:
         """Send an image; None if all slots are taken, the image is too large, or the process has ended."""
-        self.poll()
+        if not self._free:
+            self.poll()
         h, w = pixels.shape
         if not self.alive or not self._free or 2 * (h * (w + 2) + _HEADROOM) > self._slot_bytes:
             return None

@@ -29,6 +29,7 @@ class EncodingPolicy:
 
 
 ENCODE_ALL = EncodingPolicy()
+_LOOK_EVERY = 8  # messages that wait between two looks at what the other process has ready: each look is a system call
 _Then = Callable[[EncodedImage], None]
 
 
@@ -45,6 +46,7 @@ class ImageEncoder:
         self.apart = False
         self._process: EncoderProcess | None = None
         self._draining = False
+        self._unlooked = 0  # messages since the last look
         self._policy = policy
         self._thread: ThreadPoolExecutor | None = None
         self._images: deque[Future[EncodedImage]] = deque()
@@ -106,6 +108,10 @@ class ImageEncoder:
 
     def drain(self, wait: bool = True) -> None:
         """Write what is ready, in order. wait: for images that are being encoded, too."""
+        self._unlooked += 1
+        if not wait and self._process is not None and self._unlooked < _LOOK_EVERY:
+            return
+        self._unlooked = 0
         self._draining = True
         self._poll()
         try:
