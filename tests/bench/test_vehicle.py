@@ -119,3 +119,8 @@ def test_what_is_said_twice_does_not_count_as_once() -> None:
     assert all(bar.met for bar in faults._said("\n".join(once)))
     twice = [*once, "flight controller: silent for 5 s"]
     assert [bar.met for bar in faults._said("\n".join(twice))].count(False) == 1
+
+
+def test_an_agent_that_died_meets_no_bar(tmp_path: Path) -> None:
+    bars = faults._tracked("cameras unplugged at 5\nTraceback", tmp_path)
+    assert len(bars) == 3 and not any(bar.met for bar in bars)

@@ -10,6 +10,9 @@ PARTS: dict[str, tuple[str, Run]] = {
     "sitl": ("Vehicle: ArduCopter in the loop", flights.run),
     "controllers": ("Vehicle: modelled ArduPilot and PX4", controllers.run),
     "faults": ("Vehicle: faults of cameras and lines", faults.run),
-    "camera": ("Vehicle: a live camera at 20 Hz beside link, MAVLink and log", in_turn(camera.run, costs.run, raw_images.run)),
+    "camera": (
+        "Vehicle: a live camera at 20 Hz beside link, MAVLink and log",
+        in_turn(camera.run, costs.run, raw_images.run),
+    ),
     "units": ("Vehicle: services", units.run),
 }

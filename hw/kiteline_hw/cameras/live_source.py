@@ -67,6 +67,11 @@ class CameraSource:
                 yield frame
 
     @property
+    def closed(self) -> bool:
+        """True after `close`."""
+        return self._closed.is_set()
+
+    @property
     def decode_ns(self) -> int:
         """CPU time that the threads spent on decoding so far."""
         return self._decode_ns

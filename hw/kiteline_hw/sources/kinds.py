@@ -39,9 +39,10 @@ SOURCES: tuple[SourceKind, ...] = (
     SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images", told=True),
     SourceKind("sim", "SCENE", "simulated flight: room, hall, corridor or street", "kiteline_hw.sim.source"),
     SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2", told=True),
-    SourceKind("picamera", "N[,N]", "camera of a Raspberry Pi, or a pair", "kiteline_hw.cameras.picamera"),
+    SourceKind("picamera", "N[,N]", "camera of a Raspberry Pi, or a pair", "kiteline_hw.cameras.picamera", told=True),
     SourceKind("stream", "URL[,URL]", "network camera (RTSP, UDP, HTTP) through ffmpeg", "kiteline_hw.cameras.stream",
                told=True),
+    SourceKind("ros2", "TOPIC[,TOPIC]", "live topics of ROS 2, where rclpy is", "kiteline_hw.cameras.ros2", told=True),
 )  # fmt: skip
 
 
