@@ -284,6 +284,8 @@ class Agent:
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame stays. Returns events."""
         last, anchor = self._last_track, None
+        if not self._has_depth:
+            self.map.patient = self._camera.motion.running  # an IMU holds the scale of its depths
         if records and last is not None:
             anchor = MapAnchor(self.map, last, self._config, inertial=self._camera.motion.running)
         moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)

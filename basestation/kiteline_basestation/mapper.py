@@ -246,10 +246,10 @@ class Mapper:
         for keyframe in changes.requeried:
             self._local_bundles.add(keyframe)
         withdrawn = self._placements.separate(changes.split)
-        self._placements.rescale(changes.rescaled)
+        self._placements.rescale(changes.rescaled, changes.scale_sigma)
         for map_id in sorted(changes.moved):
             self._local_bundles.cancel(map_id)
-            self._placements.update_map(map_id, changes.scale_sigma.get(map_id))
+            self._placements.update_map(map_id)
             self._grid.rebuild()
         return tuple(
             (agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0))

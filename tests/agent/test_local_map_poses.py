@@ -116,12 +116,14 @@ def refined(held: LocalMap, k: int, offset_px: float) -> bool:
     return held.refine(RefinedLandmarks(KeyframeId(k), index, np.full(20, 1.0 / DEPTH_M, np.float32), offset))
 
 
-def test_a_monocular_camera_takes_refined_landmarks_at_once() -> None:
+@pytest.mark.parametrize("with_imu", [False, True])
+def test_a_monocular_camera_takes_refined_landmarks_at_once_unless_an_imu_holds_its_scale(with_imu: bool) -> None:
     held = local_map(camera=replace(CAMERA, stereo=False))
+    held.patient = held.patient or with_imu
     held.share(KeyframeId(0), 30)
     before = held.bearing.copy()
-    assert refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
-    assert np.abs(held.bearing - before)[held.slot_of(KeyframeId(0))].max() > 0.0
+    assert refined(held, 0, 0.5 * CONFIG.local_map.moved_px) != with_imu
+    assert (np.abs(held.bearing - before)[held.slot_of(KeyframeId(0))].max() > 0.0) != with_imu
 
 
 def test_refined_landmarks_wait_with_the_poses() -> None:

@@ -271,7 +271,8 @@ def steps_along(true: Callable[[float], F64], from_s: float, to_s: float, n: int
     return {name: np.array(values) for name, values in rows.items()}
 
 
-def fed(flight: Any, words: Any) -> Mapper:
+def fed(flight: Any, words: Any, told: list[SubmapPlacement] | None = None) -> Mapper:
+    """The base after a flight. told: takes the placements that it publishes."""
     mapper = Mapper(BaseConfig(), words)
     done: tuple[JobDone, ...] = ()
     for n in range(len(flight.records) + 30):
@@ -279,9 +280,21 @@ def fed(flight: Any, words: Any) -> Mapper:
         records += flight.records[n] if n < len(flight.records) else []
         output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * 250_000_000)
         done = tuple(run_job(job) for job in output.jobs)
+        if told is not None:
+            told += [r for _, records in output.publish for r in records if isinstance(r, SubmapPlacement)]
     assert mapper.idle
     assert contradictions(mapper) == []
     return mapper
+
+
+def test_a_change_of_scale_is_told_with_its_own_deviation(
+    make_flight: Callable[..., Any], lively_room: Any, words: Any
+) -> None:
+    told: list[SubmapPlacement] = []
+    mapper = fed(a_flight_in_wrong_metres(make_flight, lively_room, with_steps=True), words, told)
+    scaled = [p for p in told if sim3.scale_of(p.S_w_m) != 1.0]
+    assert scaled and all(p.scale_sigma > 0.0 for p in scaled)
+    assert scaled[-1].scale_sigma == mapper._placements._scale_sigma[scaled[-1].submap]
 
 
 def length_ratio(places: F64, flight: Any) -> float:

@@ -109,7 +109,7 @@ class Corrections:
         """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
         if not self._map.due:
             return False
-        if anchor is not None and self._map.camera.stereo:
+        if anchor is not None and self._map.patient:
             before = self._map.save()
             self._map.try_corrections(anchor.keyframes)
             self._map.compose_unplaced()

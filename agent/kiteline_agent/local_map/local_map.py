@@ -99,6 +99,7 @@ class LocalMap:
         self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
+        self.patient = camera.stereo  # landmarks wait like poses, until they matter: own depths are as good
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
@@ -334,7 +335,7 @@ class LocalMap:
     def refine(self, record: RefinedLandmarks) -> bool:
         """Take over landmarks that only the base could triangulate; hold the others ready for `apply_corrections`.
 
-        Without a right camera, all are taken over: depths by the agent's own motion are worse than the base's.
+        All are taken over while depths rest on the agent's own images alone: the base's are better.
         """
         slot = self.slot_of(record.keyframe)
         if slot < 0:
@@ -347,7 +348,7 @@ class LocalMap:
             record.inv_depth[keep].astype(np.float64),
             self._bearings(self.uv[slot, index] + record.offset[keep]),
         )
-        at_once = fresh | (not self.camera.stereo)
+        at_once = fresh | (not self.patient)
         any_at_once = bool(at_once.any())
         if any_at_once:
             self._set_landmarks(slot, index[at_once], rho[at_once], bearing[at_once])

@@ -122,8 +122,13 @@ class SubmapPlacements:
         self._set(submap, S_w_m)
         return True
 
-    def rescale(self, factors: Mapping[SubmapId, float]) -> None:
-        """Scale placements of submaps whose units grew in their maps, about their first keyframes."""
+    def rescale(self, factors: Mapping[SubmapId, float], scale_sigma: Mapping[SubmapId, float]) -> None:
+        """Scale placements of submaps whose units grew in their maps, about their first keyframes.
+
+        scale_sigma: relative deviations of lengths, by map id; they are told with the change.
+        """
+        for map_id, sigma in scale_sigma.items():
+            self._scale_sigma |= dict.fromkeys(self._map.submaps_of_map(map_id), sigma)
         for submap, factor in factors.items():
             first = self._map.first_pose(submap)
             if submap in self.S_w_m:
@@ -150,15 +155,12 @@ class SubmapPlacements:
         self._scale_sigma.pop(submap, None)
         self._recognised.discard(submap)
 
-    def update_map(self, map_id: SubmapId, scale_sigma: float | None = None) -> None:
+    def update_map(self, map_id: SubmapId) -> None:
         """Place all submaps of a map as they lie to each other, if one of them is placed.
 
-        A map in metres keeps its unit: if w had another unit, w is rescaled. scale_sigma: relative deviation of the
-        map's lengths; None: as before.
+        A map in metres keeps its unit: if w had another unit, w is rescaled.
         """
         submaps = self._map.submaps_of_map(map_id)
-        if scale_sigma is not None:
-            self._scale_sigma |= dict.fromkeys(submaps, scale_sigma)
         root = self._map.map_id(map_id)
         first = self.first
         anchor = next((s for s in [first, root, *submaps] if s in self.S_w_m and s in submaps), None)
