@@ -78,6 +78,11 @@ class LiveSource(FrameSource, Protocol):
         """CPU time that its threads spent on decoding so far."""
         ...
 
+    @property
+    def skew_ns(self) -> tuple[int, int] | None:
+        """Right stamp minus left stamp over the last pairs: median, and the largest deviation; None without pairs."""
+        ...
+
     def poll(self, until_ns: int) -> Frame | ImuBatch | OdometryBatch | None:
         """The next sample, awaited until a time of the monotonic clock at most; None if none has come."""
         ...

@@ -110,6 +110,11 @@ class RosSource:
         """CPU time that the threads of the cameras spent on decoding so far."""
         return self._frames.decode_ns
 
+    @property
+    def skew_ns(self) -> tuple[int, int] | None:
+        """Right stamp minus left stamp over the last pairs: median, and the largest deviation from it."""
+        return self._frames.skew_ns
+
     def _take_imu(self, message: Any) -> None:
         try:
             rows = read_imu(message, 0)

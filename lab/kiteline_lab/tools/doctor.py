@@ -272,17 +272,33 @@ def main(argv: list[str]) -> int:
     )
     p.add_argument("--mavlink", metavar="URL", help="check the flight controller there too; the agent must not run")
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="key of its signatures, as the agent's")
+    p.add_argument("--camera", metavar="SOURCE", help="watch these cameras for some seconds; the agent must not run")
+    p.add_argument("--calibration", metavar="FILE[,FILE]", default="", help="of the cameras, as the agent's")
     p.add_argument("--json", action="store_true", help="print the results as JSON")
     a = p.parse_args(argv)
-    results = (
-        run_checks() + (check_controller(a.mavlink, a.mavlink_key) if a.mavlink else []) + (warm() if a.warm else [])
-    )
+    results = run_checks()
+    if a.mavlink:
+        results += check_controller(a.mavlink, a.mavlink_key)
+    if a.camera:
+        results += _cameras(a.camera, a.calibration)
+    if a.warm:
+        results += warm()
     if a.json:
         lines = [{**asdict(f), "severity": f.severity.name.lower()} for f in results]
         print(json.dumps({"failed": any(f.severity is Severity.FAIL for f in results), "checks": lines}, indent=1))
     else:
         _print(results)
     return 1 if any(f.severity is Severity.FAIL for f in results) else 0
+
+
+def _cameras(spec: str, calibration: str) -> list[DoctorCheck]:
+    from kiteline_hw.ports import SourceError
+    from kiteline_lab.tools.checks.cameras import check_cameras
+
+    try:
+        return check_cameras(spec, calibration)
+    except SourceError as error:
+        return [DoctorCheck(Severity.FAIL, "cameras", str(error))]
 
 
 def _print(results: list[DoctorCheck]) -> None:
