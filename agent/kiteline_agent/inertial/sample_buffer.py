@@ -54,15 +54,15 @@ class SampleBuffer:
             return
         values = np.concatenate([imu.gyro, imu.accel], axis=1)
         newest = int(self._t[-1]) if len(self._t) else -(1 << 62)
-        good = (imu.t_ns > newest) & np.isfinite(values).all(axis=1)
-        new = int(np.count_nonzero(good))
-        t = np.concatenate([self._t, imu.t_ns[good]])
-        if len(t) == 0:
-            return
-        first = int(t.searchsorted(t[-1] - self._keep_ns))
-        self._t, self._values = t[first:], np.concatenate([self._values, values[good]])[first:]
-        self._clipped = np.concatenate([self._clipped, np.zeros((new, 2), np.bool_)])[first:]
+        stamps, new = imu.t_ns, len(imu.t_ns)
+        if int(stamps.min()) <= newest or not np.isfinite(values).all():
+            good = (stamps > newest) & np.isfinite(values).all(axis=1)
+            stamps, values, new = stamps[good], values[good], int(np.count_nonzero(good))
         if new:
+            t = np.concatenate([self._t, stamps])
+            first = int(t.searchsorted(t[-1] - self._keep_ns))
+            self._t, self._values = t[first:], np.concatenate([self._values, values])[first:]
+            self._clipped = np.concatenate([self._clipped, np.zeros((new, 2), np.bool_)])[first:]
             self._find_clipped(new)
             self._unmeasured += new
             if self._unmeasured >= _AT_ONCE:
@@ -97,7 +97,8 @@ class SampleBuffer:
         if len(t) < 2 or to_ns <= from_ns:
             return None
         lo, hi = int(t.searchsorted(from_ns, "right")), int(t.searchsorted(to_ns, "left"))
-        stamps = np.concatenate([[from_ns], t[lo:hi], [to_ns]])
+        stamps = np.empty(hi - lo + 2, np.int64)
+        stamps[0], stamps[1:-1], stamps[-1] = from_ns, t[lo:hi], to_ns
         steps = stamps[1:] - stamps[:-1]
         if from_ns < t[0] - self._gap_ns or to_ns > t[-1] + self._gap_ns or steps.max() > self._gap_ns:
             return None
@@ -106,7 +107,7 @@ class SampleBuffer:
         values[0] = self._at(from_ns)
         values[-1] = self._at(to_ns)
         return Samples(
-            (stamps - from_ns) * 1e-9,
+            (stamps - from_ns).astype(np.float64) * 1e-9,
             np.ascontiguousarray(values[:, :3]),
             np.ascontiguousarray(values[:, 3:]),
             self._densities(steps, lo, hi),
@@ -144,16 +145,15 @@ class SampleBuffer:
 
     def _find_clipped(self, new: int) -> None:
         """Mark new samples that repeat the largest magnitude of the flight: the end of the range."""
-        values = self._values[-new - 1 :]
-        for sensor in range(2):
-            size = np.abs(values[:, 3 * sensor : 3 * sensor + 3])
-            largest = float(size.max())
+        size = np.abs(self._values[-new - 1 :])
+        most = size.max(axis=0).tolist()
+        for sensor, largest in enumerate((max(most[:3]), max(most[3:]))):
             if largest < self._largest[sensor]:
                 continue
             self._largest[sensor] = largest
-            at_end = (size == largest).any(axis=1)
+            at_end = (size[:, 3 * sensor : 3 * sensor + 3] == largest).any(axis=1)
             if np.count_nonzero(at_end) > 1:
-                self._clipped[-len(values) :, sensor] |= at_end
+                self._clipped[-len(size) :, sensor] |= at_end
 
     def _measure_noise(self, new: int) -> None:
         t, values = self._t[-new - 5 :], self._values[-new - 5 :]

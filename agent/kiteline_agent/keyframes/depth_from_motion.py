@@ -138,7 +138,7 @@ class DepthFromMotion:
         sigma = self._config.depth_from_motion.sigma_px * (1 << self._map.octave[rows])
         with np.errstate(divide="ignore"):
             variance = np.where(p[:, 2] > 0.05, sigma**2 / np.einsum("ni,ni->n", slope, slope), np.inf)
-        off = np.linalg.norm(p[:, :2] / z[:, None] * f + c - uv, axis=1)
+        off = np.hypot(*(p[:, :2] / z[:, None] * f + c - uv).T)
         return rho, variance, off
 
     def _count(self, rows: I64, hit: Bool, failed: Bool) -> None:

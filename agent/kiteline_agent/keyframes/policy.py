@@ -77,7 +77,7 @@ def situation(
     side_px = round(math.sqrt(camera.width * camera.height / _COVER_CELLS))
     columns = -(-camera.width // side_px)
     rows = -(-camera.height // side_px)
-    row, column = (uv[:, 1] // side_px).astype(np.int64), (uv[:, 0] // side_px).astype(np.int64)
+    column, row = (uv / side_px).astype(np.int64).T
     covered = np.zeros((rows, columns), np.bool_)
     covered[row, column] = True
     T_c_k = track.T_c_m @ T_m_k
@@ -88,6 +88,6 @@ def situation(
         track.inliers,
         reference_inliers,
         np.count_nonzero(covered) / covered.size,
-        float(np.linalg.norm(T_c_k[:3, 3])) / max(depth, 0.1),
-        float(np.linalg.norm(se3.so3_log(T_c_k[:3, :3]))),
+        math.hypot(*T_c_k[:3, 3].tolist()) / max(depth, 0.1),
+        math.hypot(*se3.so3_log(T_c_k[:3, :3]).tolist()),
     )

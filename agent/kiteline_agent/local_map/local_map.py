@@ -316,11 +316,9 @@ class LocalMap:
 
     def _shift_px(self, slot: int, T_m_k: F64) -> float:
         """By how much landmarks at the keyframe's typical depth move in its image if its pose is set to T_m_k (4,4)."""
-        change = se3.inverse(self.T_m_k[slot]) @ T_m_k
-        usable = self.usable[slot]
-        inverse_m = median(self.rho[slot, usable]) if usable.any() else 0.0
-        turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
-        return float(self.camera.fx * (float(np.linalg.norm(change[:3, 3])) * inverse_m + turn))
+        shift_m, turn = se3.shift_and_turn(se3.inverse(self.T_m_k[slot]) @ T_m_k)
+        rho = self.rho[slot, self.usable[slot]]
+        return float(self.camera.fx * (shift_m * (median(rho) if len(rho) else 0.0) + turn))
 
     def remove(self, record: RemovedObservations | CulledLandmarks) -> bool:
         """Stop searching for landmarks that the base removed."""
@@ -356,7 +354,7 @@ class LocalMap:
             index, rho, bearing = index[~at_once], rho[~at_once], bearing[~at_once]
         if len(index):
             self._new_landmarks[record.keyframe] = index, rho, bearing
-            turned = np.linalg.norm(bearing - self.bearing[slot, index], axis=1) * self.camera.fx
+            turned = np.hypot(*(bearing - self.bearing[slot, index]).T) * self.camera.fx
             nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
             self.due |= median(np.maximum(turned, nearer)) >= self._config.moved_px
         return any_at_once

@@ -14,6 +14,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId
+from kiteline_core.order_statistics import median
 from kiteline_core.pose import pose_kernels
 
 F64 = NDArray[np.float64]
@@ -45,10 +46,9 @@ class MapAnchor:
             return True
         T_c_m = self._track.T_c_m
         change = T_c_m @ T_new_old @ se3.inverse(T_c_m)
-        depth = float(np.median(self._track.depth_m[self._track.inlier]))
-        turn = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)  # chord: the angle when small
-        moved_px = self._map.camera.fx * (float(np.linalg.norm(change[:3, 3])) / depth + turn)
-        return bool(moved_px >= self._least_px)
+        depth = median(self._track.depth_m[self._track.inlier])
+        shift_m, turn = se3.shift_and_turn(change)
+        return self._map.camera.fx * (shift_m / depth + turn) >= self._least_px
 
     def T_new_old(self) -> F64 | None:
         """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""

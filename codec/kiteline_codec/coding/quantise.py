@@ -95,13 +95,12 @@ def pose_codes(pose: F64) -> tuple[int, ...]:
     error of d in them turns the result by at most 4 d (J. Schaub, M. Junkins, "Stereographic orientation parameters
     for attitude dynamics", 1996). Raises ValueError when the matrix is no rigid motion or too far out.
     """
-    rotation = pose[:3, :3]
-    if not (np.isfinite(pose).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3):
+    if not (np.isfinite(pose).all() and se3.is_rotation(pose[:3, :3], 1e-3)):
         raise ValueError(f"a rigid motion (4,4) is expected, found\n{pose}")
-    translation = [round(float(x) * TRANSLATION_STEPS) for x in pose[:3, 3]]
+    translation = [round(x * TRANSLATION_STEPS) for x in pose[:3, 3].tolist()]
     if max(map(abs, translation)) >= TRANSLATION_CODES:
         raise ValueError(f"a translation within +-1e8 m is expected, found {pose[:3, 3]}")
-    w, x, y, z = (float(c) for c in se3.quaternion_from_rotation(rotation))
+    w, x, y, z = se3.quaternion_numbers(pose[:3, :3])
     rotated = [round(c / (1.0 + w) * ROTATION_STEPS) for c in (x, y, z)]
     while sum(c * c for c in rotated) > _ROTATION_LIMIT:
         i = max(range(3), key=lambda k: abs(rotated[k]))

@@ -2,9 +2,14 @@
 
 Tangent vectors are [translation (3), rotation (3)] in metres and radians. Quaternions are [w, x, y, z] with w >= 0.
 Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", appendix D.
+
+What is called many times a frame computes with Python's floats: on so few numbers, a call of numpy costs more than all
+of the arithmetic. The results are the same on every machine, as no library's order of summation enters.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,28 +29,36 @@ def skew(v: F64) -> F64:
 
 def so3_exp(w: F64) -> F64:
     """Rotation matrix (3,3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
-    angle = float(np.sqrt(w @ w))
-    k = skew(w)
+    angle = math.hypot(*w.tolist())
     if angle < _SMALL_RAD:
-        return np.asarray(_EYE + k + 0.5 * (k @ k))
-    return np.asarray(_EYE + (np.sin(angle) / angle) * k + ((1.0 - np.cos(angle)) / angle**2) * (k @ k))
+        return _polynomial(w, 1.0, 0.5)
+    return _polynomial(w, math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2)
+
+
+def _polynomial(w: F64, a: float, b: float) -> F64:
+    """I + a K + b K^2 with K = skew(w)."""
+    x, y, z = w.tolist()
+    ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
+    return np.array((
+        1.0 - by * y - bz * z, bx * y - az, bx * z + ay,
+        bx * y + az, 1.0 - bx * x - bz * z, by * z - ax,
+        bx * z - ay, by * z + ax, 1.0 - bx * x - by * y,
+    )).reshape(3, 3)  # fmt: skip
 
 
 def so3_log(r: F64) -> F64:
     """Rotation vector (3,) in radians, of length at most pi, of a rotation matrix (3,3)."""
-    q = quaternion_from_rotation(r)
-    n = float(np.sqrt(q[1:] @ q[1:]))
-    if n < _SMALL_RAD:
-        return np.asarray(2.0 * q[1:] / q[0])
-    return np.asarray(2.0 * np.arctan2(n, q[0]) / n * q[1:])
+    w, x, y, z = quaternion_numbers(r)
+    n = math.sqrt(x * x + y * y + z * z)
+    share = 2.0 / w if n < _SMALL_RAD else 2.0 * math.atan2(n, w) / n
+    return np.array((share * x, share * y, share * z))
 
 
 def _left_jacobian(w: F64) -> F64:
-    angle = float(np.sqrt(w @ w))
-    k = skew(w)
+    angle = math.hypot(*w.tolist())
     if angle < 1e-4:
-        return np.asarray(_EYE + 0.5 * k + (k @ k) / 6.0)
-    return np.asarray(_EYE + ((1.0 - np.cos(angle)) / angle**2) * k + ((angle - np.sin(angle)) / angle**3) * (k @ k))
+        return _polynomial(w, 0.5, 1.0 / 6.0)
+    return _polynomial(w, (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3)
 
 
 def exp(xi: F64) -> F64:
@@ -61,8 +74,13 @@ def log(t: F64) -> F64:
 
 def inverse(t: F64) -> F64:
     """T_b_a of T_a_b."""
-    back = t[:3, :3].T
-    return from_rt(back, -(back @ t[:3, 3]))
+    (a, b, c, x), (d, e, f, y), (g, h, k, z), _ = t.tolist()
+    return np.array((
+        a, d, g, -(a * x + d * y + g * z),
+        b, e, h, -(b * x + e * y + h * z),
+        c, f, k, -(c * x + f * y + k * z),
+        0.0, 0.0, 0.0, 1.0,
+    )).reshape(4, 4)  # fmt: skip
 
 
 def from_rt(r: F64, t: F64) -> F64:
@@ -74,6 +92,13 @@ def from_rt(r: F64, t: F64) -> F64:
     return out
 
 
+def shift_and_turn(t: F64) -> tuple[float, float]:
+    """Length of T's translation, and the chord of its rotation: the angle in radians when small."""
+    (a, b, c, x), (d, e, f, y), (g, h, k, z), _ = t.tolist()
+    square = (a - 1.0) ** 2 + b * b + c * c + d * d + (e - 1.0) ** 2 + f * f + g * g + h * h + (k - 1.0) ** 2
+    return math.sqrt(x * x + y * y + z * z), math.sqrt(0.5 * square)
+
+
 def transform(t: F64, points: F64) -> F64:
     """Apply T (4,4) to points (n,3)."""
     return points @ t[:3, :3].T + t[:3, 3]
@@ -81,30 +106,54 @@ def transform(t: F64, points: F64) -> F64:
 
 def orthonormalise(t: F64) -> F64:
     """The rigid motion nearest to T, since products of rotations lose orthonormality."""
-    r = t[:3, :3]
-    error = r.T @ r - _EYE
-    if np.abs(error).max() < _NEARLY:  # one step of Newton's polar iteration leaves the square of the error
-        return from_rt(r - 0.5 * (r @ error), t[:3, 3])
-    u, _, vt = np.linalg.svd(r)
-    r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return from_rt(r, t[:3, 3])
+    (a, b, c, x), (d, e, f, y), (g, h, k, z), _ = t.tolist()
+    xx, xy, xz = 0.5 * (a * a + d * d + g * g - 1.0), 0.5 * (a * b + d * e + g * h), 0.5 * (a * c + d * f + g * k)
+    yy, yz = 0.5 * (b * b + e * e + h * h - 1.0), 0.5 * (b * c + e * f + h * k)
+    zz = 0.5 * (c * c + f * f + k * k - 1.0)  # half the error of R^T R
+    if not abs(xx) + abs(yy) + abs(zz) + abs(xy) + abs(xz) + abs(yz) < _NEARLY:
+        u, _, vt = np.linalg.svd(t[:3, :3])
+        return from_rt(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, t[:3, 3])
+    # one step of Newton's polar iteration leaves the square of the error
+    return np.array((
+        a - (a * xx + b * xy + c * xz), b - (a * xy + b * yy + c * yz), c - (a * xz + b * yz + c * zz), x,
+        d - (d * xx + e * xy + f * xz), e - (d * xy + e * yy + f * yz), f - (d * xz + e * yz + f * zz), y,
+        g - (g * xx + h * xy + k * xz), h - (g * xy + h * yy + k * yz), k - (g * xz + h * yz + k * zz), z,
+        0.0, 0.0, 0.0, 1.0,
+    )).reshape(4, 4)  # fmt: skip
+
+
+def is_rotation(r: F64, tolerance: float) -> bool:
+    """True if no element of R R^T - I reaches the tolerance; R (3,3), of finite numbers, may be a reflection."""
+    (a, b, c), (d, e, f), (g, h, k) = r.tolist()
+    worst: float = max(
+        abs(a * a + b * b + c * c - 1.0), abs(d * d + e * e + f * f - 1.0), abs(g * g + h * h + k * k - 1.0),
+        abs(a * d + b * e + c * f), abs(a * g + b * h + c * k), abs(d * g + e * h + f * k),
+    )  # fmt: skip
+    return worst < tolerance
 
 
 def quaternion_from_rotation(r: F64) -> F64:
     """Unit quaternion [w, x, y, z], w >= 0, of a rotation matrix (3,3) (Shepperd's method)."""
+    return np.array(quaternion_numbers(r))
+
+
+def quaternion_numbers(r: F64) -> tuple[float, float, float, float]:
+    """`quaternion_from_rotation` as four numbers."""
     (a, b, c), (d, e, f), (g, h, k) = r.tolist()
     trace = a + e + k
     largest = max(trace, a, e, k)
     if trace == largest:
-        q = np.array([1.0 + trace, h - f, c - g, d - b])
+        w, x, y, z = 1.0 + trace, h - f, c - g, d - b
     elif a == largest:
-        q = np.array([h - f, 1.0 + a - e - k, b + d, c + g])
+        w, x, y, z = h - f, 1.0 + a - e - k, b + d, c + g
     elif e == largest:
-        q = np.array([c - g, b + d, 1.0 - a + e - k, f + h])
+        w, x, y, z = c - g, b + d, 1.0 - a + e - k, f + h
     else:
-        q = np.array([d - b, c + g, f + h, 1.0 - a - e + k])
-    q = q / np.sqrt(q @ q)
-    return np.asarray(-q if q[0] < 0 else q)
+        w, x, y, z = d - b, c + g, f + h, 1.0 - a - e + k
+    n = math.sqrt(w * w + x * x + y * y + z * z)
+    if w < 0.0:
+        n = -n
+    return w / n, x / n, y / n, z / n
 
 
 def rotation_from_quaternion(q: F64) -> F64:

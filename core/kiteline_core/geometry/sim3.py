@@ -18,7 +18,8 @@ _ONE = 1e-9  # a scale closer to 1 is 1, given the accuracy of orthonormal rotat
 
 def scale_of(S: F64) -> float:
     """Scale of S_a_b: units of a per unit of b."""
-    scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
+    (a, b, c, _), (d, e, f, _), (g, h, k, _), _ = S.tolist()
+    scale = float(np.cbrt(a * (e * k - f * h) - b * (d * k - f * g) + c * (d * h - e * g)))
     return 1.0 if abs(scale - 1.0) < _ONE else scale
 
 

@@ -21,6 +21,6 @@ def stamp(t_ns: int) -> str:
 
 def line(t_ns: int, T_a_b: NDArray[np.float64]) -> str:
     """One line, newline included, of a pose (4,4)."""
-    w, x, y, z = se3.quaternion_from_rotation(T_a_b[:3, :3]).tolist()
+    w, x, y, z = se3.quaternion_numbers(T_a_b[:3, :3])
     p = T_a_b[:3, 3].tolist()
     return f"{stamp(t_ns)} {p[0]:.9f} {p[1]:.9f} {p[2]:.9f} {x:.9f} {y:.9f} {z:.9f} {w:.9f}\n"

@@ -333,5 +333,4 @@ def _name(kind: Any) -> str:
 
 def _fill_pose(position: Any, orientation: Any, pose: F64) -> None:
     position.x, position.y, position.z = pose[:3, 3].tolist()
-    q = se3.quaternion_from_rotation(pose[:3, :3])
-    orientation.w, orientation.x, orientation.y, orientation.z = q.tolist()
+    orientation.w, orientation.x, orientation.y, orientation.z = se3.quaternion_numbers(pose[:3, :3])
