@@ -20,6 +20,7 @@ import pytest
 
 from kiteline_basestation.store.integrity import check
 from kiteline_basestation.store.store import FILE, StoreError, read
+from kiteline_cli.main import main as kiteline
 from kiteline_codec.schema import KeyframeHeader, record_log
 from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import AgentId
@@ -181,27 +182,38 @@ def test_poses_go_to_a_flight_controller(recording: Path, start: Start) -> None:
     assert not model.dropped
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("agent", "nowhere.mcap"), "no such file"),
-        (("agent", "RECORDING", "--link", "pigeon:1"), "unknown link"),
-        (("agent", "RECORDING", "--mavlink", "udp:nowhere"), "flight controller"),
-        (("agent", "RECORDING", "--config", "CONFIG"), "unknown key"),
-        (("base", "--link", "zenoh:tcp/256.0.0.1:1"), "listen"),
-        (("base", "--link", "none", "--web", "here"), "address"),
-    ],
-)
-def test_a_user_error_ends_in_one_line(
-    recording: Path, tmp_path: Path, start: Start, words: tuple[str, ...], told: str
-) -> None:
-    (tmp_path / "config.toml").write_text("[agent]\nspeed = 3\n")
-    real = {"RECORDING": str(recording), "CONFIG": str(tmp_path / "config.toml")}
-    program = start(*(real.get(word, word) for word in words))
-    _, errors = program.communicate(timeout=30.0)
-    assert program.returncode == 2
-    assert re.fullmatch(r"kiteline: error: [^\n]+\n", errors), errors
-    assert told in errors
+RUN_EACH = """
+import json, sys
+from kiteline_cli.main import main
+for words in json.loads(sys.argv[1]):
+    print(main(words), flush=True)
+    print("next", file=sys.stderr, flush=True)
+"""
+
+
+def test_a_user_error_ends_in_one_line(recording: Path, tmp_path: Path) -> None:
+    """One process runs all commands: starting it costs more than what they do."""
+    config, source = tmp_path / "config.toml", str(recording)
+    config.write_text("[agent]\nspeed = 3\n")
+    cases = {
+        ("agent", "nowhere.mcap"): "no such file",
+        ("agent", source, "--link", "pigeon:1"): "unknown link",
+        ("agent", source, "--mavlink", "udp:nowhere"): "flight controller",
+        ("agent", source, "--config", str(config)): "unknown key",
+        ("base", "--link", "zenoh:tcp/256.0.0.1:1"): "listen",
+        ("base", "--link", "none", "--web", "here"): "address",
+    }
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "XDG_STATE_HOME": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", RUN_EACH, json.dumps(list(cases))],
+        env=environment, capture_output=True, text=True, timeout=60.0, check=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["2"] * len(cases)
+    *errors, rest = done.stderr.split("next\n")
+    assert rest == ""
+    for (words, told), error in zip(cases.items(), errors, strict=True):
+        assert re.fullmatch(r"kiteline: error: [^\n]+\n", error), (words, error)
+        assert told in error, words
 
 
 def test_a_second_base_takes_over_with_a_copy_of_the_store_or_with_none(
@@ -250,7 +262,9 @@ def stretched(source: Path, out: Path, times: int) -> None:
             writer.frame(frame)
 
 
-def test_a_base_imports_logs_and_manages_maps(recording: Path, tmp_path: Path, start: Start) -> None:
+def test_a_base_imports_logs_and_manages_maps(
+    recording: Path, tmp_path: Path, start: Start, capsys: pytest.CaptureFixture[str]
+) -> None:
     agent = start("agent", recording, "--log", tmp_path / "log")  # without a link
     assert agent.wait(30.0) == 0
     log = tmp_path / "log" / "agent0" / "boot00001.mcap"
@@ -259,9 +273,9 @@ def test_a_base_imports_logs_and_manages_maps(recording: Path, tmp_path: Path, s
     base = start("base", *words, "--import", log)
 
     def ask(*verb: str) -> tuple[int, str, str]:
-        command = start("maps", "--base", endpoint, *verb)
-        out, errors = command.communicate(timeout=30.0)
-        return command.returncode, out, errors
+        capsys.readouterr()
+        status = kiteline(["maps", "--base", endpoint, *verb])
+        return status, *capsys.readouterr()
 
     wait_for("the store", lambda: heads(tmp_path / "store" / FILE) >= 3)
     status, out, _ = ask("--json", "list")
