@@ -80,19 +80,16 @@ def test_loop_is_closed_while_keyframes_arrive(around: Any, late: int) -> None:
         assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
 
 
-def test_same_flight_gives_same_map(around: Any, words: Any) -> None:
-    flight, mapper, _, _ = around(0)
-    again = Mapper(BaseConfig(), words)
-    feed(again, [flight])
+def test_loop_without_drift_is_counted_and_the_same_flight_gives_the_same_map(
+    make_flight: MakeFlight, words: Any
+) -> None:
+    flight = make_flight(keyframes=60, turns=1.5, drift_m=0.001)
+    mapper, again = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
+    for one in (mapper, again):
+        feed(one, [flight])
+    assert mapper.summary()["loops"] == 1  # the second round goes on where the first was: one loop, not one a keyframe
     for keyframe in flight.keyframes:
         assert np.array_equal(mapper.map.pose(keyframe), again.map.pose(keyframe))
-
-
-def test_loop_without_drift_is_counted(make_flight: MakeFlight, words: Any) -> None:
-    flight = make_flight(keyframes=60, turns=1.5, drift_m=0.001)
-    mapper = Mapper(BaseConfig(), words)
-    feed(mapper, [flight])
-    assert mapper.summary()["loops"] == 1  # the second round goes on where the first was: one loop, not one a keyframe
     short = Mapper(BaseConfig(), words)
     feed(short, [make_flight(keyframes=36, turns=0.7)])
     assert short.summary()["loops"] == 0

@@ -145,13 +145,24 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
     assert abs(theirs / ours - 1.0) < 0.015
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_a_monocular_map_takes_the_scale_of_a_stereo_map(make_flight: MakeFlight, words: Any, late: bool) -> None:
-    pair = make_flight(keyframes=40, turns=0.8)
-    eye = the_other_eye(make_flight)
-    flights = [eye, pair] if late else [pair, eye]  # whose map is the world at first
+Met = tuple[Any, Any, Mapper, list[Record]]
+
+
+@pytest.fixture(scope="module")
+def met(make_flight: MakeFlight, words: Any) -> Met:
+    """A stereo agent and a monocular one that fly together, the map of both, and what was published."""
+    pair, eye = make_flight(keyframes=40, turns=0.8), the_other_eye(make_flight)
     mapper = Mapper(BaseConfig(), words)
-    published = feed(mapper, flights, [0, 20] if late else [])
+    return pair, eye, mapper, feed(mapper, [pair, eye])
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_monocular_map_takes_the_scale_of_a_stereo_map(met: Met, words: Any, late: bool) -> None:
+    pair, eye, mapper, published = met
+    flights = [eye, pair] if late else [pair, eye]  # whose map is the world at first
+    if late:
+        mapper = Mapper(BaseConfig(), words)
+        published = feed(mapper, flights, [0, 20])
     assert mapper.summary()["merges"] == 1
     found = np.concatenate([placed(mapper, f) for f in flights])
     error, scale = error_m(found, np.concatenate([true_places(f) for f in flights]))
@@ -196,10 +207,8 @@ def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: Ma
     assert abs(scale * 0.37 - 1.0) < 0.1
 
 
-def test_the_map_cache_of_a_monocular_agent_is_in_its_unit(make_flight: MakeFlight, words: Any) -> None:
-    pair, eye = make_flight(keyframes=40, turns=0.8), the_other_eye(make_flight)
-    mapper = Mapper(BaseConfig(), words)
-    feed(mapper, [pair, eye])
+def test_the_map_cache_of_a_monocular_agent_is_in_its_unit(met: Met) -> None:
+    pair, eye, mapper, _ = met
     base, reader = plain_pair()
     planner = MapCachePlanner(
         replace(BaseConfig().map_cache, min_cosine=-1.0, max_distance_ratio=9.0), BaseConfig().loops, mapper.map
@@ -284,11 +293,8 @@ def test_depths_that_do_not_say_one_length_say_none() -> None:
     assert depth_scale(own, halves * own, config) is None
 
 
-def test_what_a_base_remembers_of_units_is_known_to_the_next(make_flight: MakeFlight, words: Any) -> None:
-    pair = make_flight(keyframes=40, turns=0.8)
-    eye = the_other_eye(make_flight)
-    mapper = Mapper(BaseConfig(), words)
-    published = feed(mapper, [eye, pair])
+def test_what_a_base_remembers_of_units_is_known_to_the_next(met: Met, words: Any) -> None:
+    pair, eye, mapper, published = met
     again = Mapper(BaseConfig(), words)
     for flight in (eye, pair):
         own = [r for r in published if agent_of_record(r) == flight.agent]

@@ -10,6 +10,7 @@ import textwrap
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from typing import Any, get_type_hints
 
 from kiteline_agent.config import AgentConfig
@@ -59,9 +60,10 @@ class Section:
     options: tuple[Option, ...]
 
 
-def sections() -> list[Section]:
+@cache
+def sections() -> tuple[Section, ...]:
     """All sections of agent and base that hold options, in the order of their definition."""
-    return [section for root, config in ROOTS.items() for section in _sections(config, root)]
+    return tuple(section for root, config in ROOTS.items() for section in _sections(config, root))
 
 
 def _sections(config: Any, path: str) -> Iterator[Section]:
