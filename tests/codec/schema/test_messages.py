@@ -288,16 +288,16 @@ def test_a_scan_is_rounded_by_no_more_than_the_specification_says() -> None:
 
 
 def test_a_scan_of_a_room_is_short() -> None:
-    """Walls and the floor before them, with noise of 3 cm: at most 200 bytes with the labels of 150 keypoints."""
+    """Walls and the floor before them, with noise of 2 cm: at most 200 bytes with the labels of 150 keypoints."""
     rng = np.random.default_rng(3)
     azimuth = np.linspace(-0.7, 0.7, 72)
     wall = np.minimum(4.0 / np.cos(azimuth), 2.2 / np.maximum(np.abs(np.sin(azimuth)), 1e-3))
     wall[30:38] = 2.4
-    obstacle = wall + rng.normal(0.0, 0.03, 72)
-    free = np.where(np.arange(72) % 9 > 0, obstacle - 0.1 + rng.normal(0.0, 0.03, 72), 0.0)
+    obstacle = wall + rng.normal(0.0, 0.02, 72)
+    free = np.where(np.arange(72) % 9 > 0, obstacle - 0.1 + rng.normal(0.0, 0.02, 72), 0.0)
     scan = ColumnScan(
         np.array([0.0, -0.8, -0.6]), -0.7, 1.4 / 71, np.where(free > 0.0, 1.3 / np.cos(azimuth), 0.0), free, obstacle,
-        np.full(72, 7, np.uint8), obstacle + rng.normal(0.0, 0.03, 72), 1.5,
+        np.full(72, 7, np.uint8), obstacle + rng.normal(0.0, 0.02, 72), 1.5,
     )  # fmt: skip
     labels = rng.integers(0, 3, 150).astype(np.uint8)
     assert len(messages.encode(KeyframeScan(KeyframeId(5), scan, labels))) <= 200

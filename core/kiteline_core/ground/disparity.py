@@ -1,0 +1,129 @@
+"""Measures the disparity image of a rectified stereo pair, stripe by stripe, so that no frame pays for all of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.config import GroundConfig
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+_ENOUGH_BF = 60.0  # px m of a half-size image: 0.4 m of error at 10 m; with more, half of the columns do
+_PAD_PX = 32  # px that the images are continued to the left: far surfaces are measured there as well
+_OVERLAP_ROWS = 3  # beside a stripe: matching knows what lies above and below
+_STEPS = 16  # of OpenCV's disparities in a pixel
+_SPECKLE_PX = 40  # px of an island that differs from all around it by more than a pixel: an error
+
+
+@dataclass(frozen=True, slots=True)
+class DisparityCamera:
+    """The camera of a disparity image: half the columns of the full image, or a quarter of them where that is enough.
+
+    It has a quarter of the rows: ground and walls look the same on two rows of the half-size image, at half the cost.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    bf: float  # px m; disparity = bf / depth
+    columns: int  # of the half-size image in one of these
+
+    @staticmethod
+    def of(camera: RectifiedCamera) -> DisparityCamera:
+        """That of a full-size rectified camera."""
+        columns = 2 if camera.stereo and 0.5 * camera.bf > _ENOUGH_BF else 1
+        scale, shift = 0.5 / columns, 0.25 * (columns - 1)
+        return DisparityCamera(
+            (camera.width + 1) // 2 // columns, (camera.height + 1) // 4, scale * camera.fx, 0.25 * camera.fy,
+            scale * camera.cx - shift, 0.25 * camera.cy - 0.25, scale * camera.bf, columns,
+        )  # fmt: skip
+
+    def reduced(self, half: U8) -> U8:
+        """A half-size image at the size of disparity images."""
+        rows, columns = 2 * self.height, self.columns * self.width
+        size = self.width, self.height
+        return np.asarray(cv2.resize(half[:rows, :columns], size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def disparity_of_depth(self, depth_m: F32) -> F32:
+        """A disparity image, as of a pair, of full-size depth (h,w) in m, 0 unknown."""
+        depth = depth_m[1::4, :: 2 * self.columns][: self.height, : self.width]
+        out = np.zeros((self.height, self.width), np.float32)
+        return np.divide(np.float32(self.bf), depth, out=out, where=depth > 0.0)
+
+    def at(self, uv: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns (n,) of pixels (n,2) of the full image."""
+        scale, shift = 0.5 / self.columns, 0.25 * (self.columns - 1)
+        column = np.clip(np.rint(scale * uv[:, 0] - shift), 0, self.width - 1).astype(np.int64)
+        return np.clip(np.rint(0.25 * uv[:, 1] - 0.25), 0, self.height - 1).astype(np.int64), column
+
+
+class DisparityStripes:
+    """The disparity image of one pair at a time, by semi-global matching (H. Hirschmueller, 2008) in stripes."""
+
+    def __init__(self, camera: DisparityCamera, config: GroundConfig) -> None:
+        self._camera = camera
+        area = config.block_px**2
+        self._matcher = cv2.StereoSGBM.create(
+            minDisparity=0, numDisparities=config.disparities, blockSize=config.block_px,
+            P1=config.small_step * area, P2=config.large_step * area, disp12MaxDiff=1, preFilterCap=31,
+            uniquenessRatio=config.uniqueness, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )  # fmt: skip
+        self.stripes = config.stripes
+        self.left: U8 = np.empty((0, 0), np.uint8)  # reduced: its texture is that of the disparities
+        self._pair: tuple[U8, U8] | None = None
+        self._raw = np.empty((camera.height, camera.width + _PAD_PX), np.int16)
+
+    def begin(self, left: U8, right: U8) -> None:
+        """Take a pair, rectified and of half size (h,w)."""
+        self.left = self._camera.reduced(left)
+        self._pair = _padded(self.left), _padded(self._camera.reduced(right))
+
+    def match(self, stripe: int) -> None:
+        """Measure the rows of a stripe."""
+        assert self._pair is not None
+        h = len(self._raw)
+        begin, end = h * stripe // self.stripes, h * (stripe + 1) // self.stripes
+        low, high = max(begin - _OVERLAP_ROWS, 0), min(end + _OVERLAP_ROWS, h)
+        found = self._matcher.compute(*(image[low:high] for image in self._pair))
+        self._raw[begin:end] = np.asarray(found, np.int16)[begin - low : end - low]
+
+    def finish(self) -> F32:
+        """Disparities (h,w) in px, 0 where unknown, once all stripes were matched."""
+        cv2.filterSpeckles(self._raw, -_STEPS, _SPECKLE_PX, _STEPS)
+        self._pair = None
+        return unlocked(self._raw[:, _PAD_PX:])
+
+    def measure(self, left: U8, right: U8) -> F32:
+        """The disparity image of a pair at once."""
+        self.begin(left, right)
+        for stripe in range(self.stripes):
+            self.match(stripe)
+        return self.finish()
+
+
+def _padded(image: U8) -> U8:
+    return np.asarray(cv2.copyMakeBorder(image, 0, 0, _PAD_PX, 0, cv2.BORDER_REPLICATE), np.uint8)
+
+
+def unlocked(raw: NDArray[np.int16]) -> F32:
+    """Disparities (h,w) in px of OpenCV's, in 1/16 px; 0 where unknown.
+
+    OpenCV's parabolas draw them to whole pixels. Its costs are nearly those of absolute differences, |t - s| at steps s
+    of a surface t px off the whole pixel: the parabola through three of them has its summit at m = t / (2 - 2 t).
+    Measured on rendered rooms the inverse, with the rounding of costs, is t = 2 m (1 - m): 0.13 px of error fall to
+    0.02 px.
+    """
+    table = np.arange(-_STEPS // 2, _STEPS // 2, dtype=np.float64) / _STEPS
+    table = np.where(np.abs(table) < 0.5, 2.0 * table * (1.0 - np.abs(table)), table).astype(np.float32)
+    whole = (raw + _STEPS // 2) >> 4
+    return np.where(raw > 0, whole + table[(raw + _STEPS // 2) & (_STEPS - 1)], np.float32(0.0)).astype(np.float32)

@@ -1,0 +1,168 @@
+"""Kernels that label pixels by their height above the ground, and collect them to a column scan."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_core.ground.level_kernels import BIN_PX
+from kiteline_core.jit import njit
+
+UNKNOWN, GROUND, OBSTACLE = 0, 1, 2
+_PX = 0.5  # px: half-width of the window in which pixels of one surface lie
+_BEHIND_PX = 2.0  # px behind a few pixels in which a real surface explains them as its outliers
+_LOWER_M = 0.5  # below the ground where there may be ditches and lawns beside a road
+_OUTLIERS = 0.15  # share of a surface's pixels that are outliers
+
+
+@njit
+def mark_texture(image, least, reach, out):  # type: ignore[no-untyped-def]
+    """Mark pixels (h,w) with a step of at least so many grey levels within `reach` px along the row."""
+    h, w = image.shape
+    for v in range(h):
+        last = -reach - 1
+        for u in range(w):
+            out[v, u] = False
+        for u in range(1, w - 1):
+            if abs(np.int64(image[v, u + 1]) - np.int64(image[v, u - 1])) >= least:
+                for i in range(max(last + reach + 1, u - reach), min(u + reach + 1, w)):
+                    out[v, i] = True
+                last = u
+
+
+@njit
+def label_points(  # type: ignore[no-untyped-def]
+    x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, bands, slab_m, labels, grounds, obstacles,
+    sums, in_band, slab,
+):  # fmt: skip
+    """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, and the slab.
+
+    ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
+    bands: (b,) heights. sums: of disparities of obstacles. in_band: (n, bins, b-1). slab: within slab_m of the camera's
+    height. Counts are cleared first. Returns how many pixels lie on the ground that was seen, and
+    how many below it.
+    """
+    labels[:] = UNKNOWN
+    grounds[:] = 0
+    obstacles[:] = 0
+    sums[:] = 0.0
+    in_band[:] = 0
+    slab[:] = 0
+    bins = grounds.shape[1]
+    last = len(bands) - 1
+    on, under = 0, 0
+    for v in range(x.shape[0]):
+        for u in range(x.shape[1]):
+            c = column[v, u]
+            if c < 0:
+                continue
+            d = bf / x[v, u]
+            j = int(d / BIN_PX)
+            if j >= bins:
+                continue
+            if abs(z[v, u]) < slab_m:
+                slab[c, j] += 1
+            part = d / BIN_PX - j
+            height = z[v, u] + x[v, u] * (ground[j] + part * (ground[j + 1] - ground[j]))
+            sigma = x[v, u] * abs(ground[j + 1] - ground[j]) / BIN_PX * sigma_px  # of a height above the ground
+            limit = max(ground_m, sigmas * sigma)
+            if abs(height) <= limit:
+                on += seen[j]
+                if seen[j] and textured[v, u]:
+                    labels[v, u] = GROUND
+                    grounds[c, j] += 1
+            elif height > 0.0:
+                labels[v, u] = OBSTACLE
+                if bands[0] <= height < bands[last]:
+                    b = 0
+                    while height >= bands[b + 1]:
+                        b += 1
+                    obstacles[c, j] += 1
+                    sums[c, j] += d
+                    in_band[c, j, b] += 1
+            elif height < -limit - _LOWER_M:
+                under += seen[j]
+    return on, under
+
+
+@njit
+def _surface(counts, least, lowest):  # type: ignore[no-untyped-def]
+    """Bin of the nearest surface in counts (bins,) from bin `lowest` on; -1 if there is none."""
+    bins = len(counts)
+    half = int(_PX / BIN_PX)
+    behind = int(_BEHIND_PX / BIN_PX)
+    j = bins - 1
+    while j >= lowest:
+        n = 0
+        for i in range(max(j - half, 0), min(j + half + 1, bins)):
+            n += counts[i]
+        if n >= least:
+            best, most = j, n
+            for k in range(j - 1, max(j - behind, lowest) - 1, -1):
+                m = 0
+                for i in range(max(k - half, 0), min(k + half + 1, bins)):
+                    m += counts[i]
+                if m > most:
+                    best, most = k, m
+            if n >= _OUTLIERS * most:  # no outliers of what lies behind: the summit next to it
+                best, most = j, n
+                for k in range(j - 1, max(j - 2 * half - 1, lowest) - 1, -1):
+                    m = 0
+                    for i in range(max(k - half, 0), min(k + half + 1, bins)):
+                        m += counts[i]
+                    if m <= most:
+                        break
+                    best, most = k, m
+                return best
+        j -= 1
+    return -1
+
+
+@njit
+def collect_scan(  # type: ignore[no-untyped-def]
+    grounds, obstacles, sums, in_band, slab, azimuth, bf, least, lowest, sigma_px, gap_m, free_from, free, obstacle,
+    bands, clear,
+):  # fmt: skip
+    """Ranges (n,) in m of a column scan from counts (n, bins). azimuth: (n,). lowest: least bin that counts.
+    Ground that is seen with gaps of at most gap_m, or three deviations of its range, is free.
+    """
+    n, bins = grounds.shape
+    half = int(_PX / BIN_PX)
+    for c in range(n):
+        along = 1.0 / np.cos(azimuth[c])
+        obstacle[c], bands[c], free[c], free_from[c], clear[c] = np.inf, 0, 0.0, 0.0, 0.0
+        at = _surface(obstacles[c], least, lowest)
+        if at >= 0:
+            total, k = 0.0, 0
+            for i in range(max(at - half, 0), min(at + half + 1, bins)):
+                total += sums[c, i]
+                k += obstacles[c, i]
+            obstacle[c] = bf / (total / k) * along
+            most, mask = 0, 0
+            for b in range(in_band.shape[2]):
+                m = 0
+                for i in range(max(at - half, 0), min(at + half + 1, bins)):
+                    m += in_band[c, i, b]
+                if m * 4 >= least:
+                    mask |= 1 << b
+                if m > most:
+                    most, top = m, b
+            bands[c] = mask | 1 << top
+        hit = _surface(slab[c], least, 0)
+        if hit >= 0:
+            clear[c] = bf / ((hit + 0.5) * BIN_PX) * along
+        for j in range(bins - 1, lowest - 1, -1):
+            near, far = bf / ((j + 1) * BIN_PX) * along, bf / ((j if j else 0.5) * BIN_PX) * along
+            if near >= obstacle[c]:
+                break
+            if grounds[c, j] < 2:
+                continue
+            deviation = near * sigma_px / ((j + 1) * BIN_PX)
+            if free[c] == 0.0:
+                free_from[c] = near
+            elif near - free[c] > max(gap_m, 3.0 * deviation):
+                break
+            free[c] = far
+        if free[c] > 0.0 and obstacle[c] < np.inf:
+            deviation = obstacle[c] * sigma_px / (bf * along / obstacle[c])
+            if free[c] > obstacle[c] or obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
+                free[c] = obstacle[c]

@@ -1,0 +1,115 @@
+"""Kernels that turn disparities into points of the levelled camera frame, and count them by column and disparity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_core.jit import njit
+
+BIN_PX = 0.25  # px of levelled disparity to a bin
+NO_COLUMN = -1
+
+
+@njit
+def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out, z_out, column_out):  # type: ignore[no-untyped-def]
+    """Points of pixels in the levelled frame: ahead x_out, up z_out (h,w) m, and their column (h,w), NO_COLUMN without.
+
+    disparity: (h,w) px, <= 0 unknown. rotation: (3,3) camera to levelled frame. camera: fx, fy, cx, cy in px. bf: px m.
+    offset: (5,) error of disparities over normalised image coordinates. far_px: least disparity; smaller ones
+    are taken as far. slopes: (n+1,) y/x of the borders of columns, increasing; column n-1 is the last.
+    """
+    h, w = disparity.shape
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    n = len(slopes) - 1
+    low = slopes[0]
+    table = np.empty(1024, np.int16)
+    scale = 1024.0 / (slopes[n] - low)
+    at = 0
+    for i in range(1024):
+        while at < n - 1 and slopes[at + 1] <= low + (i + 0.5) / scale:
+            at += 1
+        table[i] = at
+    for v in range(h):
+        y = (v - cy) / fy
+        for u in range(w):
+            column_out[v, u] = NO_COLUMN
+            d = disparity[v, u]
+            if not d > 0.0:
+                continue
+            x = (u - cx) / fx
+            d -= offset[0] + offset[1] * x + offset[2] * y + offset[3] * x * x + offset[4] * x * y
+            depth = bf / max(d, far_px)
+            ahead = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
+            if ahead < 0.2:
+                continue
+            slope = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]) / ahead
+            i = int((slope - low) * scale)
+            if slope < low or i >= 1024:
+                continue
+            x_out[v, u] = ahead * depth
+            z_out[v, u] = (rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]) * depth
+            column_out[v, u] = table[i]
+
+
+@njit
+def count_columns(x, z, column, bf, counts, heights):  # type: ignore[no-untyped-def]
+    """u-disparity: pixels (n, bins) of each column and levelled disparity, and sums of their z. Cleared first."""
+    counts[:] = 0
+    heights[:] = 0.0
+    bins = counts.shape[1]
+    for v in range(x.shape[0]):
+        for u in range(x.shape[1]):
+            c = column[v, u]
+            if c >= 0:
+                j = int(bf / (x[v, u] * BIN_PX))
+                if j < bins:
+                    counts[c, j] += 1
+                    heights[c, j] += z[v, u]
+
+
+@njit
+def find_upright(counts, heights, widths, rows, rows_m, upright):  # type: ignore[no-untyped-def]
+    """Mark cells (n, bins) of the u-disparity with more rows than level ground has there, by more than `rows`.
+
+    widths: (n,) px of a column. Level ground at height z fills |z| rows_m rows with each pixel of disparity.
+    """
+    n, bins = counts.shape
+    for c in range(n):
+        for j in range(bins):
+            k = counts[c, j]
+            upright[c, j] = False
+            if k:
+                ground = abs(heights[c, j] / k) * rows_m * BIN_PX
+                upright[c, j] = k / widths[c] > rows + 1.5 * ground
+
+
+@njit
+def count_heights(x, z, column, upright, bf, below, steepest, step_m, counts, disparities, slopes):  # type: ignore[no-untyped-def]
+    """v-disparity of what does not stand upright, over (bins, heights): pixels, sums of disparity and of slope -z/x.
+
+    A pixel and the one at `below` (du, dv) from it, which lies lower in the levelled frame, are on level ground if
+    their heights are the same, on a wall if their distances are: those with more than `steepest` of a wall's difference
+    are left out. Row k holds points from k step_m to (k + 1) step_m below the camera. All three are cleared.
+    """
+    counts[:] = 0
+    disparities[:] = 0.0
+    slopes[:] = 0.0
+    bins, heights = counts.shape
+    h, w = x.shape
+    du, dv = below
+    for v in range(max(0, -dv), min(h, h - dv)):
+        for u in range(max(0, -du), min(w, w - du)):
+            c = column[v, u]
+            if c < 0 or z[v, u] >= 0.0 or column[v + dv, u + du] < 0:
+                continue
+            ahead, down, other = x[v, u], -z[v, u], -z[v + dv, u + du]
+            wall = ahead * other / x[v + dv, u + du] - down  # difference of height of two points of a wall
+            if wall <= 0.0 or abs(other - down) > steepest * wall:
+                continue
+            d = bf / ahead
+            j = int(d / BIN_PX)
+            k = int(down / step_m)
+            if j < bins and k < heights and not upright[c, j]:
+                counts[j, k] += 1
+                disparities[j, k] += d
+                slopes[j, k] += down / ahead

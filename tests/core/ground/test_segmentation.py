@@ -1,0 +1,217 @@
+"""Ground segmentation of ideal and spoilt disparity images: level and banked cameras, ramps, walls, plain floors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.column_scan import ColumnScan, level_rotation
+from kiteline_core.ground.config import GroundConfig
+from kiteline_core.ground.disparity import DisparityStripes, unlocked
+from kiteline_core.ground.label_kernels import GROUND, OBSTACLE, UNKNOWN
+from kiteline_core.ground.segmentation import GroundSegmenter
+
+CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 375.0, 245.0, 0.11, True, np.eye(4))
+HEIGHT_M = 1.5
+Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def level_ground(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Range factor of rays r (…,3) in l to the ground, inf without."""
+    return np.where(r[..., 2] < -1e-6, -HEIGHT_M / np.minimum(r[..., 2], -1e-6), np.inf)
+
+
+def ramp(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Level up to 3 m ahead, then 12 percent up."""
+    level = level_ground(_o, r)
+    up = 0.12 * r[..., 0] - r[..., 2]
+    on_ramp = np.where(up > 1e-6, (HEIGHT_M + 0.36) / np.maximum(up, 1e-6), np.inf)
+    return np.where(level * r[..., 0] < 3.0, level, on_ramp)
+
+
+def wall(
+    ahead_m: float, low_m: float = -10.0, high_m: float = 10.0, left_m: float = 99.0, right_m: float = 99.0
+) -> Surface:
+    """A wall across, between heights above the camera and to the sides."""
+
+    def hit(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
+        t = np.where(r[..., 0] > 1e-6, ahead_m / np.maximum(r[..., 0], 1e-6), np.inf)
+        y, z = t * r[..., 1], t * r[..., 2]
+        return np.where((z > low_m) & (z < high_m) & (y < left_m) & (y > -right_m), t, np.inf)
+
+    return hit
+
+
+def view(
+    up_c: np.ndarray, *surfaces: Surface, noise_px: float = 0.15, seed: int = 0
+) -> tuple[GroundSegmenter, np.ndarray]:
+    """A segmenter and the disparity image of surfaces as a camera sees them."""
+    segmenter = GroundSegmenter(CAMERA, GroundConfig())
+    c = segmenter.camera
+    u, v = np.meshgrid((np.arange(c.width) - c.cx) / c.fx, (np.arange(c.height) - c.cy) / c.fy)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ level_rotation(up_c)
+    depth = np.min([surface(np.zeros(3), rays) for surface in surfaces], axis=0)
+    d = c.bf / depth
+    d = d + np.random.default_rng(seed).normal(0.0, noise_px, d.shape)
+    return segmenter, np.where((d > 0.3) & (d < 48.0), d, 0.0).astype(np.float32)
+
+
+def up(roll_deg: float = 0.0, pitch_deg: float = 8.0) -> np.ndarray:
+    """Up in the camera that looks down by a pitch, and rolls."""
+    R = se3.so3_exp(np.array([0.0, 0.0, np.radians(roll_deg)])) @ se3.so3_exp(
+        np.array([np.radians(pitch_deg), 0.0, 0.0])
+    )
+    return np.asarray(R @ np.array([0.0, -1.0, 0.0]))
+
+
+def assert_free_up_to(scan: ColumnScan, ahead_m: float, share: float = 0.95) -> None:
+    """Ground before a wall across is free, and nothing behind it; the wall is seen in most columns."""
+    true_m = ahead_m / np.cos(scan.azimuths_rad)
+    assert (scan.free_m <= true_m + 0.15).all()
+    assert (scan.free_m[scan.free_from_m > 0] > true_m[scan.free_from_m > 0] - 0.5).mean() > share
+    assert (np.abs(scan.obstacle_m - true_m) < 0.1).mean() > share
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 25.0, -40.0, 180.0])
+def test_a_banked_camera_sees_the_same_ground(roll_deg: float) -> None:
+    segmenter, disparity = view(up(roll_deg), level_ground, wall(4.0))
+    scan = segmenter.segment(disparity, None, up(roll_deg))
+    assert scan.camera_height_m == pytest.approx(HEIGHT_M, abs=0.04)
+    assert (scan.free_m > 0).mean() > 0.6
+    assert_free_up_to(scan, 4.0, 0.6 if roll_deg else 0.95)
+    if roll_deg in (0.0, 180.0):
+        assert (np.isfinite(scan.obstacle_m)).all()
+        assert (scan.bands[20:50] & 3 == 3).all()  # the wall stands on the ground
+
+
+def test_a_ramp_is_ground() -> None:
+    segmenter, disparity = view(up(), ramp)
+    scan = segmenter.segment(disparity, None, up())
+    labels = segmenter.labels[disparity > 3.0]
+    assert (labels == GROUND).mean() > 0.9
+    assert (labels == OBSTACLE).mean() < 0.05
+    assert (scan.obstacle_m > 9.5).all()  # where a disparity of 2.5 px is off by a tenth
+    assert (scan.free_m > 5.0).mean() > 0.9
+
+
+def test_a_wave_is_ground() -> None:
+    def wave(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
+        t = level_ground(_o, r)
+        for _ in range(30):
+            t = np.where(
+                np.isfinite(t),
+                (HEIGHT_M - 0.12 * np.sin(np.minimum(t, 50.0) * r[..., 0])) / -np.minimum(r[..., 2], -1e-6),
+                t,
+            )
+        return t
+
+    segmenter, disparity = view(up(), wave)
+    segmenter.segment(disparity, None, up())
+    assert (segmenter.labels[disparity > 4.0] == GROUND).mean() > 0.8
+
+
+def test_a_box_on_the_ground_is_an_obstacle_of_its_height() -> None:
+    box = wall(3.0, -HEIGHT_M, -HEIGHT_M + 0.4, 0.3, 0.3)
+    segmenter, disparity = view(up(), level_ground, wall(6.0), box)
+    scan = segmenter.segment(disparity, None, up())
+    inside = np.abs(np.tan(scan.azimuths_rad) * 3.0) < 0.22
+    assert np.abs(scan.obstacle_m[inside] * np.cos(scan.azimuths_rad[inside]) - 3.0).max() < 0.12
+    assert (scan.bands[inside] == 1).all()
+    beside = np.abs(np.tan(scan.azimuths_rad) * 3.0) > 0.4
+    assert (scan.obstacle_m[beside] > 5.0).all()
+
+
+def test_a_plain_floor_is_unknown() -> None:
+    segmenter, disparity = view(up(), level_ground, wall(4.0))
+    image = np.random.default_rng(1).normal(120.0, 0.45, segmenter.labels.shape).round().astype(np.uint8)
+    image[: len(image) // 2] = np.random.default_rng(2).integers(0, 255, image[: len(image) // 2].shape)
+    scan = segmenter.segment(disparity, image, up())
+    floor = segmenter.labels[len(image) // 2 + 5 :]
+    assert (floor == GROUND).mean() < 1e-2
+    assert (scan.free_m == 0.0).mean() > 0.95
+
+
+def test_a_camera_that_faces_a_wall_says_unknown() -> None:
+    segmenter, disparity = view(up(0.0, 0.0), level_ground, wall(0.9))
+    scan = segmenter.segment(disparity, None, up(0.0, 0.0))
+    assert np.isnan(scan.camera_height_m)
+    assert not scan.free_m.any()
+    assert np.abs(scan.clear_m * np.cos(scan.azimuths_rad) - 0.9).max() < 0.1
+    expected = segmenter.segment(disparity, None, up(0.0, 0.0), expected_m=HEIGHT_M)
+    assert np.abs(expected.obstacle_m * np.cos(scan.azimuths_rad) - 0.9).max() < 0.1
+    assert not expected.free_m.any()
+
+
+def test_a_table_is_not_taken_for_the_ground_that_was_expected() -> None:
+    segmenter, disparity = view(up(0.0, 20.0), lambda o, r: 0.5 * level_ground(o, r), wall(3.0))
+    alone = segmenter.segment(disparity, None, up(0.0, 20.0))
+    assert alone.camera_height_m == pytest.approx(0.5 * HEIGHT_M, abs=0.05)
+    scan = segmenter.segment(disparity, None, up(0.0, 20.0), expected_m=HEIGHT_M)
+    assert np.isnan(scan.camera_height_m)
+    assert not scan.free_m.any()
+    assert np.isfinite(scan.obstacle_m).mean() > 0.9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_half_of_the_disparities_may_be_missing_or_wrong(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    segmenter, disparity = view(up(), level_ground, wall(4.0), seed=seed)
+    blocks = rng.random((15, 24)) < 0.5
+    missing = np.kron(blocks, np.ones((8, 16), bool))[: disparity.shape[0], : disparity.shape[1]]
+    scan = segmenter.segment(np.where(missing, 0.0, disparity).astype(np.float32), None, up())
+    assert (scan.free_m <= 4.0 / np.cos(scan.azimuths_rad) + 0.2).all()
+    noise = rng.uniform(0.0, 48.0, disparity.shape).astype(np.float32)
+    scan = segmenter.segment(noise, None, up())
+    assert not (scan.free_m > 0).any()
+
+
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+def test_any_attitude_gives_a_scan(direction: list[float]) -> None:
+    segmenter, disparity = view(up(), level_ground, wall(4.0))
+    scan = segmenter.segment(disparity, None, np.array(direction))
+    assert (scan.free_m <= 60.0).all()
+    assert np.array_equal(np.isfinite(scan.obstacle_m), scan.bands > 0)
+    nothing = segmenter.segment(np.zeros_like(disparity), None, np.array(direction))
+    assert not nothing.free_m.any() and not nothing.clear_m.any() and np.isinf(nothing.obstacle_m).all()
+    assert (segmenter.labels == UNKNOWN).all()
+
+
+def test_level_rotation_is_a_rotation_with_z_up() -> None:
+    rng = np.random.default_rng(3)
+    for up_c in [*rng.normal(size=(20, 3)), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])]:
+        R = level_rotation(up_c)
+        assert np.allclose(R.T @ R, np.eye(3)) and np.linalg.det(R) > 0.0
+        assert np.allclose(R[:, 2], up_c / np.linalg.norm(up_c))
+        assert (R.T @ [0.0, 0.0, 1.0])[0] > -1e-12  # the camera looks ahead
+        assert abs((R.T @ [0.0, 0.0, 1.0])[1]) < 1e-12
+
+
+def test_stripes_measure_a_shifted_image_to_a_fraction_of_a_pixel() -> None:
+    rng = np.random.default_rng(4)
+    wide = np.kron(rng.integers(0, 255, (240, 500)), np.ones((1, 8))).astype(np.float64)
+    wide = (wide + np.roll(wide, 3, 1) + np.roll(wide, 5, 1)) / 3.0
+    segmenter = GroundSegmenter(CAMERA, GroundConfig())
+    stripes = DisparityStripes(segmenter.camera, GroundConfig())
+    for d in (4.0, 6.25, 9.375, 12.5):
+        left, right = (
+            wide[:, s : s + 8 * 376].reshape(240, 376, 8).mean(2).round().astype(np.uint8)
+            for s in (400, 400 + round(8 * d))
+        )
+        found = stripes.measure(left, right)
+        assert found.shape == segmenter.labels.shape
+        inner = found[5:-5, 60:-20]
+        assert (inner > 0).mean() > 0.9
+        assert abs(float(np.median(inner[inner > 0])) - d) < 0.13
+
+
+def test_unlocked_disparities_are_ordered_and_keep_whole_and_half_pixels() -> None:
+    raw = np.arange(-16, 800, dtype=np.int16)[None]
+    d = unlocked(raw)[0]
+    assert (d[:17] == 0.0).all()
+    assert (np.diff(d[17:]) > 0.0).all()
+    whole = raw[0] > 0
+    assert np.allclose(d[whole & (raw[0] % 8 == 0)], raw[0][whole & (raw[0] % 8 == 0)] / 16.0)
