@@ -228,15 +228,13 @@ class CullConfig:
 
 @dataclass(frozen=True, slots=True)
 class PublishConfig:
-    """Smallest corrections that are sent and kept, and how often the grid is built."""
+    """Smallest corrections that are sent and kept."""
 
     pose_m: float = 0.0005  # m; a tenth of a pixel at 2.5 m and 500 px of focal length
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
     batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
-    grid_every: int = 3  # keyframes between two grids
-    grid_share: int = 40  # a grid is built after 1 in so many of the map's keyframes: it reads the whole map
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,20 +274,47 @@ class GroundConfig:
 
 @dataclass(frozen=True, slots=True)
 class GridConfig:
-    """The occupancy grid. Heights are relative to the local ground."""
+    """The occupancy grid. Heights are relative to the local ground; log-odds are in 1/16."""
 
-    cell_m: float = 0.1  # m; finer cells fall between the rays to sparse points; 0.2 suits streets
-    max_ray_m: float = 20.0  # m; beyond, the error of a stereo point exceeds a cell
-    obstacle_low_m: float = 0.1  # m; anything lower is ground: noise reaches this far
-    vehicle_height_m: float = 2.0  # m; anything higher is no obstacle
-    noise_per_m: float = 0.01  # m/m; height noise per distance from the nearest view: stereo noise grows with distance
-    free_below_m: float = 0.7  # m; a ray to the ground marks cells free only below this height
-    clear_below_m: float = 0.5  # m; the same for a ray to an obstacle, which passes over boxes and chairs higher up
-    log_hit: float = 0.6  # log-odds of one view of an obstacle point (p = 0.65): two views make 0.77
-    log_through: float = -0.3  # log-odds of one ray through an obstacle's heights (p = 0.43)
-    log_free: float = -0.7  # log-odds of one ray over a cell without obstacle (p = 0.33)
-    log_limit: float = 3.5  # log-odds; p stays within 0.03..0.97, so that cells can still change
-    fence: float = 1.5  # interquartile ranges above the upper quartile: longer rays are outliers (Segfloor eq. 5.3)
+    cell_m: float = 0.05  # m; a quarter of the gap that a small vehicle passes; 0.01 possible, 0.2 suits wide streets
+    max_range_m: float = 20.0  # m; beyond, the columns of a scan are wider than half a metre
+    sigma_px: float = 0.3  # px; standard deviation of a disparity: with the baseline, how ranges err
+    max_sigma_m: float = (
+        0.25  # m; ranges with a larger deviation are not used: a wall would be as thick as a door is wide
+    )
+    fence: float = (
+        1.5  # interquartile ranges above the upper quartile: longer rays to the ground are cut (Segfloor eq. 5.3)
+    )
+    bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
+    accurate_m: float = 3.0  # m; up to here a view counts in full: the deviation of a range is about a cell
+    log_hit: int = 8  # 1/16; log-odds of one near view of an obstacle (p = 0.62); in inverse proportion to the range
+    log_free: int = (
+        3  # 1/16; log-odds of one near view of free space (p = 0.45): a third, as an edge is seen beside itself
+    )
+    log_free_far: int = 1  # 1/16; the same of a far view
+    occupied_from: int = 6  # 1/16; log-odds from which a band is occupied: one near view, two far ones
+    free_from: int = 2  # 1/16; a cell is free if all bands lie below minus this: one near view, two far ones
+    opening: bool = True  # what is free is opened by three by three cells: gaps between two rays are no ways
+    ground_m: float = -1.0  # m; height in w of the middle storey's ground: the camera that begins w flies about so high
+    storey_m: float = 2.5  # m; between two storeys: less than those of houses
+    storey_overlap_m: float = (
+        0.5  # m; beyond its half a storey also holds what lies so near: ramps, and drift of heights
+    )
+    max_position_m: float = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
+    drawn_per_step: int = 16  # scans that one step draws, half a ms each: a loop's corrections wait for later steps
+    sparse_lag: int = (
+        5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then
+    )
+    sparse_window: int = 4  # keyframes before and after it whose landmarks tell where its ground lies
+    made_per_step: int = 2  # scans that one step makes from landmarks, 3 ms each
+    sparse_columns: int = 36  # of a scan from landmarks: more would leave gaps between rays
+    sparse_floor_points: int = 20  # nearest landmarks on the ground, whose median is the camera's height
+    sparse_depth_m: float = 0.3  # m; landmarks so far behind the nearest obstacle of a column belong to it
+    free_below_m: float = (
+        0.7  # m; a ray to a landmark frees cells only where it is lower: it passes over boxes and chairs
+    )
+    noise_per_m: float = 0.01  # m/m; height noise of landmarks per distance
+    resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
     ground: GroundConfig = field(default_factory=GroundConfig)
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from kiteline_basestation.grid.grid_job import GRID
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.merging.graph_job import POSE_GRAPH
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 
-KINDS = {kind.name: kind for kind in (LOCAL_BUNDLE, FULL_BUNDLE, POSE_GRAPH, GRID)}
+KINDS = {kind.name: kind for kind in (LOCAL_BUNDLE, FULL_BUNDLE, POSE_GRAPH)}
 
 
 def run_job(job: Job) -> JobDone:

@@ -6,6 +6,7 @@ Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the 
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Published, Publisher, apply_record
-from kiteline_basestation.grid.grid import Grid
-from kiteline_basestation.grid.grid_job import GRID
 from kiteline_basestation.grid.grid_updates import GridUpdates
+from kiteline_basestation.grid.grid_view import GridViews
+from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.intake.placements import SubmapPlacements
 from kiteline_basestation.jobs import Job, JobDone
@@ -36,6 +37,8 @@ from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, su
 from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
+
+_SAMPLES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +73,15 @@ class Mapper:
         self.map = SparseMap()
         self.names: dict[SubmapId, str] = {}  # of maps, by map id
         self.counts = MapperCounts()
+        self.cpu_ns: Callable[[], int] = lambda: 0  # clock of `grid_ns`, which no output depends on
+        self.grid_ns: deque[int] = deque(maxlen=_SAMPLES)  # time of the updates of the grid
         job_ids = itertools.count(1)
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map)
         self._placements = SubmapPlacements(self.config.intake, self.map, self._intake, self._publisher)
         self._local_bundles = LocalBundles(self.config, self.map, self._publisher, job_ids)
-        self._grid = GridUpdates(self.config, self.map, self.placements, self._publisher, job_ids)
+        self._grid = GridUpdates(self.config, self.map, self.placements)
+        self.views = GridViews(self.grid)  # of the grid, for the status page
         self._sent_offsets: dict[AgentId, F64] = {}  # disparity offsets that the agents have
         self.merger: MapMerger | None = None
         if vocabulary is not None and self.config.loops.enabled:
@@ -83,7 +89,6 @@ class Mapper:
         self._manager = MapManager(self.map, self.names, self.placements, self._intake, self.merger, self._delete)
         self._finish: dict[str, Callable[[JobDone, int], MergeResult]] = {
             LOCAL_BUNDLE.name: self._finish_local_bundle,
-            GRID.name: self._finish_grid,
         }
         if self.merger is not None:
             self._finish[POSE_GRAPH.name] = self.merger.finish_graph
@@ -116,12 +121,14 @@ class Mapper:
                 changes += self.merger.tie(tie)
         # 4. Apply what merges and corrections of whole maps changed.
         withdrawn = self._apply_merges(changes)
-        # 5. Start jobs: local bundles, the grid, pose graphs, full bundles.
+        # 5. Draw the grid where keyframes are new or moved.
+        self._draw_grid()
+        # 6. Start jobs: local bundles, pose graphs, full bundles.
         self._send_calibrations()
-        jobs = self._local_bundles.jobs() + self._grid.jobs()
+        jobs = self._local_bundles.jobs()
         if self.merger is not None:
             jobs += self.merger.jobs(now_ns)
-        # 6. Publish the values that changed and for which there is room.
+        # 7. Publish the values that changed and for which there is room.
         return MapperOutput(self._publisher.collect(dict(given.room_bytes)), tuple(jobs), tuple(answers), withdrawn)
 
     def adopt(self, record: Record) -> None:
@@ -141,15 +148,23 @@ class Mapper:
         return self._intake.deleted
 
     @property
-    def grid(self) -> Grid:
+    def grid(self) -> ScanGrid:
         """The occupancy grid."""
         return self._grid.grid
+
+    def settled_grid(self) -> ScanGrid:
+        """The grid with all keyframes drawn where they are now; the mapper goes on with its own."""
+        return self._grid.settled()
+
+    def labels(self, landmarks: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Labels (n,) of landmarks: 0 unlabelled, 1 ground, 2 obstacle."""
+        return self._grid.labels(landmarks)
 
     @property
     def idle(self) -> bool:
         """True if no job is due or pending, all keyframes that arrived are used, and no change waits to be sent."""
         merged = self.merger is None or self.merger.idle
-        waiting = self._intake.backlog or self._grid.pending or self._publisher.waiting
+        waiting = self._intake.backlog or self._publisher.waiting
         return merged and self._local_bundles.idle and not waiting
 
     def live(self, agent: AgentId) -> LivePose | None:
@@ -183,6 +198,8 @@ class Mapper:
         self._intake.restore(state.intake)
         self._placements.restore(state.placements)
         self._local_bundles.restore(state.unbundled)
+        for record in self._intake.take_scans():
+            self._grid.add_scan(record)
         self._grid.rebuild()
         if self.merger is not None:
             self.merger.restore(state.merger)
@@ -202,7 +219,7 @@ class Mapper:
                 "quality": live.quality if live else None,
                 "T_w_c": self._live_pose(agent),
             }
-        pending = self._local_bundles.pending + self._grid.pending + (merger.pending_jobs if merger else 0)
+        pending = self._local_bundles.pending + (merger.pending_jobs if merger else 0)
         return {
             **asdict(self.counts),
             "keyframes": len(self.map),
@@ -233,7 +250,7 @@ class Mapper:
         culled = culling.cull_redundant_keyframes(self.map, keyframe, config.cull, publisher)
         self.counts.keyframes_culled += len(culled)
         self._local_bundles.add(keyframe)
-        self._grid.add_keyframe()
+        self._grid.add_keyframe(keyframe)
         self.counts.keyframes += 1
         if self.merger is None:
             return NOTHING
@@ -261,9 +278,15 @@ class Mapper:
         self.counts.bundles += self._local_bundles.finish(done)
         return NOTHING
 
-    def _finish_grid(self, done: JobDone, now_ns: int) -> MergeResult:
-        self.counts.grids += self._grid.finish(done)
-        return NOTHING
+    def _draw_grid(self) -> None:
+        begin_ns = self.cpu_ns()
+        for record in self._intake.take_scans():
+            self._grid.add_scan(record)
+        before = self._grid.grid.revision
+        self._grid.update()
+        if self._grid.grid.revision != before:
+            self.counts.grids += 1
+            self.grid_ns.append(self.cpu_ns() - begin_ns)
 
     def _send_calibrations(self) -> None:
         """Send new disparity offsets to the agents, which track on corrected disparities."""
@@ -288,6 +311,7 @@ class Mapper:
                 self.map.cull_keyframe(keyframe)
                 self._publisher.mark_changed(CulledLandmarks.KIND, keyframe)
             self._placements.delete(submap)
+            self._grid.remove(keyframes)
             self.names.pop(submap, None)
             self.map.root_submaps.pop(submap, None)
         self._local_bundles.delete(submaps)

@@ -30,4 +30,4 @@ def test_a_toy_job_runs_takes_modelled_time_and_is_timed(monkeypatch: pytest.Mon
     (done,) = jobs.done(3500)  # 3000 operations at one a nanosecond
     assert (done.id, done.kind, done.result, done.cost_ops) == (7, "toy", 6, 3000)
     assert jobs.idle
-    assert len(timings(jobs.cpu_ms, [])["toy_ms"]) == 1
+    assert len(timings(jobs.cpu_ms, [], [])["toy_ms"]) == 1

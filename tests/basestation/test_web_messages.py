@@ -11,9 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_basestation.grid.grid import UNKNOWN, GridMap
+from kiteline_basestation.grid.grid_view import CodedTile, GridView, differences
+from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.web import messages
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
+from kiteline_codec.schema import GridTile
+from kiteline_codec.schema import messages as codec_messages
+from kiteline_codec.schema.base.grid_tile import UNKNOWN
 from kiteline_core.ids import AgentId
 
 S = 1_000_000_000
@@ -24,12 +28,14 @@ def agent(number: int = 0, **changes: object) -> AgentStatus:
     return replace(plain, **changes)  # type: ignore[arg-type]
 
 
-def grid(*tiles: tuple[int, int], value: int = 10) -> GridMap:
-    cells = np.full((len(tiles), 64, 64), value, np.int8)
-    cells[:, 0, 0] = UNKNOWN
-    return GridMap(
-        0.5, np.array(tiles, np.int64).reshape(-1, 2), cells, np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0)
-    )
+def grid(*tiles: tuple[int, int], value: int = 0) -> GridView:
+    cells = np.full((64, 64), value, np.int8)
+    cells[0, 0] = UNKNOWN
+    coded = {
+        Place(0, row, column): CodedTile(codec_messages.encode(GridTile(column, row, 0, 0.5, cells)), 4095)
+        for column, row in tiles
+    }
+    return GridView(0.5, 1, 0, coded)
 
 
 def snapshot(*agents: AgentStatus, **changes: object) -> PageSnapshot:
@@ -109,14 +115,17 @@ def tiles(message: bytes) -> dict[tuple[int, int], np.ndarray]:
 
 
 def test_a_viewer_gets_the_tiles_that_it_does_not_hold() -> None:
-    old, new = grid((0, 0), (1, -1)), grid((0, 0), (5, 2))
-    first = messages.map_messages(snapshot(agent(2), grid=old), None)
-    assert [header(m)[0] for m in first] == [messages.PATH, messages.POINTS, messages.TILES]
-    assert header(first[0])[1] == 2 and header(first[2])[3] == 0.5
-    assert set(tiles(first[2])) == {(0, 0), (1, -1)}
-    second = tiles(messages.map_messages(snapshot(grid=new), old)[-1])
+    old = grid((0, 0), (1, -1))
+    new = replace(old, tiles={**old.tiles, **grid((5, 2), value=3).tiles})
+    gone = Place(0, -1, 1)
+    new = replace(new, tiles={p: t for p, t in new.tiles.items() if p != gone})
+    maps = messages.map_messages(snapshot(agent(2)))
+    assert [header(m)[0] for m in maps] == [messages.PATH, messages.POINTS] and header(maps[0])[1] == 2
+    first = messages.tiles_message(old, differences(GridView(1.0), old))
+    assert header(first)[0] == messages.TILES and header(first)[3] == 0.5
+    assert set(tiles(first)) == {(0, 0), (1, -1)}
+    second = tiles(messages.tiles_message(new, differences(old, new)))
     assert set(second) == {(1, -1), (5, 2)}
     assert (second[1, -1] == UNKNOWN).all()
-    assert np.array_equal(second[5, 2], new.cells[1])
-    assert [header(m)[0] for m in messages.map_messages(snapshot(grid=new), new)] == [messages.POINTS]
-    assert [header(m)[0] for m in messages.map_messages(snapshot(grid=None), None)] == [messages.POINTS]
+    assert (second[5, 2][1:] == 3).all() and second[5, 2][0, 0] == UNKNOWN
+    assert not differences(new, new)

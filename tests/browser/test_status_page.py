@@ -18,7 +18,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation import web
-from kiteline_basestation.grid.grid import GridMap
+from kiteline_basestation.grid.grid_view import CodedTile, GridView
+from kiteline_basestation.grid.tile_store import Place
+from kiteline_codec.schema import GridTile, messages
 from kiteline_core.ids import AgentId
 
 
@@ -27,8 +29,8 @@ class Base:
 
     def __init__(self) -> None:
         self.taken = 0
-        cells = np.full((1, 64, 64), 3, np.int8)
-        grid = GridMap(0.1, np.zeros((1, 2), np.int64), cells, np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
+        tile = GridTile(0, 0, 0, 0.1, np.full((64, 64), 3, np.int8))
+        grid = GridView(0.1, 1, 0, {Place(0, 0, 0): CodedTile(messages.encode(tile), 4096)})
         agent = web.AgentStatus(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
         self.now = web.PageSnapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)
 

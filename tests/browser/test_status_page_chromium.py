@@ -20,9 +20,12 @@ from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation import web
 from kiteline_basestation.config import GridConfig
-from kiteline_basestation.grid.grid import build
+from kiteline_basestation.grid.grid_view import GridViews
+from kiteline_basestation.grid.kept_scan import keep
+from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
+from tests.basestation.flat_rooms import box, camera, scan_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
@@ -107,9 +110,14 @@ def room() -> web.PageSnapshot:
     points = np.concatenate([floor, np.column_stack([x, y, rng.uniform(0.2, 1.8, 1500)])])
     turn = np.linspace(0, 5.0, 60)
     path = np.column_stack([4.5 + 3.2 * np.cos(turn), 3 + 1.9 * np.sin(turn), np.full(60, 1.0)])
-    pairs = np.column_stack([rng.integers(0, 60, 12000), rng.integers(0, 3000, 12000)])
-    near = np.linalg.norm(path[pairs[:, 0]] - points[pairs[:, 1]], axis=1) < 4
-    grid = build(GridConfig(), path, points, pairs[near])
+    grid = ScanGrid(GridConfig())
+    walls = np.array(box(0.0, 0.0, 9.0, 6.0))
+    for k, ((px, py, _), heading) in enumerate(zip(path, turn + np.pi / 2, strict=True)):
+        kept = keep(grid.config, scan_of(walls, px, py, heading), 100.0)
+        assert kept is not None
+        grid.put(k, kept, camera(px, py, heading))
+    labels = np.repeat(np.array([1, 2], np.uint8), 1500)
+    view = GridViews(grid).take()
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
     pose = se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, turn[-1] + np.pi / 2])) @ level, path[-1])
     away = np.eye(4)
@@ -119,7 +127,7 @@ def room() -> web.PageSnapshot:
         web.AgentStatus(AgentId(0), 999 * s, 86, pose, path, 60, 2100, 1, 410_000, 52_000),
         web.AgentStatus(AgentId(1), 968 * s, -1, away, path[:9] * 0.5 + [1, 3, 0.5], 9, 380, 2, 61_000, 8_000),
     )
-    return web.PageSnapshot(1000 * s, 246 * s, agents, points, grid.labels, grid, 1, {"loops": 2, "merges": 1})
+    return web.PageSnapshot(1000 * s, 246 * s, agents, points, labels, view, 1, {"loops": 2, "merges": 1})
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

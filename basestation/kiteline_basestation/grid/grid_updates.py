@@ -1,70 +1,181 @@
-"""When the occupancy grid is built anew, and which of its tiles are sent."""
+"""Draws the grid: the scans of new keyframes, and anew those of keyframes that moved."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+import copy
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.exchange.publisher import Publisher
-from kiteline_basestation.grid.grid import Grid, states
-from kiteline_basestation.grid.grid_job import GRID, GridInputs
-from kiteline_basestation.grid.placed_map import placed_map
-from kiteline_basestation.jobs import Job, JobDone
+from kiteline_basestation.grid.kept_scan import KeptScan, keep
+from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.sparse_scan import sparse_scan
+from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_core.ids import SubmapId, agent_of_submap
+from kiteline_codec.schema import KeyframeScan
+from kiteline_core.geometry import se3
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
 
 
 class GridUpdates:
-    """One grid job at a time, of all placed submaps. placements: S_w_m (4,4) of each, kept up to date by its owner."""
+    """The grid of all placed submaps in metres. placements: S_w_m (4,4) of each, kept up to date by its owner.
 
-    def __init__(
-        self, config: BaseConfig, sparse_map: SparseMap, placements: Mapping[SubmapId, NDArray[np.float64]],
-        publisher: Publisher, job_ids: Iterator[int],
-    ) -> None:  # fmt: skip
-        self._config = config
+    Keyframes of agents that send no scans get one from their landmarks.
+    """
+
+    def __init__(self, config: BaseConfig, sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> None:
+        self._config = config.grid
         self._map = sparse_map
         self._placements = placements
-        self._publisher = publisher
-        self._job_ids = job_ids
-        self._new_keyframes = 0  # since the last grid
-        self._pending: int | None = None
-        self.grid = Grid(config.grid)
+        self.grid = ScanGrid(config.grid)
+        self._scans: dict[KeyframeId, KeptScan] = {}
+        self._labels: dict[KeyframeId, U8] = {}  # of keypoints
+        self._scanning: set[AgentId] = set()  # agents that send scans
+        self._due: dict[KeyframeId, None] = {}  # may have moved, or are new
+        self._unmade: dict[KeyframeId, None] = {}  # their scan is to be made from landmarks
 
-    @property
-    def pending(self) -> int:
-        """Number of pending jobs."""
-        return int(self._pending is not None)
+    def add_scan(self, record: KeyframeScan) -> None:
+        """Take an agent's scan. From the first one on, only its scans are drawn."""
+        agent = agent_of_keyframe(record.keyframe)
+        if agent not in self._scanning:
+            self._scanning.add(agent)
+            for keyframe in [k for k in self._scans if agent_of_keyframe(k) == agent]:
+                self._drop(keyframe)
+            self._unmade = {k: None for k in self._unmade if agent_of_keyframe(k) != agent}
+        self._labels[record.keyframe] = record.labels
+        camera = self._map.cameras.get(agent)
+        kept = keep(self._config, record.scan, 0.0 if camera is None else camera.bf)
+        if kept is None:
+            self._drop(record.keyframe)
+        else:
+            self._scans[record.keyframe] = kept
+            self._due[record.keyframe] = None
 
-    def add_keyframe(self) -> None:
-        """Count a new keyframe."""
-        self._new_keyframes += 1
+    def add_keyframe(self, keyframe: KeyframeId) -> None:
+        """Take a new keyframe. Without scans, its landmarks are drawn now, and once more when they are better known."""
+        if agent_of_keyframe(keyframe) in self._scanning:
+            return
+        siblings = self._map.submaps[submap_of_keyframe(keyframe)]
+        self._unmade[keyframe] = None
+        if len(siblings) > self._config.sparse_lag:
+            self._unmade[siblings[-1 - self._config.sparse_lag]] = None
 
     def rebuild(self) -> None:
-        """Make a grid due because the map moved as a whole."""
-        self._new_keyframes = max(self._new_keyframes, len(self._map))
+        """Draw what moved, after whole submaps may have; what was not drawn before is drawn if it can be now."""
+        for submap, keyframes in self._map.submaps.items():
+            if agent_of_keyframe(keyframes[0]) in self._scanning:
+                self._due.update(dict.fromkeys(keyframes))
+            elif submap in self._placements:
+                self._unmade.update({k: None for k in keyframes if k not in self._scans})
+                self._due.update(dict.fromkeys(keyframes))
 
-    def jobs(self) -> list[Job]:
-        """The grid, if it is due."""
-        publish = self._config.publish
-        pause = max(publish.grid_every, len(self._map) // publish.grid_share)
-        if self._pending is not None or self._new_keyframes < pause:
-            return []
-        self._new_keyframes = 0
-        view = placed_map(self._map, self._placements)
-        self._pending = next(self._job_ids)
-        return [Job(self._pending, GRID.name, GridInputs(self._config.grid, view.positions, view.points, view.rays))]
+    def remove(self, keyframes: Sequence[KeyframeId]) -> None:
+        """Forget keyframes that a user deleted."""
+        for keyframe in keyframes:
+            self._drop(keyframe)
+            self._labels.pop(keyframe, None)
 
-    def finish(self, done: JobDone) -> bool:
-        """Take a finished grid, and send its changed tiles to all agents that have a placed submap."""
-        if done.id != self._pending:
+    def update(self) -> None:
+        """Draw as many keyframes as one step has time for, the oldest first."""
+        self._gather_moved()
+        for keyframe in sorted(self._unmade)[: self._config.made_per_step]:
+            del self._unmade[keyframe]
+            self._make(keyframe)
+        drawn = 0
+        for keyframe in sorted(self._due):
+            if drawn == self._config.drawn_per_step:
+                break
+            del self._due[keyframe]
+            drawn += self._draw(self.grid, keyframe)
+
+    def settled(self) -> ScanGrid:
+        """A grid in which all scans lie where their keyframes are now; a copy, if they do not in this one."""
+        self._gather_moved()
+        if not self._due:
+            return self.grid
+        grid = copy.deepcopy(self.grid)
+        for keyframe in sorted(self._due):
+            self._draw(grid, keyframe)
+        return grid
+
+    def _gather_moved(self) -> None:
+        ids = self._map.keyframes.id
+        for row in sorted(self._map.moved_rows):
+            keyframe = KeyframeId(int(ids[row]))
+            if keyframe in self._scans:
+                self._due[keyframe] = None
+        self._map.moved_rows.clear()
+
+    def _draw(self, grid: ScanGrid, keyframe: KeyframeId) -> bool:
+        scan = self._scans.get(keyframe)
+        if scan is None:
             return False
-        self._pending = None
-        tiles = self.grid.adopt(done.result)
-        for agent in sorted({agent_of_submap(s) for s in self._placements}):
-            for tile in tiles:
-                self._publisher.send(agent, replace(tile, cells=states(tile.cells)))
-        return True
+        S_w_k = self._pose(keyframe)
+        return grid.remove(keyframe) if S_w_k is None else grid.put(keyframe, scan, S_w_k)
+
+    def labels(self, landmarks: I32) -> U8:
+        """Labels (n,) of landmarks: 0 unlabelled, 1 ground, 2 obstacle."""
+        table = self._map.keypoints
+        out = np.zeros(len(landmarks), np.uint8)
+        keyframes, index = self._map.keyframes.id[table.row[landmarks]], self._map.keypoint_of(landmarks)
+        order = np.argsort(keyframes, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(keyframes[order])) + 1):
+            labels = self._labels.get(KeyframeId(int(keyframes[rows[0]]))) if len(rows) else None
+            if labels is not None:
+                known = rows[index[rows] < len(labels)]
+                out[known] = labels[index[known]]
+        return out
+
+    def _drop(self, keyframe: KeyframeId) -> None:
+        self._scans.pop(keyframe, None)
+        self._due.pop(keyframe, None)
+        self._unmade.pop(keyframe, None)
+        self.grid.remove(keyframe)
+
+    def _pose(self, keyframe: KeyframeId) -> F64 | None:
+        """S_w_k (4,4) of a keyframe; None if its submap is not placed, or not in metres."""
+        submap = submap_of_keyframe(keyframe)
+        S_w_m, T_m_k = self._placements.get(submap), self._map.pose(keyframe)
+        if S_w_m is None or T_m_k is None or self._map.is_up_to_scale(self._map.map_id(submap)):
+            return None
+        return S_w_m @ T_m_k
+
+    def _make(self, keyframe: KeyframeId) -> None:
+        """Make a scan of the landmarks of a keyframe and of those before it, and label those that are new in it."""
+        S_w_k = self._pose(keyframe) if keyframe in self._map else None
+        if S_w_k is None:
+            return
+        submap = submap_of_keyframe(keyframe)
+        siblings = self._map.submaps[submap]
+        at = siblings.index(keyframe)
+        near = siblings[max(0, at - self._config.sparse_window) : at + self._config.sparse_window + 1]
+        seen = self._map.landmarks_of(keyframe)
+        around = self._map.sorted_by_id(np.concatenate([self._map.landmarks_of(k) for k in near]))
+        xyz, known = self._map.positions(around)
+        around, xyz = around[known], xyz[known]
+        T_map_k = self._map.world_pose(keyframe)
+        assert T_map_k is not None
+        T_k_map = se3.inverse(se3.orthonormalise(T_map_k))
+        scale = self._map.scale(submap)
+        local = (xyz @ T_k_map[:3, :3].T + T_k_map[:3, 3]) / scale
+        camera = self._map.cameras[agent_of_keyframe(keyframe)]
+        made = sparse_scan(self._config, camera, S_w_k, local, np.isin(around, seen))
+        if made is None:
+            return
+        scan, labels = made
+        table = self._map.keypoints
+        slots = self._map.slots_of(keyframe)
+        mine = np.zeros(len(slots), np.uint8)
+        here = (table.row[around] == self._map.rows[keyframe]) & (table.kind[around] == LANDMARK)
+        mine[self._map.keypoint_of(around[here])] = labels[here]
+        self._labels[keyframe] = mine
+        kept = keep(self._config, scan, camera.bf)
+        if kept is not None:
+            self._scans[keyframe] = kept
+            self._due[keyframe] = None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import GroundConfig
-from kiteline_basestation.grid import grid_kernels as kernels
+from kiteline_basestation.grid import ground_kernels as kernels
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

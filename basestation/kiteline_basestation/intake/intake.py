@@ -70,6 +70,7 @@ class Intake:
         self.metres_per_unit: dict[SubmapId, float] = {}  # of submaps whose agent knows it
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
+        self._scans: list[KeyframeScan] = []  # that arrived and were not taken yet
         self.ties = Ties(sparse_map)
         self.refused = 0  # records that contradict the map
 
@@ -105,6 +106,8 @@ class Intake:
             elif isinstance(record, InertialSteps):
                 self._map.inertial_steps[record.keyframe] = record
                 self.ties.add(record)
+            elif isinstance(record, KeyframeScan):
+                self._scans.append(record)
             elif isinstance(record, NewLandmarks | Observations):
                 if record.keyframe in self._map:
                     self._take_section(record)
@@ -114,6 +117,11 @@ class Intake:
                     self._pending_count += 1
                 else:
                     self.refused += 1
+
+    def take_scans(self) -> list[KeyframeScan]:
+        """The scans that arrived since the last call."""
+        scans, self._scans = self._scans, []
+        return scans
 
     def ready(self, now_ns: int) -> list[KeyframeId]:
         """Keyframes to use now, in order of id: complete ones, those past the patience, and late completions."""

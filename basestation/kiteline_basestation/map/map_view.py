@@ -56,6 +56,7 @@ class MapView:
         self.told_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
+        self.moved_rows: set[int] = set()  # keyframes whose pose changed, by row, since a reader cleared it
         self._children: dict[KeyframeId, list[int]] = {}
         self._waiting: dict[KeyframeId, list[int]] = {}  # slots whose landmark's keyframe is not received yet
 

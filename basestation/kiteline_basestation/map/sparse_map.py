@@ -335,6 +335,7 @@ class SparseMap(MapView):
     def _update_world_pose(self, row: int) -> None:
         """Set T_w_k and scale of a keyframe from T_m_k and the pose of its submap."""
         table = self.keyframes
+        self.moved_rows.add(row)
         submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
         S_w_m, scale = self.submap_poses.get(submap), self._scales.get(submap, 1.0)
         table.scale[row] = scale

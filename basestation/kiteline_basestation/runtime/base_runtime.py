@@ -72,6 +72,7 @@ class BaseRuntime:
         if jobs is None and vocabulary is not None:
             warm_graphs()
         self.station = Station(self.config, open_channel, vocabulary)
+        self.station.mapper.cpu_ns = time.process_time_ns
         self.jobs: LockstepJobs | Worker = LockstepJobs() if jobs is None else jobs
         self.phase = Phase.FLY
         self.now_ns: int | None = None  # flight time of the next tick in lock-step
@@ -203,12 +204,13 @@ class BaseRuntime:
         self.end_of_frames()
         assert self.at_last_frame is not None
         rss = max(self.rss_mib, rss_mib())
+        grid_ms = [ns / 1e6 for ns in self.station.mapper.grid_ns]
         return {
             **self.at_last_frame.counts,
             "digest_equal": self.digest_equal,
             "agents_lost": sorted(self.agents_lost),
             "drain": {"flight_ms": self._drained_ns // 1_000_000, **counts(self.station.mapper)},
-            "timing": {**timings(self.jobs.cpu_ms, self._step_ms), "rss_mib": round(rss, 1)},
+            "timing": {**timings(self.jobs.cpu_ms, grid_ms, self._step_ms), "rss_mib": round(rss, 1)},
         }
 
     def close(self) -> None:

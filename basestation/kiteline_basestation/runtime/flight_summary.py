@@ -49,9 +49,12 @@ def counts(mapper: Mapper) -> dict[str, int]:
     return {"map_points": _whole(summary["points"]), **{name: _whole(summary[name]) for name in _COUNTS}}
 
 
-def timings(jobs_ms: Mapping[str, Iterable[float]], step_ms: Iterable[float]) -> dict[str, list[float]]:
-    """Samples of CPU time in ms: `KIND_ms` of every kind of job, and `step_ms`."""
-    return {**{f"{kind}_ms": list(jobs_ms.get(kind, ())) for kind in KINDS}, "step_ms": list(step_ms)}
+def timings(
+    jobs_ms: Mapping[str, Iterable[float]], grid_ms: Iterable[float], step_ms: Iterable[float]
+) -> dict[str, list[float]]:
+    """Samples of CPU time in ms: `KIND_ms` of every kind of job, `grid_ms` and `step_ms`."""
+    jobs = {f"{kind}_ms": list(jobs_ms.get(kind, ())) for kind in KINDS}
+    return {**jobs, "grid_ms": list(grid_ms), "step_ms": list(step_ms)}
 
 
 def _whole(value: object) -> int:

@@ -13,8 +13,9 @@ from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
 from kiteline_basestation.merging.loop_verification import verify_loop
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, Record
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, KeyframeScan, NewLandmarks, Observations, Record
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 from kiteline_core.places.place_index import Vocabulary
 
@@ -36,7 +37,9 @@ def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None)
             agent.put(record)
         output = station.step({}, done, k * 1_000_000_000)
         done = tuple(run_job(job) for job in output.jobs)
+    agent.put(_scan(_KEYFRAMES - 1))
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
+    station.mapper.views.take()
     if vocabulary is not None:
         submap = submap_id(0, 0, 0)
         easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
@@ -53,6 +56,14 @@ def warm_graphs() -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     sigma = np.tile([0.01, 0.003], (3, 1))
     optimise(GraphInputs(np.arange(3), poses, held, edges, poses, sigma, np.arange(3) == 2, GraphConfig()))
+
+
+def _scan(k: int) -> KeyframeScan:
+    """A floor and a wall behind it."""
+    near, far = np.full(8, 0.5), np.full(8, 2.0)
+    up = np.array([0.0, -1.0, 0.0])
+    scan = ColumnScan(up, -0.4, 0.1, near, far, far, np.full(8, 7, np.uint8), far, 1.0)
+    return KeyframeScan(keyframe_id(submap_id(0, 0, 0), k), scan, np.zeros(0, np.uint8))
 
 
 def _keyframe(k: int) -> list[Record]:

@@ -22,7 +22,7 @@ export class MapCanvas {
     this.following = null;
     this.clear();
     new ResizeObserver(() => this.redraw()).observe(canvas);
-    dark.addEventListener("change", () => { this.paintTiles(); this.redraw(); });
+    dark.addEventListener("change", () => { this.tiles.forEach((tile) => { tile.image = null; }); this.paintTiles(); this.redraw(); });
     this.addListeners();
   }
 
@@ -73,12 +73,14 @@ export class MapCanvas {
   paintTiles() {
     const free = rgb(css("--free")), solid = rgb(css("--solid"));
     for (const tile of this.tiles.values()) {
+      if (tile.image) continue;
       const image = new ImageData(TILE, TILE);
       for (let y = 0; y < TILE; y++) for (let x = 0; x < TILE; x++) {
-        const p = tile.cells[(TILE - 1 - y) * TILE + x]; // an image's first row is the top
-        if (p < 0) continue;
+        const state = tile.cells[(TILE - 1 - y) * TILE + x]; // an image's first row is the top
+        if (state < 0) continue;
+        const colour = state > 0 ? solid : free;
         const at = 4 * (y * TILE + x);
-        for (let k = 0; k < 3; k++) image.data[at + k] = free[k] + ((solid[k] - free[k]) * p) / 100;
+        for (let k = 0; k < 3; k++) image.data[at + k] = colour[k];
         image.data[at + 3] = 255;
       }
       tile.image = new OffscreenCanvas(TILE, TILE);

@@ -2,23 +2,23 @@
 
 A binary message starts with 16 bytes, little endian: kind u8, agent u8, 0 u16, n u32, scale f32, 0 u32. Then by kind:
 1 points: int16 (n,3) times scale = metres in w, uint8 (n) labels.
-2 tiles: int32 (n,2) column, row; int8 (n,64,64) percent; scale is the side of a cell in m.
+2 tiles: int32 (n,2) column, row; int8 (n,64,64): -1 unknown, 0 free, else occupied; scale is the side of a cell in m.
 3 path of an agent's keyframes: int16 (n,3) times scale = metres in w.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import GridConfig
-from kiteline_basestation.grid.grid import GridMap, differences, empty
+from kiteline_basestation.grid.grid_view import GridView
+from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.web.numbers import AGENT_COUNTS, TOTALS, as_json
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
-from kiteline_codec.schema import GridTile
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -84,14 +84,10 @@ def _rounded(value: float, digits: int) -> float:
     return round(value, digits) + 0.0
 
 
-def map_messages(now: PageSnapshot, held: GridMap | None) -> list[bytes]:
-    """Paths, points and changed tiles for a browser that has the grid `held` (None: no map yet)."""
+def map_messages(now: PageSnapshot) -> list[bytes]:
+    """Paths and points."""
     out = [path_message(a.agent, a.path) for a in now.agents]
     out.append(points_message(now.points, now.labels))
-    if now.grid is not None and now.grid is not held:
-        tiles = differences(held if held is not None else empty(GridConfig()), now.grid)
-        if tiles:
-            out.append(tiles_message(now.grid.cell_m, tiles))
     return out
 
 
@@ -113,10 +109,11 @@ def path_message(agent: int, path: F64) -> bytes:
     return _header(PATH, agent, len(path), scale) + coded
 
 
-def tiles_message(cell_m: float, tiles: tuple[GridTile, ...]) -> bytes:
-    """Grid tiles."""
-    places = np.array([(t.column, t.row) for t in tiles], "<i4").reshape(-1, 2)
-    return _header(TILES, 0, len(tiles), cell_m) + places.tobytes() + b"".join(t.cells.tobytes() for t in tiles)
+def tiles_message(grid: GridView, places: Sequence[Place]) -> bytes:
+    """Grid tiles; one that is gone as unknown."""
+    tiles = [grid.tile(place) for place in places]
+    where = np.array([(t.column, t.row) for t in tiles], "<i4").reshape(-1, 2)
+    return _header(TILES, 0, len(tiles), grid.cell_m) + where.tobytes() + b"".join(t.cells.tobytes() for t in tiles)
 
 
 def _header(kind: int, agent: int, n: int, scale: float) -> bytes:

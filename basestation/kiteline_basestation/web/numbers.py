@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from kiteline_basestation.grid.grid import UNKNOWN
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
 
 T = TypeVar("T", PageSnapshot, AgentStatus)
@@ -26,8 +25,7 @@ class Number(Generic[T]):
 
 def mapped_m2(page: PageSnapshot) -> float:
     """Area of the grid's known cells, m²."""
-    grid = page.grid
-    return 0.0 if grid is None else round(int((grid.cells != UNKNOWN).sum()) * grid.cell_m**2, 1)
+    return round(page.grid.known_m2(), 1)
 
 
 # In the header of the page, from left to right.

@@ -12,7 +12,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from http import HTTPStatus
 from pathlib import Path
 
@@ -22,8 +22,8 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from kiteline_basestation.grid.grid import GridMap
-from kiteline_basestation.web.messages import map_messages, status
+from kiteline_basestation.grid.grid_view import GridView, differences
+from kiteline_basestation.web.messages import map_messages, status, tiles_message
 from kiteline_basestation.web.snapshot import PageSnapshot
 
 STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read
@@ -31,6 +31,7 @@ MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larg
 WATCHED_S = 3.0  # s since the last request for which a page counts as watched
 RATE_SPAN_S = 2.0  # s over which byte rates are taken: two heartbeats
 MAX_VIEWERS = 16  # browsers at a time; each costs up to 100 kB/s
+TILES_A_MESSAGE = 64  # tiles of 4 kB
 LIVE_PATH = "/live"
 
 _FILES = {
@@ -165,22 +166,33 @@ class _Page:
 
     async def _show(self, viewer: ServerConnection) -> None:
         revision: int | None = None
-        held: GridMap | None = None
+        held = GridView(1.0)
         map_s = -MAP_PERIOD_S
         while True:
             now, before = self._snapshots()
             await viewer.send(_json(now, before).decode())
-            if now.map_revision != revision and time.monotonic() - map_s >= MAP_PERIOD_S:
+            changed = now.map_revision != revision or now.grid is not held
+            if changed and time.monotonic() - map_s >= MAP_PERIOD_S:
                 revision, map_s = now.map_revision, time.monotonic()
-                for message in map_messages(now, held):
+                for message in map_messages(now):
                     await viewer.send(message)
-                held = now.grid if now.grid is not None else held
+                async for message in self._tiles(held, now.grid):
+                    await viewer.send(message)
+                held = now.grid
             try:
                 async with asyncio.timeout(STATUS_PERIOD_S):
                     await viewer.recv()  # a page sends nothing; this notices when it closes
                     await asyncio.sleep(STATUS_PERIOD_S)
             except TimeoutError:
                 pass
+
+    @staticmethod
+    async def _tiles(held: GridView, now: GridView) -> AsyncIterator[bytes]:
+        """Messages of the changed tiles; between two of them other viewers have their turn."""
+        places = differences(held, now)
+        for k in range(0, len(places), TILES_A_MESSAGE):
+            yield tiles_message(now, places[k : k + TILES_A_MESSAGE])
+            await asyncio.sleep(0)
 
     def _snapshots(self) -> tuple[PageSnapshot, PageSnapshot | None]:
         """The newest snapshot, taken at most twice a period for all viewers, and an older one for rates."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import GridConfig
-from kiteline_basestation.grid.grid import GridMap, empty
+from kiteline_basestation.grid.grid_view import GridView
+from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
@@ -18,6 +18,8 @@ from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, AgentId, SubmapId, a
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+
+POINTS_SHARE = 20  # changes of the map, in parts of its keyframes, after which its points are gathered again
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +53,23 @@ class PageSnapshot:
     agents: tuple[AgentStatus, ...]
     points: F64
     labels: U8
-    grid: GridMap | None
+    grid: GridView
     map_revision: int
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
 def empty_snapshot(now_ns: int) -> PageSnapshot:
     """A base that has just started."""
-    grid = empty(GridConfig())
-    return PageSnapshot(now_ns, now_ns, (), grid.points, grid.labels, None, 0)
+    return PageSnapshot(now_ns, now_ns, (), np.zeros((0, 3)), np.zeros(0, np.uint8), GridView(1.0), 0)
 
 
-def take_snapshot(station: Station, now_ns: int, started_ns: int) -> PageSnapshot:
-    """The station now. Points and labels are those of the newest grid. now_ns: on the clock of its steps."""
+def take_snapshot(
+    station: Station, now_ns: int, started_ns: int, before: PageSnapshot | None = None
+) -> PageSnapshot:  # fmt: skip
+    """The station now. before: an older one, whose points are taken while the map has hardly grown.
+
+    now_ns: on the clock of its steps.
+    """
     mapper = station.mapper
     summary: dict[str, Any] = mapper.summary()
     landmarks = _landmarks_by_agent(mapper)
@@ -88,8 +94,14 @@ def take_snapshot(station: Station, now_ns: int, started_ns: int) -> PageSnapsho
         )
     counts = {name: value for name, value in summary.items() if isinstance(value, int)}
     revision = counts["keyframes"] + counts["bundles"] + counts["grids"]
-    grid = mapper.grid.map
-    return PageSnapshot(now_ns, started_ns, tuple(agents), grid.points, grid.labels, grid, revision, counts)
+    grid = mapper.views.take()
+    if before is not None and revision - before.map_revision < counts["keyframes"] // POINTS_SHARE:
+        return PageSnapshot(
+            now_ns, started_ns, tuple(agents), before.points, before.labels, grid, before.map_revision, counts
+        )  # fmt: skip
+    placed = placed_map(mapper.map, mapper.placements)
+    labels = mapper.labels(mapper.map.find_landmarks(placed.landmark_ids))
+    return PageSnapshot(now_ns, started_ns, tuple(agents), placed.points, labels, grid, revision, counts)
 
 
 def _path(mapper: Mapper, agent: AgentId) -> F64:

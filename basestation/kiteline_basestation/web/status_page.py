@@ -28,7 +28,7 @@ class StatusPage:
         """Take a new snapshot if the last one is old enough."""
         if now_ns - self._taken_ns >= _PERIOD_NS:
             self._taken_ns = now_ns
-            self._snapshot = take_snapshot(station, now_ns, self._started_ns)
+            self._snapshot = take_snapshot(station, now_ns, self._started_ns, self._snapshot)
 
     def close(self) -> None:
         """Stop serving."""

@@ -258,7 +258,7 @@ def test_tiles_of_any_cells_pass_and_plain_ones_are_short(seed: int, patch: int,
     tile = GridTile(int(rng.integers(-(1 << 23), 1 << 23)), 5, int(rng.integers(-128, 128)), 0.0001, cells)
     code = messages.encode(tile)
     assert_same(messages.decode(messages.key(tile), code), tile)
-    assert len(code) <= 40 if patch == 64 and noise == 0.0 else len(code) < 2500
+    assert len(code) <= 64 if patch == 64 and noise == 0.0 else len(code) < 2500
 
 
 def test_a_tile_of_walls_and_frontiers_takes_a_hundred_bytes() -> None:

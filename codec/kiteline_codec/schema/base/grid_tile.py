@@ -50,12 +50,16 @@ class GridTile(Record):
 
     def key(self) -> Key:
         """Column and row, packed, and the storey. Raises ValueError when out of range."""
-        column, row = self.column + _OFFSET, self.row + _OFFSET
-        if not (0 <= column < 1 << _BITS and 0 <= row < 1 << _BITS):
-            raise ValueError(f"tile ({self.column}, {self.row}) lies beyond +-{_OFFSET}")
-        if not 0 <= self.part < self.PARTS:
-            raise ValueError(f"storey {self.storey} lies beyond +-{MAX_STOREY}")
-        return Key(self.KIND, column << _BITS | row, self.part)
+        return self.key_of(self.column, self.row, self.storey)
+
+    @classmethod
+    def key_of(cls, column: int, row: int, storey: int) -> Key:
+        """The key of a place. Raises ValueError when out of range."""
+        if not (-_OFFSET <= column < _OFFSET and -_OFFSET <= row < _OFFSET):
+            raise ValueError(f"tile ({column}, {row}) lies beyond +-{_OFFSET}")
+        if not -MAX_STOREY - 1 <= storey <= MAX_STOREY:
+            raise ValueError(f"storey {storey} lies beyond +-{MAX_STOREY}")
+        return Key(cls.KIND, column + _OFFSET << _BITS | row + _OFFSET, storey + MAX_STOREY + 1)
 
     @staticmethod
     def place(key: Key) -> tuple[int, int, int]:

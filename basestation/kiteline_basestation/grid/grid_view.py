@@ -1,0 +1,149 @@
+"""The grid for others than its own stage: coded tiles for pages and links, and files for map_server."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.scan_kernels import SIDE
+from kiteline_basestation.grid.tile_store import Place
+from kiteline_codec.schema import GridTile, messages
+from kiteline_codec.schema.base.grid_tile import FREE, UNKNOWN
+
+I8 = NDArray[np.int8]
+F64 = NDArray[np.float64]
+
+FREE_GREY, UNKNOWN_GREY, SOLID_GREY = 254, 205, 0  # as map_server writes them
+_MOST_PIXELS = 1 << 26  # of a file; larger maps are written with coarser cells
+
+
+class CodedTile(NamedTuple):
+    """A tile as a code of its cells. known: number of known cells."""
+
+    code: bytes
+    known: int
+
+
+@dataclass(frozen=True, slots=True)
+class GridView:
+    """The grid at one instant, for other threads. Its tiles are those with known cells.
+
+    storey: the one with most scans.
+    """
+
+    cell_m: float
+    revision: int = 0
+    storey: int = 0
+    tiles: Mapping[Place, CodedTile] = field(default_factory=dict)
+
+    def known_m2(self) -> float:
+        """Area of the known cells of the main storey."""
+        return sum(tile.known for place, tile in self.tiles.items() if place.storey == self.storey) * self.cell_m**2
+
+    def tile(self, place: Place) -> GridTile:
+        """A tile as a record; unknown where there is none."""
+        held = self.tiles.get(place)
+        if held is None:
+            cells = np.full((SIDE, SIDE), UNKNOWN, np.int8)
+            return GridTile(place.column, place.row, place.storey, self.cell_m, cells)
+        record = messages.decode(GridTile.key_of(place.column, place.row, place.storey), held.code)
+        assert isinstance(record, GridTile)
+        return record
+
+
+def differences(old: GridView, new: GridView) -> list[Place]:
+    """Tiles of the main storey that differ between two views, in order; those that vanished too."""
+    if old.storey != new.storey:
+        old = GridView(old.cell_m, 0, new.storey, {p: t for p, t in old.tiles.items() if p.storey == old.storey})
+        gone = {Place(new.storey, p.row, p.column) for p in old.tiles}
+    else:
+        gone = {p for p in old.tiles if p.storey == new.storey}
+    here = {p for p in new.tiles if p.storey == new.storey}
+    return sorted(p for p in gone | here if old.tiles.get(p) is not new.tiles.get(p))
+
+
+class GridViews:
+    """Makes views of a grid; tiles that did not change since the last one are not coded again."""
+
+    def __init__(self, grid: ScanGrid) -> None:
+        self._grid = grid
+        self._last = GridView(grid.config.cell_m)
+
+    def take(self) -> GridView:
+        """The grid now."""
+        grid, last = self._grid, self._last
+        if grid.revision == last.revision:
+            return last
+        tiles = dict(last.tiles)
+        for place in sorted(grid.stale_since(last.revision)):
+            cells, known = grid.cells(place)
+            held = tiles.pop(place, None)
+            if known:
+                record = GridTile(place.column, place.row, place.storey, last.cell_m, cells)
+                new = CodedTile(messages.encode(record), known)
+                tiles[place] = held if held == new and held is not None else new
+        self._last = GridView(last.cell_m, grid.revision, grid.main_storey(), tiles)
+        return self._last
+
+
+def dense(grid: ScanGrid, storey: int) -> tuple[I8, F64, float]:
+    """A storey as one array: cells (rows, columns) int8, row 0 the lowest y, its corner (2,) in w and a cell's side, m.
+
+    A map of more pixels than a file can have gets coarser cells: occupied if any is, free if at least half are.
+    """
+    cell = grid.config.cell_m
+    tiles = {p: cells for p in grid.places if p.storey == storey for cells, known in [grid.cells(p)] if known}
+    if not tiles:
+        return np.full((1, 1), UNKNOWN, np.int8), np.zeros(2), cell
+    places = np.array([(p.row, p.column) for p in tiles], np.int64)
+    first, last = places.min(axis=0), places.max(axis=0) + 1
+    rows, columns = ((last - first) * SIDE).tolist()
+    factor = 1
+    while rows * columns > _MOST_PIXELS * factor**2 and factor < SIDE:
+        factor *= 2
+    side = SIDE // factor
+    # Tiles far from all others would make an image of any size: then only what lies around the median is shown.
+    if (rows // factor) * (columns // factor) > _MOST_PIXELS:
+        centre, reach = np.median(places, axis=0).astype(np.int64), int(np.sqrt(_MOST_PIXELS)) // (2 * side)
+        first, last = np.maximum(first, centre - reach), np.minimum(last, centre + reach)
+        rows, columns = ((last - first) * SIDE).tolist()
+    out = np.full((rows // factor, columns // factor), UNKNOWN, np.int8)
+    for place, cells in tiles.items():
+        r, c = place.row - int(first[0]), place.column - int(first[1])
+        if r >= 0 and c >= 0 and (r + 1) * side <= out.shape[0] and (c + 1) * side <= out.shape[1]:
+            out[r * side : (r + 1) * side, c * side : (c + 1) * side] = _coarser(cells, factor)
+    return out, np.array([first[1], first[0]]) * (SIDE * cell), cell * factor
+
+
+def _coarser(cells: I8, factor: int) -> I8:
+    if factor == 1:
+        return cells
+    side = SIDE // factor
+    blocks = cells.reshape(side, factor, side, factor).transpose(0, 2, 1, 3).reshape(side, side, -1)
+    mask = np.bitwise_or.reduce(np.maximum(blocks, 0), axis=2)
+    free = 2 * np.count_nonzero(blocks == FREE, axis=2) >= factor**2
+    return np.where(mask > 0, mask, np.where(free, FREE, UNKNOWN)).astype(np.int8)
+
+
+def grid_files(grid: ScanGrid, stem: str = "grid") -> dict[str, bytes]:
+    """Images (binary PGM, highest y first: 254 free, 0 occupied, 205 unknown) and YAML files of map_server, by name.
+
+    The main storey is STEM.pgm; others STEM_storeyN.pgm, counted from the main one.
+    """
+    main, out = grid.main_storey(), {}
+    for storey in sorted({main, *grid.separate_storeys()}):
+        name = stem if storey == main else f"{stem}_storey{storey - main:+d}"
+        cells, corner, cell = dense(grid, storey)
+        grey = np.where(cells == UNKNOWN, UNKNOWN_GREY, np.where(cells == FREE, FREE_GREY, SOLID_GREY)).astype(np.uint8)
+        out[f"{name}.pgm"] = f"P5\n{grey.shape[1]} {grey.shape[0]}\n255\n".encode() + grey[::-1].tobytes()
+        out[f"{name}.yaml"] = (
+            f"image: {name}.pgm\nmode: trinary\nresolution: {cell:.6g}\n"
+            f"origin: [{corner[0]:.6f}, {corner[1]:.6f}, 0.000000]\n"
+            "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        ).encode()
+    return out

@@ -1,0 +1,192 @@
+"""The occupancy grid of w, drawn from column scans that hang on keyframes.
+
+    grid = ScanGrid(GridConfig())
+    kept = keep(grid.config, scan, bf_px_m)
+    grid.put(keyframe, kept, S_w_c)  # draws a scan, or draws it anew where its keyframe is now
+    grid.remove(keyframe)
+    grid.cells(Place(0, 2, -1))  # (64,64) int8: -1 unknown, 0 free, else the mask of occupied height bands
+
+Log-odds are sums of integers, and a scan is drawn at a pose on a lattice: to draw the scans that moved anew gives
+exactly the grid that all scans give when they are drawn from scratch. A storey holds the scans whose ground lies near
+its height; neighbouring storeys overlap.
+
+Method: log-odds of A. Hornung et al., "OctoMap", 2013, equation 2, in the sectors of a scan's columns; overlong rays
+and the opening of the result after "Segfloor", equation 5.3 and section 5.6.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid import scan_kernels as kernels
+from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of
+from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
+from kiteline_basestation.grid.tile_store import Place, TileStore
+
+F64 = NDArray[np.float64]
+I8 = NDArray[np.int8]
+U16 = NDArray[np.uint16]
+
+
+class _Drawn(NamedTuple):
+    lattice: Lattice
+    scan: KeptScan
+
+
+class ScanGrid:
+    """Tiles of log-odds, and the scans that are drawn in them, by keyframe."""
+
+    def __init__(self, config: GridConfig) -> None:
+        self.config = config
+        self.revision = 0  # number of changes so far
+        self.touched: dict[Place, int] = {}  # revision at which a tile changed last; also of tiles that are gone
+        self._store = TileStore(config.resident_tiles)
+        self._drawn: dict[int, _Drawn] = {}
+        self._storeys: Counter[tuple[int, ...]] = Counter()  # scans by the storeys on which they are drawn
+        self._hits: U16 = np.zeros((0, 0), np.uint16)  # zero between two draws
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self._drawn)
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._drawn
+
+    @property
+    def places(self) -> list[Place]:
+        """Tiles that a scan touches, in order of storey, row, column."""
+        return sorted(self._store)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of tiles and scans, without dictionaries."""
+        return self._store.nbytes + sum(len(drawn.scan.rows) for drawn in self._drawn.values())
+
+    def put(self, keyframe: int, scan: KeptScan, S_w_c: F64) -> bool:
+        """Draw a scan at its camera's pose (4,4), or anew if it or its pose changed. True if cells may have changed.
+
+        A scan with a pose that is not finite, or lies beyond the farthest tile, is not drawn.
+        """
+        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > self.config.max_position_m:
+            return self.remove(keyframe)
+        new = _Drawn(scan.lattice(self.config, S_w_c), scan)
+        held = self._drawn.get(keyframe)
+        if new == held:
+            return False
+        self.revision += 1
+        if held is not None:
+            self._draw(held, -1)
+        self._drawn[keyframe] = new
+        self._draw(new, 1)
+        return True
+
+    def remove(self, keyframe: int) -> bool:
+        """Take a scan out. True if it was there."""
+        held = self._drawn.pop(keyframe, None)
+        if held is None:
+            return False
+        self.revision += 1
+        self._draw(held, -1)
+        return True
+
+    def main_storey(self) -> int:
+        """The storey with most scans."""
+        scans = Counter(storey for storeys in self._storeys.elements() for storey in storeys)
+        return min(scans, key=lambda s: (-scans[s], abs(s), s), default=0)
+
+    def separate_storeys(self) -> list[int]:
+        """Storeys that hold scans which are not in the main one."""
+        main = self.main_storey()
+        return sorted({s for storeys in self._storeys if main not in storeys for s in storeys if s != main})
+
+    def log_odds(self, place: Place) -> NDArray[np.int16]:
+        """Log-odds (BANDS, 64, 64) int16 of a tile."""
+        slot = int(self._store.open_box(place.storey, place.row, place.column, 1, 1)[0, 0])
+        return np.zeros((BANDS, SIDE, SIDE), np.int16) if slot < 0 else self._store.pool[slot].copy()
+
+    def cells(self, place: Place) -> tuple[I8, int]:
+        """Cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands; and how many are known."""
+        slots = self._store.open_box(place.storey, place.row - 1, place.column - 1, 3, 3)
+        cells = np.empty((SIDE, SIDE), np.int8)
+        config = self.config
+        known = kernels.read_states(
+            slots, self._store.pool, config.occupied_from, config.free_from, int(config.opening), cells
+        )
+        self._store.close()
+        return cells, int(known)
+
+    def stale_since(self, revision: int) -> Iterable[Place]:
+        """Tiles whose cells may have changed after a revision: those that were drawn on, and those around them."""
+        changed = {place for place, at in self.touched.items() if at > revision}
+        return changed | {
+            Place(storey, row + r, column + c)
+            for storey, row, column in changed
+            for r in (-1, 0, 1)
+            for c in (-1, 0, 1)
+        }
+
+    def _draw(self, drawn: _Drawn, sign: int) -> None:
+        """Add a scan to its storeys (sign 1), or take it out (-1)."""
+        config, (lattice, scan) = self.config, drawn
+        self._storeys[lattice.storeys] += sign
+        if not self._storeys[lattice.storeys]:
+            del self._storeys[lattice.storeys]
+        cell, scale = config.cell_m, scale_of(lattice)
+        ranges = scan.ranges()
+        bands = ranges[1].astype(np.uint8)
+        obstacle, start, free, clear = (r * (scale / cell) for r in (ranges[0], ranges[2], ranges[3], ranges[4]))
+        # Cells before an obstacle are free up to two deviations of its range, and at least a cell, before it.
+        near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
+        gap = np.maximum(1.0, 2.0 * scan.sigma_per_m2 * near_m**2 * scale / cell)
+        before = np.where(bands > 0, obstacle - gap, np.inf)
+        under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
+        space = np.stack([start, np.minimum(free, before), free, np.minimum(clear, before)], 1)
+        accurate_m = config.accurate_m
+        weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
+
+        reach = max(float(np.max(space)), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
+        x, y = position_cells(lattice)
+        first = scan.heading_rad(config, lattice) + scan.first_rad
+        box = _box(x, y, first, scan.step, scan.columns, reach)
+        rows, columns = box[2] - box[0], box[3] - box[1]
+        x, y = x - SIDE * box[1], y - SIDE * box[0]
+        if self._hits.shape[0] < rows * SIDE or self._hits.shape[1] < columns * SIDE:
+            self._hits = np.zeros((rows * SIDE, columns * SIDE), np.uint16)
+        hits = self._hits[: rows * SIDE, : columns * SIDE]
+        cells = np.empty((int(np.sum(np.where(bands > 0, 2.0 * obstacle * scan.step + 2.0, 0.0))), 2), np.int32)
+        found = kernels.mark_hits(x, y, first, scan.step, obstacle, bands, weight, hits, cells)
+        camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
+        camera_band = camera_band if 0 <= camera_band < BANDS else -1
+        for storey in lattice.storeys:
+            slots = self._store.open_box(storey, box[0], box[1], rows, columns)
+            spare = self._store.spare(int(np.count_nonzero(slots < 0)))
+            touched, used = np.zeros((rows, columns), np.uint8), np.zeros(1, np.int64)
+            kernels.draw_hits(hits, cells, found, sign, slots, spare, used, self._store.pool, touched)
+            kernels.draw_free(
+                x, y, first, scan.step, space, under, camera_band, accurate_m / cell, config.log_free,
+                config.log_free_far, hits, sign, slots, spare, used, self._store.pool, touched,
+            )  # fmt: skip
+            for r, c in np.argwhere(touched).tolist():
+                place = Place(storey, box[0] + r, box[1] + c)
+                self._store.enter(place, int(slots[r, c]), sign)
+                self.touched[place] = self.revision
+        kernels.clear_hits(hits, cells, found)
+        self._store.close()
+
+
+def _box(x: float, y: float, first: float, step: float, n: int, reach: float) -> tuple[int, int, int, int]:
+    """First row and column, and those after the last, of the tiles around a scan's sectors. x, y, reach: in cells."""
+    angles = first + step * np.arange(n + 1)
+    ends_x, ends_y = x + reach * np.cos(angles), y + reach * np.sin(angles)
+    low_x, high_x = min(x - 2.0, ends_x.min()), max(x + 2.0, ends_x.max())
+    low_y, high_y = min(y - 2.0, ends_y.min()), max(y + 2.0, ends_y.max())
+    return (
+        int(np.floor(low_y / SIDE)), int(np.floor(low_x / SIDE)),
+        int(np.floor(high_y / SIDE)) + 1, int(np.floor(high_x / SIDE)) + 1,
+    )  # fmt: skip

@@ -1,0 +1,208 @@
+"""Kernels that draw a column scan into tiles of log-odds, and that read the state of their cells.
+
+Cells are numbered from the lower left corner of a box of tiles; `slots` (rows, columns) int32 maps a tile of the box to
+its place in the pool (capacity, BANDS, 64, 64) int16, -1 none. All drawing is the sum of integers, so that a scan that
+is drawn with sign -1 leaves no trace.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.jit import helper, njit
+
+I8 = NDArray[np.int8]
+I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+F64 = NDArray[np.float64]
+
+SIDE = 64  # cells along a side of a tile: the shape of a GridTile record
+BANDS = 3  # height bands
+_SHIFT, _MASK = 6, SIDE - 1  # quotient and remainder by SIDE
+_ALL = (1 << BANDS) - 1
+_MOST = 32767  # log-odds saturate: a cell that was seen so often stays what it is
+
+
+@helper
+def _tile(row: int, column: int, slots: I32, spare: I32, used: I64) -> int:
+    """Slot of the tile of a cell, taken from `spare` if it has none. used: (1,) number of spare slots taken."""
+    slot = slots[row >> _SHIFT, column >> _SHIFT]
+    if slot < 0:
+        slot = spare[used[0]]
+        used[0] += 1
+        slots[row >> _SHIFT, column >> _SHIFT] = slot
+    return int(slot)
+
+
+@helper
+def _add(pool: I16, slot: int, row: int, column: int, bands: int, value: int) -> None:
+    for b in range(BANDS):
+        if bands >> b & 1:
+            total = int(pool[slot, b, row & _MASK, column & _MASK]) + value
+            pool[slot, b, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
+
+
+@njit
+def mark_hits(
+    x: float, y: float, first_rad: float, step_rad: float, range_cells: F64, bands: U8, weight: I64, hits: U16,
+    cells: I32,
+) -> int:  # fmt: skip
+    """Enter the cells of the nearest obstacles of a scan's columns into `hits` (rows, columns), zero before.
+
+    x, y: camera in cells of the box. first_rad: lower edge of column 0. range_cells: (n,) inf without an obstacle.
+    weight: (n,) below 128. A cell gets 256 weight + bands; of several columns the largest weight and all bands.
+    cells: (m,2) row, column of the cells, out. Returns how many.
+    """
+    found = 0
+    for i in range(range_cells.shape[0]):
+        reach = range_cells[i]
+        if not reach < np.inf:
+            continue
+        samples = max(1, int(np.ceil(2.0 * reach * step_rad)))
+        for k in range(samples):
+            angle = first_rad + (i + (k + 0.5) / samples) * step_rad
+            row, column = int(np.floor(y + reach * np.sin(angle))), int(np.floor(x + reach * np.cos(angle)))
+            if row < 0 or column < 0 or row >= hits.shape[0] or column >= hits.shape[1]:
+                continue
+            before = np.int64(hits[row, column])
+            if before == 0:
+                cells[found, 0], cells[found, 1] = row, column
+                found += 1
+            hits[row, column] = (max(before >> 8, weight[i]) << 8) | (before & 255) | np.int64(bands[i])
+    return found
+
+
+@njit
+def draw_hits(
+    hits: U16, cells: I32, found: int, sign: int, slots: I32, spare: I32, used: I64, pool: I16, touched: U8
+) -> None:
+    """Add the weights of marked cells to their bands. touched: (rows, columns) of tiles, out."""
+    for i in range(found):
+        row, column = cells[i, 0], cells[i, 1]
+        slot = _tile(row, column, slots, spare, used)
+        touched[row >> _SHIFT, column >> _SHIFT] = 1
+        value = int(np.int64(hits[row, column]))  # unsigned and signed numbers would make a float
+        _add(pool, slot, row, column, value & _ALL, sign * (value >> 8))
+
+
+@njit
+def draw_free(
+    x: float, y: float, first_rad: float, step_rad: float, free: F64, under: U8, camera_band: int, near_cells: float,
+    weight: int, far_weight: int, hits: U16, sign: int, slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
+) -> None:  # fmt: skip
+    """Take evidence of free space from the cells of each column's sector; each cell belongs to one column.
+
+    free: (n,4) ranges in cells: from and up to where all bands are free, up to where the bands `under` (n,) are free
+    too, and up to where the line of sight is clear, which frees camera_band (-1: none). weight: up to near_cells;
+    far_weight: beyond. Marked cells keep the bands of their obstacles.
+    """
+    rows, columns = hits.shape
+    for i in range(free.shape[0]):
+        start, end, low, clear = free[i, 0], free[i, 1], free[i, 2], free[i, 3] if camera_band >= 0 else 0.0
+        reach = max(end, low, clear)
+        if reach <= 0.0:
+            continue
+        a0, a1 = first_rad + i * step_rad, first_rad + (i + 1) * step_rad
+        c0, s0, c1, s1 = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
+        bottom = max(0, int(np.floor(y + min(0.0, reach * s0, reach * s1) - 1.0)))
+        top = min(rows - 1, int(np.ceil(y + max(0.0, reach * s0, reach * s1) + 1.0)))
+        for row in range(bottom, top + 1):
+            dy = row + 0.5 - y
+            width2 = reach * reach - dy * dy
+            if width2 <= 0.0:
+                continue
+            width = np.sqrt(width2)
+            first, last = int(np.ceil(x - width - 0.5)), int(np.floor(x + width - 0.5))
+            # On or left of the lower edge, and right of the upper one: each cell centre in exactly one column.
+            if s0 > 0.0:
+                last = min(last, int(np.floor(c0 / s0 * dy + x - 0.5)))
+            elif s0 < 0.0:
+                first = max(first, int(np.ceil(c0 / s0 * dy + x - 0.5)))
+            elif c0 * dy < 0.0:
+                continue
+            if s1 > 0.0:
+                first = max(first, int(np.floor(c1 / s1 * dy + x - 0.5)) + 1)
+            elif s1 < 0.0:
+                last = min(last, int(np.ceil(c1 / s1 * dy + x - 0.5)) - 1)
+            elif c1 * dy >= 0.0:
+                continue
+            for column in range(max(first, 0), min(last, columns - 1) + 1):
+                dx = column + 0.5 - x
+                distance = np.sqrt(dx * dx + dy * dy)
+                bands = 0
+                if distance >= start:
+                    if distance <= end:
+                        bands = _ALL
+                    elif distance <= low:
+                        bands = int(np.int64(under[i]))
+                if distance <= clear:
+                    bands |= 1 << camera_band
+                bands &= ~int(np.int64(hits[row, column]))
+                if bands & _ALL:
+                    slot = _tile(row, column, slots, spare, used)
+                    touched[row >> _SHIFT, column >> _SHIFT] = 1
+                    taken = weight if distance <= near_cells else far_weight
+                    _add(pool, slot, row, column, bands & _ALL, -sign * taken)
+
+
+@njit
+def clear_hits(hits: U16, cells: I32, found: int) -> None:
+    """Set the marked cells to zero again."""
+    for i in range(found):
+        hits[cells[i, 0], cells[i, 1]] = 0
+
+
+@helper
+def _state(pool: I16, slots: I32, row: int, column: int, occupied_from: int, free_from: int) -> int:
+    """-1 unknown, 0 free, else the mask of occupied bands. row, column: from the corner of the tile in the middle."""
+    slot = slots[(row + SIDE) >> _SHIFT, (column + SIDE) >> _SHIFT]
+    if slot < 0:
+        return -1
+    mask, free = 0, 0
+    for b in range(BANDS):
+        value = int(pool[slot, b, row & _MASK, column & _MASK])
+        mask |= (value >= occupied_from) << b
+        free += value <= -free_from
+    return mask if mask else 0 if free == BANDS else -1
+
+
+@njit
+def read_states(slots: I32, pool: I16, occupied_from: int, free_from: int, opening: int, cells: I8) -> int:
+    """States of the cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands.
+
+    slots: (3,3) of the tile and those around it. occupied_from, free_from: log-odds from which a band is occupied, and
+    below minus which all bands have to be for the cell to be free. opening: 1 keeps free only what lies in a square of
+    three by three free cells. Returns the number of known cells.
+    """
+    margin = 2 if opening else 0
+    wide = SIDE + 2 * margin
+    states = np.empty((wide, wide), np.int8)
+    for row in range(wide):
+        for column in range(wide):
+            states[row, column] = _state(pool, slots, row - margin, column - margin, occupied_from, free_from)
+    known = 0
+    if opening:
+        kept = np.zeros((wide, wide), np.uint8)
+        for row in range(1, wide - 1):
+            for column in range(1, wide - 1):
+                whole = True
+                for r in range(row - 1, row + 2):
+                    for c in range(column - 1, column + 2):
+                        whole = whole and states[r, c] == 0
+                if whole:
+                    for r in range(row - 1, row + 2):
+                        for c in range(column - 1, column + 2):
+                            kept[r, c] = 1
+        for row in range(wide):
+            for column in range(wide):
+                if states[row, column] == 0 and kept[row, column] == 0:
+                    states[row, column] = -1
+    for row in range(SIDE):
+        for column in range(SIDE):
+            cells[row, column] = states[row + margin, column + margin]
+            known += cells[row, column] >= 0
+    return known

@@ -1,0 +1,84 @@
+"""A column scan from sparse landmarks, where an agent sends none: with one eye, or with the grid turned off.
+
+Method: "Segfloor", section 5.6, points above the ground and rays to points of the ground, with the heights of the rays:
+a ray over a box clears neither the box nor the floor below.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.ground_height import ground_heights
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.column_scan import ColumnScan, level_rotation
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of landmarks
+
+
+def label(config: GridConfig, height_m: F64, distance_m: F64) -> U8:
+    """Labels (n,) uint8 of points by height above the ground (n,) and distance (n,), both m; NaN: unlabelled."""
+    low = config.bands_m[0] + config.noise_per_m * distance_m
+    out = np.zeros(len(height_m), np.uint8)
+    out[np.abs(height_m) <= low] = GROUND  # comparisons with NaN are false
+    out[(height_m > low) & (height_m <= config.bands_m[-1])] = OBSTACLE
+    return out
+
+
+def sparse_scan(
+    config: GridConfig, camera: RectifiedCamera, S_w_k: F64, points_k: F64, seen: Bool
+) -> tuple[ColumnScan, U8] | None:
+    """A scan of the landmarks that a keyframe sees, and the labels of all. None if they tell no ground.
+
+    S_w_k: (4,4), z of w up. points_k: (n,3) landmarks around it in its camera, in units of its submap. seen: (n,) those
+    that the keyframe sees; the others only tell the ground.
+    """
+    up_c = S_w_k[2, :3] / np.linalg.norm(S_w_k[2, :3])
+    local = points_k @ level_rotation(up_c)
+    distance = np.hypot(local[:, 0], local[:, 1])
+    near = np.isfinite(local).all(axis=1) & (distance <= config.max_range_m)
+    labels = np.zeros(len(local), np.uint8)
+    if not near.any():
+        return None
+    ground = np.full(len(local), np.nan)
+    ground[near] = ground_heights(config.ground, local[near], np.zeros(int(near.sum())))
+    labels[near] = label(config, (local[:, 2] - ground)[near], distance[near])
+    floor = labels == GROUND
+    if not floor.any():
+        return None
+    nearest = np.argsort(distance + np.where(floor, 0.0, np.inf))[: config.sparse_floor_points]
+    height = -float(np.median(ground[nearest[floor[nearest]]]))
+    if not height > 0.0:
+        return None
+    n = config.sparse_columns
+    half = float(np.arctan2(0.5 * camera.width, camera.fx))
+    step = 2.0 * half / n
+    column = np.floor((np.arctan2(local[:, 1], local[:, 0]) + half) / step).astype(np.int64)
+    used = near & seen & (column >= 0) & (column < n) & (labels != UNLABELLED)
+    column, distance, label_of = column[used], distance[used], labels[used]
+    above = (local[:, 2] - ground)[used]
+    solid = label_of == OBSTACLE
+    obstacle = np.full(n, np.inf)
+    np.minimum.at(obstacle, column[solid], distance[solid])
+    bands = np.zeros(n, np.uint8)
+    band = np.searchsorted(config.bands_m[1:-1], above, side="right").astype(np.uint8)
+    front = solid & (distance <= obstacle[column] + config.sparse_depth_m)
+    np.bitwise_or.at(bands, column[front], np.uint8(1) << band[front])
+    # A ray frees the cells over which it is lower than `free_below_m`.
+    drop = np.maximum(height - np.where(solid, above, 0.0), 1e-6)
+    start = np.where(
+        solid & (above >= config.free_below_m),
+        distance,
+        distance * np.clip((height - config.free_below_m) / drop, 0.0, 1.0),
+    )
+    free, free_from = np.zeros(n), np.full(n, np.inf)
+    np.maximum.at(free, column, np.where(start < distance, distance, 0.0))
+    np.minimum.at(free_from, column, start)
+    free_from = np.where(free > 0.0, np.minimum(free_from, free), 0.0)
+    azimuth0 = -half + 0.5 * step
+    return ColumnScan(up_c, azimuth0, step, free_from, free, obstacle, bands, np.zeros(n), height), labels

@@ -1,0 +1,63 @@
+"""The ground under sparse points, and scans made from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.config import GridConfig, GroundConfig
+from kiteline_basestation.grid.ground_height import ground_heights
+from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_scan
+from kiteline_core.geometry.cameras import RectifiedCamera
+from tests.basestation.flat_rooms import camera
+
+CAMERA = RectifiedCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.1, True, np.eye(4))
+
+
+def test_ground_is_the_floor_and_neither_a_table_nor_noise_below() -> None:
+    rng = np.random.default_rng(1)
+    floor = np.column_stack([rng.uniform(0, 4, (200, 2)), rng.normal(0.0, 0.01, 200)])
+    table = np.column_stack([rng.uniform(1, 3, (500, 2)), rng.normal(0.7, 0.01, 500)])
+    noise = np.column_stack([rng.uniform(0, 4, (30, 2)), rng.uniform(-2.0, -0.2, 30)])
+    points = np.concatenate([floor, table, noise])
+    ground = ground_heights(GroundConfig(), points, np.full(len(points), 1.2))
+    np.testing.assert_allclose(ground, 0.0, atol=0.06)
+
+
+def test_labels_follow_height_and_distance() -> None:
+    height = np.array([-0.5, -0.05, 0.05, 0.12, 0.12, 1.9, 2.1, np.nan])
+    distance = np.array([1.0, 1.0, 1.0, 0.0, 10.0, 1.0, 1.0, 1.0])
+    expected = [UNLABELLED, GROUND, GROUND, OBSTACLE, GROUND, OBSTACLE, UNLABELLED, UNLABELLED]
+    assert label(GridConfig(), height, distance).tolist() == expected
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1])
+def test_landmarks_of_a_hall_make_a_scan(slope: float) -> None:
+    """A floor 1 m below the camera, a wall 5 m ahead, and before it to the left a box that is lower than the camera."""
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform([0.5, -4], [5, 4], (500, 2)), np.full(500, -1.0)])
+    wall = np.column_stack([np.full(300, 5.0), rng.uniform(-4, 4, 300), rng.uniform(-0.8, 0.9, 300)])
+    box = np.column_stack([np.full(60, 3.0), rng.uniform(0.5, 1.5, 60), rng.uniform(-0.8, -0.6, 60)])
+    floor = floor[~((floor[:, 0] > 3.0) & (np.abs(floor[:, 1] / floor[:, 0] - 1 / 3) < 0.2))]  # hidden by the box
+    points = np.concatenate([floor, wall, box])
+    points[:, 2] += slope * points[:, 0]
+    points_k = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0]])
+    made = sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points_k, np.ones(len(points), bool))
+    assert made is not None
+    scan, labels = made
+    assert np.mean(labels[: len(floor)] == GROUND) > 0.97 and np.mean(labels[len(floor) :] == OBSTACLE) > 0.97
+    assert scan.camera_height_m == pytest.approx(1.0 - 0.8 * slope, abs=0.1)
+    ahead = scan.azimuths_rad
+    at_box, at_wall = np.abs(ahead - 0.32) < 0.1, np.abs(ahead + 0.4) < 0.2
+    assert scan.obstacle_m[at_wall] * np.cos(ahead[at_wall]) == pytest.approx(5.0, abs=0.2)
+    assert (scan.bands[at_wall] & 4).any()
+    assert scan.obstacle_m[at_box] * np.cos(ahead[at_box]) == pytest.approx(3.0, abs=0.2)
+    assert (scan.bands[at_box] == 1).all(), "only low"
+    assert (scan.free_m[at_wall] > 3.5).mean() > 0.8 and (scan.free_from_m[at_wall] < 2.5).mean() > 0.8
+
+
+def test_without_a_floor_there_is_no_scan() -> None:
+    rng = np.random.default_rng(0)
+    ceiling = np.column_stack([rng.uniform(-3, 3, 200), np.full(200, -1.5), rng.uniform(1, 6, 200)])
+    assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), ceiling, np.ones(200, bool)) is None
+    assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), np.full((3, 3), np.nan), np.ones(3, bool)) is None

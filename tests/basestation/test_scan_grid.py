@@ -1,0 +1,296 @@
+"""The grid from column scans: what it says of a room, that redrawing equals drawing from scratch, storeys, memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid import scan_kernels as kernels
+from kiteline_basestation.grid.grid_view import GridViews, dense, differences, grid_files
+from kiteline_basestation.grid.kept_scan import KeptScan, keep
+from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.tile_store import Place
+from kiteline_core.ground.column_scan import ColumnScan
+from tests.basestation.flat_rooms import HEIGHT_M, ROOM, box, camera, circle, scan_of
+
+CONFIG = GridConfig()
+BF = 100.0  # px m
+
+
+def kept(scan: ColumnScan, config: GridConfig = CONFIG) -> KeptScan:
+    found = keep(config, scan, BF)
+    assert found is not None
+    return found
+
+
+def flight(n: int = 40, seed: int = 0) -> list[tuple[KeptScan, tuple[float, float, float]]]:
+    rng = np.random.default_rng(seed)
+    return [(kept(scan_of(ROOM, *pose, noise=0.003, rng=rng)), pose) for pose in circle(n)]
+
+
+def drawn(scans: list[tuple[KeptScan, tuple[float, float, float]]], config: GridConfig = CONFIG) -> ScanGrid:
+    grid = ScanGrid(config)
+    for k, (scan, pose) in enumerate(scans):
+        grid.put(k, scan, camera(*pose))
+    return grid
+
+
+def assert_equal(a: ScanGrid, b: ScanGrid) -> None:
+    assert a.places == b.places
+    for place in a.places:
+        assert np.array_equal(a.log_odds(place), b.log_odds(place))
+        assert np.array_equal(a.cells(place)[0], b.cells(place)[0])
+
+
+def at(grid: ScanGrid, x: NDArray[np.float64] | float, y: NDArray[np.float64] | float) -> NDArray[np.int8]:
+    cells, corner, cell = dense(grid, 0)
+    rows = np.floor((np.asarray(y) - corner[1]) / cell).astype(int)
+    return np.asarray(cells[rows, np.floor((np.asarray(x) - corner[0]) / cell).astype(int)])
+
+
+def test_a_room_is_free_solid_at_walls_box_and_leg_and_unknown_outside() -> None:
+    grid = drawn(flight())
+    cells, corner, cell = dense(grid, 0)
+    rows, columns = np.indices(cells.shape)
+    x, y = corner[0] + (columns + 0.5) * cell, corner[1] + (rows + 0.5) * cell
+    in_box = (x > -0.5) & (x < 0.4) & (y > -0.5) & (y < 0.6)
+    near_leg = np.hypot(x - 2.02, y - 2.02) < 0.15
+    near_box = (x > -0.6) & (x < 0.5) & (y > -0.6) & (y < 0.7)
+    inside = (abs(x) < 3.85) & (abs(y) < 3.35) & ~near_box & ~near_leg
+    assert np.mean(cells[inside] == 0) > 0.97
+    assert not (cells[in_box] == 0).any()
+    assert (cells[near_leg] > 0).any()
+    assert not (cells[(abs(x) > 4.2) | (abs(y) > 3.7)] == 0).any()
+    along = np.arange(-3.0, 3.0, 0.05)
+    wall = np.stack([at(grid, along, np.full(len(along), 3.5 + d)) > 0 for d in (-0.06, -0.02, 0.02, 0.06)])
+    assert wall.any(axis=0).mean() > 0.98, "walls are closed"
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**31))
+def test_any_order_of_drawing_moving_and_removing_equals_drawing_from_scratch(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scans = flight(12)
+    grid = ScanGrid(replace(CONFIG, resident_tiles=4))
+    for _ in range(30):
+        k = int(rng.integers(12))
+        if rng.random() < 0.2:
+            grid.remove(k)
+        else:
+            x, y, heading = scans[k][1]
+            grid.put(k, scans[k][0], camera(x + rng.normal(0, 2), y, heading + rng.normal(0, 0.5), rng.normal(0, 2)))
+    final = {k: camera(x + 0.5 * rng.random(), y, heading) for k, (_, (x, y, heading)) in enumerate(scans) if k % 3}
+    for k in range(12):
+        if k in final:
+            grid.put(k, scans[k][0], final[k])
+        else:
+            grid.remove(k)
+    fresh = ScanGrid(CONFIG)
+    for k in sorted(final, reverse=True):
+        fresh.put(k, scans[k][0], final[k])
+    assert_equal(grid, fresh)
+    for k in final:
+        grid.remove(k)
+    assert not grid.places and not grid._store.pool.any()
+
+
+def test_what_moves_less_than_the_lattice_is_not_drawn_again() -> None:
+    scan, pose = flight(1)[0]
+    grid = ScanGrid(CONFIG)
+    assert grid.put(0, scan, camera(*pose))
+    assert not grid.put(0, scan, camera(*pose))
+    revision = grid.revision
+    assert grid.put(0, scan, camera(pose[0] + 0.5, *pose[1:])) and grid.revision == revision + 1
+    assert not grid.put(0, scan, camera(np.nan, 0.0, 0.0)) or len(grid) == 0
+
+
+def test_each_cell_of_a_scan_is_freed_once() -> None:
+    """Sectors share no cell and leave none out, whatever the heading."""
+    config = replace(CONFIG, storey_overlap_m=0.0, opening=False)
+    rng = np.random.default_rng(3)
+    for heading in [*np.arange(8) * np.pi / 4, *rng.uniform(-4, 4, 12)]:
+        wide = ColumnScan(
+            np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 0.5), np.full(70, 6.0), np.full(70, np.inf),
+            np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
+        )  # fmt: skip
+        x, y = rng.uniform(-1, 1, 2).round(2)
+        grid = ScanGrid(config)
+        grid.put(0, kept(wide, config), camera(x, y, heading))
+        counted = 0
+        for place in grid.places:
+            odds = grid.log_odds(place)
+            assert set(np.unique(odds)) <= {0, -config.log_free, -config.log_free_far}
+            column, row = np.arange(64) + 64 * place.column, np.arange(64) + 64 * place.row
+            dx, dy = (column[None, :] + 0.5) * 0.05 - x, (row[:, None] + 0.5) * 0.05 - y
+            r, a = np.hypot(dx, dy), np.arctan2(dy, dx) - heading
+            a = (a + np.pi) % (2 * np.pi) - np.pi
+            sure = (np.abs(r - 3.25) < 2.7) & (np.abs(a) < 0.69)
+            assert (odds[:, sure] < 0).all()
+            assert not odds[:, (r > 6.06) | (r < 0.45) | (np.abs(a) > 0.71)].any()
+            counted += np.count_nonzero(odds[0])
+        assert counted == pytest.approx(1.4 / 2 * (36 - 0.25) / 0.0025, rel=0.01)
+
+
+def reference(
+    x: float, y: float, first: float, step: float, ranges: NDArray[np.float64], bands: NDArray[np.uint8], size: int
+) -> NDArray[np.int64]:
+    """Cells (size, size) with the bands of obstacles, sampled densely on each arc."""
+    out = np.zeros((size, size), np.int64)
+    for i, r in enumerate(ranges):
+        n = max(1, int(np.ceil(2.0 * r * step)))
+        for a in first + (i + (np.arange(n) + 0.5) / n) * step:
+            out[int(np.floor(y + r * np.sin(a))), int(np.floor(x + r * np.cos(a)))] |= int(bands[i])
+    return out
+
+
+@given(st.integers(0, 2**31))
+def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ranges, bands = rng.uniform(2, 90, 30), rng.integers(1, 8, 30).astype(np.uint8)
+    weight = rng.integers(1, 9, 30)
+    first, step = float(rng.uniform(-4, 4)), 0.03
+    hits, cells = np.zeros((192, 192), np.uint16), np.zeros((4000, 2), np.int32)
+    found = kernels.mark_hits(96.25, 95.5, first, step, ranges, bands, weight, hits, cells)
+    assert np.array_equal(hits & 255, reference(96.25, 95.5, first, step, ranges, bands, 192))
+    assert found == np.count_nonzero(hits)
+    slots, pool = np.full((3, 3), -1, np.int32), np.zeros((9, 3, 64, 64), np.int16)
+    touched, used = np.zeros((3, 3), np.uint8), np.zeros(1, np.int64)
+    for sign in (1, -1):
+        kernels.draw_hits(hits, cells, found, sign, slots, np.arange(9, dtype=np.int32), used, pool, touched)
+        if sign == 1:
+            whole = np.zeros((3, 192, 192), np.int64)
+            for r, c in np.argwhere(slots >= 0):
+                whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]]
+            for b in range(3):
+                assert np.array_equal(whole[b], np.where(hits >> b & 1, hits >> 8, 0))
+    assert not pool.any()
+    kernels.clear_hits(hits, cells, found)
+    assert not hits.any()
+
+
+@given(st.integers(0, 2**31), st.booleans())
+def test_states_are_read_as_in_the_reference(seed: int, opening: bool) -> None:
+    rng = np.random.default_rng(seed)
+    pool = np.repeat(rng.integers(-5, 9, (4, 1, 16, 16)), 3, 1).repeat(4, 2).repeat(4, 3).astype(np.int16)
+    pool[:, rng.integers(3)] += rng.integers(-1, 2, (4, 64, 64)).astype(np.int16)
+    slots = np.array([[-1, 1, -1], [2, 0, -1], [-1, -1, 3]], np.int32)
+    whole = np.zeros((3, 192, 192), np.int64)
+    for r, c in np.argwhere(slots >= 0):
+        whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]]
+    mask = sum((whole[b] >= 6).astype(int) << b for b in range(3))
+    free = (whole <= -2).all(axis=0)
+    if opening:
+        shifts = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
+        eroded = np.all([np.roll(free, s, (0, 1)) for s in shifts], axis=0)
+        free &= np.any([np.roll(eroded, s, (0, 1)) for s in shifts], axis=0)
+    expected = np.where(mask > 0, mask, np.where(free, 0, -1))[64:128, 64:128]
+    cells = np.empty((64, 64), np.int8)
+    known = kernels.read_states(slots, pool, 6, 2, int(opening), cells)
+    assert np.array_equal(cells, expected)
+    assert known == np.count_nonzero(expected >= 0)
+
+
+def test_storeys_lie_apart_and_a_ramp_joins_them() -> None:
+    scans = flight(8)
+    grid = ScanGrid(CONFIG)
+    for k, (scan, pose) in enumerate(scans):
+        grid.put(k, scan, camera(*pose, z=0.0))
+        grid.put(100 + k, kept(scan_of(np.array(box(-2.0, -2.0, 2.0, 2.0)), 0.0, 0.0, k)), camera(0.0, 0.0, k, z=2.8))
+    assert {p.storey for p in grid.places} == {0, 1}
+    assert grid.main_storey() == 0 and grid.separate_storeys() == [1]
+    alone = drawn(scans)
+    for place in alone.places:
+        assert np.array_equal(grid.log_odds(place), alone.log_odds(place))
+    assert set(grid_files(grid)) == {"grid.pgm", "grid.yaml", "grid_storey+1.pgm", "grid_storey+1.yaml"}
+    ramp = ScanGrid(CONFIG)
+    ramp.put(0, scans[0][0], camera(*scans[0][1], z=1.3))
+    assert {p.storey for p in ramp.places} == {0, 1}
+
+
+def test_a_table_leaves_the_floor_below_it_and_nothing_is_known_behind_a_wall() -> None:
+    table = scan_of(np.array(box(-3.0, -3.0, 3.0, 3.0)), 0.0, 0.0, 0.0)
+    under = replace(table, obstacle_m=np.full(84, 2.03), bands=np.full(84, 2, np.uint8), free_m=np.full(84, 2.8))
+    config = replace(CONFIG, opening=False)
+    grid = ScanGrid(config)
+    grid.put(0, kept(under, config), camera(0.0, 0.0, 0.0))
+    odds = grid.log_odds(Place(0, 0, 0))
+    assert odds[1, 2, 40] > 0 > odds[0, 2, 40], "top and floor at 2 m"
+    assert odds[0, 2, 50] < 0 and odds[1, 2, 50] == odds[2, 2, 50] == 0
+    solid = replace(under, bands=np.full(84, 3, np.uint8))
+    grid.put(0, kept(solid, config), camera(0.0, 0.0, 0.0))
+    assert not grid.log_odds(Place(0, 0, 0))[:, 2, 42:].any()
+
+
+def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None:
+    scan = scan_of(ROOM, 3.0, -2.0, 0.0)
+    long = scan.free_m.copy()
+    long[40] = 19.5
+    bare = replace(scan, free_m=long, obstacle_m=np.full(84, np.inf), bands=np.zeros(84, np.uint8))
+    found = keep(CONFIG, bare, 1e4)
+    assert found is not None
+    ranges = found.ranges()
+    q1, q3 = np.quantile(long[long > 0], (0.25, 0.75))
+    assert ranges[3].max() == pytest.approx(q3 + 1.5 * (q3 - q1), abs=0.01)
+    near = keep(CONFIG, replace(scan, free_m=np.full(84, 19.0), obstacle_m=np.full(84, 19.0)), 20.0)
+    assert near is not None and near.ranges()[3].max() < np.sqrt(CONFIG.max_sigma_m * 20.0 / CONFIG.sigma_px) + 0.01
+    assert np.isinf(near.ranges()[0]).all()
+    assert keep(CONFIG, replace(scan, camera_height_m=np.nan), BF) is None
+
+
+def test_memory_goes_by_tiles_touched_and_a_far_outlier_costs_nothing() -> None:
+    config = replace(CONFIG, resident_tiles=64)
+    scan = kept(scan_of(np.array(box(-60.0, -60.0, 60.0, 60.0)), 0.0, 0.0, 0.0), config)
+    grid = ScanGrid(config)
+    tracemalloc.start()
+    for k in range(60):
+        grid.put(k, scan, camera(50.0 * k, 30.0 * k, 0.1 * k))
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used / 60 < 50_000
+    tiles = len(grid.places)
+    grid.put(60, scan, camera(9e4, -9e4, 0.0))
+    assert len(grid.places) < tiles * 1.1
+    cells, _, cell = dense(grid, 0)
+    assert cells.size <= 1 << 26 and cell > 0
+    assert not grid.put(61, scan, camera(1e9, 0.0, 0.0)), "beyond all tiles"
+
+
+def test_views_code_what_changed_and_stay_as_they_were() -> None:
+    scans = flight(10)
+    grid = drawn(scans)
+    views = GridViews(grid)
+    first = views.take()
+    assert views.take() is first
+    assert first.known_m2() > 20.0
+    for place in grid.places:
+        assert np.array_equal(first.tile(place).cells, grid.cells(place)[0])
+    held = dict(first.tiles)
+    grid.remove(3)
+    grid.put(50, kept(scan_of(ROOM, 0.0, 3.0, 0.0)), camera(30.0, 3.0, 0.0))
+    second = views.take()
+    assert dict(first.tiles) == held
+    changed = differences(first, second)
+    assert changed and set(changed) >= {p for p in second.tiles if p not in first.tiles and p.storey == second.storey}
+    for place in {*first.tiles, *second.tiles} - set(changed):
+        if place.storey == second.storey:
+            assert np.array_equal(first.tile(place).cells, second.tile(place).cells)
+
+
+def test_files_are_what_map_server_reads() -> None:
+    grid = drawn(flight(10))
+    files = grid_files(grid, "plan")
+    cells, corner, _ = dense(grid, 0)
+    head, size, most, pixels = files["plan.pgm"].split(b"\n", 3)
+    assert (head, most) == (b"P5", b"255") and size == f"{cells.shape[1]} {cells.shape[0]}".encode()
+    grey = np.frombuffer(pixels, np.uint8).reshape(cells.shape)[::-1]
+    assert np.array_equal(grey == 254, cells == 0) and np.array_equal(grey == 0, cells > 0)
+    text = files["plan.yaml"].decode()
+    assert "resolution: 0.05\n" in text and f"origin: [{corner[0]:.6f}, {corner[1]:.6f}, 0.000000]" in text
+    assert grid_files(ScanGrid(CONFIG))["grid.pgm"] == b"P5\n1 1\n255\n" + bytes([205])
