@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_agent.config import DepthFilterConfig, DisparityConfig, LocalMapConfig
+from kiteline_agent.config import AgentConfig, DepthFilterConfig, DisparityConfig, LocalMapConfig
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_codec.schema import KeyframeHeader
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.geometry.disparity_offset import terms
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera, Rectifier
+from kiteline_core.geometry.disparity_offset import TERMS, terms
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
@@ -100,19 +107,21 @@ class Flight:
         self.map.add(header, np.eye(4), uv, np.maximum(disparity, 0.1) / CAMERA.bf, np.full(len(uv), 0.01), bytes_,
                      bytes_, descriptors, templates, 0)  # fmt: skip
 
-    def fly(self, frames: int) -> list[F64]:
-        """Changes of the map's offset."""
-        changes = []
-        for k in range(frames):
+    def frames(self, count: int) -> Iterator[tuple[F64, NDArray[np.int64], F64]]:
+        """Pose, rows and observations of frames."""
+        for k in range(count):
             T = se3.inverse(se3.exp(np.concatenate([k * self.step, [0.0, 0.002 * k, 0.0]])))
             q = se3.transform(T, self.xyz)
             uv = q[:, :2] / q[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
             inside = (q[:, 2] > 0.3) & (uv > 10).all(1) & (uv < [740, 470]).all(1)
             disparity = CAMERA.bf / q[:, 2] + terms(normalised(uv)) @ self.offset - self.map.offset_px(uv)
             seen = np.column_stack([uv, disparity]) + self.rng.normal(0, 0.2, (len(uv), 3))
-            change = self.alignment.add(T, np.flatnonzero(inside), seen[inside])
-            changes += [] if change is None else [change]
-        return changes
+            yield T, np.flatnonzero(inside), seen[inside]
+
+    def fly(self, frames: int) -> list[F64]:
+        """Changes of the map's offset."""
+        changes = (self.alignment.add(*frame) for frame in self.frames(frames))
+        return [change for change in changes if change is not None]
 
 
 SIDEWAYS, AHEAD = np.array([0.03, 0.01, 0.02]), np.array([0.0, 0.0, 0.04])
@@ -142,6 +151,30 @@ def test_a_true_rig_is_left_alone(seed: int) -> None:
     assert flight.fly(80) == []
     assert flight.alignment.worn < 0.05
     assert np.trace(flight.alignment.expected_cov) < 0.05 * begin
+
+
+def test_rows_that_are_off_tell_of_a_worn_rig_before_it_moves() -> None:
+    alignment = Flight(NOTHING, 0, SIDEWAYS).alignment
+    doubtful, prior, share = alignment.expected_cov, alignment.cov, DisparityConfig().worn_share
+    assert alignment.rig_worn == pytest.approx(share)
+    alignment.add_row_evidence(12.0)
+    assert alignment.rig_worn > 0.999
+    np.testing.assert_allclose(alignment.expected_cov, prior, rtol=1e-3)
+    alignment.add_row_evidence(math.log(0.5))
+    assert alignment.rig_worn == pytest.approx(0.5 * share / (0.5 * share + 1.0 - share))
+    assert np.trace(alignment.expected_cov) < np.trace(doubtful)
+    assert alignment.worn == pytest.approx(share)  # that of the disparities themselves
+
+
+def test_disparities_and_rows_count_together() -> None:
+    with_rows, alone = Flight(NOTHING, 1, SIDEWAYS), Flight(NOTHING, 1, SIDEWAYS)
+    with_rows.alignment.add_row_evidence(3.0)
+    with_rows.fly(30), alone.fly(30)
+    ours, theirs = with_rows.alignment, alone.alignment
+    odds = math.log(ours.rig_worn / (1.0 - ours.rig_worn)) - math.log(theirs.rig_worn / (1.0 - theirs.rig_worn))
+    assert odds == pytest.approx(3.0, abs=1e-6)
+    assert ours.worn == theirs.worn
+    np.testing.assert_allclose(ours.expected_cov / ours.rig_worn, theirs.expected_cov / theirs.rig_worn)
 
 
 def test_whoever_knows_more_sets_the_offset() -> None:
@@ -193,6 +226,38 @@ def test_what_earlier_flights_found_is_where_it_begins() -> None:
     known.fly(12)
     grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
     assert np.sqrt(np.mean((grid @ (WORN - known.map.disparity_offset)) ** 2)) < 0.1
+
+
+class Camera:
+    """In place of CameraState: what the covariance was told, and what it held as the odometry left the map."""
+
+    def __init__(self) -> None:
+        self.covariance = self
+        self.error = np.zeros((TERMS, TERMS))
+        self.left: list[tuple[F64, F64]] = []
+
+    def set_disparity_error(self, cov: F64, worn: float) -> None:
+        self.error, self.worn = cov, worn
+
+    def correct_disparities(self, change: F64) -> None:
+        self.left.append((change, self.error))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_odometry_keeps_the_error_that_the_map_had(seed: int) -> None:
+    flight, camera = Flight(WORN, seed, SIDEWAYS), Camera()
+    lens = CameraModel(752, 480, 430.0, 430.0, 376.0, 240.0)
+    rectifier = Rectifier(CameraRig(lens, lens, np.eye(4), se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))))
+    right = RightCamera(AgentId(0), cast("Any", camera), flight.map, rectifier, AgentConfig(), NoBaseChannel())
+    right.disparities = flight.alignment
+    for T, rows, seen in flight.frames(80):
+        track = SimpleNamespace(T_c_m=T, rows=rows, inlier=np.ones(len(rows), np.bool_), observed=seen)
+        right.add(cast("Any", track))
+    assert camera.left
+    for change, error in camera.left:
+        assert change @ np.linalg.solve(error, change) <= 1.0  # it was within a deviation of what was found
+    assert np.trace(camera.error) < 0.3 * np.trace(camera.left[0][1])  # the map is better now
+    assert camera.worn == flight.alignment.rig_worn
 
 
 def begun(offset: F64, seed: int, way: F64) -> Flight:

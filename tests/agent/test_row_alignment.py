@@ -19,6 +19,7 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifi
 U8 = NDArray[np.uint8]
 NO_GRID = np.zeros((0, 0, 2), np.float32)
 WIDTH, HEIGHT, FOCAL, DEPTH_M = 640, 400, 420.0, 3.0
+T_C_R = se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))
 TURNED = np.array([2.5e-3, -1e-3, 1.5e-3])  # rad: pitch, yaw and roll of the right camera
 UV = np.array([[float(x), float(y)] for y in range(40, 370, 18) for x in range(90, 600, 22)])
 
@@ -43,13 +44,16 @@ def image(camera: CameraModel, T_c_w: NDArray[np.float64]) -> U8:
     return wall(at[:, 0], at[:, 1]).reshape(HEIGHT, WIDTH)
 
 
+def told_camera(lens: Lens) -> CameraModel:
+    distortion = () if lens is Lens.NONE else (-0.25, 0.06, 0.0, 0.0)
+    return CameraModel(WIDTH, HEIGHT, FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1), lens, distortion)
+
+
 def flight(lens: Lens, turned: NDArray[np.float64]) -> tuple[Rectifier, U8, U8]:
     """The rectifier of a told calibration, and a pair by a rig whose right camera is turned against it."""
-    distortion = () if lens is Lens.NONE else (-0.25, 0.06, 0.0, 0.0)
-    camera = CameraModel(WIDTH, HEIGHT, FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1), lens, distortion)
-    T_c_r = se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))
-    true = T_c_r @ se3.from_rt(se3.so3_exp(turned), np.zeros(3))
-    rig = CameraRig(camera, camera, np.eye(4), T_c_r)
+    camera = told_camera(lens)
+    true = T_C_R @ se3.from_rt(se3.so3_exp(turned), np.zeros(3))
+    rig = CameraRig(camera, camera, np.eye(4), T_C_R)
     return Rectifier(rig), image(camera, np.eye(4)), image(camera, se3.inverse(true))
 
 
@@ -111,6 +115,27 @@ def test_a_true_rig_is_left_alone(lens: Lens) -> None:
     rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
     assert rows.apply() == 0.0
     assert rectifier.right_grid is grid
+
+
+@pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
+@pytest.mark.parametrize(("turned", "least", "most"), [
+    (TURNED, 10.0, np.inf),
+    (np.array([0.0, 0.0, 2.5e-3]), 5.0, np.inf),  # twisted about the optical axis: the middle is right
+    (np.zeros(3), -0.7, -0.4),  # a good calibration: half of all worn ones show nothing, either
+    (np.array([2e-4, 0.0, 0.0]), -0.7, 0.0),  # a tenth of a pixel
+])  # fmt: skip
+def test_rows_tell_whether_a_rig_is_worn(lens: Lens, turned: NDArray[np.float64], least: float, most: float) -> None:
+    rectifier, left, right = flight(lens, turned)
+    rows = RowAlignment(rectifier, RowConfig())
+    assert rows.worn_evidence == 0.0
+    disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
+    rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
+    assert least < rows.worn_evidence < most
+    fresh = Rectifier(CameraRig(told_camera(lens), told_camera(lens), np.eye(4), T_C_R))
+    later = RowAlignment(fresh, RowConfig())
+    later.begin_with(rows.estimate_px, read=False)  # from the rig file
+    assert (later.worn_evidence > 2.0) == (least > 0.0)
 
 
 def test_offsets_of_few_points_or_without_texture_count_for_nothing() -> None:

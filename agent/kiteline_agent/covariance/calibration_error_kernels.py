@@ -220,17 +220,24 @@ def pose_covariance(
 ) -> None:  # fmt: skip
     """Covariance of a body pose in a frame a (o or m itself), the sum of all parts of pose_covariance.py.
 
-    noise (6,6), shift (6,11): of the camera in m, on the left. calibration: (11,) variances. carried: (6,6) of m in a.
+    noise (6,6), shift (6,11): of the camera in m, on the left. calibration: (11,11). carried: (6,6) of m in a.
     reckoned: (6,6) [translation in m, rotation about the body's axes]. extrinsic: (6,6), camera in the body. T_a_b0:
     first pose in a. Out: left (6,6) the first three parts on the left of T_a_b; out (6,6) all of it, [translation
     in a, rotation about the body's axes].
     """
     a, j, m, e = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    shapes = shift.shape[1]
+    weighted = np.empty((6, shapes))
     for i in range(6):
+        for p in range(shapes):
+            s = 0.0
+            for q in range(shapes):
+                s += shift[i, q] * calibration[q, p]
+            weighted[i, p] = s
         for k in range(6):
             s = noise[i, k]
-            for p in range(shift.shape[1]):
-                s += shift[i, p] * calibration[p] * shift[k, p]
+            for p in range(shapes):
+                s += weighted[i, p] * shift[k, p]
             m[i, k] = s
     adjoint_into(T_a_m, a)
     _sandwich(a, m, left)

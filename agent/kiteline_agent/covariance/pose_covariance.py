@@ -27,6 +27,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
     sensitivity,
 )
 from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
+from kiteline_agent.covariance.evaluation_schedule import EvaluationSchedule
 from kiteline_agent.covariance.odometry_drift import covariance_by_map
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
@@ -38,11 +39,9 @@ F64 = NDArray[np.float64]
 
 _CACHE_PX = 1.0  # px, error of a corner at octave 0 that matched a landmark of the map cache
 _CACHE_DEPTH_M = 4.0  # typical depth of such corners
-_EVERY = 4  # frames between two evaluations
 _MOUNT = 2.0  # growth of the error of the extrinsic rotation with that of the lenses: .15 degrees an axis if worn
 _WORN_LENS_PX = 0.8  # px at the image's edge: focal length and centre of a worn lens
 _WORN_MOUNT_RAD = 3e-3  # rad: rotation of the camera in the body about an axis, if worn
-_FEWER = 0.7  # share of the inliers of the last evaluation below which the next one is due at once
 
 
 class PoseCovariance:
@@ -59,16 +58,15 @@ class PoseCovariance:
         slots = len(local_map.keyframe)
         self._noise_k, self._shift_k = np.zeros((slots, 6, 6)), np.zeros((slots, 6, SHAPES))  # of each keyframe
         self._refined = np.zeros(slots, np.bool_)
-        self._calibration = np.full(SHAPES, config.calibration_px**2)
-        self._calibration[CALIBRATION] = config.imu_offset_share**2
-        self._calibration[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # a disparity has the errors of two cameras
-        self._evidence = CalibrationEvidence(self._calibration[:CALIBRATION])
+        self._good_variance = np.full(CALIBRATION, config.calibration_px**2)
+        self._good_variance[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # a disparity has the errors of two cameras
+        self._calibration = np.diag([*self._good_variance, config.imu_offset_share**2])
+        self._evidence = CalibrationEvidence(self._good_variance)
         self._disparity_error: F64 | None = None  # as set last
         self._worn = 0.0  # probability of a worn rig
-        self._worn_variance = np.zeros(CALIBRATION)  # beyond a good calibration
+        self._worn_cov = np.zeros((CALIBRATION, CALIBRATION))  # beyond a good calibration
         half = 0.5 * local_map.camera.width / local_map.camera.fx  # edge of the image, normalised
         self._at_edge = np.array([1.0, half, half, half**2, half**2])  # px there for a pixel of each term of an offset
-        self._good_calibration = self._calibration.copy()
         self._has_body = has_body
         self._camera_rotation_rad = 0.0  # found against the IMU
         self._extrinsic = self._extrinsic_cov()
@@ -85,8 +83,7 @@ class PoseCovariance:
         self._carried = np.zeros((6, 6))  # of the submap in o
         self._zero = np.zeros((6, 6))
         self._same_frame = True  # o is the submap's own frame
-        self._age = 0  # frames since the last evaluation
-        self._inliers = 0  # of the last evaluation
+        self._schedule = EvaluationSchedule()
         self._track: Track | None = None  # of this frame, if not evaluated yet
         self._T_m_b0: F64 = np.eye(4)  # first pose of the submap
         self._T_o_b0: F64 | None = None  # first pose of the flight
@@ -98,9 +95,10 @@ class PoseCovariance:
     def begin_submap(self, T_m_b: F64) -> None:
         """Begin a submap, with its first keyframe at T_m_b (4,4)."""
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))
-        self._reset_reckoning(0)
+        self._reset_reckoning()
         self._unmeasured_s = 0.0
         self._T_m_b0 = T_m_b
+        self._schedule.begin((T_m_b @ self._T_b_c)[:3, 3])
         if self._T_o_b0 is None:
             self._T_o_b0 = T_m_b
 
@@ -108,11 +106,10 @@ class PoseCovariance:
         """Update after images gave the pose, from landmarks of the local map. dt_s: since the last such frame.
 
         As a perturbation on the left, the covariance changes slowly: it is evaluated for every keyframe, after every
-        frame without a pose from images, and every few frames.
+        frame without a pose from images, and when the schedule says so.
         """
         self._doubtful_s = max(self._doubtful_s - dt_s, 0.0)
-        if self._unmeasured_s is None and self._age < _EVERY and track.inliers >= _FEWER * self._inliers:
-            self._age += 1
+        if not self._schedule.is_due(track) and self._unmeasured_s is None:
             self._track = track
             return
         self._evaluate(track)
@@ -165,12 +162,12 @@ class PoseCovariance:
         self._noise = a @ (noise + self._imu_offset_cov) @ a.T + np.tensordot(share, self._noise_k[slots], 1)
         self._shift = a @ (inverse @ self._g)
         self._shift[:, CALIBRATION] -= a @ self._imu_offset
-        self._reset_reckoning(track.inliers)
+        self._schedule.evaluated(track)
+        self._reset_reckoning()
 
-    def _reset_reckoning(self, inliers: int) -> None:
+    def _reset_reckoning(self) -> None:
         """Clear the covariance of dead reckoning, since the pose is known again."""
-        self._reckoned, self._unmeasured_s = np.zeros((6, 6)), None
-        self._age, self._inliers, self._track = 0, inliers, None
+        self._reckoned, self._unmeasured_s, self._track = np.zeros((6, 6)), None, None
 
     def store(self, keyframe: KeyframeId) -> None:
         """Store the covariance of this frame, which became a keyframe."""
@@ -218,7 +215,7 @@ class PoseCovariance:
         back = np.eye(6)
         back[:3, 3:], back[3:, 3:] = se3.skew(T_m_b[:3, 3]) @ T_m_b[:3, :3], T_m_b[:3, :3]
         self._noise = self._noise + back @ self._reckoned @ back.T
-        self._reset_reckoning(0)
+        self._reset_reckoning()
         self._unmeasured_s = 0.0
 
     def relocalise(self, keyframe: KeyframeId, T_c_m: F64, points: int) -> None:
@@ -229,7 +226,7 @@ class PoseCovariance:
         own = np.diag(np.repeat([turn * depth_m, turn], 3) ** 2)
         a = adjoint(se3.inverse(T_c_m))
         self._noise, self._shift = self._noise_k[slot] + a @ own @ a.T, self._shift_k[slot].copy()
-        self._reset_reckoning(0)
+        self._reset_reckoning()
         self._unmeasured_s = 0.0
 
     def before_map_change(self, pose: PoseState, T_c_b: F64, submap: SubmapId) -> None:
@@ -274,7 +271,7 @@ class PoseCovariance:
         for slot in np.flatnonzero(m.keyframe >> SEQUENCE_BITS == m.active):
             m.T_m_k[slot] = se3.orthonormalise(se3.exp(-self._shift_k[slot] @ errors) @ m.T_m_k[slot])
         m.relate_to_parents()
-        self._evidence = CalibrationEvidence(self._good_calibration[:CALIBRATION])
+        self._evidence = CalibrationEvidence(self._good_variance)
         self._set_calibration()
         return np.asarray(-self._shift @ errors)
 
@@ -282,14 +279,15 @@ class PoseCovariance:
         """Set the covariance (5,5) px^2 of the map's disparity offset, and the probability that the rig is worn."""
         if cov is not self._disparity_error:
             self._disparity_error = cov
-            self._worn_variance[:DISPARITY_SHAPES] = self._at_edge**2 * np.diag(cov)
-            self._worn_variance[DISPARITY_SHAPES : CALIBRATION - 1] = worn * _WORN_LENS_PX**2
+            at_edge, lens = self._at_edge, np.arange(DISPARITY_SHAPES, CALIBRATION - 1)
+            self._worn_cov[:DISPARITY_SHAPES, :DISPARITY_SHAPES] = at_edge[:, None] * cov * at_edge
+            self._worn_cov[lens, lens] = worn * _WORN_LENS_PX**2
             self._worn = worn
             self._set_calibration()
 
     def _set_calibration(self) -> None:
-        self._calibration[:CALIBRATION] = self._good_calibration[:CALIBRATION] * self._evidence.level**2
-        self._calibration[:CALIBRATION] += self._worn_variance
+        good = np.diag(self._good_variance * self._evidence.level**2)
+        self._calibration[:CALIBRATION, :CALIBRATION] = good + self._worn_cov
         self._extrinsic = self._extrinsic_cov()
 
     # results

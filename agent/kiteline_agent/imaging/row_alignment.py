@@ -8,6 +8,7 @@ a pixel.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,10 @@ class RowConfig:
     min_significance: float = 4.0  # standard deviations of a change that is applied
     known_px: float = 0.1  # px; standard deviation of each number where an earlier flight measured it
     share_px: float = 0.1  # px; rms over points of a change that the base is told: a tenth of what a worn rig has
+    good_px: float = 0.1  # px; standard deviation of level and slope along x with a good calibration
+    worn_px: float = 0.9  # px; standard deviation of the level with a worn rig: both centres moved
+    worn_slope_px: float = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
+    shown: float = 0.5  # share of worn rigs whose rows are off; focal lengths and a turn about y do not move them
 
 
 def terms(xy: F64) -> F64:
@@ -59,6 +64,7 @@ class RowAlignment:
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
         self._taken_read = False
         self._measured = False  # since take_change
+        self.worn_evidence = 0.0  # logarithm of the likelihood of the rows with a worn rig over that with a good one
         self.known = False  # something was measured, in this flight or an earlier one
         self._events: list[str] = []
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
@@ -89,6 +95,7 @@ class RowAlignment:
             weight = 1.0 / np.maximum(residual, 1.0) ** 2  # a point on an occluding edge counts little
         self._information, self._vector, self._at = information, vector, at
         self._measured = self.known = True
+        self._weigh()
 
     def apply(self) -> float:
         """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0."""
@@ -123,6 +130,7 @@ class RowAlignment:
         self._vector = self._information @ rows_px
         self._taken_px = rows_px
         self.known = True
+        self._weigh()
         self._events.append("the right camera is taken as earlier flights found it")
         self._taken_read = read
         if read:
@@ -145,6 +153,14 @@ class RowAlignment:
         events, self._events = self._events, []
         return events
 
+    def _weigh(self) -> None:
+        """Compare a worn rig with a good one by level and slope along x, which no depth and little distortion moves."""
+        c = self._config
+        found, cov = self.estimate_px[:2], np.linalg.inv(self._information)[:2, :2]
+        good, worn = (_log_normal(found, cov + np.diag(np.array(s) ** 2))
+                      for s in ((c.good_px, c.good_px), (c.worn_px, c.worn_slope_px)))  # fmt: skip
+        self.worn_evidence = float(np.logaddexp(math.log1p(-c.shown), math.log(c.shown) + worn - good))
+
     def _read_at(self, rows_px: F64) -> None:
         self.applied_px = rows_px
         self._rectifier.set_right_rows(self._on_grid(rows_px))
@@ -159,3 +175,8 @@ class RowAlignment:
     def _normalised(self, uv: F64) -> F64:
         camera = self._rectifier.camera
         return np.asarray((uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy])
+
+
+def _log_normal(x: F64, cov: F64) -> float:
+    """Logarithm of a normal density about zero at x (n,), but for a constant of n."""
+    return -0.5 * (float(x @ np.linalg.solve(cov, x)) + float(np.linalg.slogdet(cov)[1]))

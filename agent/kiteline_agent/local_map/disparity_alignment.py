@@ -7,6 +7,8 @@ tells most: disparities of one keyframe have the same errors in all frames.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,7 +45,9 @@ class DisparityAlignment:
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
-        self.worn = config.worn_share  # probability of it
+        self._odds = float(np.log(config.worn_share / (1.0 - config.worn_share)))  # logarithm, by disparities alone
+        self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
+        self._row_evidence = 0.0  # see add_row_evidence
         self.applied = False  # the rig is worn: an offset found here was applied
         self._base_sigma_px: float | None = None  # of the map's offset, if the base found it
         self.expected_cov = self._expected_cov()  # beside the error of a good calibration
@@ -84,6 +88,13 @@ class DisparityAlignment:
             self.expected_cov = self._expected_cov()
             return change
         return None
+
+    def add_row_evidence(self, log_likelihood: float) -> None:
+        """Set the logarithm of the likelihood of the right camera's rows with a worn rig over that with a good one."""
+        if log_likelihood != self._row_evidence:
+            self._row_evidence = log_likelihood
+            self._set_rig_worn()
+            self.expected_cov = self._expected_cov()
 
     @property
     def sigma_px(self) -> float:
@@ -196,7 +207,12 @@ class DisparityAlignment:
         self.cov = np.linalg.inv(h + self._prior)
         self._estimate = self.cov @ b
         odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
-        self.worn = float(1.0 / (1.0 + np.exp(-np.clip(odds, -50.0, 50.0))))
+        self._odds = float(odds)
+        self.worn = _probability(self._odds)
+        self._set_rig_worn()
+
+    def _set_rig_worn(self) -> None:
+        self.rig_worn = _probability(self._odds + self._row_evidence)
 
     def _moves_sideways(self) -> bool:
         """True if enough of the motion was across the optical axis for the estimate to be believed."""
@@ -208,7 +224,7 @@ class DisparityAlignment:
         if self._map.disparity_offset.any():
             left = none() if self._base_sigma_px is not None else self._estimate - self._map.disparity_offset
             return np.asarray(self.cov + np.outer(left, left))
-        return np.asarray(self.worn * (self.cov + np.outer(self._estimate, self._estimate)))
+        return np.asarray(self.rig_worn * (self.cov + np.outer(self._estimate, self._estimate)))
 
     def _apply(self) -> F64 | None:
         """Change the offset of the map's disparities where the rig is worn, unless the base knows better."""
@@ -229,6 +245,10 @@ class DisparityAlignment:
         self._map.set_disparity_offset(offset)
         self._events.append(f"disparities in the middle are {offset[0]:+.2f} px too large, by parallax")
         return np.asarray(change)
+
+
+def _probability(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-min(max(log_odds, -50.0), 50.0)))
 
 
 def _log_evidence(h: F64, b: F64, prior: F64, side: F64 | None = None) -> float:

@@ -52,11 +52,16 @@ class RightCamera:
         """Estimate the disparity offset with a tracked frame; map and camera move with it. Returns events."""
         if self.disparities is None:
             return []
-        change = self.disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
-        self._camera.covariance.set_disparity_error(self.disparities.expected_cov, self.disparities.worn)
+        covariance, disparities = self._camera.covariance, self.disparities
+        disparities.add_row_evidence(self.rows.worn_evidence)
+        change = disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
         if change is None:
+            covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
             return []
+        # the odometry frame keeps the error that the map had until now
+        covariance.set_disparity_error(disparities.cov + np.outer(change, change), disparities.rig_worn)
         self._camera.correct_disparities(change)
+        covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
         self._found_px, self._sigma_px = self._map.disparity_offset, self.disparities.sigma_px
         self._put(self.rows.estimate_px)
         return self.disparities.take_events()
