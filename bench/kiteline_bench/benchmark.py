@@ -20,6 +20,7 @@ BENCHMARKS = {
     "first-flight": "kiteline_bench.system.first_flight",
     "vehicle": "kiteline_bench.vehicle.vehicle",
     "house": "kiteline_bench.system.house",
+    "grid": "kiteline_bench.grid.grid",
     "reality": "kiteline_bench.reality.reality",
     "agent": "kiteline_bench.agent.flights",
     "governor": "kiteline_bench.agent.governor_settings",

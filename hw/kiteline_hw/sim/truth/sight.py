@@ -35,10 +35,10 @@ class SeenWorld:
     ended: U8
 
     def grid(self, low_m: float | None = None, high_m: float | None = None, seen: bool = True) -> TrueGrid:
-        """True occupancy between two limits of height bands; all of them by default.
+        """True occupancy between two limits of height bands; of all bands by default.
 
-        `seen`: a free cell is known if a ray of sight crosses every band between the limits or reaches its ground, an
-        occupied one if a ray of sight ends in one of these bands; all other cells are UNKNOWN.
+        `seen`: an occupied cell is known if a ray of sight ends in one of these bands. A free one is known if its
+        ground was seen; of a single band also if a ray crosses the band. All other cells are UNKNOWN.
         """
         low, high = low_m or self.heights_m[0], high_m or self.heights_m[-1]
         grid = occupancy(self.world, low, high, self.cell_m)
@@ -46,8 +46,10 @@ class SeenWorld:
             return grid
         first, last = self.heights_m.index(low) + 1, self.heights_m.index(high) + 1
         bits = sum(1 << k for k in range(first, last))
-        free = ((self.passed & bits) == bits) | ((self.passed & 1) > 0)
-        return grid.only(np.where(grid.image == FREE, free, (grid.image == OCCUPIED) & ((self.ended & bits) > 0)))
+        through = self.passed & (1 | (bits if last == first + 1 else 0))
+        return grid.only(
+            np.where(grid.image == FREE, through > 0, (grid.image == OCCUPIED) & ((self.ended & bits) > 0))
+        )
 
 
 def look(

@@ -1,0 +1,109 @@
+"""What the grid's benchmark judges with: reference methods on scenes whose answer is known, and objects in a grid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kiteline_bench.grid.accuracy import objects_present
+from kiteline_bench.grid.places import Place
+from kiteline_bench.grid.ray_kernels import cast_rays
+from kiteline_bench.grid.sparse import (
+    GROUND,
+    OBSTACLE,
+    UNLABELLED,
+    SparsePoints,
+    binary_grid,
+    labels_by_height,
+    log_odds_grid,
+)
+from kiteline_hw.sim.source import open_sim
+from kiteline_hw.sim.truth.occupancy import occupancy
+from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
+
+
+def room() -> SparsePoints:
+    """A floor of 6 by 6 m with a wall at x = 3, seen from a ring of cameras 1.2 m above it."""
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-3, 3, (1500, 2)), rng.normal(0, 0.01, 1500)])
+    wall = np.column_stack([np.full(600, 3.0), rng.uniform(-3, 3, 600), rng.uniform(0.2, 2.5, 600)])
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    cameras = np.column_stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), np.full(12, 1.2)])
+    points = np.concatenate([floor, wall])
+    pairs = np.array([(i, j) for i in range(12) for j in range(i % 4, len(points), 4)], np.int64)
+    return SparsePoints(cameras, points, pairs)
+
+
+def state_at(grid: GridFile, x: float, y: float) -> int:
+    c, r = np.floor(grid.cells(np.array([[x, y]]))[0]).astype(int)
+    return int(grid.state[r, c])
+
+
+@pytest.mark.parametrize("method", ["log_odds", "binary"])
+def test_references_see_floor_and_wall(method: str) -> None:
+    sparse = room()
+    labels, ground = labels_by_height(sparse)
+    assert np.abs(ground[:1500]).max() < 0.05
+    assert (labels[:1500] == GROUND).all() and (labels[1500:][sparse.points[1500:, 2] < 1.9] == OBSTACLE).all()
+    assert (labels[1500:][sparse.points[1500:, 2] > 2.1] == UNLABELLED).all()
+    grid = log_odds_grid(sparse, 0.1) if method == "log_odds" else binary_grid(sparse, labels, 0.1)
+    inside = [state_at(grid, x, y) for x in np.arange(-2.0, 2.1, 0.5) for y in np.arange(-2.0, 2.1, 0.5)]
+    assert np.mean(np.array(inside) == FREE) > 0.9
+    assert np.mean([state_at(grid, 3.02, y) == OCCUPIED for y in np.arange(-2.5, 2.5, 0.1)]) > 0.8
+    assert not (grid.state[:, grid.state.shape[1] - 1] == FREE).any()
+
+
+def test_overlong_rays_free_nothing() -> None:
+    sparse = room()
+    far = SparsePoints(
+        sparse.cameras, np.concatenate([sparse.points, [[-15.0, 0.0, 0.0]]]),
+        np.concatenate([sparse.pairs, [[6, len(sparse.points)]]]),
+    )  # fmt: skip
+    labels = np.append(labels_by_height(sparse)[0], GROUND).astype(np.uint8)
+    assert state_at(binary_grid(far, labels, 0.1), -8.0, 0.0) in (UNKNOWN,)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_rays_as_counted_one_by_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    start, end = rng.integers(0, 20, (6, 2)), rng.integers(0, 20, (6, 2))
+    z, ceiling, short = rng.uniform(0, 2, (6, 2)), rng.uniform(0.5, 2.5, 6), rng.integers(0, 2, 6)
+    low = np.where(rng.random((20, 20)) < 0.3, 0.5, np.inf)
+    high = np.where(np.isfinite(low), 1.2, -np.inf)
+    free, through, expected_free, expected_through = (np.zeros((20, 20), np.int64) for _ in range(4))
+    cast_rays(start, end, z, ceiling, short, 0.1, low, high, free, through)
+    for (c, r), (c1, r1), (za, zb), top, left in zip(start, end, z, ceiling, short, strict=True):
+        steps, error = max(abs(c1 - c), abs(r1 - r)), abs(c1 - c) - abs(r1 - r)
+        dc, dr = abs(c1 - c), abs(r1 - r)
+        for k in range(steps + 1 - left):
+            height = za + (zb - za) / max(steps, 1) * k
+            expected_free[r, c] += height < top
+            expected_through[r, c] += low[r, c] - 0.1 < height < high[r, c] + 0.1
+            twice = 2 * error
+            if twice > -dr:
+                error -= dr
+                c += 1 if c1 > c else -1
+            if twice < dc:
+                error += dc
+                r += 1 if r1 > r else -1
+    assert np.array_equal(free, expected_free) and np.array_equal(through, expected_through)
+
+
+def test_objects_are_present_or_missed() -> None:
+    world = open_sim("room?objects=1", seed=1, texture_bits=7, scale=0.1).world
+    true = occupancy(world, 0.1, 2.0)
+    states = np.full(true.image.shape, FREE, np.int8)
+    states[true.image == 0] = OCCUPIED
+    grid = GridFile(true.cell_m, (*true.corner, 0.0), states)
+    place = Place("room", "", grid, grid, world)
+    bars = objects_present(place, grid, np.eye(3))
+    assert len(bars) == 5 and all(bar.met for bar in bars)
+    empty = replace(grid, state=np.full(states.shape, FREE, np.int8))
+    assert not any(bar.met for bar in objects_present(place, empty, np.eye(3)))
+    unseen = Place("room", "", grid, replace(grid, state=np.full(states.shape, UNKNOWN, np.int8)), world)
+    assert objects_present(unseen, grid, np.eye(3)) == []
