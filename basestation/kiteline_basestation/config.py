@@ -258,6 +258,25 @@ class MapCacheConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TileConfig:
+    """Tiles of the grid that are sent to an agent."""
+
+    max_tiles: int = 96  # tiles that an agent holds, 0 none: 4 kB each on board; a disc of 15 m radius at 0.05 m has 70
+    period_s: float = 1.0  # s between two plans
+    horizon_s: float = 3.0  # s that the motion is predicted: what lies ahead is of use before the agent is there
+    reach_m: float = 14.0  # m; tiles whose centres are nearer are sent: distances are told up to 10 m
+    kept_ratio: float = 1.5  # of reach_m; tiles farther away are removed
+    keyframe_bytes: float = 100.0  # bytes that each of the agent's keyframes earns: two thirds of a scan upwards
+    most_credit_bytes: float = 3000.0  # bytes at once: after a loop closure, or when an agent comes to a known place
+    overhead_bytes: int = 14  # of a tile in a packet: its key, version and a share of headers
+    min_changes: int = (
+        96  # cells that differ before a tile is sent again: its newest edges are in the agent's own scans
+    )
+    solid_weight: int = 4  # added cells for each one that became an obstacle, or is none any more
+    near_m: float = 4.0  # m; added to distances: among near tiles changes decide
+
+
+@dataclass(frozen=True, slots=True)
 class GroundConfig:
     """Estimation of the ground height."""
 
@@ -314,6 +333,7 @@ class GridConfig:
         0.7  # m; a ray to a landmark frees cells only where it is lower: it passes over boxes and chairs
     )
     noise_per_m: float = 0.01  # m/m; height noise of landmarks per distance
+    ground_keyframes: int = 20  # newest keyframes among which one must know the height of the ground: 20 s
     resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
     ground: GroundConfig = field(default_factory=GroundConfig)
 
@@ -337,3 +357,4 @@ class BaseConfig:
     publish: PublishConfig = field(default_factory=PublishConfig)
     map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
     grid: GridConfig = field(default_factory=GridConfig)
+    tiles: TileConfig = field(default_factory=TileConfig)

@@ -80,7 +80,7 @@ class Mapper:
         self._publisher = Publisher(self.map)
         self._placements = SubmapPlacements(self.config.intake, self.map, self._intake, self._publisher)
         self._local_bundles = LocalBundles(self.config, self.map, self._publisher, job_ids)
-        self._grid = GridUpdates(self.config, self.map, self.placements)
+        self.grid_updates = GridUpdates(self.config, self.map, self.placements)
         self.views = GridViews(self.grid)  # of the grid, for the status page
         self._sent_offsets: dict[AgentId, F64] = {}  # disparity offsets that the agents have
         self.merger: MapMerger | None = None
@@ -100,7 +100,7 @@ class Mapper:
         for agent, records in given.arrivals:
             self._intake.take(agent, records, now_ns)
         if self._placements.align_with_gravity() or self._placements.make_metric():
-            self._grid.rebuild()
+            self.grid_updates.rebuild()
         # 2. Apply the results of finished jobs, then carry out commands.
         changes = NOTHING
         for done in given.done:
@@ -114,7 +114,7 @@ class Mapper:
         for keyframe in self._intake.ready(now_ns):
             changes += self._add_keyframe(keyframe)
         if self._placements.follow_ties():
-            self._grid.rebuild()
+            self.grid_updates.rebuild()
         if self.merger is not None:
             changes += self.merger.requery()
             while (tie := self._intake.ties.take()) is not None:
@@ -150,15 +150,15 @@ class Mapper:
     @property
     def grid(self) -> ScanGrid:
         """The occupancy grid."""
-        return self._grid.grid
+        return self.grid_updates.grid
 
     def settled_grid(self) -> ScanGrid:
         """The grid with all keyframes drawn where they are now; the mapper goes on with its own."""
-        return self._grid.settled()
+        return self.grid_updates.settled()
 
     def labels(self, landmarks: NDArray[np.int32]) -> NDArray[np.uint8]:
         """Labels (n,) of landmarks: 0 unlabelled, 1 ground, 2 obstacle."""
-        return self._grid.labels(landmarks)
+        return self.grid_updates.labels(landmarks)
 
     @property
     def idle(self) -> bool:
@@ -199,8 +199,8 @@ class Mapper:
         self._placements.restore(state.placements)
         self._local_bundles.restore(state.unbundled)
         for record in self._intake.take_scans():
-            self._grid.add_scan(record)
-        self._grid.rebuild()
+            self.grid_updates.add_scan(record)
+        self.grid_updates.rebuild()
         if self.merger is not None:
             self.merger.restore(state.merger)
 
@@ -250,7 +250,7 @@ class Mapper:
         culled = culling.cull_redundant_keyframes(self.map, keyframe, config.cull, publisher)
         self.counts.keyframes_culled += len(culled)
         self._local_bundles.add(keyframe)
-        self._grid.add_keyframe(keyframe)
+        self.grid_updates.add_keyframe(keyframe)
         self.counts.keyframes += 1
         if self.merger is None:
             return NOTHING
@@ -267,7 +267,7 @@ class Mapper:
         for map_id in sorted(changes.moved):
             self._local_bundles.cancel(map_id)
             self._placements.update_map(map_id)
-            self._grid.rebuild()
+            self.grid_updates.rebuild()
         return tuple(
             (agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0))
             for submap in withdrawn
@@ -281,10 +281,10 @@ class Mapper:
     def _draw_grid(self) -> None:
         begin_ns = self.cpu_ns()
         for record in self._intake.take_scans():
-            self._grid.add_scan(record)
-        before = self._grid.grid.revision
-        self._grid.update()
-        if self._grid.grid.revision != before:
+            self.grid_updates.add_scan(record)
+        before = self.grid_updates.grid.revision
+        self.grid_updates.update()
+        if self.grid_updates.grid.revision != before:
             self.counts.grids += 1
             self.grid_ns.append(self.cpu_ns() - begin_ns)
 
@@ -311,13 +311,13 @@ class Mapper:
                 self.map.cull_keyframe(keyframe)
                 self._publisher.mark_changed(CulledLandmarks.KIND, keyframe)
             self._placements.delete(submap)
-            self._grid.remove(keyframes)
+            self.grid_updates.remove(keyframes)
             self.names.pop(submap, None)
             self.map.root_submaps.pop(submap, None)
         self._local_bundles.delete(submaps)
         if self.merger is not None:
             self.merger.delete(submaps)
-        self._grid.rebuild()
+        self.grid_updates.rebuild()
 
     def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
         live = self._intake.live.get(agent)

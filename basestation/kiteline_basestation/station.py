@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.correction_batches import CorrectionBatches
 from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
+from kiteline_basestation.exchange.tile_planner import TilePlanner
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.mapper import Mapper, MapperInput
@@ -42,6 +43,9 @@ class Station:
     ) -> None:  # fmt: skip
         self.mapper = Mapper(config, vocabulary)
         self.map_cache_planner = MapCachePlanner(config.map_cache, config.loops, self.mapper.map)
+        self.tile_planner = TilePlanner(
+            config.tiles, self.mapper.map, self.mapper.grid_updates, self.mapper.placements
+        )  # fmt: skip
         self.channels: dict[AgentId, RecordChannel] = {}
         self._batches: dict[AgentId, CorrectionBatches] = {}  # of corrections, by agent
         self._publish = config.publish
@@ -95,6 +99,7 @@ class Station:
             self._put(agent, [] if replaced is None else [replaced])
         for agent, channel in sorted(self.channels.items()):
             self.map_cache_planner.update(agent, self.mapper.live(agent), channel, now_ns)
+            self.tile_planner.update(agent, self.mapper.live(agent), channel, now_ns)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))
         return StationOutput(sent, output.jobs, output.answers)
 

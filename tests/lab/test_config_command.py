@@ -33,7 +33,7 @@ def test_options_have_units_and_all_a_reason() -> None:
     by_name = {o.name: o for s in sections() for o in s.options}
     assert by_name["agent.smoothing.max_m_s"].unit == "m/s"
     assert by_name["agent.keyframe.max_gap_s"].unit == "s"
-    assert by_name["base.grid.cell_m"].reason.startswith("finer cells")
+    assert by_name["base.grid.cell_m"].reason.startswith("a quarter of the gap")
     assert all(s.purpose for s in sections())
     assert by_name["base.measurement.sigma_disparity_px"].reason.startswith("px at octave 0")  # in brackets
     assert [o.name for o in by_name.values() if not o.reason] == []
@@ -91,6 +91,6 @@ def test_explaining_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert "[agent.keyframe]" in text
     assert "max_gap_s = 3.0 s  (a number)" in text
     assert command.main(["--explain", "grid"]) == 0
-    assert "cell_m = 0.1 m" in capsys.readouterr().out
+    assert "cell_m = 0.05 m" in capsys.readouterr().out
     assert command.main(["--explain", "keyframe.max_gap_sec"]) == 2
     assert "did you mean agent.keyframe.max_gap_s?" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, Key, LivePose, messages
+from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, GridTile, Key, LivePose, messages
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
@@ -256,5 +256,5 @@ def _arrived(entry: _Cached, channel: RecordChannel) -> bool:
 
 
 def is_cached_key(key: Key) -> bool:
-    """True for keys of cached keyframes, which each base process sends anew."""
-    return key.kind in CACHED_KINDS
+    """True for keys of cached keyframes and grid tiles, which each base process sends anew."""
+    return key.kind in CACHED_KINDS or key.kind == GridTile.KIND

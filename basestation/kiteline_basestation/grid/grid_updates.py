@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from kiteline_basestation.grid.sparse_scan import sparse_scan
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 
 F64 = NDArray[np.float64]
@@ -118,6 +119,15 @@ class GridUpdates:
             return False
         S_w_k = self._pose(keyframe)
         return grid.remove(keyframe) if S_w_k is None else grid.put(keyframe, scan, S_w_k)
+
+    def ground_below(self, keyframe: KeyframeId) -> float | None:
+        """Height in w of the ground below a keyframe, or the last one before it that knows; None if none does."""
+        siblings = self._map.submaps.get(submap_of_keyframe(keyframe), [])
+        for other in siblings[: bisect_right(siblings, keyframe)][: -1 - self._config.ground_keyframes : -1]:
+            scan, S_w_k = self._scans.get(other), self._pose(other)
+            if scan is not None and S_w_k is not None:
+                return float(S_w_k[2, 3]) - sim3.scale_of(S_w_k) * scan.height_m
+        return None
 
     def labels(self, landmarks: I32) -> U8:
         """Labels (n,) of landmarks: 0 unlabelled, 1 ground, 2 obstacle."""

@@ -95,6 +95,10 @@ class ScanGrid:
         self._draw(held, -1)
         return True
 
+    def storey_of(self, ground_m: float) -> int:
+        """The storey whose ground lies nearest to a height in w."""
+        return round((ground_m - self.config.ground_m) / self.config.storey_m)
+
     def main_storey(self) -> int:
         """The storey with most scans."""
         scans = Counter(storey for storeys in self._storeys.elements() for storey in storeys)
