@@ -53,10 +53,13 @@ class AgentRuntime:
     """Drives one agent step by step, in lock-step or live: reads frames, logs, counts, and models link and CPU.
 
     whole_process: the agent is alone in this process. Then all CPU time between two frames but for decoding counts as
-    the agent's, else only that of its steps.
+    the agent's, else only that of its steps. config: in place of what the options name.
     """
 
-    def __init__(self, options: AgentOptions, source: FrameSource, channel: RecordChannel, whole_process: bool) -> None:
+    def __init__(
+        self, options: AgentOptions, source: FrameSource, channel: RecordChannel, whole_process: bool,
+        config: AgentConfig | None = None,
+    ) -> None:  # fmt: skip
         cv2.setNumThreads(1)
         self.options = options
         self.source = source
@@ -64,7 +67,7 @@ class AgentRuntime:
         self.counts = FrameCounts()
         self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
         self.rss_mib = 0.0
-        config = agent_config(options.config, options.cpu_percent, options.rig)
+        config = config or agent_config(options.config, options.cpu_percent, options.rig)
         self._rig_file = RigFile(options.rig) if options.rig else None
         if whole_process:
             kernel_cache.fill("kiteline_agent.runtime.warm")

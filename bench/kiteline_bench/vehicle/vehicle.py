@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kiteline_bench.harness.bars import Run, in_turn
-from kiteline_bench.vehicle import camera, controllers, costs, faults, raw_images, units
+from kiteline_bench.vehicle import camera, controllers, costs, faults, guided, raw_images, units
 from kiteline_bench.vehicle.sitl import flights
 
 PARTS: dict[str, tuple[str, Run]] = {
@@ -14,5 +14,6 @@ PARTS: dict[str, tuple[str, Run]] = {
         "Vehicle: a live camera at 20 Hz beside link, MAVLink and log",
         in_turn(camera.run, costs.run, raw_images.run),
     ),
+    "calibration": ("Vehicle: camera and IMU by a guided motion", guided.run),
     "units": ("Vehicle: services", units.run),
 }

@@ -1,4 +1,4 @@
-"""`kiteline calibrate camera|board|export`: calibrates cameras by a board, draws boards, converts calibrations."""
+"""`kiteline calibrate camera|board|imu|export`: cameras by a board, IMUs by a motion; boards and conversions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from kiteline_hw.calibration.own import texts as own_texts
 from kiteline_hw.calibration.told import UNCALIBRATED, ToldCalibration
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.calibration import boards
+from kiteline_lab.calibration import boards, imu
 from kiteline_lab.calibration.best_lens import best_lens
 from kiteline_lab.calibration.boards import Board, parse_board
 from kiteline_lab.calibration.picture import residual_picture
@@ -67,12 +67,15 @@ def calibrated(
 def main(argv: Sequence[str]) -> int:
     """Run `kiteline calibrate`; the exit status. Raises KitelineError."""
     args = _parser().parse_args(argv)
-    run = {"camera": _camera, "board": _board, "export": _export}
+    run = {"camera": _camera, "board": _board, "imu": imu.run, "export": _export}
     return run[args.verb](args)
 
 
 def _parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(prog="kiteline calibrate", description="Calibrate cameras by a printed board.")
+    p = argparse.ArgumentParser(
+        prog="kiteline calibrate",
+        description="Calibrate cameras by a printed board, and an IMU against them by a guided motion.",
+    )
     verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
     camera = verbs.add_parser("camera", help="calibrate a camera or a pair by images or a recording of the board")
     camera.add_argument("source", metavar="SOURCE", help=source_forms())
@@ -96,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     board = verbs.add_parser("board", help="draw a board to print")
     board.add_argument("board", type=parse_board, metavar="BOARD", help=boards.FORMS)
     board.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    imu.add_parser(verbs)
     export = verbs.add_parser("export", help="write a calibration in the form of another tool")
     export.add_argument("calibration", metavar="FILE[,FILE]", help="of any form that is read")
     export.add_argument("--format", choices=tuple(FORMS), required=True)
