@@ -75,7 +75,7 @@ def test_truth_is_interpolated_across_south() -> None:
 
 def test_all_parts_are_there_and_one_can_be_chosen() -> None:
     assert [name for name, _, _ in parts("vehicle")] == [
-        f"vehicle/{part}" for part in ("sitl", "controllers", "faults", "camera", "units")
+        f"vehicle/{part}" for part in ("sitl", "controllers", "faults", "camera", "calibration", "units")
     ]
     assert len(parts("vehicle/units")) == 1
 

@@ -63,7 +63,8 @@ def _fly(recording: str, raw: AgentRuntime, encoded: AgentRuntime) -> list[tuple
         now_ns = item.t_ns - first_ns
         turns = [(raw, replace(item, encoded=()), 0), (encoded, item, 1)]
         spent = [0.0, 0.0]
-        for runtime, frame, side in turns[:: 1 if len(out) % 2 else -1]:  # the first one has the colder caches
+        turns = turns[:: 1 if len(out) % 2 else -1]  # the first one has the colder caches
+        for runtime, frame, side in turns:
             mark_ns = time.process_time_ns()
             runtime.step(frame, imu, (), now_ns)
             spent[side] += (time.process_time_ns() - mark_ns) * 1e-6
