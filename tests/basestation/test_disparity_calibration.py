@@ -158,13 +158,13 @@ def test_a_restarted_base_tells_an_offset_that_it_knows_better(make_flight: Make
     received = (CameraIntrinsics(flight.agent, flight.camera), StereoAlignment(flight.agent, NONE, False, found, 0.1))
     first, second = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
     first.restore(flight.agent, received, (), 0)
-    first.map.disparity_offset_px[flight.agent] = better
+    first.map.disparity_offset_px[flight.agent], first.map.disparity_sigma_px[flight.agent] = better, 0.04
     second.restore(flight.agent, received, (), 0)
     second.restore_state(first.state())
     assert np.array_equal(prior_mean(second.map, flight.agent, BaseConfig().disparity), found)
     output = second.step(MapperInput(()), 0)
     sent = [r for _, records in output.publish for r in records if isinstance(r, DisparityCalibration)]
-    assert [r.disparity_px.tolist() for r in sent] == [better.tolist()]
+    assert [(r.disparity_px.tolist(), r.sigma_px) for r in sent] == [(better.tolist(), 0.04)]
 
 
 def test_an_offset_of_a_worn_rig_is_found_early(make_flight: MakeFlight, words: Any) -> None:

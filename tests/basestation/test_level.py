@@ -12,7 +12,7 @@ from kiteline_basestation.config import BaseConfig, GraphConfig, LoopConfig
 from kiteline_basestation.inertial.level import Level, level_of, tilt_between
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
+from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise
 from kiteline_basestation.merging.loop_consistency import keeps_level
 from kiteline_basestation.merging.loop_edges import LoopEdge
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose, Record, SubmapTie
@@ -88,8 +88,11 @@ def test_a_match_that_tilts_a_map_is_refused(degrees: float, kept: bool) -> None
     assert keeps_level(sparse_map, edge, LoopConfig())  # one agent has no IMU
 
 
-def a_loop(tilted_rad: float, level: bool) -> tuple[F64, F64]:
-    """A ring of 60 level keyframes whose loop edge is tilted. Returns poses before and after."""
+def a_loop(tilted_rad: float, level: bool, scaled: bool) -> tuple[F64, F64]:
+    """A ring of 60 level keyframes whose loop edge is tilted. Returns poses before and after.
+
+    scaled: scale may drift.
+    """
     angle = 2.0 * np.pi * np.arange(60) / 60
     T = np.array([se3.from_rt(se3.so3_exp(a * UP), 9.0 * np.array([np.cos(a), np.sin(a), 0.0])) for a in angle])
     edges = [(i, i + 1) for i in range(59)] + [(0, 59)]
@@ -98,19 +101,21 @@ def a_loop(tilted_rad: float, level: bool) -> tuple[F64, F64]:
     held = np.arange(60) == 0
     sigma = np.tile([0.01, 0.003], (60, 1))
     known = Level(np.arange(60), UP, np.full(60, 0.002)) if level else None
+    scales = Scaled(np.ones(60, np.bool_), np.ones(60), np.full(60, 0.003)) if scaled else None
     inputs = GraphInputs(
-        np.arange(60), T, held, np.array(edges), np.array(between), sigma, np.arange(60) == 59, GraphConfig(), None,
+        np.arange(60), T, held, np.array(edges), np.array(between), sigma, np.arange(60) == 59, GraphConfig(), scales,
         known,
     )  # fmt: skip
     return T, optimise(inputs).T_w_k
 
 
-def test_a_loop_bends_yaw_and_keeps_roll_and_pitch() -> None:
+@pytest.mark.parametrize("scaled", [False, True])
+def test_a_loop_bends_yaw_and_keeps_roll_and_pitch(scaled: bool) -> None:
     def tilts(T: F64) -> float:
         return float(np.linalg.norm(np.cross(T[:, :3, 2], UP), axis=1).mean())
 
-    before, without = a_loop(0.05, level=False)
-    _, kept = a_loop(0.05, level=True)
+    before, without = a_loop(0.05, level=False, scaled=scaled)
+    _, kept = a_loop(0.05, level=True, scaled=scaled)
     assert tilts(without) > 0.01
     assert tilts(kept) < 0.4 * tilts(without)
     assert float(np.abs(kept[:, 2, 3]).max()) < 0.4 * float(np.abs(without[:, 2, 3]).max())  # nor do heights
@@ -163,6 +168,30 @@ def test_a_submap_after_a_loss_lies_where_its_tie_says(late: bool) -> None:
     found = placed(mapper)
     assert found is not None
     assert np.allclose(found, better, atol=1e-9)
+
+
+def test_submaps_after_one_that_follows_its_tie_move_along() -> None:
+    mapper, later = Mapper(BaseConfig()), submap_id(AGENT, 0, 2)
+    T_m_third = se3.exp(np.array([0.1, 0.3, -0.2, 0.0, 0.4, 0.1]))
+    step(mapper, 0.0, *FLOWN[:3])
+    step(
+        mapper, 1.0, SubmapTie(NEW, LAST, T_K_F, 0.1, 0.004), FLOWN[3], LivePose(AGENT, 5 * 10**9, FIRST, np.eye(4), 50)
+    )
+    step(mapper, 2.0, KeyframeHeader(keyframe_id(later, 0), 5 * 10**9 + 10**8, NO_KEYFRAME, T_m_third, 0))
+    between = se3.inverse(mapper.placements[NEW]) @ mapper.placements[later]
+    assert np.allclose(mapper.placements[NEW] @ T_M_FIRST, mapper.placements[later] @ T_m_third)  # where it was left
+    before = mapper.placements[later]
+    better = T_K_F @ se3.exp(np.array([0.1, 0.0, -0.2, 0.0, 0.0, 0.3]))
+    step(mapper, 3.0, SubmapTie(NEW, LAST, better, 0.05, 0.004))
+    found = placed(mapper)
+    assert found is not None
+    assert np.allclose(found, better, atol=1e-9)
+    assert not np.allclose(before, mapper.placements[later], atol=0.05)
+    assert np.allclose(se3.inverse(mapper.placements[NEW]) @ mapper.placements[later], between, atol=1e-9)
+    mapper.map.root_submaps[later] = OLD  # recognised: it lies where the merge says
+    kept = mapper.placements[later]
+    step(mapper, 4.0, SubmapTie(NEW, LAST, T_K_F, 0.05, 0.004))
+    assert np.allclose(mapper.placements[later], kept)
 
 
 def test_a_recognised_submap_no_longer_follows_its_tie() -> None:

@@ -36,7 +36,9 @@ def full_state() -> MapperState:
     )  # fmt: skip
     return MapperState(
         names={A: 'hall "7"'}, unbundled={A: (KeyframeId(1), KeyframeId(2))},
-        map=MapState({B: A}, {B: S}, {AgentId(1): np.array([0.1, 0, 0, 0, 0])}, frozenset({AgentId(1)})),
+        map=MapState(
+            {B: A}, {B: S}, {AgentId(1): np.array([0.1, 0, 0, 0, 0])}, frozenset({AgentId(1)}), {AgentId(1): 0.07}
+        ),
         intake=IntakeState({A: LivePose(AgentId(0), 5, KeyframeId(2), T, 80)}, {A: 5}, (KeyframeId(3),), (B,)),
         placements=PlacementState({B: S, A: T}, {A: T}, frozenset({B})), merger=merger,
     )  # fmt: skip
@@ -51,6 +53,18 @@ def test_a_state_comes_back_to_the_last_bit() -> None:
     assert again.merger.merges[0].fused.shape == (0, 2)
     assert again.merger.detector.matches[A, B][1].old_landmarks.tolist() == [4, 2**50]
     assert texts_of(state_of({})) == texts_of(MapperState())
+
+
+def test_a_state_of_an_earlier_version_can_be_read() -> None:
+    texts = texts_of(full_state())
+    before = json.loads(texts["mapper.map"])
+    assert before.pop("disparity_sigma_px") == [[1, 0.07]]
+    again = state_of({**texts, "mapper.map": json.dumps(before)})
+    assert again.map.disparity_sigma_px == {}
+    assert again.map.disparity_calibrated == {AgentId(1)}
+    del before["root_submaps"]  # always there
+    with pytest.raises(KeyError):
+        state_of({**texts, "mapper.map": json.dumps(before)})
 
 
 def test_only_changed_parts_are_written() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kiteline_agent.runtime.live import fly_live
+import pytest
+
+from kiteline_agent.runtime import live
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.mavlink.messages import MavlinkMessage, Tunnel
 from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
@@ -21,14 +23,17 @@ class Listening(FlightController):
         return super()._process(messages, now_ns)
 
 
-def test_packets_for_the_base_go_through_the_controllers_connection(recording: Path, tmp_path: Path) -> None:
+def test_packets_for_the_base_go_through_the_controllers_connection(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "_DRAIN_S", 0.5)  # no base will ever answer
     model = Listening("ardupilot")
     with UdpFlightController(model) as controller:
         url = f"udp:127.0.0.1:{controller.port}"
         spec = AgentOptions(source=str(recording), folder=str(tmp_path), mavlink=url, link=f"mavlink:{url}", axes="frd",
                             seconds=3.0)  # fmt: skip
         stop = process.StopSignal()
-        fly_live(spec, None, stop)
+        live.fly_live(spec, None, stop)
     assert len(model.accepted) > 10 and not model.dropped
     assert model.packets > 3
     assert (tmp_path / "last_pose.json").exists()

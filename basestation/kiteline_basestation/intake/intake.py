@@ -14,9 +14,9 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import (
     CameraIntrinsics,
     GravityAlignment,
+    IdOf,
     InertialSteps,
     KeyframeHeader,
-    KeyframeScan,
     LivePose,
     NewLandmarks,
     Observations,
@@ -33,6 +33,7 @@ from kiteline_core.ids import (
     KeyframeId,
     SubmapId,
     agent_of_keyframe,
+    agent_of_submap,
     submap_of_keyframe,
 )
 
@@ -72,12 +73,15 @@ class Intake:
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
         self._scans: list[KeyframeScan] = []  # that arrived and were not taken yet
         self.ties = Ties(sparse_map)
-        self.refused = 0  # records that contradict the map
+        self.refused = 0  # records that contradict the map, or are of another agent than the one that wrote them
 
     def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int) -> None:
         """Put an agent's records into the map."""
         for record in records:
             self.last_contact_ns[agent] = now_ns
+            if not _is_own(agent, record):
+                self.refused += 1
+                continue
             if self.deleted and _submap_of(record) in self.deleted:
                 continue
             if isinstance(record, CameraIntrinsics):
@@ -217,6 +221,20 @@ def _order(live: LivePose) -> tuple[int, int]:
 
 
 def _submap_of(record: Record) -> SubmapId | None:
-    if isinstance(record, KeyframeHeader | NewLandmarks | Observations | InertialSteps | KeyframeScan | LivePose):
+    """The submap that a record is of; None for one of the whole agent."""
+    if isinstance(record, LivePose):
         return submap_of_keyframe(record.keyframe)
-    return record.submap if isinstance(record, GravityAlignment | SubmapScale | SubmapTie) else None
+    if record.ID is IdOf.AGENT:
+        return None
+    named = record.key().id
+    return SubmapId(named) if record.ID is IdOf.SUBMAP else submap_of_keyframe(KeyframeId(named))
+
+
+def _is_own(agent: AgentId, record: Record) -> bool:
+    """True if a record is of its writer's own submaps. Landmarks that it observes may be of other agents."""
+    submap = _submap_of(record)
+    if submap is not None and agent_of_submap(submap) != agent:
+        return False
+    if isinstance(record, InertialSteps | SubmapTie):
+        return agent_of_keyframe(record.since) == agent
+    return record.ID is not IdOf.AGENT or record.key().id == agent

@@ -100,9 +100,28 @@ class SubmapPlacements:
         self._set(submap, S_w_m)
 
     def follow_ties(self) -> bool:
-        """Place submaps that are not recognised where their agents' motion over a loss says. True if one moved."""
+        """Place submaps that are not recognised where their agents' motion over a loss says. True if one moved.
+
+        Submaps that were placed after such a submap, by how the agent left it, move along.
+        """
         fresh, self._intake.fresh_ties = sorted(self._intake.fresh_ties), set()
-        return sum(self._place_by_tie(submap) for submap in fresh) > 0
+        moved = False
+        for submap in fresh:
+            before = self.S_w_m.get(submap)
+            if not self._place_by_tie(submap):
+                continue
+            moved = True
+            if before is not None:
+                self._move_later(submap, self.S_w_m[submap] @ sim3.inverse(before))
+        return moved
+
+    def _move_later(self, submap: SubmapId, S_new_old: F64) -> None:
+        """Move the submaps that follow one without a break, as far as none is recognised, by S_new_old (4,4) in w."""
+        later = SubmapId(submap + 1)
+        while later in self.unmerged and later in self.S_w_m and self._map.submaps_of_map(later) == [later]:
+            self.unmerged[later] = S_w_m = self._moved(later, S_new_old, self.unmerged[later])
+            self._set(later, S_w_m)
+            later = SubmapId(later + 1)
 
     def _place_by_tie(self, submap: SubmapId) -> bool:
         """Place a submap by its agent's motion over a loss; False if that is too uncertain, or not known yet."""

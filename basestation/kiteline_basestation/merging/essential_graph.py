@@ -25,6 +25,8 @@ Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
+_FREE = 1e3  # rad, and units of lengths: a deviation that holds nothing
+
 
 @dataclass(frozen=True, slots=True)
 class GraphInputs:
@@ -144,6 +146,11 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
             graph.add(gtsam.PriorFactorSimilarity3(i, S_w_k, fixed if inputs.held[i] else unit_scale))
     for (a, b), T, scale, key in zip(inputs.edges.tolist(), inputs.T_a_b, scaled.scale.tolist(), rows.tolist()):
         graph.add(gtsam.BetweenFactorSimilarity3(a, b, _similarity(T, scale), noises[tuple(key)]))
+    if inputs.level is not None:
+        for i, sigma in zip(inputs.level.rows.tolist(), inputs.level.sigma.tolist()):
+            pose = inputs.T_w_k[i]
+            tilt = _tilt_noise(pose[:3, :3].T @ inputs.level.up_w, config.level_inflation * sigma)
+            graph.add(gtsam.PriorFactorSimilarity3(i, _similarity(pose, 1.0), tilt))
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(config.scale_iterations)
     params.setRelativeErrorTol(config.stop)
@@ -159,6 +166,15 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
     work = int(optimiser.iterations()) * (12_000 * len(inputs.edges) + 9_000 * len(poses))
     residual = residuals(inputs, poses, scale)
     return GraphResult(inputs.keyframes, poses, scale, residual, 300_000 + 9_000 * len(inputs.edges) + work // 4)
+
+
+def _tilt_noise(up_k: F64, sigma: float) -> gtsam.noiseModel.Base:
+    """Noise of a known direction of gravity up_k (3,) in a keyframe: all but the turns across it are free."""
+    import gtsam
+
+    covariance = np.diag([_FREE**2] * 7)
+    covariance[:3, :3] = sigma**2 * np.eye(3) + (_FREE**2 - sigma**2) * np.outer(up_k, up_k)
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
 def _similarity(T: F64, scale: float) -> gtsam.Similarity3:

@@ -58,6 +58,7 @@ def _combined(ours: MapperState, theirs: MapperState, new: list[KeyframeId]) -> 
         submap_poses={**b.submap_poses, **a.submap_poses},
         disparity_offset_px={**b.disparity_offset_px, **a.disparity_offset_px},
         disparity_calibrated=a.disparity_calibrated | b.disparity_calibrated,
+        disparity_sigma_px={**b.disparity_sigma_px, **a.disparity_sigma_px},
     )
     intake = replace(
         ours.intake,

@@ -24,6 +24,7 @@ T = TypeVar("T")
 _HINTS: dict[Any, dict[str, Any]] = {}  # by dataclass
 
 ROOT = "mapper"  # name of the text of the state itself
+_ADDED = {"disparity_sigma_px"}  # fields that states of earlier versions lack: as in a new mapper
 
 
 class StateWriter:
@@ -91,7 +92,7 @@ def _assemble(cls: type[T], texts: Mapping[str, str], name: str) -> T:
             else:
                 read = _key_reader(typing.get_args(hint)[0])
                 values[field] = {read(key): value for key, value in entries}
-        elif held is not None:
+        elif held is not None and (field in held or field not in _ADDED):
             values[field] = _decode(hint, held[field], field)
     return cls(**values)
 
