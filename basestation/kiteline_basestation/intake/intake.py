@@ -17,6 +17,7 @@ from kiteline_codec.schema import (
     IdOf,
     InertialSteps,
     KeyframeHeader,
+    KeyframeScan,
     LivePose,
     NewLandmarks,
     Observations,

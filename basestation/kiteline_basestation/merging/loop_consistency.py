@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.inertial.level import tilt_between
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, correction_of, depth_of
+from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, correction_of, depth_of, similarity
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 
@@ -73,6 +73,16 @@ def keeps_level(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bo
     new, old = submap_of_keyframe(edge.new), submap_of_keyframe(edge.old)
     found = tilt_between(sparse_map, new, old, correction_of(sparse_map, edge))
     return found is None or found[0] <= config.tilt_rad + config.tilt_deviations * found[1]
+
+
+def is_fusible(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:
+    """True if the correction of a loop is so small that fusing landmarks and a bundle suffice."""
+    S_w_new = similarity(sparse_map, edge.new)
+    error = sim3.inverse(S_w_new) @ similarity(sparse_map, edge.old) @ sim3.of(edge.scale, edge.T_old_new)
+    moved = float(sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]))
+    turned = float(np.linalg.norm(se3.so3_log(sim3.rigid(error)[:3, :3])))
+    grown = abs(float(np.log(sim3.scale_of(error))))
+    return moved <= config.fuse_m and turned <= config.fuse_rad and grown <= config.fuse_scale
 
 
 def path_length(sparse_map: SparseMap, a: KeyframeId, b: KeyframeId) -> float:

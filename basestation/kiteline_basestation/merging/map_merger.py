@@ -19,6 +19,7 @@ from kiteline_basestation.inertial.ties import Tie
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging import loop_consistency as consistency
 from kiteline_basestation.merging.correction import apply_scales, keyframes_of, move_keyframes, scale_map
 from kiteline_basestation.merging.correction_jobs import CorrectionJobs, FullBundle
 from kiteline_basestation.merging.essential_graph import GraphResult
@@ -29,15 +30,14 @@ from kiteline_basestation.merging.loop_detector import (
     LoopDetector,
     known_matches,
 )
-from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, rescaled, similarity, slot_pairs
-from kiteline_basestation.merging.merges import NOTHING, MapMerge, MergeResult
+from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, rescaled, slot_pairs
+from kiteline_basestation.merging.merges import NOTHING, MapMerge, MergeResult, is_contradicted
 from kiteline_basestation.refinement import disparity_calibration as disparity
 from kiteline_basestation.refinement import landmark_matching
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
-from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_basestation.refinement.odometry_factors import without_odometry_factors
 from kiteline_codec.schema import FusedLandmarks
-from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry import sim3
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from kiteline_core.places.place_index import Vocabulary
@@ -163,9 +163,9 @@ class MapMerger:
             return NOTHING
         if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
             return NOTHING
-        wrong = self._contradicted_merge(map_id, window, result)
-        if wrong is not None:
-            return self.undo(wrong)
+        last = next((m for m in reversed(self.merges) if m.into == map_id), None)
+        if last is not None and is_contradicted(self._map, last, window, result, self._config):
+            return self.undo(last)
         changed = self._apply_full_bundle(bundle, result)
         if agents:
             self._corrections.uncertain_at.pop(map_id, None)
@@ -288,7 +288,7 @@ class MapMerger:
         self._edges.extend(match.edge for match in closure.matches)
         self._unfused.setdefault(map_id, []).extend(closure.matches)
         self._corrections.cancel_pending(map_id)
-        if self._needs_graph(closure):
+        if any(not consistency.is_fusible(self._map, match, self._config.loops) for match in closure.matches):
             self._corrections.request_graph(map_id)
         else:
             self._fuse_matches(map_id)
@@ -310,20 +310,6 @@ class MapMerger:
         before = self._last_return.get(submap, -self._config.loops.loop_gap - 1)
         self._last_return[submap] = at
         return at - before > self._config.loops.loop_gap
-
-    def _needs_graph(self, closure: LoopClosure) -> bool:
-        """True if the correction is too large for fusing landmarks and bundling alone."""
-        limits = self._config.loops
-        for match in closure.matches:
-            S_w_new = similarity(self._map, match.new)
-            error = sim3.inverse(S_w_new) @ similarity(self._map, match.old) @ sim3.of(match.scale, match.T_old_new)
-            if sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]) > limits.fuse_m:
-                return True
-            if np.linalg.norm(se3.so3_log(sim3.rigid(error)[:3, :3])) > limits.fuse_rad:
-                return True
-            if abs(np.log(sim3.scale_of(error))) > limits.fuse_scale:
-                return True
-        return False
 
     def _merge(self, closure: LoopClosure) -> MergeResult:
         """Move the newer map onto the older one, and make its submaps part of it."""
@@ -364,20 +350,6 @@ class MapMerger:
                     )
 
     # -- full bundles --------------------------------------------------------------------------------------------------
-
-    def _contradicted_merge(self, map_id: SubmapId, window: BundleWindow, result: BundleResult) -> MapMerge | None:
-        """The last merge into a map, if the bundle rejects most observations of the landmarks that it fused."""
-        merge = next((m for m in reversed(self.merges) if m.into == map_id), None)
-        if merge is None or not len(merge.fused):
-            return None
-        table = self._map.keypoints
-        roots = np.unique(table.root[self._map.find_landmarks(merge.fused.ravel())])
-        which = np.repeat(window.points, np.diff(window.problem.starts))
-        submap = self._map.keyframes.id[table.row[window.slots]] >> SEQUENCE_BITS
-        moved = np.isin(submap, sorted(merge.moved)) & np.isin(which, roots)
-        if int(np.count_nonzero(moved)) < self._config.loops.min_inliers:
-            return None
-        return None if float(np.mean(result.inlier[moved])) >= self._config.graph.min_kept else merge
 
     def _apply_full_bundle(self, bundle: FullBundle, result: BundleResult) -> MergeResult:
         """Move a map to the result of its full bundle; newer keyframes move along the spanning tree."""

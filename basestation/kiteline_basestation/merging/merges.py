@@ -8,7 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
+from kiteline_core.optimisation.bundle import BundleResult
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -29,6 +33,22 @@ class MapMerge:
     into: SubmapId
     moved: dict[SubmapId, F64]
     fused: I64 = field(default_factory=_no_pairs)
+
+
+def is_contradicted(
+    sparse_map: SparseMap, merge: MapMerge, window: BundleWindow, result: BundleResult, config: BaseConfig
+) -> bool:
+    """True if a full bundle rejects most observations of the landmarks that a merge fused."""
+    if not len(merge.fused):
+        return False
+    table = sparse_map.keypoints
+    roots = np.unique(table.root[sparse_map.find_landmarks(merge.fused.ravel())])
+    which = np.repeat(window.points, np.diff(window.problem.starts))
+    submap = sparse_map.keyframes.id[table.row[window.slots]] >> SEQUENCE_BITS
+    moved = np.isin(submap, sorted(merge.moved)) & np.isin(which, roots)
+    if int(np.count_nonzero(moved)) < config.loops.min_inliers:
+        return False
+    return float(np.mean(result.inlier[moved])) < config.graph.min_kept
 
 
 @dataclass(frozen=True, slots=True)
