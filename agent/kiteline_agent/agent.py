@@ -28,6 +28,7 @@ from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
+from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
@@ -100,6 +101,11 @@ class Agent:
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
             self._two_view_start, inertial_start, self._governor, channel,
         )  # fmt: skip
+        self._scans = None
+        if self._has_depth and config.scan.on:
+            self._scans = ScanStage(
+                self._camera, self.map, maker, self._governor, channel, config.scan, config.ground, self.work
+            )
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,
@@ -192,6 +198,8 @@ class Agent:
             # 7. Make a keyframe if the policy needs one.
             self._relocaliser.enter_keyframes()  # of earlier frames
             events += self._keyframes.add_if_needed(ctx, track)
+            if self._scans is not None:
+                self._scans.step(ctx)
             # 8. Join an older submap, or continue a monocular one in metres.
             events += self._submaps.join_older(ctx, track)
             restarted = self._submaps.restart_in_metres(ctx, track)

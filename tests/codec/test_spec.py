@@ -249,10 +249,13 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["camera_height_m"] = float("nan") if z < 0 else (-(z + 1) // 2 if z % 2 else z // 2) / 256
         obstacle, free, free_from, clear, out["bands"] = scan(s, s.varint())
         out["obstacle_m"] = [r or float("inf") for r in ranges(obstacle)]
-        out["free_m"], out["free_from_m"], out["clear_m"] = ranges(free), ranges(free_from), ranges(clear)
+        out["free_m"], out["free_from_m"], out["clear_m"] = (
+            ranges(free),
+            ranges([8 * c for c in free_from]),
+            ranges(clear),
+        )
         m = s.varint()
-        packed = s.raw((m + 4) // 5)
-        out["labels"] = [packed[i // 5] // 3 ** (i % 5) % 3 for i in range(m)]
+        out["labels"] = [2 - code for code in residual_columns(s, 1, m)[0]]
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())

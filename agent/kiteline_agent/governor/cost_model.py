@@ -26,6 +26,8 @@ class Work:
     bearings: int = 0
     searches: int = 0
     window_keyframes: int = 0
+    matched_px: int = 0
+    segmented_px: int = 0
 
     def clear(self) -> None:
         """Reset all counts for a new step."""
@@ -55,6 +57,8 @@ PRICES_NS: dict[str, float] = {
     "bearings": 7_500,  # an epipolar segment searched for a landmark without depth
     "searches": 5_000_000,  # a relocalisation attempt
     "window_keyframes": 3_500_000,  # a keyframe of a solved window of the inertial start
+    "matched_px": 75,  # semi-global matching, at the size of disparity images
+    "segmented_px": 35,  # ground, labels and scan
 }
 
 

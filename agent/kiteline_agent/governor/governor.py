@@ -62,11 +62,12 @@ class Extra(Enum):
     KEYFRAME = "keyframe"
     SEARCH = "search"  # relocalisation
     SUBMAP = "submap"  # the first keyframe of a submap
+    SCAN = "scan"  # a part of a column scan: only what nothing else needs
 
 
 _LONGER = 1.03  # growth of the expected period per frame, if the camera is slower than assumed
 _FIRST_LONGER = 2.5  # the same between the first two frames; a longer gap is due to the first frame's processing
-_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0}  # initial estimate, in frames
+_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0, Extra.SCAN: 0.5}  # initial estimate, in frames
 _OUTLIER = 1.5  # cost of a frame, in usual frames, above which it is clipped
 _SPREAD = 2.0  # mean deviations that cover nine of ten frames
 _LEAST = 0.1  # least share of the budget for frames
@@ -82,7 +83,10 @@ class Decision:
 
 
 def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
-    """The configuration at an effort: with fewer points, cells are larger and fewer inliers are required."""
+    """The configuration at an effort: with fewer points, cells are larger and fewer inliers are required.
+
+    Below full effort there are no scans.
+    """
     align, keyframe = config.align, config.keyframe
     points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
     return replace(
@@ -107,6 +111,7 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
             rotation_rad=keyframe.rotation_rad * min(effort.keyframes, 1.4),
         ),
         local_map=replace(config.local_map, searched=max(round(config.local_map.searched * effort.slots), 8)),
+        scan=replace(config.scan, on=config.scan.on and effort == FULL),
     )
 
 
@@ -204,6 +209,20 @@ class Governor:
         self.note(extra)
         return True
 
+    def may_scan(self) -> bool:
+        """True if a part of a scan fits in this frame, which does nothing else extra; it is booked then.
+
+        Scans are what is dropped first: none is made below full effort (`governed`), or without comfort at it.
+        """
+        if self.on:
+            if self._last_extra is not None:
+                return False
+            need_ns = self._frame_ns + (self._extra_ns[Extra.SCAN] or _GUESS[Extra.SCAN] * self._frame_ns)
+            if self._window_ns + need_ns > self._config.comfort * self._budget_ns:
+                return False
+        self.note(Extra.SCAN)
+        return True
+
     def note(self, extra: Extra) -> None:
         """Book an extra that is done in this frame whether or not there is CPU time."""
         self._last_extra = extra
@@ -224,7 +243,7 @@ class Governor:
             known_ns = self._extra_ns[self._last_extra]
             more_ns = max(cpu_ns - self._frame_ns, 0.0)
             self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * gain if known_ns else 1.0)
-            if self._last_extra is not Extra.SEARCH:
+            if self._last_extra not in (Extra.SEARCH, Extra.SCAN):
                 self._count_keyframe(self._last_t_ns)
         elif self._measured:
             cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # outliers: a frame that lost and regained tracking

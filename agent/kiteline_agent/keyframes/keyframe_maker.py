@@ -33,6 +33,7 @@ class KeyframeMaker:
         self._camera = local_map.camera
         self._channel = channel
         self._work = work
+        self.new_uv: F64 = np.zeros((0, 2))  # px of the first keypoints of the last keyframe that was shared
 
     def lacks_right_image(self, ctx: FrameContext) -> bool:
         """True if a frame of a stereo camera came without its right image."""
@@ -96,6 +97,7 @@ class KeyframeMaker:
         seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
         self._store(ctx, header, T_m_k, uv, seen_uv, rho, landmarks)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
+        self.new_uv = seen_uv[: min(len(order), profile.landmarks)]
         return T_m_k
 
     def make_unshared(

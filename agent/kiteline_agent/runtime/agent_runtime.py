@@ -67,7 +67,7 @@ class AgentRuntime:
         self.counts = FrameCounts()
         self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
         self.rss_mib = 0.0
-        config = config or agent_config(options.config, options.cpu_percent, options.rig)
+        config = config or agent_config(options.config, options.cpu_percent, options.rig, options.grid)
         self._rig_file = RigFile(options.rig) if options.rig else None
         if whole_process:
             kernel_cache.fill("kiteline_agent.runtime.warm")

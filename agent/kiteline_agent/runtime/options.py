@@ -53,6 +53,7 @@ class AgentOptions:
     origin: str = ""  # LAT,LON,ALT to set in the flight controller; "": none
     obstacles: bool = False  # send OBSTACLE_DISTANCE from the base's grid
     mavlink_key: str = ""  # a file with the key of MAVLink's signatures; "": none
+    grid: str = "agent"  # who makes scans of ground and obstacles: agent, or off
     imu_of: str = ""  # whose IMU is used: controller; "": the source's, if it has one
     kill_at_s: float | None = None  # end like a crash at this flight time
     await_base_at_s: float | None = None  # look for a base again at this flight time
@@ -68,19 +69,23 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
         up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
         origin=a.origin, mavlink_key=a.mavlink_key, obstacles=a.obstacles,
+        grid=a.grid,
     )  # fmt: skip
 
 
-def agent_config(path: str, cpu_percent: float = 0.0, rig: str = "") -> AgentConfig:
+def agent_config(path: str, cpu_percent: float = 0.0, rig: str = "", grid: str = "agent") -> AgentConfig:
     """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError.
 
     cpu_percent: of one core, overrides the governor's budget; 0: what the file says. rig: a rig file.
+    grid: "off" for no scans, whatever the file says.
     """
     config = AgentConfig()
     if path:
         config = configuration.load(config, Path(path).read_text(encoding="utf-8"), "agent", path)
     if rig:
         config = replace(config, known_rig=rig_file.load(rig))
+    if grid == "off":
+        config = replace(config, scan=replace(config.scan, on=False))
     if cpu_percent <= 0.0:
         return config
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
@@ -153,6 +158,10 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument(
         "--obstacles", action="store_true",
         help="send distances to obstacles around the vehicle (OBSTACLE_DISTANCE) from the base's grid",
+    )  # fmt: skip
+    p.add_argument(
+        "--grid", choices=("agent", "off"), default="agent",
+        help="who looks for ground and obstacles: the agent, where CPU time is left (default), or nobody",
     )  # fmt: skip
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")

@@ -103,6 +103,11 @@ class DisparityStripes:
         self._pair = None
         return unlocked(self._raw[:, _PAD_PX:])
 
+    @property
+    def stripe_px(self) -> int:
+        """Pixels of a stripe, about."""
+        return self._raw.size // self.stripes
+
     def measure(self, left: U8, right: U8) -> F32:
         """The disparity image of a pair at once."""
         self.begin(left, right)

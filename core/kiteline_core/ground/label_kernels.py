@@ -32,13 +32,13 @@ def mark_texture(image, least, reach, out):  # type: ignore[no-untyped-def]
 @njit
 def label_points(  # type: ignore[no-untyped-def]
     x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, bands, slab_m, labels, grounds, obstacles,
-    sums, in_band, slab,
+    sums, in_band, slab, slab_sums,
 ):  # fmt: skip
     """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, and the slab.
 
     ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
-    bands: (b,) heights. sums: of disparities of obstacles. in_band: (n, bins, b-1). slab: within slab_m of the camera's
-    height. Counts are cleared first. Returns how many pixels lie on the ground that was seen, and
+    bands: (b,) heights. sums: of disparities of obstacles. in_band: (n, bins, b-1). slab, slab_sums: within slab_m
+    of the camera's height. Counts are cleared first. Returns how many pixels lie on the ground that was seen, and
     how many below it.
     """
     labels[:] = UNKNOWN
@@ -47,6 +47,7 @@ def label_points(  # type: ignore[no-untyped-def]
     sums[:] = 0.0
     in_band[:] = 0
     slab[:] = 0
+    slab_sums[:] = 0.0
     bins = grounds.shape[1]
     last = len(bands) - 1
     on, under = 0, 0
@@ -61,6 +62,7 @@ def label_points(  # type: ignore[no-untyped-def]
                 continue
             if abs(z[v, u]) < slab_m:
                 slab[c, j] += 1
+                slab_sums[c, j] += d
             part = d / BIN_PX - j
             height = z[v, u] + x[v, u] * (ground[j] + part * (ground[j + 1] - ground[j]))
             sigma = x[v, u] * abs(ground[j + 1] - ground[j]) / BIN_PX * sigma_px  # of a height above the ground
@@ -118,9 +120,20 @@ def _surface(counts, least, lowest):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _mean(counts, sums, at):  # type: ignore[no-untyped-def]
+    """Mean disparity of a surface at a bin."""
+    half = int(_PX / BIN_PX)
+    total, n = 0.0, 0
+    for i in range(max(at - half, 0), min(at + half + 1, len(counts))):
+        total += sums[i]
+        n += counts[i]
+    return total / n
+
+
+@njit
 def collect_scan(  # type: ignore[no-untyped-def]
-    grounds, obstacles, sums, in_band, slab, azimuth, bf, least, lowest, sigma_px, gap_m, free_from, free, obstacle,
-    bands, clear,
+    grounds, obstacles, sums, in_band, slab, slab_sums, azimuth, bf, least, lowest, sigma_px, gap_m, free_from, free,
+    obstacle, bands, clear,
 ):  # fmt: skip
     """Ranges (n,) in m of a column scan from counts (n, bins). azimuth: (n,). lowest: least bin that counts.
     Ground that is seen with gaps of at most gap_m, or three deviations of its range, is free.
@@ -132,11 +145,7 @@ def collect_scan(  # type: ignore[no-untyped-def]
         obstacle[c], bands[c], free[c], free_from[c], clear[c] = np.inf, 0, 0.0, 0.0, 0.0
         at = _surface(obstacles[c], least, lowest)
         if at >= 0:
-            total, k = 0.0, 0
-            for i in range(max(at - half, 0), min(at + half + 1, bins)):
-                total += sums[c, i]
-                k += obstacles[c, i]
-            obstacle[c] = bf / (total / k) * along
+            obstacle[c] = bf / _mean(obstacles[c], sums[c], at) * along
             most, mask = 0, 0
             for b in range(in_band.shape[2]):
                 m = 0
@@ -149,7 +158,9 @@ def collect_scan(  # type: ignore[no-untyped-def]
             bands[c] = mask | 1 << top
         hit = _surface(slab[c], least, 0)
         if hit >= 0:
-            clear[c] = bf / ((hit + 0.5) * BIN_PX) * along
+            clear[c] = bf / _mean(slab[c], slab_sums[c], hit) * along
+            if abs(clear[c] - obstacle[c]) < obstacle[c] * obstacle[c] / (bf * along) * sigma_px:
+                clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
         for j in range(bins - 1, lowest - 1, -1):
             near, far = bf / ((j + 1) * BIN_PX) * along, bf / ((j if j else 0.5) * BIN_PX) * along
             if near >= obstacle[c]:

@@ -77,18 +77,21 @@ class GroundSegmenter:
         self.labels = np.zeros((h, w), np.uint8)
         self._textured = np.ones((h, w), np.bool_)
         self._counts, self._sums = np.empty((4, n, bins), np.int32), np.empty((n, bins))
+        self._slab_sums = np.empty((n, bins))
         self._upright = np.empty((n, bins), np.bool_)
         self._in_band = np.empty((n, bins, len(self._bands) - 1), np.int32)
         self._heights = np.empty((bins, heights), np.int32)
         self._height_sums = np.empty((2, bins, heights))
 
     def segment(
-        self, disparity: F32, image: U8 | None, up_c: F64, offset_px: F64 | None = None, expected_m: float | None = None
-    ) -> ColumnScan:
+        self, disparity: F32, image: U8 | None, up_c: F64, offset_px: F64 | None = None,
+        expected_m: float | None = None, *, certain: bool = True,
+    ) -> ColumnScan:  # fmt: skip
         """Label a disparity image (h,w) in px, 0 unknown, into `labels`, and make its column scan.
 
         image: (h,w) whose texture the ground must have; None: none is asked for. up_c: (3,) unit vector against
-        gravity. offset_px: (5,) error of disparities. expected_m: of the camera above the ground as scans saw it.
+        gravity. offset_px: (5,) error of disparities. expected_m: of the camera above the ground as scans saw it; while
+        that is certain, ground that lies higher is taken for a table or a box.
         """
         config = self.config
         level_kernels.level_points(
@@ -99,8 +102,8 @@ class GroundSegmenter:
         if image is not None:
             label_kernels.mark_texture(image, config.texture, config.texture_px, self._textured)
         ground = self._find_ground(up_c, expected_m)
-        if ground is not None and expected_m is not None and abs(ground.height_m - expected_m) > config.expected_m:
-            ground = None
+        if ground is not None and expected_m is not None and certain:
+            ground = ground if ground.height_m > expected_m - config.expected_m else None
         return self._scan(ground, up_c, expected_m)
 
     def label_of(self, uv: F64) -> U8:
@@ -165,15 +168,15 @@ class GroundSegmenter:
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
             config.ground_sigmas, self._bands, config.slab_m, self.labels, grounds, obstacles, self._sums,
-            self._in_band, slab,
+            self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
             return self._scan(None, up_c, expected_m)
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
         bands = np.empty(n, np.uint8)
         label_kernels.collect_scan(
-            grounds, obstacles, self._sums, self._in_band, slab, self._azimuths, self.bf, config.column_pixels,
-            round(self._lowest_px / level_kernels.BIN_PX), self.sigma_px, _GAP_M, free_from, free, obstacle, bands,
-            clear,
+            grounds, obstacles, self._sums, self._in_band, slab, self._slab_sums, self._azimuths, self.bf,
+            config.column_pixels, round(self._lowest_px / level_kernels.BIN_PX), self.sigma_px, _GAP_M, free_from, free,
+            obstacle, bands, clear,
         )  # fmt: skip
         return ColumnScan(up_c, self._azimuth0, self._step, free_from, free, obstacle, bands, clear, height_m)

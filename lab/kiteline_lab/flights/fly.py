@@ -53,6 +53,8 @@ def parser() -> argparse.ArgumentParser:
                    help="begin with what earlier flights found of the rig, and write what this one finds")  # fmt: skip
     p.add_argument("--calibration", metavar="FILE[,FILE]", default="",
                    help="cameras, extrinsics and IMU noise in place of what each SOURCE says")  # fmt: skip
+    p.add_argument("--grid", choices=("agent", "off"), default="agent",
+                   help="who looks for ground and obstacles: the agents (default), or nobody")  # fmt: skip
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
     p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
@@ -81,7 +83,7 @@ def options(argv: list[str]) -> Options:
         tuple(a.sources), a.out, a.mode, a.link, a.profile, a.link_delay, up, down, a.link_loss, a.cpu, a.mono,
         not a.no_imu, a.realtime,
         a.config, a.rig, a.seed, a.seconds, a.store, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
-        calibration=a.calibration,
+        calibration=a.calibration, grid=a.grid,
     )  # fmt: skip
 
 

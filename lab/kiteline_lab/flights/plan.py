@@ -42,6 +42,7 @@ class Options:
     # when each base in turn is killed, s of flight time and s of real time after it; the next base follows
     base_kills: tuple[tuple[float, float], ...] = ()
     calibration: str = ""  # FILE[,FILE…] in place of the sources'
+    grid: str = "agent"  # who makes scans of ground and obstacles: agent, or off
 
 
 @dataclass(slots=True)
@@ -80,7 +81,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
         made.agents.append(
             AgentOptions(
                 source=text, folder=str(o.out / f"agent{k}"), agent=k, boot=boot, mono=o.mono, imu=o.imu,
-                config=o.config, rig=o.rig, calibration=o.calibration,
+                config=o.config, rig=o.rig, calibration=o.calibration, grid=o.grid,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,

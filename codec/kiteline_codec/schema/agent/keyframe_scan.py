@@ -21,9 +21,8 @@ _STEP_STEPS = 1 << 20  # codes in 1 rad: over 128 columns an error of 61 microra
 _MAX_AZIMUTH = 4 * _AZIMUTH_STEPS
 _HEIGHT_STEPS = 256  # codes in 1 m
 _MAX_HEIGHT = 1 << 18  # 1024 m
+_COARSE = 8  # range codes in a step of where free ground begins, which is rounded up: it depends on the image's border
 _LABELS = 3  # unknown, ground, obstacle
-_PACKED = 5  # labels in a byte
-_POWERS = _LABELS ** np.arange(_PACKED)
 
 
 @register
@@ -66,11 +65,10 @@ class KeyframeScan(Record):
             raise ValueError("an obstacle reaches into at least one height band, and only an obstacle does")
         obstacle = np.where(scan.bands > 0, quantise.range_codes(np.where(scan.bands > 0, scan.obstacle_m, 0.0)), 0)
         free_from, free, clear = (quantise.range_codes(r) for r in (scan.free_from_m, scan.free_m, scan.clear_m))
+        free_from = -(-free_from // _COARSE)
         out.residual_columns(_predicted(np.stack([obstacle, free, free_from, clear]), scan.bands.astype(np.int64)))
         out.varint(len(self.labels))
-        padded = np.zeros((-(-len(self.labels) // _PACKED), _PACKED), np.int64)
-        padded.reshape(-1)[: len(self.labels)] = self.labels
-        out.raw((padded @ _POWERS).astype(np.uint8).tobytes())
+        out.residual_columns(_LABELS - 1 - self.labels.astype(np.int64)[None])
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
@@ -87,17 +85,19 @@ class KeyframeScan(Record):
         if not step or not n:
             raise WireError("a scan has columns, and a step between them")
         obstacle, free, free_from, clear, bands = _ranges(source.residual_columns(5, n))
+        free_from = free_from * _COARSE
+        if free_from.max() >= quantise.RANGE_CODES:
+            raise WireError("free ground begins too far away")
         scan = ColumnScan(
             up_c, first / _AZIMUTH_STEPS, step / _STEP_STEPS, quantise.ranges(free_from), quantise.ranges(free),
             np.where(obstacle > 0, quantise.ranges(obstacle), np.inf), bands.astype(np.uint8), quantise.ranges(clear),
             unzigzag(height - 1) / _HEIGHT_STEPS if height else float("nan"),
         )  # fmt: skip
         m = source.varint(MAX_KEYPOINTS)
-        packed = np.frombuffer(source.raw(-(-m // _PACKED)), np.uint8).astype(np.int64)
-        labels = (packed[:, None] // _POWERS % _LABELS).reshape(-1)
-        if (packed >= _LABELS**_PACKED).any() or labels[m:].any():
+        labels = _LABELS - 1 - source.residual_columns(1, m)[0]
+        if m and (labels.min() < 0 or labels.max() >= _LABELS):
             raise WireError("labels are 0, 1 or 2")
-        return cls(KeyframeId(key.id), scan, labels[:m].astype(np.uint8))
+        return cls(KeyframeId(key.id), scan, labels.astype(np.uint8))
 
 
 def _predicted(ranges: I64, bands: I64) -> I64:
