@@ -16,6 +16,7 @@ from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
+from numba.np import arrayobj
 
 TRIED = ("0.68.",)  # beginnings of numba's versions
 
@@ -89,6 +90,8 @@ _lower = typed_passes.NativeLowering.run_pass
 _set_env = JITCPUCodegen.set_env
 _call_type = types.Dispatcher.get_call_type
 _resolve = BaseFunction.get_call_type
+_fix_index = arrayobj.fix_integer_index
+_lowering = [False]  # whether the code that is being generated is a kernel's, innermost last
 
 
 def lower(self: Any, state: Any) -> Any:
@@ -100,7 +103,21 @@ def lower(self: Any, state: Any) -> Any:
     if flags.no_cpython_wrapper and (flags.no_cfunc_wrapper or state.func_id.modname.startswith("numba.")):
         flags.no_cfunc_wrapper = True
         state.library.is_linked_only = True
-    return _lower(self, state)  # type: ignore[no-untyped-call]
+    _lowering.append(isinstance(state.pipeline, KernelCompiler) and not state.func_id.modname.startswith("numba."))
+    try:
+        return _lower(self, state)  # type: ignore[no-untyped-call]
+    finally:
+        _lowering.pop()
+
+
+def plain_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    """Take a kernel's index as it is: no kernel counts from the end of an array by a negative one.
+
+    The choice at each access stands in the way of vectors. With NUMBA_BOUNDSCHECK=1 a negative index raises IndexError.
+    """
+    if not _lowering[-1]:
+        return _fix_index(context, builder, kind, index, size)  # type: ignore[no-untyped-call]
+    return context.cast(builder, index, kind, types.intp if kind.signed else types.uintp)
 
 
 def set_env(self: Any, env_name: str, env: Any) -> None:
@@ -171,6 +188,7 @@ def install() -> dict[str, Any]:
         (typed_passes.NativeLowering, "run_pass", lower),
         (JITCPUCodegen, "_library_class", KernelLibrary),
         (JITCPUCodegen, "set_env", set_env),
+        (arrayobj, "fix_integer_index", plain_index),
         (ir.Inst, "_rec_list_vars", variables_in),
     ):
         setattr(owner, name, value)

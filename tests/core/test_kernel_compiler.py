@@ -1,3 +1,4 @@
+import ast
 import operator
 import os
 import re
@@ -13,6 +14,7 @@ from numba.core import ir
 from numba.core.compiler import run_frontend
 from numba.core.registry import cpu_target
 from numba.core.types.functions import BaseFunction
+from numba.np import arrayobj
 
 from kiteline_core import kernel_compiler
 from kiteline_core.imaging.matching_kernels import fill_cells
@@ -48,8 +50,41 @@ def _code(options: dict[str, Any]) -> str:
     return re.sub(r'_ZN[\w.$]+|@[\w.$"]+|[!#]\d+|\d{6,}', "", code)
 
 
-def test_the_short_pipeline_makes_the_same_code() -> None:
+def test_the_short_pipeline_makes_the_same_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrayobj, "fix_integer_index", kernel_compiler._fix_index)
     assert _code({"pipeline_class": KernelCompiler}) == _code({})
+
+
+def _at(line: Any, k: int) -> float:
+    return line[k] + line.max()
+
+
+def test_a_kernel_takes_an_index_as_it_is() -> None:
+    if not numba.__version__.startswith(kernel_compiler.TRIED):
+        pytest.skip("compiles as numba does")
+    line = np.arange(4.0)
+    usual: Any = numba.njit(_at)
+    kernel: Any = numba.njit(pipeline_class=KernelCompiler)(_at)
+    checked: Any = numba.njit(pipeline_class=KernelCompiler, boundscheck=True)(_at)
+    assert usual(line, -1) == 6.0
+    assert [kernel(line, k) for k in range(4)] == [checked(line, k) for k in range(4)] == [3.0, 4.0, 5.0, 6.0]
+    for k in (-1, 4):
+        with pytest.raises(IndexError):
+            checked(line, k)
+
+
+def test_no_kernel_counts_from_the_end_of_an_array() -> None:
+    root = Path(__file__).parents[2]
+    modules = [
+        path for room in ("core", "codec", "hw", "agent", "basestation") for path in (root / room).rglob("*_kernels.py")
+    ]
+    assert len(modules) > 30
+    for path in modules:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Subscript):
+                parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+                negative = [p for p in parts if isinstance(p, ast.UnaryOp) and isinstance(p.op, ast.USub)]
+                assert not negative, f"{path.name}:{node.lineno}"
 
 
 @numba.njit(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True, pipeline_class=KernelCompiler)

@@ -14,22 +14,29 @@ BORDER = 18  # least distance of a corner from the image border, px of its level
 def corner_scores(image, xy, score):  # type: ignore[no-untyped-def]
     """Smaller eigenvalue of the structure tensor over 7x7 px (J. Shi, C. Tomasi, 1994), per pixel of the window.
 
-    xy: (n,2) int32 pixels at least 5 px inside. score: (n,) float64 out.
+    xy: (n,2) int32 pixels at least 5 px inside. score: (n,) float64 out. The sums are exact: of integers.
     """
+    u1, u2 = np.uint64(1), np.uint64(2)
     for i in range(xy.shape[0]):
-        x = xy[i, 0]
-        y = xy[i, 1]
-        a = 0.0
-        b = 0.0
-        c = 0.0
-        for r in range(-3, 4):
-            for q in range(-3, 4):
-                dx = 0.5 * (float(image[y + r, x + q + 1]) - float(image[y + r, x + q - 1]))
-                dy = 0.5 * (float(image[y + r + 1, x + q]) - float(image[y + r - 1, x + q]))
-                a += dx * dx
-                b += dx * dy
-                c += dy * dy
-        score[i] = (0.5 * (a + c) - np.sqrt(0.25 * (a - c) * (a - c) + b * b)) / 49.0
+        left = np.uint64(xy[i, 0] - 4)
+        top = np.uint64(xy[i, 1] - 4)
+        a = np.int32(0)
+        b = np.int32(0)
+        c = np.int32(0)
+        for r in range(7):
+            y = top + np.uint64(r)
+            for q in range(7):
+                x = left + np.uint64(q)
+                dx = np.int32(image[y + u1, x + u2]) - np.int32(image[y + u1, x])
+                dy = np.int32(image[y + u2, x + u1]) - np.int32(image[y, x + u1])
+                a = np.int32(a + dx * dx)
+                b = np.int32(b + dx * dy)
+                c = np.int32(c + dy * dy)
+        # each slope is twice the derivative
+        half = 0.125 * (a + c)
+        apart = 0.25 * (a - c)
+        across = 0.25 * b
+        score[i] = (half - np.sqrt(0.25 * apart * apart + across * across)) / 49.0
 
 
 @njit
