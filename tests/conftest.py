@@ -21,6 +21,11 @@ settings.register_profile("ci", parent=settings.get_profile("default"), derandom
 settings.load_profile("ci" if IN_CI else "default")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of whole programs come first: they wait most, and their files take long, which is no way to end a run."""
+    items.sort(key=lambda item: item.path.parent != ROOT / "tests" / "system")
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of recordings: KITELINE_DATA, else ../shared/data beside the repository.
