@@ -11,6 +11,8 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_codec.channel import RecordChannel, plain_pair
+from kiteline_codec.schema import KeyframeHeader, SubmapTie
 from kiteline_core import odometry
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
@@ -22,10 +24,15 @@ DARK = range(70, 110)  # 2 s
 
 
 def fly(
-    room_flight: RoomFlight, driven: OdometryBatch | None, dark: range = range(0), *, one_eye: bool = False
+    room_flight: RoomFlight,
+    driven: OdometryBatch | None,
+    dark: range = range(0),
+    *,
+    one_eye: bool = False,
+    channel: RecordChannel | None = None,
 ) -> tuple[Agent, list[Estimate], list[str]]:
     rig = replace(room_flight.rig, right=None, T_c_r=None) if one_eye else room_flight.rig
-    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), channel or NoBaseChannel())
     out, events, done = [], [], 0
     for k, shown in enumerate(room_flight.frames):
         frame = replace(shown, right=None) if one_eye else shown
@@ -94,7 +101,8 @@ def test_a_bad_odometer_costs_nothing_in_sight(
 
 
 def test_a_monocular_map_gets_its_metre(room_flight: RoomFlight) -> None:
-    agent, found, events = fly(room_flight, room_flight.driven, one_eye=True)
+    near, far = plain_pair()
+    agent, found, events = fly(room_flight, room_flight.driven, one_eye=True, channel=near)
     assert agent.metric
     assert any(event.startswith("mono: metric") for event in events)
     metric = [k for k, e in enumerate(found) if e.submap == agent.submap and e.T_m_b is not None]
@@ -103,6 +111,17 @@ def test_a_monocular_map_gets_its_metre(room_flight: RoomFlight) -> None:
     true = se3.inverse(room_flight.truth[a]) @ room_flight.truth[b]
     assert np.linalg.norm(true[:3, 3]) > 0.3
     assert np.linalg.norm(flown[:3, 3]) == pytest.approx(np.linalg.norm(true[:3, 3]), rel=0.05)
+    # the base is told how the new submap lies to the last keyframe, whatever live poses reach it
+    said = far.receive((), 0)
+    (tie,) = [r for r in said if isinstance(r, SubmapTie)]
+    headers = {r.keyframe: r for r in said if isinstance(r, KeyframeHeader)}
+    T_b_c = agent.map.camera.T_b_c
+    before, first = (found[k].T_o_b @ T_b_c for k in (a - 1, a))
+    T_r_f, keyframe = tie.T_k_f, tie.since  # camera in the reference keyframe of the frame before
+    while keyframe != found[a - 1].keyframe:
+        T_r_f, keyframe = headers[keyframe].T_p_k @ T_r_f, headers[keyframe].parent
+    assert tie.submap == agent.submap
+    assert np.allclose(T_r_f, found[a - 1].T_k_c @ se3.inverse(before) @ first, rtol=0.0, atol=1e-6)
     plain, _, _ = fly(room_flight, None, one_eye=True)
     assert not plain.metric
 

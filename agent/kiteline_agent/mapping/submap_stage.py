@@ -29,6 +29,8 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
 
+_TRACKED_M, _TRACKED_RAD = 0.005, 0.002  # deviations of a tracked frame to its reference keyframe
+
 
 @dataclass(frozen=True, slots=True)
 class OpenedSubmap:
@@ -209,6 +211,7 @@ class SubmapStage:
 
     def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> None:
         camera = self._camera
+        since, T_k_c = camera.reference.keyframe, camera.reference.T_k_c.copy()
         camera.leave_map()
         self._channel.put(SubmapScale(camera.submaps.active, unit_m))
         T_new_old = camera.pose.rescale(unit_m)
@@ -217,4 +220,6 @@ class SubmapStage:
         keyframe = self._keyframes.make(ctx, None, metric.points, camera.pose.T_m_c, Extra.SUBMAP)
         metric.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))
+        if since != NO_KEYFRAME:
+            self._channel.put(SubmapTie(submap, since, T_k_c, _TRACKED_M, _TRACKED_RAD))
         camera.motion.set_scale(ctx.t_ns, unit_m, T_new_old)

@@ -1,4 +1,4 @@
-"""How a submap lies to the one before it, over a loss of images."""
+"""How a submap lies to the one before it: over a loss of images, or where a monocular map goes on in other metres."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from kiteline_core.ids import KeyframeId, SubmapId
 @register
 @dataclass(frozen=True, slots=True)
 class SubmapTie(Record):
-    """Motion of the camera while no image was tracked, by the IMU.
+    """Motion of the camera while no image was tracked, by the IMU; or from a keyframe to a frame that was tracked.
 
-    since: the last keyframe before. T_k_f: (4,4) camera of the submap's first keyframe in it. sigma_m, sigma_rad:
-    largest standard deviations of its position along any axis, and of its rotation about any; up to 0.47.
+    since: the last keyframe before, in whose submap's unit the motion is. T_k_f: (4,4) camera of the submap's first
+    keyframe in it. sigma_m, sigma_rad: largest standard deviations of its position along any axis, and of its rotation
+    about any; up to 0.47.
     """
 
     KIND = 10
