@@ -16,6 +16,7 @@ and the opening of the result after "Segfloor", equation 5.3 and section 5.6.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -45,7 +46,9 @@ class ScanGrid:
     def __init__(self, config: GridConfig) -> None:
         self.config = config
         self.revision = 0  # number of changes so far
-        self.touched: dict[Place, int] = {}  # revision at which a tile changed last; also of tiles that are gone
+        self.touched: dict[
+            Place, int
+        ] = {}  # revision of the last change, the oldest first; also of tiles that are gone
         self._store = TileStore(config.resident_tiles)
         self._drawn: dict[int, _Drawn] = {}
         self._storeys: Counter[tuple[int, ...]] = Counter()  # scans by the storeys on which they are drawn
@@ -112,7 +115,10 @@ class ScanGrid:
     def log_odds(self, place: Place) -> NDArray[np.int16]:
         """Log-odds (BANDS, 64, 64) int16 of a tile."""
         slot = int(self._store.open_box(place.storey, place.row, place.column, 1, 1)[0, 0])
-        return np.zeros((BANDS, SIDE, SIDE), np.int16) if slot < 0 else self._store.pool[slot].copy()
+        if slot < 0:
+            return np.zeros((BANDS, SIDE, SIDE), np.int16)
+        planes = self._store.pool[slot]
+        return np.asarray(planes[:1] + planes[1:])
 
     def cells(self, place: Place) -> tuple[I8, int]:
         """Cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands; and how many are known."""
@@ -127,7 +133,7 @@ class ScanGrid:
 
     def stale_since(self, revision: int) -> Iterable[Place]:
         """Tiles whose cells may have changed after a revision: those that were drawn on, and those around them."""
-        changed = {place for place, at in self.touched.items() if at > revision}
+        changed = set(itertools.takewhile(lambda place: self.touched[place] > revision, reversed(self.touched)))
         return changed | {
             Place(storey, row + r, column + c)
             for storey, row, column in changed
@@ -179,6 +185,7 @@ class ScanGrid:
             for r, c in np.argwhere(touched).tolist():
                 place = Place(storey, box[0] + r, box[1] + c)
                 self._store.enter(place, int(slots[r, c]), sign)
+                self.touched.pop(place, None)
                 self.touched[place] = self.revision
         kernels.clear_hits(hits, cells, found)
         self._store.close()

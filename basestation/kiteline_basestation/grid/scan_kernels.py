@@ -1,8 +1,9 @@
 """Kernels that draw a column scan into tiles of log-odds, and that read the state of their cells.
 
 Cells are numbered from the lower left corner of a box of tiles; `slots` (rows, columns) int32 maps a tile of the box to
-its place in the pool (capacity, BANDS, 64, 64) int16, -1 none. All drawing is the sum of integers, so that a scan that
-is drawn with sign -1 leaves no trace.
+its place in the pool (capacity, PLANES, 64, 64) int16, -1 none. Plane 0 holds what all height bands have in common, and
+plane 1 + b what band b has beyond it. All drawing is the sum of integers, so that a scan that is drawn with sign -1
+leaves no trace.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ F64 = NDArray[np.float64]
 
 SIDE = 64  # cells along a side of a tile: the shape of a GridTile record
 BANDS = 3  # height bands
+PLANES = 1 + BANDS
 _SHIFT, _MASK = 6, SIDE - 1  # quotient and remainder by SIDE
 _ALL = (1 << BANDS) - 1
 _MOST = 32767  # log-odds saturate: a cell that was seen so often stays what it is
@@ -42,8 +44,8 @@ def _tile(row: int, column: int, slots: I32, spare: I32, used: I64) -> int:
 def _add(pool: I16, slot: int, row: int, column: int, bands: int, value: int) -> None:
     for b in range(BANDS):
         if bands >> b & 1:
-            total = int(pool[slot, b, row & _MASK, column & _MASK]) + value
-            pool[slot, b, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
+            total = int(pool[slot, 1 + b, row & _MASK, column & _MASK]) + value
+            pool[slot, 1 + b, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
 
 
 @njit
@@ -101,11 +103,17 @@ def draw_free(
     far_weight: beyond. Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
+    near2 = near_cells * near_cells
     for i in range(free.shape[0]):
         start, end, low, clear = free[i, 0], free[i, 1], free[i, 2], free[i, 3] if camera_band >= 0 else 0.0
         reach = max(end, low, clear)
         if reach <= 0.0:
             continue
+        start2, end2, low2, clear2 = start * start, end * end, max(end, low) ** 2, clear * clear
+        if end <= 0.0:
+            end2 = -1.0
+        if max(end, low) <= 0.0:
+            low2 = -1.0
         a0, a1 = first_rad + i * step_rad, first_rad + (i + 1) * step_rad
         c0, s0, c1, s1 = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
         bottom = max(0, int(np.floor(y + min(0.0, reach * s0, reach * s1) - 1.0)))
@@ -130,23 +138,30 @@ def draw_free(
                 last = min(last, int(np.ceil(c1 / s1 * dy + x - 0.5)) - 1)
             elif c1 * dy >= 0.0:
                 continue
-            for column in range(max(first, 0), min(last, columns - 1) + 1):
-                dx = column + 0.5 - x
-                distance = np.sqrt(dx * dx + dy * dy)
-                bands = 0
-                if distance >= start:
-                    if distance <= end:
-                        bands = _ALL
-                    elif distance <= low:
-                        bands = int(np.int64(under[i]))
-                if distance <= clear:
-                    bands |= 1 << camera_band
-                bands &= ~int(np.int64(hits[row, column]))
-                if bands & _ALL:
-                    slot = _tile(row, column, slots, spare, used)
-                    touched[row >> _SHIFT, column >> _SHIFT] = 1
-                    taken = weight if distance <= near_cells else far_weight
-                    _add(pool, slot, row, column, bands & _ALL, -sign * taken)
+            first, last = max(first, 0), min(last, columns - 1)
+            while first <= last:  # a run of cells in one tile
+                slot, end_of_run = -1, min(last, first | _MASK)
+                for column in range(first, end_of_run + 1):
+                    dx = column + 0.5 - x
+                    distance2 = dx * dx + dy * dy
+                    bands = 0
+                    if start2 <= distance2 <= low2:
+                        bands = _ALL if distance2 <= end2 else int(np.int64(under[i]))
+                    if distance2 <= clear2:
+                        bands |= 1 << camera_band
+                    bands &= ~int(np.int64(hits[row, column]))
+                    if bands == 0:
+                        continue
+                    if slot < 0:
+                        slot = _tile(row, column, slots, spare, used)
+                        touched[row >> _SHIFT, column >> _SHIFT] = 1
+                    value = -sign * (weight if distance2 <= near2 else far_weight)
+                    if bands == _ALL:
+                        total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
+                        pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
+                    else:
+                        _add(pool, slot, row, column, bands, value)
+                first = end_of_run + 1
 
 
 @njit
@@ -162,9 +177,9 @@ def _state(pool: I16, slots: I32, row: int, column: int, occupied_from: int, fre
     slot = slots[(row + SIDE) >> _SHIFT, (column + SIDE) >> _SHIFT]
     if slot < 0:
         return -1
-    mask, free = 0, 0
+    mask, free, common = 0, 0, int(pool[slot, 0, row & _MASK, column & _MASK])
     for b in range(BANDS):
-        value = int(pool[slot, b, row & _MASK, column & _MASK])
+        value = common + int(pool[slot, 1 + b, row & _MASK, column & _MASK])
         mask |= (value >= occupied_from) << b
         free += value <= -free_from
     return mask if mask else 0 if free == BANDS else -1

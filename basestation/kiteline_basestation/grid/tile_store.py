@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
+from kiteline_basestation.grid.scan_kernels import PLANES, SIDE
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
 
-_SHAPE = (BANDS, SIDE, SIDE)
+_SHAPE = (PLANES, SIDE, SIDE)
 
 
 class Place(NamedTuple):
@@ -26,7 +26,7 @@ class Place(NamedTuple):
 
 
 class TileStore:
-    """Log-odds (BANDS, 64, 64) int16 by place. A tile exists while a scan touches it.
+    """Planes of log-odds (PLANES, 64, 64) int16 by place. A tile exists while a scan touches it.
 
     `pool` holds the inflated ones; `open_box` inflates those of a box and names their slots.
     """
@@ -93,8 +93,8 @@ class TileStore:
             place = next(iter(self._slots))
             slot = self._slots.pop(place)
             planes = self.pool[slot]
-            data = np.concatenate([planes[:1], np.diff(planes, axis=0)])  # bands differ little
-            self._deflated[place] = zlib.compress(data.tobytes(), 1)
+            used = [k for k in range(PLANES) if planes[k].any()]
+            self._deflated[place] = bytes(used) + b"\xff" + zlib.compress(planes[used].tobytes(), 1)
             self._release(slot)
 
     def _release(self, slot: int) -> None:
@@ -104,9 +104,9 @@ class TileStore:
     def _inflate(self, place: Place) -> int:
         held = self._slots.pop(place, None)
         if held is None:
-            data = np.frombuffer(zlib.decompress(self._deflated.pop(place)), np.int16).reshape(_SHAPE)
+            used, data = self._deflated.pop(place).split(b"\xff", 1)
             self.spare(1)
             held = self._spare.pop()
-            np.cumsum(data, axis=0, dtype=np.int16, out=self.pool[held])
+            self.pool[held, list(used)] = np.frombuffer(zlib.decompress(data), np.int16).reshape(-1, SIDE, SIDE)
         self._slots[place] = held
         return held

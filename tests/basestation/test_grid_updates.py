@@ -1,0 +1,197 @@
+"""The grid as the mapper draws it: from scans and landmarks, after corrections, restarts and deletions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.grid.grid_view import dense
+from kiteline_basestation.grid.kept_scan import keep
+from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, messages
+from kiteline_core.ground.column_scan import level_rotation
+from kiteline_core.ids import KEYPOINT_BITS, submap_of_keyframe
+from tests.basestation.flat_rooms import box, scan_of
+
+MakeFlight = Callable[..., Any]
+ROOM = np.array(box(-4.0, -3.5, 4.0, 3.5))  # that of `make_flight`
+HEIGHT_M = 1.5
+STEP_NS = 500_000_000
+
+
+def scans(flight: Any, first: int = 0, last: int | None = None) -> list[KeyframeScan]:
+    """What each keyframe truly saw; even keypoints lie on the ground, odd ones on obstacles."""
+    out = []
+    for keyframe, T_w_k in list(zip(flight.keyframes, flight.true_T_w_k, strict=True))[first:last]:
+        up = T_w_k[2, :3]
+        ahead = T_w_k[:3, :3] @ level_rotation(up)[:, 0]
+        scan = scan_of(ROOM, T_w_k[0, 3], T_w_k[1, 3], float(np.arctan2(ahead[1], ahead[0])))
+        changes = {"up_c": up, "camera_height_m": HEIGHT_M + T_w_k[2, 3]}
+        scan = type(scan)(**{f: changes.get(f, getattr(scan, f)) for f in scan.__dataclass_fields__})
+        record = KeyframeScan(keyframe, scan, (1 + np.arange(150) % 2).astype(np.uint8))
+        decoded = messages.decode(messages.key(record), messages.encode(record))
+        assert isinstance(decoded, KeyframeScan)
+        out.append(decoded)
+    return out
+
+
+def feed(mapper: Mapper, flight: Any, groups: Sequence[Sequence[Record]], more: int = 12) -> list[Record]:
+    done: tuple[JobDone, ...] = ()
+    published: list[Record] = []
+    for n, records in enumerate([[CameraIntrinsics(flight.agent, flight.camera)], *groups, *[[]] * more]):
+        output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * STEP_NS)
+        done = tuple(run_job(job) for job in output.jobs)
+        for _, out in output.publish:
+            published.extend(out)
+    return published
+
+
+def with_scans(flight: Any, late: int = 2) -> list[list[Record]]:
+    """The records of a flight, with each scan some keyframes after its keyframe."""
+    groups: list[list[Record]] = [list(records) for records in flight.records]
+    groups += [[] for _ in range(late)]
+    for n, scan in enumerate(scans(flight)):
+        groups[n + late].append(scan)
+    return groups
+
+
+def from_scratch(mapper: Mapper, records: Sequence[KeyframeScan]) -> ScanGrid:
+    grid = ScanGrid(mapper.config.grid)
+    for record in reversed(records):
+        pose = mapper.map.pose(record.keyframe)
+        S_w_m = mapper.placements.get(submap_of_keyframe(record.keyframe))
+        camera = mapper.map.cameras[next(iter(mapper.map.cameras))]
+        kept = keep(grid.config, record.scan, camera.bf)
+        if pose is not None and S_w_m is not None and kept is not None:
+            grid.put(record.keyframe, kept, S_w_m @ pose)
+    return grid
+
+
+def assert_equal(a: ScanGrid, b: ScanGrid) -> None:
+    assert a.places == b.places
+    assert all(np.array_equal(a.log_odds(place), b.log_odds(place)) for place in a.places)
+
+
+def known(grid: ScanGrid) -> tuple[NDArray[np.int8], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Cells of the main storey, those well inside the room, and those well outside."""
+    cells, corner, cell = dense(grid, grid.main_storey())
+    rows, columns = np.indices(cells.shape)
+    x, y = corner[0] + (columns + 0.5) * cell, corner[1] + (rows + 0.5) * cell
+    return cells, (abs(x) < 3.7) & (abs(y) < 3.2), (abs(x) > 4.4) | (abs(y) > 3.9)
+
+
+def test_scans_of_a_flight_draw_its_room_and_the_grid_equals_that_of_the_final_poses(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=40, turns=1.5, memory=3)
+    mapper = Mapper()
+    feed(mapper, flight, with_scans(flight))
+    assert_equal(mapper.grid, from_scratch(mapper, scans(flight)))
+    assert mapper.settled_grid() is mapper.grid
+    cells, inside, outside = known(mapper.grid)
+    assert np.mean(cells[inside] == 0) > 0.5 and np.mean(cells[inside] > 0) < 0.01
+    assert np.mean(cells[outside] == 0) < 0.002
+
+
+def test_a_loop_that_moves_keyframes_by_half_a_metre_is_drawn_over_several_steps(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=40, turns=1.5)
+    mapper = Mapper()
+    feed(mapper, flight, with_scans(flight))
+    for n, keyframe in enumerate(flight.keyframes):
+        pose = mapper.map.pose(keyframe)
+        assert pose is not None
+        pose[:3, 3] += [0.5 * n / 39, -0.3 * n / 39, 0.0]
+        mapper.map.set_pose(keyframe, pose)
+    expected = from_scratch(mapper, scans(flight))
+    assert_equal(mapper.settled_grid(), expected)
+    steps = 0
+    while mapper.settled_grid() is not mapper.grid:
+        mapper.step(MapperInput(()), 10**12)
+        steps += 1
+    assert steps >= 40 // mapper.config.grid.drawn_per_step
+    assert_equal(mapper.grid, expected)
+
+
+def test_two_runs_are_equal_whatever_the_order_of_scans(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=16, turns=0.6)
+    grids = []
+    for late in (0, 0, 5):
+        mapper = Mapper()
+        feed(mapper, flight, with_scans(flight, late))
+        grids.append(mapper.grid)
+    assert_equal(grids[0], grids[1])
+    assert grids[0].revision == grids[1].revision
+    assert_equal(grids[0], grids[2])
+
+
+def test_a_restored_map_has_the_same_grid(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=20, turns=0.8)
+    first = Mapper()
+    published = feed(first, flight, with_scans(flight))
+    records = [r for group in with_scans(flight) for r in group]
+    own = {messages.key(r): r for r in published}
+    second = Mapper()
+    camera = CameraIntrinsics(flight.agent, flight.camera)
+    second.restore(flight.agent, (camera, *records), tuple(own[key] for key in sorted(own)), 0)
+    second.restore_state(first.state())
+    assert second.idle
+    assert_equal(second.settled_grid(), first.grid)
+    for _ in range(4):
+        second.step(MapperInput(()), 0)
+    assert_equal(second.grid, first.grid)
+
+
+def test_deleted_submaps_leave_the_grid(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=12, turns=0.5)
+    mapper = Mapper()
+    feed(mapper, flight, with_scans(flight))
+    assert mapper.grid.places
+    mapper._delete([submap_of_keyframe(flight.keyframes[0])])
+    assert not mapper.grid.places and not len(mapper.grid)
+    feed(mapper, flight, [scans(flight)])
+    assert not mapper.grid.places
+
+
+def test_landmarks_draw_the_grid_until_scans_come(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=20, turns=1.0, points=1500, scene=floor_and_walls())
+    mapper = Mapper()
+    feed(mapper, flight, flight.records)
+    assert len(mapper.grid) > 12
+    cells, inside, outside = known(mapper.grid)
+    assert np.mean(cells[inside] == 0) > 0.2 and np.mean(cells[inside] > 0) < 0.05
+    assert np.mean(cells[outside] == 0) < 0.01
+    landmarks = mapper.map.live_landmarks()
+    xyz, _ = mapper.map.positions(landmarks)
+    labels = mapper.labels(landmarks)
+    assert np.mean(labels[xyz[:, 2] < -1.45] == 1) > 0.7
+    assert np.mean(labels[(xyz[:, 2] > -1.2) & (xyz[:, 2] < 0.4)] == 2) > 0.7
+    feed(mapper, flight, [scans(flight, 5)])
+    assert_equal(mapper.grid, from_scratch(mapper, scans(flight, 5)))
+
+
+def test_labels_of_the_agent_go_by_keypoint(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=6, turns=0.2)
+    mapper = Mapper(BaseConfig())
+    feed(mapper, flight, with_scans(flight, 0))
+    landmarks = mapper.map.live_landmarks()
+    index = mapper.map.keypoint_of(landmarks)
+    expected = np.where(index < 150, 1 + index % 2, 0)
+    assert np.array_equal(mapper.labels(landmarks), expected)
+    assert np.array_equal(mapper.map.landmark_ids(landmarks) & ((1 << KEYPOINT_BITS) - 1), index)
+    assert not len(mapper.labels(landmarks[:0]))
+
+
+def floor_and_walls() -> Any:
+    """The room of `make_flight` with a floor, as its scene."""
+    from tests.basestation import conftest
+
+    rng = np.random.default_rng(1)
+    scene = conftest.room(rng, 1800)
+    scene.world[:700, 2] = -1.5
+    scene.world[:700, :2] = rng.uniform(-1, 1, (700, 2)) * [3.9, 3.4]
+    return scene
