@@ -28,6 +28,7 @@ from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
+from kiteline_agent.scans.local_grid import LocalGrid, Surroundings
 from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -47,6 +48,8 @@ from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 
+# Forward, right, down of a vehicle that flies where its camera looks.
+_T_C_F = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
 
 
@@ -88,7 +91,7 @@ class Agent:
             )  # fmt: skip
         self._corrections = Corrections(
             self.map, self.map_cache, config.smoothing,
-            None if self.right_camera is None else self.right_camera.take_base,
+            None if self.right_camera is None else self.right_camera.take_base, config.local_grid.tiles,
         )  # fmt: skip
         rows = None if self.right_camera is None else self.right_camera.rows
         maker = KeyframeMaker(self.map, channel, rows, self.work)
@@ -101,6 +104,7 @@ class Agent:
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
             self._two_view_start, inertial_start, self._governor, channel,
         )  # fmt: skip
+        self._local_grid = LocalGrid(config.local_grid)
         self._scans = None
         if self._has_depth and config.scan.on:
             self._scans = ScanStage(
@@ -117,6 +121,7 @@ class Agent:
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
+        self._told_t_ns = 0  # when the log was last told of the nearest obstacle
         channel.put(CameraIntrinsics(identity.agent, camera))
         if self.right_camera is not None:
             self.right_camera.begin_with(config.known_rig)
@@ -198,8 +203,7 @@ class Agent:
             # 7. Make a keyframe if the policy needs one.
             self._relocaliser.enter_keyframes()  # of earlier frames
             events += self._keyframes.add_if_needed(ctx, track)
-            if self._scans is not None:
-                self._scans.step(ctx)
+            events += self._scan(ctx)
             # 8. Join an older submap, or continue a monocular one in metres.
             events += self._submaps.join_older(ctx, track)
             restarted = self._submaps.restart_in_metres(ctx, track)
@@ -275,6 +279,19 @@ class Agent:
         self._corrections.set_upright(alignment)
         return [f"submap tilted by {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees"]
 
+    def _scan(self, ctx: FrameContext) -> list[str]:
+        """Go on with a scan of ground and obstacles; a finished one is drawn into the local grid. Returns events."""
+        scanned = None if self._scans is None else self._scans.step(ctx)
+        if scanned is None:
+            return []
+        self._local_grid.add(scanned)
+        if ctx.t_ns - self._told_t_ns < self._full_config.scan.told_s * 1e9:
+            return []
+        self._told_t_ns = ctx.t_ns
+        pose = self._camera.pose
+        around = self._local_grid.around(pose.T_o_m @ pose.T_m_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)
+        return [] if around is None else [around.line]
+
     def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
         """Whether to track the frame, at the effort that the governor decides; its IMU samples are kept. And events."""
         if step_input.imu is not None:
@@ -318,6 +335,15 @@ class Agent:
     def tiles(self) -> dict[tuple[int, int], GridTile]:
         """Tiles of the base's grid, by column and row."""
         return self._corrections.tiles
+
+    def surroundings(self, estimate: Estimate, T_b_f: F64) -> Surroundings | None:
+        """Obstacles around the vehicle, by its own scans and the base's grid; None if nothing is known.
+
+        T_b_f: (4,4) vehicle (forward, right, down) in the body.
+        """
+        T_w_f = None if estimate.T_w_b is None else estimate.T_w_b @ T_b_f
+        bands_m = self._full_config.ground.bands_m
+        return self._local_grid.around(estimate.T_o_b @ T_b_f, T_w_f, self.tiles, bands_m)
 
     @property
     def metric(self) -> bool:

@@ -10,6 +10,8 @@ from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial_start_config import InertialStartConfig
 from kiteline_agent.known_rig import KnownRigConfig
+from kiteline_agent.scans.scan_config import LocalGridConfig as LocalGridConfig
+from kiteline_agent.scans.scan_config import ScanConfig as ScanConfig
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
@@ -338,16 +340,6 @@ class GovernorConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class ScanConfig:
-    """When keyframes are scanned for ground and obstacles; `ground` says how."""
-
-    on: bool = True  # False: the agent makes no scans
-    moved_m: float = 0.2  # m since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
-    turned_rad: float = 0.17  # rad since the last scan: a tenth of the field of view is new
-    doubted: int = 6  # scans without the expected ground, after which another height is believed
-
-
-@dataclass(frozen=True, slots=True)
 class LogConfig:
     """Images in the log; those of a source that delivers them encoded are logged as they are."""
 
@@ -387,5 +379,6 @@ class AgentConfig:
     matching: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
     scan: ScanConfig = field(default_factory=ScanConfig)
+    local_grid: LocalGridConfig = field(default_factory=LocalGridConfig)
     ground: GroundConfig = field(default_factory=GroundConfig)
     log: LogConfig = field(default_factory=LogConfig)

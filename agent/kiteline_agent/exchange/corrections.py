@@ -46,9 +46,12 @@ class Corrections:
 
     def __init__(
         self, local_map: LocalMap, cache: MapCache, smoothing: SmoothingConfig,
-        calibrate: Callable[[DisparityCalibration], list[str]] | None = None,
+        calibrate: Callable[[DisparityCalibration], list[str]] | None = None, most_tiles: int = 512,
     ) -> None:  # fmt: skip
-        """calibrate: takes over an offset of disparities, and returns events; None without a right camera."""
+        """calibrate: takes over an offset of disparities, and returns events; None without a right camera.
+
+        most_tiles: tiles that are kept.
+        """
         self._map = local_map
         self._calibrate = calibrate
         self._cache = cache
@@ -61,6 +64,7 @@ class Corrections:
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self._continued: SubmapId | None = None  # submap that began in a tracked frame
         self._upright: GravityAlignment | None = None  # of the submap that began in motion
+        self._most_tiles = most_tiles
         self.tiles: dict[tuple[int, int], GridTile] = {}
         # A handler returns whether the local map moved.
         self._handlers: Mapping[type[Record], Callable[[Any], bool]] = {
@@ -143,6 +147,8 @@ class Corrections:
 
     def _add_tile(self, record: GridTile) -> bool:
         self.tiles[record.column, record.row] = record
+        if len(self.tiles) > self._most_tiles:  # the base sends what lies near: the farthest from that goes
+            del self.tiles[max(self.tiles, key=lambda at: max(abs(at[0] - record.column), abs(at[1] - record.row)))]
         return False
 
     def note_continued(self, submap: SubmapId) -> None:

@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.exchange.obstacles import REACH_M, obstacle_distances
 from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
@@ -17,7 +16,7 @@ from kiteline_hw.sources.overrides import with_other_imu
 from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 
-OBSTACLES_HZ = 5.0  # of distances around the vehicle; ArduPilot drops those older than half a second
+OBSTACLES_HZ = 10.0  # distances to obstacles, a flight controller wants 10 to 15
 
 
 def controller_link(
@@ -79,10 +78,10 @@ def pose_sample(agent: Agent, output: StepOutput, t_ns: int, epoch: int) -> Pose
 
 
 def push_obstacles(controller: ControllerLink, agent: Agent, output: StepOutput | None, now_ns: int) -> None:
-    """Send what the base's grid has around the vehicle, while the vehicle is tracked in it."""
+    """Send what stands around the vehicle, while it is tracked."""
     estimate = None if output is None else output.estimate
-    if estimate is None or not estimate.tracked or estimate.T_w_b is None:
+    if estimate is None or not estimate.tracked:
         return
-    distances = obstacle_distances(agent.tiles, estimate.T_w_b @ controller.T_b_f)
-    if distances is not None:
-        controller.push_obstacles(distances.tolist(), REACH_M, now_ns)
+    around = agent.surroundings(estimate, controller.T_b_f)
+    if around is not None:
+        controller.push_obstacles(around.distance_m.tolist(), around.reach_m, now_ns)

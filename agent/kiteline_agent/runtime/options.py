@@ -51,7 +51,7 @@ class AgentOptions:
     heading: str = "start"  # of the poses sent: start (0 at the start), controller (as it has it)
     pose_messages: str = "odometry"  # odometry, or vision: the older messages
     origin: str = ""  # LAT,LON,ALT to set in the flight controller; "": none
-    obstacles: bool = False  # send OBSTACLE_DISTANCE from the base's grid
+    obstacles: bool = False  # send OBSTACLE_DISTANCE
     mavlink_key: str = ""  # a file with the key of MAVLink's signatures; "": none
     grid: str = "agent"  # who makes scans of ground and obstacles: agent, or off
     imu_of: str = ""  # whose IMU is used: controller; "": the source's, if it has one
@@ -157,7 +157,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     )  # fmt: skip
     p.add_argument(
         "--obstacles", action="store_true",
-        help="send distances to obstacles around the vehicle (OBSTACLE_DISTANCE) from the base's grid",
+        help="send distances to obstacles around the vehicle (OBSTACLE_DISTANCE)",
     )  # fmt: skip
     p.add_argument(
         "--grid", choices=("agent", "off"), default="agent",

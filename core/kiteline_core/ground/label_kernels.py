@@ -175,5 +175,5 @@ def collect_scan(  # type: ignore[no-untyped-def]
             free[c] = far
         if free[c] > 0.0 and obstacle[c] < np.inf:
             deviation = obstacle[c] * sigma_px / (bf * along / obstacle[c])
-            if free[c] > obstacle[c] or obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
-                free[c] = obstacle[c]
+            if obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):  # up to its foot, as well as that is known
+                free[c] = max(obstacle[c] - deviation, free_from[c])

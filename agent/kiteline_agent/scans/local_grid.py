@@ -1,0 +1,187 @@
+"""What stands around the vehicle at its height: its own newest scans, and the base's grid where those saw nothing."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.scans import local_grid_kernels as kernels
+from kiteline_agent.scans.scan_config import LocalGridConfig
+from kiteline_agent.scans.scan_stage import Scanned
+from kiteline_codec.schema import GridTile
+from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS
+from kiteline_core.ground.column_scan import ColumnScan, level_rotation
+
+F64 = NDArray[np.float64]
+I8 = NDArray[np.int8]
+
+SECTORS = 72  # of 5 degrees
+_CELLS = 512  # along each side of the local grid
+_WINDOW = 512  # the same of the tiles around the vehicle
+_MOST_DRAWN = 8000  # scans between two drawings of all: marks are 16-bit numbers
+_RAYS = 5  # in each sector
+_LEAST_HEADING = 0.3  # horizontal part of the vehicle's forward axis: less has no heading
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """A scan in the grid's axes. x_m, y_m, z_m: of its camera. heading: of its azimuth 0."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    heading: float
+    scan: ColumnScan
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """Distances (SECTORS,) in m to obstacles in sectors clockwise from ahead; inf: none up to reach_m, nan: unknown."""
+
+    distance_m: F64
+    reach_m: float
+
+    @property
+    def nearest(self) -> tuple[float, float] | None:
+        """Distance in m and direction in rad, clockwise from ahead, of the nearest obstacle; None without one."""
+        finite = np.where(np.isfinite(self.distance_m), self.distance_m, np.inf)
+        k = int(np.argmin(finite))
+        if not np.isfinite(finite[k]):
+            return None
+        turn = 2.0 * np.pi * k / SECTORS
+        return float(finite[k]), turn if turn <= np.pi else turn - 2.0 * np.pi
+
+    @property
+    def line(self) -> str:
+        """The nearest obstacle, for the log."""
+        unknown = 100.0 * float(np.isnan(self.distance_m).mean())
+        if self.nearest is None:
+            return f"nearest obstacle: none seen, {unknown:.0f} % unknown"
+        distance_m, turn_rad = self.nearest
+        turn = f"{abs(np.degrees(turn_rad)):.0f} degrees {'right' if turn_rad >= 0.0 else 'left'}"
+        return f"nearest obstacle: {distance_m:.2f} m, {turn}, {unknown:.0f} % unknown"
+
+
+class LocalGrid:
+    """The newest scans in a grid about the vehicle, in the odometry frame levelled by gravity: no correction moves it.
+
+    Takes 1.2 MB. A scan is drawn when it comes; all are drawn again when the vehicle has moved on or climbed.
+    """
+
+    def __init__(self, config: LocalGridConfig) -> None:
+        self._config = config
+        self._cells: I8 = np.zeros((_CELLS, _CELLS), np.int8)
+        self._marks = np.zeros((_CELLS, _CELLS), np.int16)
+        self._window: I8 = np.zeros((_WINDOW, _WINDOW), np.int8)
+        self._window_of: tuple[object, ...] = ()
+        self._scans: deque[_Drawn] = deque(maxlen=config.scans)
+        self._R_g_o: F64 | None = None
+        self._corner = np.zeros(2)  # of the grid, m
+        self._z_m = 0.0  # at which scans are drawn
+        self._number = 0
+        self._ground_m: float | None = None  # z of the ground of the newest scan that saw it
+
+    def add(self, scanned: Scanned) -> None:
+        """Draw a new scan."""
+        T, scan = scanned.T_o_c, scanned.record.scan
+        R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
+        if self._R_g_o is None:
+            self._R_g_o = R_l_o
+        p = self._R_g_o @ T[:3, 3]
+        ahead = self._R_g_o @ R_l_o.T[:, 0]
+        drawn = _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan)
+        self._scans.append(drawn)
+        if np.isfinite(scan.camera_height_m):
+            self._ground_m = drawn.z_m - scan.camera_height_m
+        if not self._moved_on(drawn.x_m, drawn.y_m, drawn.z_m):
+            self._draw(drawn)
+
+    def around(
+        self, T_o_f: F64, T_w_f: F64 | None, tiles: Mapping[tuple[int, int], GridTile], bands_m: tuple[float, ...]
+    ) -> Surroundings | None:
+        """Obstacles around the vehicle (forward, right, down) at T_o_f (4,4) in o, and T_w_f in w if that is known.
+
+        bands_m: limits of the height bands of tiles. None without a scan or tile, and with the nose up or down.
+        """
+        config = self._config
+        if self._R_g_o is None and (not tiles or T_w_f is None):
+            return None
+        R = np.eye(3) if self._R_g_o is None else self._R_g_o
+        p, ahead = R @ T_o_f[:3, 3], R @ T_o_f[:3, 0]
+        if float(np.hypot(ahead[0], ahead[1])) < _LEAST_HEADING:
+            return None
+        self._moved_on(float(p[0]), float(p[1]), float(p[2]))
+        own_at = np.array([*(p[:2] - self._corner), np.arctan2(ahead[1], ahead[0])])
+        cell_m, tile_at = config.cell_m, np.zeros(3)
+        if tiles and T_w_f is not None:
+            height_m = None if self._ground_m is None else float(p[2]) - self._ground_m
+            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.slab_m))
+            tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
+        else:
+            self._window[:], self._window_of = 0, ()
+        out = np.empty(SECTORS)
+        kernels.read_distances(
+            self._cells, config.cell_m, own_at, self._window, cell_m, tile_at, config.vehicle_m, config.reach_m, _RAYS,
+            out,
+        )  # fmt: skip
+        return Surroundings(out, config.reach_m)
+
+    def _moved_on(self, x_m: float, y_m: float, z_m: float) -> bool:
+        """Draw all scans anew about a place if it is no longer in the middle of the grid. True if they were."""
+        side_m = _CELLS * self._config.cell_m
+        centre = self._corner + 0.5 * side_m
+        near = bool(np.abs(centre - [x_m, y_m]).max() < 0.5 * side_m - self._config.reach_m - 0.2)
+        if 0 < self._number < _MOST_DRAWN and near and abs(z_m - self._z_m) < self._config.slab_m:
+            return False
+        self._corner, self._z_m, self._number = np.array([x_m, y_m]) - 0.5 * side_m, z_m, 0
+        self._cells[:], self._marks[:] = 0, 0
+        for drawn in self._scans:
+            self._draw(drawn)
+        return True
+
+    def _draw(self, drawn: _Drawn) -> None:
+        """Draw a scan, unless it was made much higher or lower."""
+        config, scan = self._config, drawn.scan
+        if abs(drawn.z_m - self._z_m) > config.slab_m + config.seen_m:
+            return
+        self._number += 1
+        kernels.draw_rays(
+            self._cells, self._marks, self._number, drawn.x_m - self._corner[0], drawn.y_m - self._corner[1],
+            drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, scan.clear_m, config.reach_m, config.cell_m,
+        )  # fmt: skip
+
+    def _place_window(self, T_w_f: F64, tiles: Mapping[tuple[int, int], GridTile], mask: int) -> tuple[float, F64]:
+        """Copy the tiles around the vehicle together, if they have changed. Returns size of a cell and corner in w."""
+        first = next(iter(tiles.values()))
+        cell_m = first.cell_m
+        side_m = TILE_CELLS * cell_m
+        column, row = (int(np.clip(v // side_m, -(1 << 23), 1 << 23)) for v in T_w_f[:2, 3])
+        reach = _WINDOW // TILE_CELLS // 2
+        window_of = column, row, mask, cell_m, tuple(map(id, tiles.values()))
+        corner = np.array([column - reach, row - reach]) * side_m
+        if window_of == self._window_of:
+            return cell_m, corner
+        self._window_of = window_of
+        self._window[:] = 0
+        for (c, r), tile in tiles.items():
+            i, j = r - row + reach, c - column + reach
+            if tile.cell_m != cell_m or not (0 <= i < 2 * reach and 0 <= j < 2 * reach):
+                continue
+            solid = (tile.cells > FREE) & ((tile.cells & mask) > 0)
+            values = np.where(solid, kernels.OCCUPIED, np.where(tile.cells == FREE, kernels.FREE, 0))
+            self._window[i * TILE_CELLS : (i + 1) * TILE_CELLS, j * TILE_CELLS : (j + 1) * TILE_CELLS] = values
+        return cell_m, corner
+
+
+def _mask(bands_m: tuple[float, ...], height_m: float | None, slab_m: float) -> int:
+    """Height bands that a vehicle at a height above the ground is in; all if that is unknown."""
+    mask = 0
+    for i in range(len(bands_m) - 1):
+        low, high = bands_m[i], bands_m[i + 1]
+        if height_m is None or (height_m + slab_m > low and height_m - slab_m < high):
+            mask |= 1 << i
+    return mask

@@ -1,0 +1,96 @@
+"""Kernels of the local grid: rays of scans are drawn into it, and distances are read from it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kiteline_core.jit import njit
+
+HIT, MISS = 2, -1  # what a seen surface and a clear ray add to a cell
+MOST, LEAST = 8, -6
+_THICK_M = 0.3  # m of a smeared surface, at most: it may be a solid that was seen from other sides
+OCCUPIED, FREE = 2, -1  # from which, and up to which a cell is so; unknown between
+
+
+@njit
+def _add(cells, drawn, number, i, j, value):  # type: ignore[no-untyped-def]
+    """Add to a cell once for each scan; a surface counts more than a ray beside it."""
+    mark = 2 * number + (1 if value > 0 else 0)
+    if drawn[i, j] >= mark:
+        return
+    before = MISS if drawn[i, j] == mark - 1 and value > 0 else 0
+    drawn[i, j] = mark
+    cells[i, j] = min(max(cells[i, j] - before + value, LEAST), MOST)
+
+
+@njit
+def draw_rays(cells, drawn, number, x, y, heading, azimuth, step, clear_m, reach_m, cell_m):  # type: ignore[no-untyped-def]
+    """Draw a scan into cells (n,n): clear up to clear_m (m,), where a surface is unless it lies beyond reach_m.
+
+    x, y: of the camera in cells' axes, m from their corner; heading: of its azimuth 0. drawn: (n,n) marks of scans;
+    number: of this one, from 1.
+    """
+    n = len(cells)
+    for c in range(len(azimuth)):
+        if clear_m[c] <= 0.0:
+            continue
+        until = min(clear_m[c], reach_m)
+        parts = int(step * until / cell_m) + 1
+        for p in range(parts):
+            angle = heading + azimuth[c] + ((p + 0.5) / parts - 0.5) * step
+            dx, dy = np.cos(angle), np.sin(angle)
+            if clear_m[c] < reach_m:
+                i, j = int((y + dy * until) / cell_m), int((x + dx * until) / cell_m)
+                if 0 <= i < n and 0 <= j < n:
+                    _add(cells, drawn, number, i, j, HIT)
+            for k in range(int((until - 1.5 * cell_m) / (0.7 * cell_m))):
+                r = k * 0.7 * cell_m
+                i, j = int((y + dy * r) / cell_m), int((x + dx * r) / cell_m)
+                if 0 <= i < n and 0 <= j < n:
+                    _add(cells, drawn, number, i, j, MISS)
+
+
+@njit
+def _state(cells, x, y, cell_m):  # type: ignore[no-untyped-def]
+    """1 occupied, 0 free, -1 unknown, at a place in m from the corner of cells (n,n)."""
+    i, j = int(np.floor(y / cell_m)), int(np.floor(x / cell_m))
+    if i < 0 or j < 0 or i >= cells.shape[0] or j >= cells.shape[1]:
+        return -1
+    value = cells[i, j]
+    return 1 if value >= OCCUPIED else 0 if value <= FREE else -1
+
+
+@njit
+def read_distances(own, own_cell_m, own_at, tiles, tile_cell_m, tile_at, around_m, reach_m, rays, out):  # type: ignore[no-untyped-def]
+    """Distance (s,) in m to the nearest occupied cell in each sector, clockwise from ahead.
+
+    inf: all is free up to reach_m; nan: some of it is unknown. own, tiles: (n,n) cells; the first that knows a place
+    counts. own_at, tile_at: x, y in m from their corner, and heading of the vehicle. around_m: about the vehicle, where
+    it is itself.
+    """
+    sectors = len(out)
+    width = 2.0 * np.pi / sectors
+    step_m = 0.5 * own_cell_m
+    for s in range(sectors):
+        nearest, known = np.inf, True
+        for k in range(rays):
+            turn = (s + (k + 0.5) / rays - 0.5) * width
+            ax, ay = np.cos(own_at[2] - turn), np.sin(own_at[2] - turn)
+            bx, by = np.cos(tile_at[2] - turn), np.sin(tile_at[2] - turn)
+            r = around_m
+            while r < min(reach_m, nearest):
+                state = _state(own, own_at[0] + ax * r, own_at[1] + ay * r, own_cell_m)
+                if state < 0:
+                    state = _state(tiles, tile_at[0] + bx * r, tile_at[1] + by * r, tile_cell_m)
+                if state > 0:
+                    end, state = r, 1
+                    while state > 0 and end < r + _THICK_M:  # noise smears a surface: it is in the middle
+                        end += step_m
+                        state = _state(own, own_at[0] + ax * end, own_at[1] + ay * end, own_cell_m)
+                        if state < 0:
+                            state = _state(tiles, tile_at[0] + bx * end, tile_at[1] + by * end, tile_cell_m)
+                    nearest = min(nearest, 0.5 * (r + end))
+                    break
+                known = known and state == 0
+                r += step_m
+        out[s] = nearest if nearest < reach_m else np.inf if known else np.nan

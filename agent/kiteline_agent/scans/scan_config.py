@@ -1,0 +1,29 @@
+"""Configuration of scans and of the local grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ScanConfig:
+    """When keyframes are scanned for ground and obstacles; `ground` says how."""
+
+    on: bool = True  # False: the agent makes no scans
+    moved_m: float = 0.2  # m since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
+    turned_rad: float = 0.17  # rad since the last scan: a tenth of the field of view is new
+    told_s: float = 1.0  # s between two lines of the log about the nearest obstacle
+    doubted: int = 6  # scans without the expected ground, after which another height is believed
+
+
+@dataclass(frozen=True, slots=True)
+class LocalGridConfig:
+    """Grid of obstacles around the vehicle, for a flight controller that avoids them."""
+
+    cell_m: float = 0.05  # m; the grid has 512 x 512 cells
+    reach_m: float = 10.0  # m; farther obstacles are not told
+    scans: int = 48  # newest ones that are kept: 10 m of flight, or more than a turn
+    slab_m: float = 0.25  # m that the vehicle climbs until scans made at other heights do not count
+    seen_m: float = 0.2  # m above and below the camera that a scan's line of sight covers: `ground.slab_m`
+    vehicle_m: float = 0.15  # m about its middle where the vehicle is itself
+    tiles: int = 512  # of the base's grid that are kept, 2 MiB: the farthest go

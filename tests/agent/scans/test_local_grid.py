@@ -1,0 +1,250 @@
+"""Distances around the vehicle from its own scans and from tiles of the base's grid, in a room that is known."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_agent.config import LocalGridConfig
+from kiteline_agent.runtime.controller import push_obstacles
+from kiteline_agent.scans import local_grid_kernels as kernels
+from kiteline_agent.scans.local_grid import SECTORS, LocalGrid, Surroundings
+from kiteline_agent.scans.scan_stage import Scanned
+from kiteline_codec.schema import GridTile, KeyframeScan
+from kiteline_core.geometry import se3
+from kiteline_core.ground.column_scan import ColumnScan
+from kiteline_core.ids import KeyframeId
+
+CELL_M = 0.1
+WEST, EAST, SOUTH, NORTH = -2.0, 3.0, -1.5, 2.0  # walls of a room
+BANDS_M = (0.1, 0.5, 1.2, 2.0)
+REACH_M = LocalGridConfig().reach_m
+
+
+def room(known_until_m: float = 20.0, mask: int = 7) -> dict[tuple[int, int], GridTile]:
+    """Tiles in which cells beyond the walls are unknown, and those west of known_until_m too."""
+    tiles = {}
+    for column in range(-4, 5):
+        for row in range(-4, 5):
+            x = ((column * 64 + np.arange(64)) + 0.5)[None, :] * CELL_M
+            y = ((row * 64 + np.arange(64)) + 0.5)[:, None] * CELL_M
+            inside = (x > WEST) & (x < EAST) & (y > SOUTH) & (y < NORTH)
+            wall = ~inside & (x > WEST - 0.2) & (x < EAST + 0.2) & (y > SOUTH - 0.2) & (y < NORTH + 0.2)
+            cells = np.where(wall, mask, np.where(inside, 0, -1))
+            tiles[column, row] = GridTile(
+                column, row, 0, CELL_M, np.where(x > -known_until_m, cells, -1).astype(np.int8)
+            )
+    return tiles
+
+
+def vehicle(x: float, y: float, heading_rad: float, tilt_rad: float = 0.0, z: float = 1.0) -> np.ndarray:
+    """T_w_f: heading counter-clockwise from x of w."""
+    upright = se3.so3_exp(np.array([0.0, 0.0, heading_rad])) @ np.diag([1.0, -1.0, -1.0])
+    return se3.from_rt(upright @ se3.so3_exp(np.array([tilt_rad, 0.0, 0.0])), np.array([x, y, z]))
+
+
+def around(tiles: dict[tuple[int, int], GridTile], T_w_f: np.ndarray) -> np.ndarray | None:
+    """Distances by tiles alone."""
+    found = LocalGrid(LocalGridConfig()).around(T_w_f, T_w_f, tiles, BANDS_M)
+    return None if found is None else found.distance_m
+
+
+def scan_at(x: float, y: float, heading_rad: float, z: float = 1.0, noise_m: float = 0.0, seed: int = 0) -> Scanned:
+    """What a camera sees of the walls, over 80 degrees; o is w turned by half a radian."""
+    n, step = 64, 1.4 / 64
+    azimuth = (np.arange(n) - 31.5) * step
+    angle = heading_rad + azimuth
+    with np.errstate(divide="ignore"):
+        to_x = np.where(np.cos(angle) > 0, (EAST - x) / np.cos(angle), (WEST - x) / np.cos(angle))
+        to_y = np.where(np.sin(angle) > 0, (NORTH - y) / np.sin(angle), (SOUTH - y) / np.sin(angle))
+    clear = np.minimum(to_x, to_y) + np.random.default_rng(seed).normal(0.0, noise_m, n)
+    R_w_c = se3.so3_exp(np.array([0.0, 0.0, heading_rad])) @ np.array([[0, 0, 1.0], [-1.0, 0, 0], [0, -1.0, 0]])
+    scan = ColumnScan(
+        np.array([0.0, -1.0, 0.0]), azimuth[0], step, np.zeros(n), np.zeros(n), clear, np.full(n, 7, np.uint8), clear, z
+    )
+    record = KeyframeScan(KeyframeId(1), scan, np.zeros(0, np.uint8))
+    return Scanned(record, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])))
+
+
+TURN = se3.exp(np.array([4.0, -2.0, 0.3, 0.0, 0.0, 0.5]))
+
+
+@given(
+    x=st.floats(-1.5, 2.5), y=st.floats(-1.0, 1.5), quarter=st.integers(0, 3), tilt=st.floats(-0.4, 0.4),
+)  # fmt: skip
+def test_walls_of_a_room_lie_ahead_right_behind_and_left(x: float, y: float, quarter: int, tilt: float) -> None:
+    distances = around(room(), vehicle(x, y, quarter * np.pi / 2, tilt))
+    assert distances is not None and distances.shape == (SECTORS,)
+    walls = [EAST - x, y - SOUTH, x - WEST, NORTH - y]  # clockwise from x of w
+    for k in range(4):
+        assert distances[k * SECTORS // 4] == pytest.approx(walls[(k - quarter) % 4] + CELL_M, abs=1.6 * CELL_M)
+    assert np.isfinite(distances).all()
+
+
+def test_own_scans_show_walls_wherever_the_odometry_frame_lies() -> None:
+    grid = LocalGrid(LocalGridConfig())
+    for k in range(12):
+        grid.add(scan_at(0.1 * k, 0.0, 0.5 * k, noise_m=0.03, seed=k))
+    found = grid.around(TURN @ vehicle(0.5, 0.2, np.pi / 2), None, {}, BANDS_M)
+    assert found is not None
+    for k, wall in enumerate([NORTH - 0.2, EAST - 0.5, 0.2 - SOUTH, 0.5 - WEST]):
+        assert found.distance_m[k * SECTORS // 4] == pytest.approx(wall, abs=0.1)
+    assert found.nearest is not None
+    assert found.nearest[0] == pytest.approx(0.2 - SOUTH, abs=0.1) and abs(found.nearest[1]) > 2.8
+    assert "nearest obstacle: 1." in found.line
+
+
+def test_what_was_not_seen_is_unknown_and_own_scans_count_before_tiles() -> None:
+    grid = LocalGrid(LocalGridConfig())
+    grid.add(scan_at(0.0, 0.0, 0.0))
+    T_w_f = vehicle(0.0, 0.0, 0.0)
+    alone = grid.around(TURN @ T_w_f, None, {}, BANDS_M)
+    assert alone is not None
+    assert np.isfinite(alone.distance_m[[0, 3, -3]]).all() and np.isnan(alone.distance_m[18:54]).all()
+    nearer = {at: GridTile(*at, 0, CELL_M, np.full((64, 64), 7, np.int8)) for at in ((0, 0), (0, -1))}
+    both = grid.around(TURN @ T_w_f, T_w_f, nearer, BANDS_M)
+    assert both is not None
+    assert both.distance_m[0] == pytest.approx(EAST, abs=0.1)  # seen clear since
+    assert both.distance_m[18] < 0.5  # told by the base: not seen from here
+    with_room = grid.around(TURN @ T_w_f, T_w_f, room(), BANDS_M)
+    assert with_room is not None and np.isfinite(with_room.distance_m).all()
+
+
+def test_obstacles_far_above_or_below_do_not_count() -> None:
+    grid = LocalGrid(LocalGridConfig())
+    grid.add(scan_at(0.0, 0.0, 0.0, z=1.0))
+    higher = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=2.5), None, {}, BANDS_M)
+    assert higher is not None and np.isnan(higher.distance_m).all()
+    low = room(mask=1)  # walls that reach 0.5 m above the ground
+    over = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=1.5), vehicle(0.0, 0.0, 0.0, z=1.5), low, BANDS_M)
+    assert over is not None and np.isnan(over.distance_m[SECTORS // 2])
+
+
+def test_a_vehicle_that_flies_on_takes_its_scans_along() -> None:
+    grid = LocalGrid(LocalGridConfig(scans=200))
+    for k in range(100):
+        grid.add(scan_at(-1.5 + 0.04 * k, 0.0, 0.0))
+    far = [scan_at(2.0, 0.0, 0.0)]
+    for k in range(60):  # 30 m away, and back
+        moved = se3.from_rt(np.eye(3), np.array([0.5 * k, 0.0, 0.0]))
+        grid.add(Scanned(far[0].record, moved @ far[0].T_o_c))
+        assert grid.around(moved @ TURN @ vehicle(2.0, 0.0, 0.0), None, {}, BANDS_M) is not None
+    back = grid.around(TURN @ vehicle(1.0, 0.0, 0.0), None, {}, BANDS_M)
+    assert back is not None and back.distance_m[0] == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_grid_and_its_tiles_take_less_than_four_mib() -> None:
+    config = LocalGridConfig()
+    grid = LocalGrid(config)
+    arrays = [value for value in vars(grid).values() if isinstance(value, np.ndarray)]
+    scans = config.scans * sum(v.nbytes for v in (scan_at(0, 0, 0).record.scan.clear_m,) * 5)
+    assert sum(a.nbytes for a in arrays) + scans + config.tiles * (64 * 64 + 200) < 4 << 20
+
+
+def test_what_is_not_known_is_not_free() -> None:
+    distances = around(room(known_until_m=1.0), vehicle(0.0, 0.0, 0.0))
+    assert distances is not None
+    assert np.isnan(distances[SECTORS // 2]) and distances[0] == pytest.approx(EAST + CELL_M, abs=0.15)
+    free = {(c, r): GridTile(c, r, 0, CELL_M, np.zeros((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
+    far = around(free, vehicle(0.0, 0.0, 0.7))
+    assert far is not None and np.isinf(far).all()
+    free[0, 0].cells[5, 20] = 4  # one cell, 2.1 m away
+    near = around(free, vehicle(0.0, 0.0, np.arctan2(5.5, 20.5)))
+    assert near is not None and near[0] == pytest.approx(2.12, abs=0.1) and near.min() <= near[0] < REACH_M
+
+
+def test_without_a_grid_or_a_heading_nothing_is_told() -> None:
+    assert around({}, vehicle(0.0, 0.0, 0.0)) is None
+    nose_up = vehicle(0.0, 0.0, 0.0) @ se3.from_rt(se3.so3_exp(np.array([0.0, np.pi / 2, 0.0])), np.zeros(3))
+    assert around(room(), nose_up) is None
+
+
+@pytest.mark.parametrize("cell_m", [1e-4, 25.0, 100.0])
+def test_any_size_of_cells_costs_little(cell_m: float) -> None:
+    """A tile is a record from the link."""
+    tiles = {(0, 0): GridTile(0, 0, 0, cell_m, np.full((64, 64), 3, np.int8))}
+    distances = around(tiles, vehicle(0.5, 0.5, 0.0))
+    assert distances is not None and distances.shape == (SECTORS,)
+
+
+class Heard:
+    """Stands for the flight controller's link."""
+
+    T_b_f = np.eye(4)
+
+    def __init__(self) -> None:
+        self.sent: list[list[float]] = []
+
+    def push_obstacles(self, distance_m: list[float], reach_m: float, now_ns: int) -> None:
+        self.sent.append(distance_m)
+
+
+def test_only_a_vehicle_that_is_tracked_tells_its_obstacles() -> None:
+    told: Surroundings | None = Surroundings(np.full(SECTORS, 2.0), REACH_M)
+    heard = Heard()
+
+    def push(*, tracked: bool, known: bool) -> int:
+        agent = SimpleNamespace(surroundings=lambda estimate, T_b_f: told if known else None)
+        estimate = SimpleNamespace(tracked=tracked)
+        push_obstacles(cast(Any, heard), cast(Any, agent), cast(Any, SimpleNamespace(estimate=estimate)), 5)
+        return len(heard.sent)
+
+    assert push(tracked=False, known=True) == 0
+    assert push(tracked=True, known=False) == 0
+    assert push(tracked=True, known=True) == 1
+    assert heard.sent[0][0] == 2.0
+
+
+def test_rays_clear_what_they_pass_and_mark_what_they_hit() -> None:
+    cells, marks = np.zeros((60, 60), np.int8), np.zeros((60, 60), np.int16)
+    for number in (1, 2):
+        kernels.draw_rays(
+            cells, marks, number, 1.025, 1.525, 0.0, np.zeros(1), 0.02, np.array([1.2]), 10.0, 0.05
+        )  # fmt: skip
+    expected = np.zeros((60, 60), np.int8)
+    expected[30, 20:43] = 2 * kernels.MISS  # up to a cell and a half before the surface
+    expected[30, 44] = 2 * kernels.HIT
+    assert np.array_equal(cells[:, :43], expected[:, :43])
+    assert np.array_equal(cells[:, 44:], expected[:, 44:])
+    assert cells[30, 43] <= 0
+
+
+def test_distances_are_those_of_plain_arithmetic() -> None:
+    rng = np.random.default_rng(5)
+    own = rng.choice([-2, 0, 4], (80, 80), p=[0.9, 0.05, 0.05]).astype(np.int8)
+    tiles = rng.choice([-2, 0, 4], (80, 80), p=[0.9, 0.05, 0.05]).astype(np.int8)
+    at, other, out = np.array([2.1, 1.9, 0.4]), np.array([2.3, 2.2, -1.0]), np.empty(36)
+    kernels.read_distances(own, 0.05, at, tiles, 0.05, other, 0.1, 1.5, 1, out)
+
+    def state(cells: np.ndarray, x: float, y: float) -> int:
+        i, j = int(np.floor(y / 0.05)), int(np.floor(x / 0.05))
+        if not (0 <= i < 80 and 0 <= j < 80):
+            return -1
+        value = cells[i, j]
+        return 1 if value >= kernels.OCCUPIED else 0 if value <= kernels.FREE else -1
+
+    for s in range(36):
+        turn = s * 2 * np.pi / 36
+        r, known, expected = 0.1, True, np.inf
+        states = []
+        while r < 1.8:
+            here = state(own, at[0] + np.cos(at[2] - turn) * r, at[1] + np.sin(at[2] - turn) * r)
+            if here < 0:
+                here = state(tiles, other[0] + np.cos(other[2] - turn) * r, other[1] + np.sin(other[2] - turn) * r)
+            states.append((r, here))
+            r += 0.025
+        for k, (r, here) in enumerate(states):
+            if r >= 1.5:
+                break
+            if here > 0:
+                end = next((q for q, h in states[k + 1 :] if h <= 0 or q >= states[k][0] + 0.3), r)
+                expected = 0.5 * (r + end)
+                break
+            known &= here == 0
+        expected = expected if expected < 1.5 else np.inf if known else np.nan
+        assert out[s] == pytest.approx(expected, nan_ok=True, abs=1e-9), s

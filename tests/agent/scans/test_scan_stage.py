@@ -1,0 +1,88 @@
+"""The agent's scans in flight: spread over frames, the same each time, shared last, dropped first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from kiteline_agent.agent import Agent
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.step import Identity, StepInput
+from kiteline_codec.schema import Key, KeyframeScan, Record, messages
+from kiteline_core.frame import Frame
+from kiteline_core.ids import AgentId
+from kiteline_hw.sources.open import open_source
+
+
+class Heard(NoBaseChannel):
+    """Keeps the scans that are shared. busy: nothing arrives."""
+
+    def __init__(self, busy: bool = False) -> None:
+        super().__init__()
+        self.busy = busy
+        self.scans: list[KeyframeScan] = []
+
+    def put(self, record: Record) -> Record:
+        if isinstance(record, KeyframeScan):
+            self.scans.append(record)
+        return super().put(record)
+
+    def arrived(self, key: Key) -> bool:
+        return not self.busy
+
+
+def flown(path: Path, config: AgentConfig, busy: bool = False) -> tuple[Agent, Heard, list[int], list[str]]:
+    source = open_source(str(path))
+    channel = Heard(busy)
+    agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), channel)
+    matched, events = [], []
+    for frame in [item for item in source if isinstance(item, Frame)]:
+        events += agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns).events
+        matched.append(agent.work.matched_px)
+    return agent, channel, matched, events
+
+
+def eager() -> AgentConfig:
+    config = AgentConfig()
+    return replace(config, scan=replace(config.scan, moved_m=0.0, turned_rad=0.0))
+
+
+def test_a_scan_is_spread_over_frames_and_the_same_each_time(recording: Path) -> None:
+    agent, channel, matched, _ = flown(recording, eager())
+    _, again, _, _ = flown(recording, eager())
+    assert channel.scans
+    assert [messages.encode(s) for s in channel.scans] == [messages.encode(s) for s in again.scans]
+    whole = agent.map.camera.width * agent.map.camera.height / 8
+    assert 0 < max(matched) < 0.6 * whole  # never more than a stripe, with what it overlaps
+    for scan in channel.scans:
+        assert scan.keyframe in [scan.keyframe for scan in channel.scans]
+        assert (scan.scan.free_m >= scan.scan.free_from_m - 1e-9).all()
+
+
+def test_without_scans_nothing_is_matched(recording: Path) -> None:
+    config = eager()
+    _, channel, matched, _ = flown(recording, replace(config, scan=replace(config.scan, on=False)))
+    assert not channel.scans and not any(matched)
+
+
+def test_scans_do_not_pile_up_on_a_link_that_carries_none(recording: Path) -> None:
+    _, channel, _, _ = flown(recording, eager(), busy=True)
+    assert len(channel.scans) <= 4
+
+
+def test_scans_are_dropped_first_when_cpu_time_is_short(recording: Path) -> None:
+    config = eager()
+    short = replace(config, governor=replace(config.governor, cpu_percent=4.0, grace_s=0.0))
+    _, channel, matched, _ = flown(recording, short)
+    assert not channel.scans
+    assert not any(matched)
+
+
+def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
+    _, channel, _, events = flown(recording, eager())
+    told = [event for event in events if event.startswith("nearest obstacle")]
+    assert told and len(told) <= len(channel.scans)
+    assert np.isfinite([s.scan.up_c for s in channel.scans]).all()
