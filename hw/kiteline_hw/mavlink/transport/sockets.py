@@ -72,12 +72,13 @@ class MavlinkUdp:
         except OSError:  # an earlier datagram reached no listener
             return b"", None
         now_s = time.monotonic()
-        if self._peer is not None and sender[:2] == self._peer[:2]:
+        peer = self._peer
+        if sender == peer or (peer is not None and sender[:2] == peer[:2]):
             self._heard_s = now_s
             return data, None
         self.strangers += 1
-        moved = self._peer is not None and sender[0] == self._peer[0] and now_s - self._heard_s > _SILENT_S
-        return (data, sender) if self._listens and (self._peer is None or moved) else (b"", None)
+        moved = peer is not None and sender[0] == peer[0] and now_s - self._heard_s > _SILENT_S
+        return (data, sender) if self._listens and (peer is None or moved) else (b"", None)
 
     def adopt(self, sender: Any) -> None:
         """Serve this address from now on."""
