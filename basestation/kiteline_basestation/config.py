@@ -314,7 +314,9 @@ class GridConfig:
     occupied_from: int = 6  # 1/16; log-odds from which a band is occupied: one near view, two far ones
     free_from: int = 2  # 1/16; a cell is free if all bands lie below minus this: one near view, two far ones
     opening: bool = True  # what is free is opened by three by three cells: gaps between two rays are no ways
-    ground_m: float = -1.2  # m; height in w of the middle storey: the camera that begins w flies 0.4 to 2 m above ground
+    ground_m: float = (
+        -1.2
+    )  # m; height in w of the middle storey: the camera that begins w flies 0.4 to 2 m above ground
     storey_m: float = 2.5  # m; between two storeys: less than those of houses
     storey_overlap_m: float = 0.4  # m; beyond its half a storey also holds what lies so near: ramps, drift of heights
     max_position_m: float = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
