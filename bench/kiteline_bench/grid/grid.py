@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from kiteline_bench.grid import accuracy
+from kiteline_bench.grid import accuracy, maps, robust
 from kiteline_bench.harness.bars import Run
 
 PARTS: dict[str, tuple[str, Run]] = {
+    "maps": ("Grid: corrections, time and memory on the base", maps.run),
+    "robust": ("Grid: scans that see badly", robust.run),
     "accuracy": ("Grid: precision and recall against true occupancy", accuracy.run),
 }

@@ -34,24 +34,34 @@ class PosedScan:
 
 
 class Scanner:
-    """Makes scans of the stereo pairs of a rig. damage: changes the disparity image first."""
+    """Makes scans of the stereo pairs of a rig, each with the ground that the ones before saw, as an agent does.
 
-    def __init__(self, rig: CameraRig, damage: Callable[[F32], F32] | None = None) -> None:
+    damage: changes the disparity image first. ground_z: of the ground where the vehicle took off, None if it saw none.
+    """
+
+    def __init__(
+        self, rig: CameraRig, damage: Callable[[F32], F32] | None = None, ground_z: float | None = None
+    ) -> None:
+        self._ground_z = ground_z
         self._rectifier = Rectifier(rig)
         self.camera = self._rectifier.camera
         self._segmenter = GroundSegmenter(self.camera, GroundConfig())
         self._stripes = DisparityStripes(self._segmenter.camera, GroundConfig())
         self._damage = damage
 
-    def scan(self, frame: Frame, T_w_b: F64, expected_m: float | None = None) -> PosedScan:
+    def scan(self, frame: Frame, T_w_b: F64) -> PosedScan:
         """The scan of a frame whose true body pose (4,4) tells which way is up."""
         assert frame.right is not None
         T_w_c = T_w_b @ self.camera.T_b_c
         disparity = self._stripes.measure(self._rectifier.half(0, frame.left), self._rectifier.half(1, frame.right))
         if self._damage is not None:
             disparity = self._damage(disparity)
-        up_c = np.ascontiguousarray(T_w_c[2, :3])
-        return PosedScan(self._segmenter.segment(disparity, self._stripes.left, up_c, None, expected_m), T_w_c)
+        z, up_c = float(T_w_c[2, 3]), np.ascontiguousarray(T_w_c[2, :3])
+        expected_m = None if self._ground_z is None else z - self._ground_z
+        scan = self._segmenter.segment(disparity, self._stripes.left, up_c, None, expected_m)
+        if np.isfinite(scan.camera_height_m):
+            self._ground_z = z - scan.camera_height_m
+        return PosedScan(scan, T_w_c)
 
 
 def scans_of(recording: Recording, every: int, damage: Callable[[F32], F32] | None = None) -> list[PosedScan]:
