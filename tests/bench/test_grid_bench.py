@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kiteline_bench.grid import maps, robust
 from kiteline_bench.grid.accuracy import objects_present
 from kiteline_bench.grid.places import Place
 from kiteline_bench.grid.ray_kernels import cast_rays
@@ -21,8 +23,12 @@ from kiteline_bench.grid.sparse import (
     labels_by_height,
     log_odds_grid,
 )
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.sim.source import open_sim
+from kiteline_hw.sim.truth.box_files import read_boxes
 from kiteline_hw.sim.truth.occupancy import occupancy
+from kiteline_hw.sim.truth.sight import look
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
 
 
@@ -109,3 +115,54 @@ def test_objects_are_present_or_missed() -> None:
     assert not any(bar.met for bar in objects_present(place, empty, np.eye(3)))
     unseen = Place("room", "", grid, replace(grid, state=np.full(states.shape, UNKNOWN, np.int8)), world)
     assert objects_present(unseen, grid, np.eye(3)) == []
+
+
+def test_a_loop_that_leaves_traces_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, rng = maps.GridConfig(), np.random.default_rng(0)
+    kept = maps.keep(config, maps.road_scan(rng), 175.0)
+    assert kept is not None
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    scans = [(kept, se3.from_rt(level, np.array([0.5 * k, 0.0, 0.6]))) for k in range(6)]
+    (bar,) = maps._after_a_loop(config, scans)
+    assert bar.met and "0 changed" not in bar.measured
+    put = maps.ScanGrid.put
+    monkeypatch.setattr(maps.ScanGrid, "put", lambda grid, k, scan, pose: k not in grid and put(grid, k, scan, pose))
+    (bar,) = maps._after_a_loop(config, scans)
+    assert not bar.met, "keyframes that stay where they were drawn first"
+
+
+def test_half_of_a_disparity_image_goes_missing_in_blocks() -> None:
+    disparity = np.random.default_rng(1).uniform(1, 40, (120, 376)).astype(np.float32)
+    damaged = robust._without_half(disparity)
+    assert 0.35 < (damaged == 0).mean() < 0.65
+    assert np.array_equal(damaged[damaged > 0], disparity[damaged > 0])
+    assert np.array_equal(damaged, robust._without_half(disparity))
+
+
+def test_poses_that_face_walls_stand_before_them() -> None:
+    source = open_sim("room", seed=2, texture_bits=7, scale=0.1, seconds=2.0)
+    assert source.world.shell is not None
+    shell = source.world.boxes[source.world.shell]
+    for pose in robust._at_walls(source):
+        T_w_c = pose @ source.rig.T_b_c
+        gap = shell[3:5] - np.abs(T_w_c[:2, 3] - shell[:2])
+        axis = int(np.argmin(gap))
+        assert 0.45 < gap[axis] < 0.95 and gap[1 - axis] > 1.0
+        ahead = T_w_c[:3, 2]
+        assert ahead[axis] * np.sign(T_w_c[axis, 3] - shell[axis]) > 0.999, "it looks at the near wall"
+        assert T_w_c[2, 1] < -0.999, "level"
+
+
+def test_free_cells_inside_a_box_and_out_of_sight_are_told(tmp_path: Path) -> None:
+    (tmp_path / "b.csv").write_text("0,0,1.5,4,3,1.5,0\n1,0,0.5,0.5,0.5,0.5,0\n")
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    camera = CameraModel(160, 120, 80.0, 80.0, 79.5, 59.5, Lens.NONE, ())
+    seen = look(read_boxes(tmp_path / "b.csv"), camera, se3.from_rt(level, np.array([-2.0, 0.0, 0.8]))[None])
+
+    class Case(robust._Case):
+        def grid(self) -> GridFile:
+            return GridFile(0.05, (-0.5, -0.5, 0.0), np.full((20, 60), FREE, np.int8))  # x to 2.5, y from -.5 to .5
+
+    wrong, unseen = robust._bars("case", Case([], seen, 1.0))
+    assert not wrong.met and float(wrong.measured.split()[0]) == pytest.approx(100 / 3, abs=3)
+    assert not unseen.met and float(unseen.measured.split()[0]) == pytest.approx(100 / 3, abs=3)
