@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -49,12 +50,17 @@ def told_camera(lens: Lens) -> CameraModel:
     return CameraModel(WIDTH, HEIGHT, FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1), lens, distortion)
 
 
+@cache
+def eye(lens: Lens, right: bool, turned: tuple[float, ...]) -> U8:
+    """The left image, or that of a right camera which is turned; drawn once."""
+    true = T_C_R @ se3.from_rt(se3.so3_exp(np.array(turned)), np.zeros(3))
+    return image(told_camera(lens), se3.inverse(true) if right else np.eye(4))
+
+
 def flight(lens: Lens, turned: NDArray[np.float64]) -> tuple[Rectifier, U8, U8]:
     """The rectifier of a told calibration, and a pair by a rig whose right camera is turned against it."""
-    camera = told_camera(lens)
-    true = T_C_R @ se3.from_rt(se3.so3_exp(turned), np.zeros(3))
-    rig = CameraRig(camera, camera, np.eye(4), T_C_R)
-    return Rectifier(rig), image(camera, np.eye(4)), image(camera, se3.inverse(true))
+    rig = CameraRig(told_camera(lens), told_camera(lens), np.eye(4), T_C_R)
+    return Rectifier(rig), eye(lens, False, (0.0, 0.0, 0.0)), eye(lens, True, tuple(turned.tolist()))
 
 
 def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
