@@ -13,13 +13,19 @@ from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
+from kiteline_agent.scans.local_grid import LocalGrid
+from kiteline_agent.scans.scan_config import LocalGridConfig
+from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_codec import warm as codec_warm
+from kiteline_codec.schema import KeyframeScan
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
-from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.geometry.se3 import from_rt
-from kiteline_core.ids import AgentId
+from kiteline_core.ground.config import GroundConfig
+from kiteline_core.ground.segmentation import GroundSegmenter
+from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_core.imaging.matching import MatchConfig, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pose.pnp import solve_pnp
@@ -46,6 +52,7 @@ def warm(config: AgentConfig | None = None) -> None:
         pair = [np.ascontiguousarray(np.roll(one, shift, axis=1)) for one in (image, right)]
         agent.step(StepInput(Frame(k * 50_000_000, pair[0], pair[1]), _resting(k)), k * 50_000_000)
     _warm_disparities()
+    _warm_scans(small)
     _warm_relocalisation(vocabulary, pixels)
     _warm_monocular(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
 
@@ -55,6 +62,20 @@ def _warm_disparities() -> None:
     none, rho, system, point = np.zeros((0, 3)), np.zeros(0), np.empty((11, 12)), np.empty((0, 12))
     linearise_pair(np.zeros((0, 2)), rho, rho, none, np.eye(4), np.ones(5), np.zeros(5), rho, system, point)
     move_points(point, np.zeros(11), 0.0, rho)
+
+
+def _warm_scans(rig: CameraRig) -> None:
+    """A scan over level ground with a wall behind it, drawn and read."""
+    camera = Rectifier(rig).camera
+    segmenter, grid = GroundSegmenter(camera, GroundConfig()), LocalGrid(LocalGridConfig())
+    view = segmenter.camera
+    rows = (np.arange(view.height) - view.cy) / view.fy
+    disparity = np.broadcast_to(np.maximum(rows * view.bf, 2.6)[:, None], (view.height, view.width))
+    image = np.zeros((view.height, view.width), np.uint8)
+    up_c = np.array([0.0, -1.0, 0.0])
+    scan = segmenter.segment(np.ascontiguousarray(disparity, np.float32), (image, image), up_c)
+    grid.add(Scanned(KeyframeScan(KeyframeId(0), scan, np.zeros(0, np.uint8)), np.eye(4)))
+    grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
 
 def _warm_relocalisation(vocabulary: Vocabulary, noise: NDArray[np.uint8]) -> None:

@@ -128,7 +128,7 @@ class ScanStage:
         height_m = float(up_o @ begun.T_o_c[:3, 3])
         expected_m = None if self._ground_m is None else height_m - self._ground_m
         scan = segmenter.segment(
-            disparity, self._stripes.left if self._stripes is not None else None, begun.up_c,
+            disparity, self._stripes.pair if self._stripes is not None else None, begun.up_c,
             self._map.disparity_offset * (segmenter.camera.bf / self._map.camera.bf) if stereo else None, expected_m,
             certain=self._without_ground < self._config.doubted,
         )  # fmt: skip

@@ -79,28 +79,28 @@ class DisparityStripes:
             uniquenessRatio=config.uniqueness, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
         self.stripes = config.stripes
-        self.left: U8 = np.empty((0, 0), np.uint8)  # reduced: its texture is that of the disparities
-        self._pair: tuple[U8, U8] | None = None
+        self.pair: tuple[U8, U8] | None = None  # the images of the disparities, of their size
+        self._padded: tuple[U8, U8] | None = None
         self._raw = np.empty((camera.height, camera.width + _PAD_PX), np.int16)
 
     def begin(self, left: U8, right: U8) -> None:
         """Take a pair, rectified and of half size (h,w)."""
-        self.left = self._camera.reduced(left)
-        self._pair = _padded(self.left), _padded(self._camera.reduced(right))
+        self.pair = self._camera.reduced(left), self._camera.reduced(right)
+        self._padded = _padded(self.pair[0]), _padded(self.pair[1])
 
     def match(self, stripe: int) -> None:
         """Measure the rows of a stripe."""
-        assert self._pair is not None
+        assert self._padded is not None
         h = len(self._raw)
         begin, end = h * stripe // self.stripes, h * (stripe + 1) // self.stripes
         low, high = max(begin - _OVERLAP_ROWS, 0), min(end + _OVERLAP_ROWS, h)
-        found = self._matcher.compute(*(image[low:high] for image in self._pair))
+        found = self._matcher.compute(*(image[low:high] for image in self._padded))
         self._raw[begin:end] = np.asarray(found, np.int16)[begin - low : end - low]
 
     def finish(self) -> F32:
         """Disparities (h,w) in px, 0 where unknown, once all stripes were matched."""
         cv2.filterSpeckles(self._raw, -_STEPS, _SPECKLE_PX, _STEPS)
-        self._pair = None
+        self._padded = None
         return unlocked(self._raw[:, _PAD_PX:])
 
     @property

@@ -11,6 +11,9 @@ UNKNOWN, GROUND, OBSTACLE = 0, 1, 2
 _PX = 0.5  # px: half-width of the window in which pixels of one surface lie
 _BEHIND_PX = 2.0  # px behind a few pixels in which a real surface explains them as its outliers
 _LOWER_M = 0.5  # below the ground where there may be ditches and lawns beside a road
+_SAME_PX = 0.25  # px between two surfaces that are one
+_LEAST_ENERGY = 300.0  # grey levels^2 of a surface's gradients: 0.06 px for an error of one level
+_MOST_STEP_PX = 0.4  # px of a refinement: more is another surface
 _OUTLIERS = 0.15  # share of a surface's pixels that are outliers
 
 
@@ -38,16 +41,9 @@ def label_points(  # type: ignore[no-untyped-def]
 
     ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
     bands: (b,) heights. sums: of disparities of obstacles. in_band: (n, bins, b-1). slab, slab_sums: within slab_m
-    of the camera's height. Counts are cleared first. Returns how many pixels lie on the ground that was seen, and
-    how many below it.
+    of the camera's height. Labels and counts are zero before. Returns how many pixels lie on the ground that was seen,
+    and how many below it.
     """
-    labels[:] = UNKNOWN
-    grounds[:] = 0
-    obstacles[:] = 0
-    sums[:] = 0.0
-    in_band[:] = 0
-    slab[:] = 0
-    slab_sums[:] = 0.0
     bins = grounds.shape[1]
     last = len(bands) - 1
     on, under = 0, 0
@@ -131,21 +127,18 @@ def _mean(counts, sums, at):  # type: ignore[no-untyped-def]
 
 
 @njit
-def collect_scan(  # type: ignore[no-untyped-def]
-    grounds, obstacles, sums, in_band, slab, slab_sums, azimuth, bf, least, lowest, sigma_px, gap_m, free_from, free,
-    obstacle, bands, clear,
-):  # fmt: skip
-    """Ranges (n,) in m of a column scan from counts (n, bins). azimuth: (n,). lowest: least bin that counts.
-    Ground that is seen with gaps of at most gap_m, or three deviations of its range, is free.
+def find_surfaces(obstacles, sums, in_band, slab, slab_sums, least, lowest, surface, bands):  # type: ignore[no-untyped-def]
+    """Levelled disparities (n,2) of the nearest obstacle and of what stands at the camera's height; 0 for none.
+
+    Counts are over (n, bins). lowest: least bin in which obstacles count. bands: (n,) mask of the obstacle's.
     """
-    n, bins = grounds.shape
+    n, bins = obstacles.shape
     half = int(_PX / BIN_PX)
     for c in range(n):
-        along = 1.0 / np.cos(azimuth[c])
-        obstacle[c], bands[c], free[c], free_from[c], clear[c] = np.inf, 0, 0.0, 0.0, 0.0
+        surface[c, 0], surface[c, 1], bands[c] = 0.0, 0.0, 0
         at = _surface(obstacles[c], least, lowest)
         if at >= 0:
-            obstacle[c] = bf / _mean(obstacles[c], sums[c], at) * along
+            surface[c, 0] = _mean(obstacles[c], sums[c], at)
             most, mask = 0, 0
             for b in range(in_band.shape[2]):
                 m = 0
@@ -158,8 +151,79 @@ def collect_scan(  # type: ignore[no-untyped-def]
             bands[c] = mask | 1 << top
         hit = _surface(slab[c], least, 0)
         if hit >= 0:
-            clear[c] = bf / _mean(slab[c], slab_sums[c], hit) * along
-            if abs(clear[c] - obstacle[c]) < obstacle[c] * obstacle[c] / (bf * along) * sigma_px:
+            surface[c, 1] = _mean(slab[c], slab_sums[c], hit)
+
+
+@njit
+def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, labels, slab_m, surface, sums):  # type: ignore[no-untyped-def]
+    """Refine levelled disparities (n,2) of surfaces by all their pixels at once: one step of least squares.
+
+    left, right: images (h,w) of the pair. offset: (5,) error of disparities. A pixel belongs to a surface whose
+    disparity it has, if it is labelled so, or lies within slab_m of the camera's height. sums: (n,2,5), zero before:
+    pixels, and of them gradient g, g^2, error e, g e. Means are taken off, as brightness may differ.
+    """
+    h, w = left.shape
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    for v in range(h):
+        q = (v - cy) / fy
+        for u in range(1, w - 1):
+            c = column[v, u]
+            if c < 0:
+                continue
+            d = bf / x[v, u]
+            for k in range(2):
+                s = surface[c, k]
+                if s == 0.0 or abs(d - s) > _PX:
+                    continue
+                if (k == 0 and labels[v, u] != OBSTACLE) or (k == 1 and abs(z[v, u]) >= slab_m):
+                    continue
+                p = (u - cx) / fx
+                ahead = rotation[0, 0] * p + rotation[0, 1] * q + rotation[0, 2]
+                error = offset[0] + offset[1] * p + offset[2] * q + offset[3] * p * p + offset[4] * p * q
+                at = u - (s * ahead + error)
+                i = int(np.floor(at))
+                if i < 1 or i >= w - 2:
+                    continue
+                f = at - i
+                a, b = float(right[v, i]), float(right[v, i + 1])
+                before, after = float(right[v, i - 1]), float(right[v, i + 2])
+                slope = 0.5 * ((1.0 - f) * (b - before) + f * (after - a))
+                slope = 0.5 * slope + 0.25 * (float(left[v, u + 1]) - float(left[v, u - 1]))
+                g, e = slope * ahead, float(left[v, u]) - (a + f * (b - a))
+                sums[c, k, 0] += 1.0
+                sums[c, k, 1] += g
+                sums[c, k, 2] += g * g
+                sums[c, k, 3] += e
+                sums[c, k, 4] += g * e
+    for c in range(len(surface)):
+        for k in range(2):
+            n = sums[c, k, 0]
+            if n < 4.0:
+                continue
+            energy = sums[c, k, 2] - sums[c, k, 1] * sums[c, k, 1] / n
+            if energy < _LEAST_ENERGY:
+                continue
+            step = -(sums[c, k, 4] - sums[c, k, 1] * sums[c, k, 3] / n) / energy
+            if abs(step) < _MOST_STEP_PX:
+                surface[c, k] += step
+
+
+@njit
+def collect_scan(grounds, surface, azimuth, bf, lowest, sigma_px, gap_m, free_from, free, obstacle, clear):  # type: ignore[no-untyped-def]
+    """Ranges (n,) in m of a column scan from ground counted over (n, bins) and disparities of surfaces (n,2).
+
+    azimuth: (n,). lowest: least bin that counts. Ground that is seen with gaps of at most gap_m, or three deviations of
+    its range, is free.
+    """
+    n, bins = grounds.shape
+    for c in range(n):
+        along = 1.0 / np.cos(azimuth[c])
+        obstacle[c], free[c], free_from[c], clear[c] = np.inf, 0.0, 0.0, 0.0
+        if surface[c, 0] > 0.0:
+            obstacle[c] = bf / surface[c, 0] * along
+        if surface[c, 1] > 0.0:
+            clear[c] = bf / surface[c, 1] * along
+            if abs(surface[c, 1] - surface[c, 0]) < _SAME_PX:
                 clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
         for j in range(bins - 1, lowest - 1, -1):
             near, far = bf / ((j + 1) * BIN_PX) * along, bf / ((j if j else 0.5) * BIN_PX) * along
@@ -174,6 +238,6 @@ def collect_scan(  # type: ignore[no-untyped-def]
                 break
             free[c] = far
         if free[c] > 0.0 and obstacle[c] < np.inf:
-            deviation = obstacle[c] * sigma_px / (bf * along / obstacle[c])
+            deviation = obstacle[c] * sigma_px / surface[c, 0]
             if obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):  # up to its foot, as well as that is known
                 free[c] = max(obstacle[c] - deviation, free_from[c])

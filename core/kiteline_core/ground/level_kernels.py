@@ -53,9 +53,7 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
 
 @njit
 def count_columns(x, z, column, bf, counts, heights):  # type: ignore[no-untyped-def]
-    """u-disparity: pixels (n, bins) of each column and levelled disparity, and sums of their z. Cleared first."""
-    counts[:] = 0
-    heights[:] = 0.0
+    """u-disparity: pixels (n, bins) of each column and levelled disparity, and sums of their z; zero before."""
     bins = counts.shape[1]
     for v in range(x.shape[0]):
         for u in range(x.shape[1]):
@@ -89,11 +87,8 @@ def count_heights(x, z, column, upright, bf, below, steepest, step_m, counts, di
 
     A pixel and the one at `below` (du, dv) from it, which lies lower in the levelled frame, are on level ground if
     their heights are the same, on a wall if their distances are: those with more than `steepest` of a wall's difference
-    are left out. Row k holds points from k step_m to (k + 1) step_m below the camera. All three are cleared.
+    are left out. Row k holds points from k step_m to (k + 1) step_m below the camera. All three are zero before.
     """
-    counts[:] = 0
-    disparities[:] = 0.0
-    slopes[:] = 0.0
     bins, heights = counts.shape
     h, w = x.shape
     du, dv = below

@@ -138,8 +138,10 @@ def fit_spline(disparity, slope, weight, low, high, sigma, stiffness, rounds, co
     b = np.zeros(COEFFICIENTS)
     basis = np.zeros(4)
     for k in range(rounds):
-        A[:] = 0.0
-        b[:] = 0.0
+        for p in range(COEFFICIENTS):
+            b[p] = 0.0
+            for q in range(COEFFICIENTS):
+                A[p, q] = 0.0
         total = 0.0
         for i in range(m):
             at, s = _section(disparity[i], low, high)

@@ -4,6 +4,7 @@ The method is that of "Segfloor" (u-disparity, v-disparity, B-spline), in the le
 - disparities of columns of equal azimuth with more rows than level ground fills stand upright and are left out,
 - the ground is a uniform cubic B-spline of five sections through the v-disparity of the others, fitted robustly,
 - pixels within a threshold and their error of it are ground, if the image has texture there.
+Beyond it, what a column of azimuth sees is one disparity for each surface, refined by all of its pixels at once.
 """
 
 from __future__ import annotations
@@ -50,6 +51,16 @@ class Ground:
     height_m: float  # of the camera above its nearest part
 
 
+@dataclass(frozen=True, slots=True)
+class _View:
+    """What was seen. rotation: (3,3) camera to levelled frame. pair, offset_px: see `GroundSegmenter.segment`."""
+
+    up_c: F64
+    rotation: F64
+    offset_px: F64
+    pair: tuple[U8, U8] | None
+
+
 class GroundSegmenter:
     """Segments disparity images of one camera. Its arrays are used again for each image."""
 
@@ -78,33 +89,35 @@ class GroundSegmenter:
         self._textured = np.ones((h, w), np.bool_)
         self._counts, self._sums = np.empty((4, n, bins), np.int32), np.empty((n, bins))
         self._slab_sums = np.empty((n, bins))
+        self._surface, self._surface_sums = np.empty((n, 2)), np.empty((n, 2, 5))
         self._upright = np.empty((n, bins), np.bool_)
         self._in_band = np.empty((n, bins, len(self._bands) - 1), np.int32)
         self._heights = np.empty((bins, heights), np.int32)
         self._height_sums = np.empty((2, bins, heights))
 
     def segment(
-        self, disparity: F32, image: U8 | None, up_c: F64, offset_px: F64 | None = None,
+        self, disparity: F32, pair: tuple[U8, U8] | None, up_c: F64, offset_px: F64 | None = None,
         expected_m: float | None = None, *, certain: bool = True,
     ) -> ColumnScan:  # fmt: skip
         """Label a disparity image (h,w) in px, 0 unknown, into `labels`, and make its column scan.
 
-        image: (h,w) whose texture the ground must have; None: none is asked for. up_c: (3,) unit vector against
-        gravity. offset_px: (5,) error of disparities. expected_m: of the camera above the ground as scans saw it; while
-        that is certain, ground that lies higher is taken for a table or a box.
+        pair: the images (h,w) of a stereo pair: ground must have texture, and ranges are refined; None with depth.
+        up_c: (3,) unit vector against gravity. offset_px: (5,) error of disparities. expected_m: of the camera above
+        the ground as scans saw it; while that is certain, ground that lies higher is taken for a table or a box.
         """
         config = self.config
+        offset_px = disparity_offset.none() if offset_px is None else offset_px
+        view = _View(up_c, np.ascontiguousarray(level_rotation(up_c).T), offset_px, pair)
         level_kernels.level_points(
-            disparity, np.ascontiguousarray(level_rotation(up_c).T), self._camera, self.bf,
-            disparity_offset.none() if offset_px is None else offset_px, self._far_px, self._slopes, self.x, self.z,
+            disparity, view.rotation, self._camera, self.bf, offset_px, self._far_px, self._slopes, self.x, self.z,
             self._column,
         )  # fmt: skip
-        if image is not None:
-            label_kernels.mark_texture(image, config.texture, config.texture_px, self._textured)
+        if pair is not None:
+            label_kernels.mark_texture(pair[0], config.texture, config.texture_px, self._textured)
         ground = self._find_ground(up_c, expected_m)
         if ground is not None and expected_m is not None and certain:
             ground = ground if ground.height_m > expected_m - config.expected_m else None
-        return self._scan(ground, up_c, expected_m)
+        return self._scan(ground, view, expected_m)
 
     def label_of(self, uv: F64) -> U8:
         """Labels (n,) of pixels (n,2) of the full image."""
@@ -116,12 +129,16 @@ class GroundSegmenter:
         in_image = float(np.hypot(up_c[0], up_c[1]))
         if in_image < _LEAST_IN_IMAGE:  # the camera looks straight up or down
             return None
+        counts.fill(0)
+        self._sums.fill(0.0)
         level_kernels.count_columns(self.x, self.z, self._column, bf, counts, self._sums)
         # Rows that level ground 1 m below fills with each pixel of disparity.
         rows_m = float(self._camera[1]) / bf
         level_kernels.find_upright(counts, self._sums, self._widths, 0.5 * config.obstacle_rows, rows_m, self._upright)
         below = round(-_BELOW_PX * up_c[0] / in_image), round(-0.5 * _BELOW_PX * up_c[1] / in_image)
         heights, (disparities, slopes) = self._heights, self._height_sums
+        heights.fill(0)
+        self._height_sums.fill(0.0)
         level_kernels.count_heights(
             self.x, self.z, self._column, self._upright, bf, below, _STEEPEST, _HEIGHT_STEP_M, heights, disparities,
             slopes,
@@ -153,7 +170,7 @@ class GroundSegmenter:
             coefficients, low, high, float(profile_kernels.spline_at(coefficients, low, high, high)) * bf / high
         )
 
-    def _scan(self, ground: Ground | None, up_c: F64, expected_m: float | None) -> ColumnScan:
+    def _scan(self, ground: Ground | None, view: _View, expected_m: float | None) -> ColumnScan:
         """Label the pixels by the ground that was found, or obstacles by the one expected, and collect them."""
         config, bins, n = self.config, self._bins, self.config.columns
         borders = np.arange(bins + 1) * level_kernels.BIN_PX
@@ -165,18 +182,28 @@ class GroundSegmenter:
         elif expected_m is not None:
             slope = borders * (expected_m / self.bf)
         grounds, obstacles, slab = self._counts[1:]
+        self.labels.fill(label_kernels.UNKNOWN)
+        for counts in (self._counts[1:], self._sums, self._in_band, self._slab_sums, self._surface_sums):
+            counts.fill(0)
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
             config.ground_sigmas, self._bands, config.slab_m, self.labels, grounds, obstacles, self._sums,
             self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
-            return self._scan(None, up_c, expected_m)
+            return self._scan(None, view, expected_m)
+        lowest = round(self._lowest_px / level_kernels.BIN_PX)
+        surface, bands = self._surface, np.empty(n, np.uint8)
+        label_kernels.find_surfaces(
+            obstacles, self._sums, self._in_band, slab, self._slab_sums, config.column_pixels, lowest, surface, bands
+        )
+        if view.pair is not None:
+            label_kernels.refine_surfaces(
+                *view.pair, view.rotation, self._camera, self.bf, view.offset_px, self.x, self.z, self._column,
+                self.labels, config.slab_m, surface, self._surface_sums,
+            )  # fmt: skip
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-        bands = np.empty(n, np.uint8)
         label_kernels.collect_scan(
-            grounds, obstacles, self._sums, self._in_band, slab, self._slab_sums, self._azimuths, self.bf,
-            config.column_pixels, round(self._lowest_px / level_kernels.BIN_PX), self.sigma_px, _GAP_M, free_from, free,
-            obstacle, bands, clear,
-        )  # fmt: skip
-        return ColumnScan(up_c, self._azimuth0, self._step, free_from, free, obstacle, bands, clear, height_m)
+            grounds, surface, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M, free_from, free, obstacle, clear
+        )
+        return ColumnScan(view.up_c, self._azimuth0, self._step, free_from, free, obstacle, bands, clear, height_m)

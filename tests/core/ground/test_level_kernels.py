@@ -51,7 +51,7 @@ def test_level_points() -> None:
 def test_counts_by_column_and_height() -> None:
     x, z, column = levelled(2)
     n, bins, heights, step_m = 12, 80, 60, 0.05
-    counts, sums = np.full((n, bins), 9, np.int32), np.full((n, bins), 9.0)
+    counts, sums = np.zeros((n, bins), np.int32), np.zeros((n, bins))
     level_kernels.count_columns(x, z, column, BF, counts, sums)
     valid = column >= 0
     j = np.where(valid, BF / (np.where(valid, x, 1.0) * np.float32(BIN_PX)), bins).astype(int)
@@ -68,7 +68,7 @@ def test_counts_by_column_and_height() -> None:
     assert np.array_equal(upright, (counts > 0) & (counts / 4.0 > 0.3 + 1.5 * mean * 0.5 * BIN_PX))
     assert upright.any() and not upright.all()
 
-    got, disparities, slopes = np.ones((bins, heights), np.int32), np.ones((bins, heights)), np.ones((bins, heights))
+    got, disparities, slopes = np.zeros((bins, heights), np.int32), np.zeros((bins, heights)), np.zeros((bins, heights))
     below = (2, 5)
     level_kernels.count_heights(x, z, column, upright, BF, below, 0.6, step_m, got, disparities, slopes)
     want = np.zeros((bins, heights))

@@ -129,7 +129,7 @@ def test_a_plain_floor_is_unknown() -> None:
     segmenter, disparity = view(up(), level_ground, wall(4.0))
     image = np.random.default_rng(1).normal(120.0, 0.45, segmenter.labels.shape).round().astype(np.uint8)
     image[: len(image) // 2] = np.random.default_rng(2).integers(0, 255, image[: len(image) // 2].shape)
-    scan = segmenter.segment(disparity, image, up())
+    scan = segmenter.segment(disparity, (image, image), up())
     floor = segmenter.labels[len(image) // 2 + 5 :]
     assert (floor == GROUND).mean() < 1e-2
     assert (scan.free_m == 0.0).mean() > 0.95
@@ -215,3 +215,24 @@ def test_unlocked_disparities_are_ordered_and_keep_whole_and_half_pixels() -> No
     assert (np.diff(d[17:]) > 0.0).all()
     whole = raw[0] > 0
     assert np.allclose(d[whole & (raw[0] % 8 == 0)], raw[0][whole & (raw[0] % 8 == 0)] / 16.0)
+
+
+def test_surfaces_are_refined_by_their_images() -> None:
+    """A wall whose disparities are all off by a fifth of a pixel is found where the images show it."""
+    segmenter, disparity = view(up(0.0, 0.0), level_ground, wall(3.0), noise_px=0.0)
+    rng, (h, w) = np.random.default_rng(6), disparity.shape
+    texture = rng.normal(120.0, 40.0, (h, w + 80))
+    for _ in range(4):
+        texture = (np.roll(texture, 1, 1) + 2.0 * texture + np.roll(texture, -1, 1)) / 4.0
+    true_px = segmenter.camera.bf / 3.0
+    at = np.arange(w) + 40.0
+    left = texture[:, 40 : 40 + w]
+    right = np.array([np.interp(at + true_px, np.arange(w + 80), row) for row in texture]) * 1.03 + 4.0
+    pair = left.round().clip(0, 255).astype(np.uint8), right.round().clip(0, 255).astype(np.uint8)
+    wrong = np.where(disparity > 0.0, disparity + 0.2, 0.0).astype(np.float32)
+    plain = segmenter.segment(wrong, None, up(0.0, 0.0), expected_m=HEIGHT_M)
+    refined = segmenter.segment(wrong, pair, up(0.0, 0.0), expected_m=HEIGHT_M)
+    seen = slice(8, -8)
+    errors = [np.median(np.abs((s.obstacle_m * np.cos(s.azimuths_rad))[seen] - 3.0)) for s in (plain, refined)]
+    assert errors[0] > 0.05
+    assert errors[1] < 0.015
