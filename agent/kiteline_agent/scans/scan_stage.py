@@ -134,7 +134,7 @@ class ScanStage:
         )  # fmt: skip
         self._work.segmented_px += disparity.size
         self._without_ground += 1
-        if np.isfinite(scan.camera_height_m):
+        if segmenter.saw_ground:
             self._ground_m, self._without_ground = height_m - scan.camera_height_m, 0
         labels = segmenter.label_of(begun.uv)
         record = KeyframeScan(begun.keyframe, scan, labels[:0] if self._channel.profile.thin else labels)

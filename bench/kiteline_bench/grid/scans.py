@@ -58,7 +58,7 @@ class Scanner:
             disparity = self._damage(disparity)
         z, up_c = float(T_w_c[2, 3]), np.ascontiguousarray(T_w_c[2, :3])
         expected_m = None if self._ground_z is None else z - self._ground_z
-        scan = self._segmenter.segment(disparity, self._stripes.left, up_c, None, expected_m)
+        scan = self._segmenter.segment(disparity, self._stripes.pair, up_c, None, expected_m)
         if np.isfinite(scan.camera_height_m):
             self._ground_z = z - scan.camera_height_m
         return PosedScan(scan, T_w_c)

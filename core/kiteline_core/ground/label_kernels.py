@@ -209,14 +209,33 @@ def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, lab
 
 
 @njit
+def _longest_ground(grounds, begin_m, end_m, lowest, bf, sigma_px, gap_m):  # type: ignore[no-untyped-def]
+    """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
+
+    The longest part with gaps of at most gap_m, or three deviations of the range. bf: px m along the column.
+    """
+    best_from, best, start, last = 0.0, 0.0, 0.0, 0.0
+    for j in range(len(grounds) - 1, lowest - 1, -1):
+        near, far = bf / ((j + 1) * BIN_PX), bf / ((j if j else 0.5) * BIN_PX)
+        if near < begin_m or grounds[j] < 2:
+            continue
+        if near >= end_m:
+            break
+        if last == 0.0 or near - last > max(gap_m, 3.0 * near * sigma_px / ((j + 1) * BIN_PX)):
+            start = near
+        last = far
+        if last - start > best - best_from:
+            best_from, best = start, last
+    return best_from, min(best, end_m)
+
+
+@njit
 def collect_scan(grounds, surface, azimuth, bf, lowest, sigma_px, gap_m, free_from, free, obstacle, clear):  # type: ignore[no-untyped-def]
     """Ranges (n,) in m of a column scan from ground counted over (n, bins) and disparities of surfaces (n,2).
 
-    azimuth: (n,). lowest: least bin that counts. Ground that is seen with gaps of at most gap_m, or three deviations of
-    its range, is free.
+    azimuth: (n,). lowest: least bin that counts. Free is the longest part of the ground, before the obstacle or behind.
     """
-    n, bins = grounds.shape
-    for c in range(n):
+    for c in range(len(grounds)):
         along = 1.0 / np.cos(azimuth[c])
         obstacle[c], free[c], free_from[c], clear[c] = np.inf, 0.0, 0.0, 0.0
         if surface[c, 0] > 0.0:
@@ -225,19 +244,14 @@ def collect_scan(grounds, surface, azimuth, bf, lowest, sigma_px, gap_m, free_fr
             clear[c] = bf / surface[c, 1] * along
             if abs(surface[c, 1] - surface[c, 0]) < _SAME_PX:
                 clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
-        for j in range(bins - 1, lowest - 1, -1):
-            near, far = bf / ((j + 1) * BIN_PX) * along, bf / ((j if j else 0.5) * BIN_PX) * along
-            if near >= obstacle[c]:
-                break
-            if grounds[c, j] < 2:
-                continue
-            deviation = near * sigma_px / ((j + 1) * BIN_PX)
-            if free[c] == 0.0:
-                free_from[c] = near
-            elif near - free[c] > max(gap_m, 3.0 * deviation):
-                break
-            free[c] = far
-        if free[c] > 0.0 and obstacle[c] < np.inf:
+        free_from[c], free[c] = _longest_ground(grounds[c], 0.0, obstacle[c], lowest, bf * along, sigma_px, gap_m)
+        if obstacle[c] < np.inf:
             deviation = obstacle[c] * sigma_px / surface[c, 0]
-            if obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):  # up to its foot, as well as that is known
-                free[c] = max(obstacle[c] - deviation, free_from[c])
+            if free[c] > 0.0 and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
+                free[c] = max(obstacle[c] - deviation, free_from[c])  # up to its foot, as well as that is known
+            begin, end = _longest_ground(
+                grounds[c], obstacle[c] + 3.0 * deviation, np.inf, lowest, bf * along, sigma_px, gap_m
+            )
+            end -= 2.0 * end * end / (bf * along) * sigma_px  # what stands there is not in the scan
+            if end - begin > free[c] - free_from[c]:  # seen over a low obstacle
+                free_from[c], free[c] = begin, end

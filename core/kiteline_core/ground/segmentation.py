@@ -86,6 +86,7 @@ class GroundSegmenter:
         self.x, self.z = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
         self._column = np.empty((h, w), np.int16)
         self.labels = np.zeros((h, w), np.uint8)
+        self.saw_ground = False  # in the last image
         self._textured = np.ones((h, w), np.bool_)
         self._counts, self._sums = np.empty((4, n, bins), np.int32), np.empty((n, bins))
         self._slab_sums = np.empty((n, bins))
@@ -174,13 +175,14 @@ class GroundSegmenter:
         """Label the pixels by the ground that was found, or obstacles by the one expected, and collect them."""
         config, bins, n = self.config, self._bins, self.config.columns
         borders = np.arange(bins + 1) * level_kernels.BIN_PX
+        self.saw_ground = ground is not None
         slope, seen, height_m = np.full(bins + 1, np.nan), np.zeros(bins, np.bool_), float("nan")
         if ground is not None:
             profile_kernels.sample_spline(ground.coefficients, ground.low_px, ground.high_px, borders, slope)
             seen = (borders[:-1] >= ground.low_px - _BEYOND_PX) & (borders[1:] <= ground.high_px * _NEARER)
             height_m = ground.height_m
         elif expected_m is not None:
-            slope = borders * (expected_m / self.bf)
+            slope, height_m = borders * (expected_m / self.bf), expected_m
         grounds, obstacles, slab = self._counts[1:]
         self.labels.fill(label_kernels.UNKNOWN)
         for counts in (self._counts[1:], self._sums, self._in_band, self._slab_sums, self._surface_sums):

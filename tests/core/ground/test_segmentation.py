@@ -125,6 +125,18 @@ def test_a_box_on_the_ground_is_an_obstacle_of_its_height() -> None:
     assert (scan.obstacle_m[beside] > 5.0).all()
 
 
+def test_ground_behind_a_low_obstacle_is_free() -> None:
+    """A box so near that no ground is seen before it."""
+    box = wall(1.2, -HEIGHT_M, -HEIGHT_M + 0.6)
+    segmenter, disparity = view(up(0.0, 25.0), level_ground, wall(5.0), box)
+    scan = segmenter.segment(disparity, None, up(0.0, 25.0))
+    ahead = np.cos(scan.azimuths_rad)
+    middle = slice(12, -12)
+    assert np.abs((scan.obstacle_m * ahead)[middle] - 1.2).max() < 0.1
+    assert ((scan.free_from_m * ahead)[middle] > 1.2 * HEIGHT_M / 0.9 - 0.15).all()  # what the box hides is unknown
+    assert ((scan.free_m * ahead)[middle] > 4.0).mean() > 0.9 and (scan.free_m * ahead < 5.0).all()
+
+
 def test_a_plain_floor_is_unknown() -> None:
     segmenter, disparity = view(up(), level_ground, wall(4.0))
     image = np.random.default_rng(1).normal(120.0, 0.45, segmenter.labels.shape).round().astype(np.uint8)
@@ -151,7 +163,7 @@ def test_a_table_is_not_taken_for_the_ground_that_was_expected() -> None:
     alone = segmenter.segment(disparity, None, up(0.0, 20.0))
     assert alone.camera_height_m == pytest.approx(0.5 * HEIGHT_M, abs=0.05)
     scan = segmenter.segment(disparity, None, up(0.0, 20.0), expected_m=HEIGHT_M)
-    assert np.isnan(scan.camera_height_m)
+    assert scan.camera_height_m == HEIGHT_M and not segmenter.saw_ground
     assert not scan.free_m.any()
     assert np.isfinite(scan.obstacle_m).mean() > 0.9
 
