@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_bench.grid import maps, robust
+from kiteline_bench.grid import maps, obstacles, robust, street
 from kiteline_bench.grid.accuracy import objects_present
+from kiteline_bench.grid.flown import FlownGrid
 from kiteline_bench.grid.places import Place
 from kiteline_bench.grid.ray_kernels import cast_rays
 from kiteline_bench.grid.sparse import (
@@ -29,6 +31,7 @@ from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sim.truth.box_files import read_boxes
 from kiteline_hw.sim.truth.occupancy import occupancy
 from kiteline_hw.sim.truth.sight import look
+from kiteline_hw.sim.world.world import World
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
 
 
@@ -166,3 +169,59 @@ def test_free_cells_inside_a_box_and_out_of_sight_are_told(tmp_path: Path) -> No
     wrong, unseen = robust._bars("case", Case([], seen, 1.0))
     assert not wrong.met and float(wrong.measured.split()[0]) == pytest.approx(100 / 3, abs=3)
     assert not unseen.met and float(unseen.measured.split()[0]) == pytest.approx(100 / 3, abs=3)
+
+
+def posed(x: float, y: float, yaw: float = 0.0) -> np.ndarray:
+    """A vehicle (forward, right, down) at a height of 1 m."""
+    turn = se3.so3_exp(np.array([0.0, 0.0, yaw])) @ np.diag([1.0, -1.0, -1.0])
+    return se3.from_rt(turn, np.array([x, y, 1.0]))
+
+
+BANDS_M = (0.1, 0.5, 1.2, 2.0)
+
+
+def box_room(tmp_path: Path) -> World:
+    """8 by 6 m with a pillar ahead, and a low box to the right of the middle."""
+    (tmp_path / "b.csv").write_text("0,0,1.5,4,3,1.5,0\n2.1,0,1.5,0.1,0.5,1.5,0\n0,-1.5,0.2,0.3,0.3,0.2,0\n")
+    return read_boxes(tmp_path / "b.csv")
+
+
+def test_true_distances_go_clockwise_and_know_heights(tmp_path: Path) -> None:
+    near, far = obstacles.true_distances(box_room(tmp_path), posed(0.0, 0.0), 72, BANDS_M)
+    assert near[0] == pytest.approx(2.0, abs=0.01) and far[0] == pytest.approx(2.0, abs=0.01)
+    assert far[18] == pytest.approx(3.0, abs=0.01), "to the right, over the low box"
+    assert near[18] == pytest.approx(3.0, abs=0.01), "which lies below the bands that the vehicle is in"
+    assert far[36] == pytest.approx(4.0, abs=0.01) and (near <= far + 1e-9).all()
+    turned, _ = obstacles.true_distances(box_room(tmp_path), posed(0.0, 0.0, 0.5 * np.pi), 72, BANDS_M)
+    assert np.allclose(turned[18], near[0]) and np.allclose(turned[0], 3.0, atol=0.01)
+
+
+def test_the_judge_counts_right_wrong_unknown_and_phantoms(tmp_path: Path) -> None:
+    world = box_room(tmp_path)
+    judge = obstacles.Judge(world, BANDS_M)
+    _, far = obstacles.true_distances(world, posed(0.0, 0.0), 72, BANDS_M)
+    only_ahead = np.where(np.abs((np.arange(72) + 36) % 72 - 36) <= 8, far, np.nan)
+    judge.compare(only_ahead, posed(0.0, 0.0), 0.05)
+    assert (judge.told, judge.right, judge.unknown, judge.unseen) == (17, 17, 55, 0)
+    phantom = only_ahead.copy()
+    phantom[3] = 0.4
+    for _ in range(4):
+        judge.compare(phantom, posed(0.0, 0.0), 0.05)
+    assert judge.phantom_s == pytest.approx(0.3) and judge.told - judge.right == 4
+    judge.compare(far, posed(0.0, 0.0), 0.05)
+    assert judge.unseen == 72 - 23, "the vehicle has not turned yet"
+    judge.compare(only_ahead + 0.3, posed(0.0, 0.0), 0.05)
+    assert judge.told - judge.right > 4 + 12
+
+
+def test_the_way_that_was_driven_is_looked_up_in_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = np.full((100, 200), UNKNOWN, np.int8)
+    states[40:60, :150] = FREE
+    states[20, :] = OCCUPIED
+    path = np.column_stack([np.linspace(0.5, 9.5, 30), np.full(30, 2.5)])
+    monkeypatch.setattr(street, "_path", lambda _: path)
+    flight = FlownGrid(None, GridFile(0.05, (0.0, 0.0, 0.0), states), np.eye(4), 0.0)  # type: ignore[arg-type]
+    free, known, solid = street._driven(flight)
+    assert free == 1.0 and 0.4 < known < 0.6 and solid == pytest.approx(200 * 0.05**2)
+    picture = cv2.imdecode(np.frombuffer(street._picture(flight, np.zeros((37, 124), np.uint8)), np.uint8), 1)
+    assert picture.shape[1] == 900 and ((picture[..., 2] > 180) & (picture[..., 0] < 90)).sum() > 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,8 +106,12 @@ def fly_recording(
     base: BaseConfig | None = None,
     bytes_s: tuple[int, int] = (0, 0),
     profile: str = "wifi",
+    each: Callable[[FlyingAgent], None] | None = None,
 ) -> RecordingRun:
-    """Fly an agent with a base, in lock-step; packets arrive with the next frame. bytes_s: budget up and down."""
+    """Fly an agent with a base, in lock-step; packets arrive with the next frame. bytes_s: budget up and down.
+
+    each: is called with the agent after each of its steps.
+    """
     station = Station(base or BaseConfig(), lambda _: coded_channel(1, bytes_s[1], profile), shipped_vocabulary())
     jobs, number = LockstepJobs(), AgentId(0)
     channel = coded_channel(1, bytes_s[0], profile)
@@ -117,6 +121,8 @@ def fly_recording(
     for item in recording.items:
         now_ns = item.frame.t_ns - first_ns
         up = flying.step(item, down, now_ns)
+        if each is not None:
+            each(flying)
         flying.run.placed.append(bool(flying.run.found[-1].submap in station.mapper.placements))
         flying.run.bytes_down += sum(map(len, down))
         flying.run.bytes_up += sum(map(len, up))

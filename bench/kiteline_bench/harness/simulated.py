@@ -16,6 +16,7 @@ from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3, tum
 from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import open_sim
+from kiteline_hw.sim.world.world import World
 from kiteline_lab.flights import simulate
 
 SIM_SECONDS = 30.0
@@ -77,10 +78,11 @@ def rendered_paths(bench: Bench, name: str, scene: str, paths: Sequence[str], se
 
 @dataclass(frozen=True, slots=True)
 class RandomFlight:
-    """A simulated flight in memory. moving: it begins in full motion."""
+    """A simulated flight in memory. moving: it begins in full motion. world: what is true of it."""
 
     recording: Recording
     moving: bool
+    world: World
 
 
 def random_flight(
@@ -116,7 +118,7 @@ def random_flight(
     source = open_sim(scene, os.cpu_count() or 1, **options, **more)
     assert source.imu is not None and source.ground_truth is not None
     recording = Recording(source.rig, source.imu, tuple(items_of(source)))
-    return RandomFlight(recording, options["rest"] == 0.0)
+    return RandomFlight(recording, options["rest"] == 0.0, source.world)
 
 
 def _write_path(file: Path, rng: np.random.Generator, seconds: float, size_m: tuple[float, float, float]) -> None:

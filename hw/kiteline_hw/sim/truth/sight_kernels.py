@@ -82,3 +82,19 @@ def mark_sight(
             else:
                 tr += tall
                 r += sr
+
+
+@njit(cache=True, nogil=True)
+def level_distances(boxes: F64, shell: int, xy: F64, heights: F64, angles: F64, out: F64) -> None:
+    """Distance to the nearest solid along level rays. xy: (2,). heights: (h,) z. angles: (n,). out: (n, h)."""
+    o = np.empty(3)
+    o[0], o[1] = xy[0], xy[1]
+    for j in range(heights.shape[0]):
+        o[2] = heights[j]
+        for i in range(angles.shape[0]):
+            dx, dy = np.cos(angles[i]), np.sin(angles[i])
+            best = np.inf
+            for k in range(boxes.shape[0]):
+                t, _ = box_hit(boxes, k, o, dx, dy, 0.0, k == shell)
+                best = min(best, t)
+            out[i, j] = best
