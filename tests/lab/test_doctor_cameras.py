@@ -84,6 +84,25 @@ def test_lost_images_count(checked) -> None:  # type: ignore[no-untyped-def]
     assert drops.severity is Severity.FAIL and "lost by camera or driver" in drops.text and "USB" in drops.remedy
 
 
+def test_looking_at_images_loses_none_on_a_slow_computer(checked, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+    ratio = cameras.edge_ratio
+
+    def slow(view: np.ndarray) -> float:
+        time.sleep(0.07)
+        return ratio(view)
+
+    monkeypatch.setattr(cameras, "edge_ratio", slow)
+    assert checked(pair())["camera drops"].severity is Severity.OK
+
+
+def test_a_program_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(f"fx: 200\nfy: 200\ncx: 159.5\ncy: 119.5\nwidth: {W}\nheight: {H}\n")
+    monkeypatch.setattr(cameras, "_PATIENCE_S", 0.5)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    (found,) = cameras.check_cameras(f"stream:rtsp://127.0.0.1:9/a?calibration={tmp_path / 'camera.yaml'}")
+    assert found.severity is Severity.FAIL and "apt install ffmpeg" in found.text and "cable" not in found.remedy
+
+
 def test_a_rate_that_is_not_as_asked(checked) -> None:  # type: ignore[no-untyped-def]
     devices = pair()
     for device in devices:

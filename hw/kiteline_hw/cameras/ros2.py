@@ -26,6 +26,8 @@ from kiteline_hw.sources.open import open_source as open_recording
 _WAITING = 4  # messages that wait for the thread that decodes; the oldest are dropped
 _MAX_SAMPLES = 8192  # buffered between two frames; 40 s at 200 Hz
 _IMU = "imu="
+_AT_ONCE_NS = 20_000  # ns between two readings of a clock without a pause between them
+_READINGS = 5  # of both clocks, at most
 
 
 class RosCamera:
@@ -79,7 +81,19 @@ class RosCamera:
 def monotonic_ns(message: Any) -> int | None:
     """The stamp of a message, which is on the wall clock, on the monotonic one; None if it has none."""
     stamp_ns = read_stamp(message, 0)
-    return None if stamp_ns == 0 else stamp_ns - (time.time_ns() - time.monotonic_ns())
+    return None if stamp_ns == 0 else stamp_ns - _wall_less_monotonic_ns()
+
+
+def _wall_less_monotonic_ns() -> int:
+    """Difference of the two clocks. A thread that waits for its turn between two readings would add the wait."""
+    least_ns, difference_ns = 2**63, 0
+    for _ in range(_READINGS):
+        before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after_ns - before_ns < least_ns:
+            least_ns, difference_ns = after_ns - before_ns, wall_ns - (before_ns + after_ns) // 2
+        if least_ns < _AT_ONCE_NS:
+            break
+    return difference_ns
 
 
 class RosSource:

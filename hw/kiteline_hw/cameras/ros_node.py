@@ -11,6 +11,7 @@ from typing import Any
 from kiteline_hw.cameras.camera import CameraError
 
 _SPIN_S = 0.1  # s that the thread waits for a message at most: it ends as soon after `close`
+_FAILED_S = 0.01  # s after an error: one that lasts must not take a processor
 MISSING = (
     "ROS 2 is not there (rclpy and sensor_msgs cannot be imported: {}): `apt install ros-DISTRO-rclpy "
     "ros-DISTRO-sensor-msgs`, then `source /opt/ros/DISTRO/setup.bash` before kiteline, which must run in ROS's Python "
@@ -60,8 +61,10 @@ class RosNode:
 
     def _spin(self) -> None:
         while not self._closed.is_set():
-            with contextlib.suppress(Exception):  # of a message that cannot be decoded: the next one may be
+            try:
                 self._executor.spin_once(timeout_sec=_SPIN_S)
+            except Exception:  # a message that cannot be decoded: the next one may be; a context that was shut down
+                self._closed.wait(_FAILED_S)
 
     def close(self) -> None:
         """End node and thread, within a second. May be called twice."""

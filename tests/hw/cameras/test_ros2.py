@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from kiteline_core.frame import Frame, ImuBatch
+from kiteline_hw.cameras import ros2
 from kiteline_hw.cameras.ros2 import RosSource
 from kiteline_hw.ports import SourceError, is_live
 from kiteline_hw.sources.open import open_source
@@ -196,6 +197,41 @@ def test_inertial_samples_come_before_their_frame(graph: Graph, calibrated: str)
     late = polled(source)
     assert isinstance(late, ImuBatch) and late.gyro[:, 0] == pytest.approx([0.3])
     source.close()
+
+
+def test_a_pause_between_readings_of_the_clocks_does_not_move_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
+    for paused in range(4):
+        now_ns, readings = [5 * S], [0]
+
+        def read(
+            begin_ns: int, paused: int = paused, now_ns: list[int] = now_ns, readings: list[int] = readings
+        ) -> int:
+            now_ns[0] += 30_000_000 if readings[0] == paused else 100  # another thread runs for 30 ms
+            readings[0] += 1
+            return begin_ns + now_ns[0]
+
+        clocks = SimpleNamespace(monotonic_ns=lambda: read(0), time_ns=lambda: read(1000 * S))
+        monkeypatch.setattr(ros2, "time", clocks)
+        message = SimpleNamespace(header=header(1004 * S))
+        assert ros2.monotonic_ns(message) == pytest.approx(4 * S, abs=1000)
+
+
+def test_a_middleware_that_fails_on_and_on_takes_no_processor(
+    graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, calls = tmp_path / "camera.yaml", [0]
+    path.write_text(CAMERA)
+
+    def fail(timeout_sec: float) -> None:
+        calls[0] += 1
+        raise RuntimeError("the context was shut down")
+
+    executor = SimpleNamespace(add_node=lambda node: None, spin_once=fail, shutdown=lambda: None)
+    monkeypatch.setattr(sys.modules["rclpy.executors"], "SingleThreadedExecutor", lambda context: executor)
+    source = open_source(f"ros2:/image?calibration={path}")
+    time.sleep(0.3)
+    source.close()
+    assert 2 < calls[0] < 60
 
 
 def test_an_imu_needs_its_calibration(graph: Graph, tmp_path: Path) -> None:

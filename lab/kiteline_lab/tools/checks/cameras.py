@@ -21,7 +21,7 @@ U8 = NDArray[np.uint8]
 
 WATCH_S = 6.0  # s of images
 _PATIENCE_S = 15.0  # s until the first image
-_EVERY = 5  # images of which one is looked at
+_LOOK_NS = 250_000_000  # ns from one image that is looked at to the next
 _GOOD_SKEW_MS, _BAD_SKEW_MS = 1.0, 5.0  # at 1 m/s and 2 m, 1 ms is a quarter of a pixel
 _GOOD_JITTER_MS, _LATE_MS = 2.0, 60.0
 _GOOD_RATE, _BAD_RATE = 0.05, 0.25  # relative
@@ -31,14 +31,20 @@ _CLIPPED = 0.05  # of the pixels
 _UNEQUAL = 0.2  # relative; alignment compares left and right images pixel by pixel
 _SHARP, _BLURRED = 0.75, 0.64  # edge ratio: sharp recordings have .83 to .93, blurred by 1 px .67, by 1.5 px .60
 _NO_STAMPS = "tells no capture times"  # of what a camera says
+_TRIED = "it is tried again and again"  # the end of what is said of a camera that cannot be opened
 _OPENED = re.compile(r"(picamera \d+|\S+): (?!images again)")  # what a camera took; of outages it says "NAME was …"
 _CORNERS = 60  # tracking begins to fail below
 
 
 @dataclass
 class Watched:
-    """What was seen. fps: asked for, 0: unknown. said: what the cameras told."""
+    """What was seen. said: what the cameras told.
 
+    Images are looked at when all have come: on a small computer it takes longer than the next one waits.
+    """
+
+    views: list[tuple[U8, ...]] = field(default_factory=list)  # left, right: kept until `look`
+    kept_ns: int = 0  # stamp of the last of them
     t_ns: list[int] = field(default_factory=list)
     age_ms: list[float] = field(default_factory=list)
     grey: list[tuple[float, ...]] = field(default_factory=list)  # mean of each view
@@ -52,16 +58,22 @@ class Watched:
 
     def add(self, frame: Frame, now_ns: int | None) -> None:
         """Add a frame, and when it was there."""
-        if len(self.t_ns) % _EVERY == 0:
-            views = [frame.left] if frame.right is None else [frame.left, frame.right]
-            self.grey.append(tuple(float(view.mean()) for view in views))
-            self.clipped.append(float(max(((view < 4) | (view > 251)).mean() for view in views)))
-            self.sharp.append(tuple(edge_ratio(view) for view in views))
-            found: Any = cv2.goodFeaturesToTrack(frame.left, 300, 0.02, 10.0)
-            self.corners.append(0 if found is None else len(found))
+        if not self.views or frame.t_ns - self.kept_ns >= _LOOK_NS:
+            self.views.append((frame.left,) if frame.right is None else (frame.left, frame.right))
+            self.kept_ns = frame.t_ns
         self.t_ns.append(frame.t_ns)
         if now_ns is not None:
             self.age_ms.append((now_ns - frame.t_ns) / 1e6)
+
+    def look(self) -> None:
+        """Look at the images that were kept, and drop them."""
+        for views in self.views:
+            self.grey.append(tuple(float(view.mean()) for view in views))
+            self.clipped.append(float(max(((view < 4) | (view > 251)).mean() for view in views)))
+            self.sharp.append(tuple(edge_ratio(view) for view in views))
+            found: Any = cv2.goodFeaturesToTrack(views[0], 300, 0.02, 10.0)
+            self.corners.append(0 if found is None else len(found))
+        self.views.clear()
 
 
 def check_cameras(spec: str, calibration: str = "", seconds: float = WATCH_S) -> list[DoctorCheck]:
@@ -98,15 +110,16 @@ def watch(source: FrameSource, seconds: float) -> Watched:
         seen.dropped = source.take_dropped()
         seen.skew_ns = source.skew_ns
     seen.skipped = dict(source.report.skipped)
+    seen.look()
     return seen
 
 
 def judge(seen: Watched, fps: float) -> Iterator[DoctorCheck]:
     """The verdicts. fps: asked for; 0: of a recording, whose stamps and drops are history."""
-    told = [line.removeprefix("camera ") for line in seen.said if line.startswith("camera ")]
+    told = [line.removeprefix("camera ") for line in seen.said if line.startswith("camera ") or line.endswith(_TRIED)]
     if not seen.t_ns:
-        text = told[-1] if told else "no image came"
-        yield DoctorCheck(Severity.FAIL, "cameras", text, "check its cable, and its trigger if it has one")
+        mend = "" if told and told[-1].endswith(_TRIED) else "check its cable, and its trigger if it has one"
+        yield DoctorCheck(Severity.FAIL, "cameras", told[-1] if told else "no image came", mend)
         return
     outages = [line for line in told if not _OPENED.match(line) and _NO_STAMPS not in line]
     if outages:
