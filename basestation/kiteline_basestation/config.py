@@ -313,6 +313,7 @@ class GridConfig:
     log_free_far: int = 1  # 1/16; the same of a far view
     occupied_from: int = 6  # 1/16; log-odds from which a band is occupied: one near view, two far ones
     free_from: int = 2  # 1/16; a cell is free if all bands lie below minus this: one near view, two far ones
+    free_beside: int = 5  # 1/16; the same beside an occupied cell: two near views, as one may lie a cell off
     opening: bool = True  # what is free is opened by three by three cells: gaps between two rays are no ways
     ground_m: float = (
         -1.2

@@ -113,7 +113,7 @@ def test_what_moves_less_than_the_lattice_is_not_drawn_again() -> None:
 
 def test_each_cell_of_a_scan_is_freed_once() -> None:
     """Sectors share no cell and leave none out, whatever the heading."""
-    config = replace(CONFIG, storey_overlap_m=0.0, opening=False)
+    config = replace(CONFIG, storey_overlap_m=0.0, opening=False, free_below_m=0.0)
     rng = np.random.default_rng(3)
     for heading in [*np.arange(8) * np.pi / 4, *rng.uniform(-4, 4, 12)]:
         wide = ColumnScan(
@@ -187,13 +187,15 @@ def test_states_are_read_as_in_the_reference(seed: int, opening: bool) -> None:
         whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]][:1] + pool[slots[r, c]][1:]
     mask = sum((whole[b] >= 6).astype(int) << b for b in range(3))
     free = (whole <= -2).all(axis=0)
+    shifts = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
+    beside = np.any([np.roll(mask > 0, s, (0, 1)) for s in shifts], axis=0)
+    free &= ~beside | (whole <= -4).all(axis=0)
     if opening:
-        shifts = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
         eroded = np.all([np.roll(free, s, (0, 1)) for s in shifts], axis=0)
         free &= np.any([np.roll(eroded, s, (0, 1)) for s in shifts], axis=0)
     expected = np.where(mask > 0, mask, np.where(free, 0, -1))[64:128, 64:128]
     cells = np.empty((64, 64), np.int8)
-    known = kernels.read_states(slots, pool, 6, 2, int(opening), cells)
+    known = kernels.read_states(slots, pool, 6, 2, 4, int(opening), cells)
     assert np.array_equal(cells, expected)
     assert known == np.count_nonzero(expected >= 0)
 
@@ -227,6 +229,23 @@ def test_a_table_leaves_the_floor_below_it_and_nothing_is_known_behind_a_wall() 
     solid = replace(under, bands=np.full(84, 3, np.uint8))
     grid.put(0, kept(solid, config), camera(0.0, 0.0, 0.0))
     assert not grid.log_odds(Place(0, 0, 0))[:, 2, 42:].any()
+
+
+def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_if_two_views_say_so() -> None:
+    bare = ColumnScan(
+        np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 2.0), np.full(70, 4.0), np.full(70, np.inf),
+        np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
+    )  # fmt: skip
+    grid = ScanGrid(CONFIG)
+    grid.put(0, kept(bare), camera(0.0, 0.0, 0.0))
+    near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.free_below_m / HEIGHT_M)
+    odds = grid.log_odds(near)[:, 1]
+    columns = (np.arange(64) + 0.5) * 0.05
+    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
+    assert not odds[:, columns < first - 0.05].any()
+    assert grid.cells(near)[0][1, 30] == -1
+    grid.put(1, kept(bare), camera(0.0, 0.0, 0.05))
+    assert grid.cells(near)[0][1, 30] == 0
 
 
 def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None:

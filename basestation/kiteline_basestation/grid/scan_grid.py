@@ -126,7 +126,13 @@ class ScanGrid:
         cells = np.empty((SIDE, SIDE), np.int8)
         config = self.config
         known = kernels.read_states(
-            slots, self._store.pool, config.occupied_from, config.free_from, int(config.opening), cells
+            slots,
+            self._store.pool,
+            config.occupied_from,
+            config.free_from,
+            config.free_beside,
+            int(config.opening),
+            cells,
         )
         self._store.close()
         return cells, int(known)
@@ -156,7 +162,9 @@ class ScanGrid:
         gap = np.maximum(1.0, 2.0 * scan.sigma_per_m2 * near_m**2 * scale / cell)
         before = np.where(bands > 0, obstacle - gap, np.inf)
         under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
-        space = np.stack([start, np.minimum(free, before), free, np.minimum(clear, before)], 1)
+        # A ray to the ground passes low over the cells before it: only what stands lower would not have been seen.
+        low = start * max(0.0, 1.0 - config.free_below_m / max(scan.height_m, 1e-3))
+        space = np.stack([low, start, np.minimum(free, before), free, np.minimum(clear, before)], 1)
         accurate_m = config.accurate_m
         weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
 

@@ -98,18 +98,25 @@ def draw_free(
 ) -> None:  # fmt: skip
     """Take evidence of free space from the cells of each column's sector; each cell belongs to one column.
 
-    free: (n,4) ranges in cells: from and up to where all bands are free, up to where the bands `under` (n,) are free
-    too, and up to where the line of sight is clear, which frees camera_band (-1: none). weight: up to near_cells;
-    far_weight: beyond. Marked cells keep the bands of their obstacles.
+    free: (n,5) ranges in cells: from where the rays to the nearest seen ground are low, from and up to where the ground
+    was seen and all bands are free, up to where the bands `under` (n,) are free too, and up to where the line of sight
+    is clear, which frees camera_band (-1: none). weight: of seen ground up to near_cells; far_weight: beyond, and where
+    rays are low. Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
     near2 = near_cells * near_cells
     for i in range(free.shape[0]):
-        start, end, low, clear = free[i, 0], free[i, 1], free[i, 2], free[i, 3] if camera_band >= 0 else 0.0
+        start, end, low, clear = free[i, 1], free[i, 2], free[i, 3], free[i, 4] if camera_band >= 0 else 0.0
         reach = max(end, low, clear)
         if reach <= 0.0:
             continue
-        start2, end2, low2, clear2 = start * start, end * end, max(end, low) ** 2, clear * clear
+        begin2, start2, end2, low2, clear2 = (
+            free[i, 0] * free[i, 0],
+            start * start,
+            end * end,
+            max(end, low) ** 2,
+            clear * clear,
+        )
         if end <= 0.0:
             end2 = -1.0
         if max(end, low) <= 0.0:
@@ -145,7 +152,7 @@ def draw_free(
                     dx = column + 0.5 - x
                     distance2 = dx * dx + dy * dy
                     bands = 0
-                    if start2 <= distance2 <= low2:
+                    if begin2 <= distance2 <= low2:
                         bands = _ALL if distance2 <= end2 else int(np.int64(under[i]))
                     if distance2 <= clear2:
                         bands |= 1 << camera_band
@@ -155,7 +162,7 @@ def draw_free(
                     if slot < 0:
                         slot = _tile(row, column, slots, spare, used)
                         touched[row >> _SHIFT, column >> _SHIFT] = 1
-                    value = -sign * (weight if distance2 <= near2 else far_weight)
+                    value = -sign * (weight if start2 <= distance2 <= near2 else far_weight)
                     if bands == _ALL:
                         total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
                         pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
@@ -172,38 +179,49 @@ def clear_hits(hits: U16, cells: I32, found: int) -> None:
 
 
 @helper
-def _state(pool: I16, slots: I32, row: int, column: int, occupied_from: int, free_from: int) -> int:
-    """-1 unknown, 0 free, else the mask of occupied bands. row, column: from the corner of the tile in the middle."""
+def _state(pool: I16, slots: I32, row: int, column: int, occupied_from: int) -> tuple[int, int]:
+    """Mask of occupied bands, and the largest log-odds. row, column: from the corner of the tile in the middle."""
     slot = slots[(row + SIDE) >> _SHIFT, (column + SIDE) >> _SHIFT]
     if slot < 0:
-        return -1
-    mask, free, common = 0, 0, int(pool[slot, 0, row & _MASK, column & _MASK])
+        return 0, 0
+    mask, most, common = 0, -2 * _MOST, int(pool[slot, 0, row & _MASK, column & _MASK])
     for b in range(BANDS):
         value = common + int(pool[slot, 1 + b, row & _MASK, column & _MASK])
         mask |= (value >= occupied_from) << b
-        free += value <= -free_from
-    return mask if mask else 0 if free == BANDS else -1
+        most = max(most, value)
+    return mask, most
 
 
 @njit
-def read_states(slots: I32, pool: I16, occupied_from: int, free_from: int, opening: int, cells: I8) -> int:
+def read_states(
+    slots: I32, pool: I16, occupied_from: int, free_from: int, free_beside: int, opening: int, cells: I8
+) -> int:
     """States of the cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands.
 
     slots: (3,3) of the tile and those around it. occupied_from, free_from: log-odds from which a band is occupied, and
-    below minus which all bands have to be for the cell to be free. opening: 1 keeps free only what lies in a square of
-    three by three free cells. Returns the number of known cells.
+    minus which all bands must not exceed for the cell to be free. free_beside: the same beside an occupied cell.
+    opening: 1 keeps free only what lies in a square of three by three free cells. Returns the number of known cells.
     """
-    margin = 2 if opening else 0
+    margin = 3  # what is read around the tile: a square reaches two cells far, and each of its cells has neighbours
     wide = SIDE + 2 * margin
-    states = np.empty((wide, wide), np.int8)
+    states, odds = np.empty((wide, wide), np.int8), np.empty((wide, wide), np.int32)
     for row in range(wide):
         for column in range(wide):
-            states[row, column] = _state(pool, slots, row - margin, column - margin, occupied_from, free_from)
+            mask, most = _state(pool, slots, row - margin, column - margin, occupied_from)
+            states[row, column] = mask if mask else 0 if most <= -free_from else -1
+            odds[row, column] = most
+    for row in range(1, wide - 1):
+        for column in range(1, wide - 1):
+            if states[row, column] == 0 and odds[row, column] > -free_beside:
+                for r in range(row - 1, row + 2):
+                    for c in range(column - 1, column + 2):
+                        if states[r, c] > 0:
+                            states[row, column] = -1
     known = 0
     if opening:
         kept = np.zeros((wide, wide), np.uint8)
-        for row in range(1, wide - 1):
-            for column in range(1, wide - 1):
+        for row in range(2, wide - 2):
+            for column in range(2, wide - 2):
                 whole = True
                 for r in range(row - 1, row + 2):
                     for c in range(column - 1, column + 2):
@@ -212,8 +230,8 @@ def read_states(slots: I32, pool: I16, occupied_from: int, free_from: int, openi
                     for r in range(row - 1, row + 2):
                         for c in range(column - 1, column + 2):
                             kept[r, c] = 1
-        for row in range(wide):
-            for column in range(wide):
+        for row in range(margin, wide - margin):
+            for column in range(margin, wide - margin):
                 if states[row, column] == 0 and kept[row, column] == 0:
                     states[row, column] = -1
     for row in range(SIDE):
