@@ -248,6 +248,20 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_if_tw
     assert grid.cells(near)[0][1, 30] == 0
 
 
+def test_ground_that_was_seen_over_a_low_obstacle_is_free_and_what_it_hides_is_unknown() -> None:
+    seen = scan_of(np.array(box(-3.0, -3.0, 3.0, 3.0)), 0.0, 0.0, 0.0)
+    over = replace(
+        seen, obstacle_m=np.full(84, 1.03), bands=np.full(84, 1, np.uint8), free_from_m=np.full(84, 1.8),
+        free_m=np.full(84, 2.6), clear_m=np.zeros(84),
+    )  # fmt: skip
+    grid = ScanGrid(replace(CONFIG, opening=False))
+    grid.put(0, kept(over), camera(0.0, 0.0, 0.0))
+    odds = grid.log_odds(Place(0, 0, 0))
+    assert odds[:, 2, 20].max() > 0 and not odds[0, 2, :20].any()
+    assert not odds[0, 2, 23:35].any(), "hidden"
+    assert (odds[0, 2, 38:50] < 0).all(), "seen behind it"
+
+
 def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None:
     scan = scan_of(ROOM, 3.0, -2.0, 0.0)
     long = scan.free_m.copy()
