@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
+_RECENT = 16  # scans that are taken back if a lower ground is seen
 _WAITING = 256  # scans kept while the link has no room, 1 MB
 
 
@@ -72,6 +73,7 @@ class ScanStage:
         self._without_ground = 0  # scans since ground was seen
         self._under_way: list[Key] = []
         self._waiting: deque[KeyframeScan] = deque(maxlen=_WAITING)
+        self._recent: deque[tuple[KeyframeScan, float]] = deque(maxlen=_RECENT)  # and the height of their ground
 
     def step(self, ctx: FrameContext) -> Scanned | None:
         """Go on with the scan in work, or begin one if this frame became a keyframe that shows something new."""
@@ -136,11 +138,27 @@ class ScanStage:
         self._without_ground += 1
         if segmenter.saw_ground:
             self._ground_m, self._without_ground = height_m - scan.camera_height_m, 0
+            self._withdraw(self._ground_m + segmenter.config.expected_m)
         labels = segmenter.label_of(begun.uv)
         record = KeyframeScan(begun.keyframe, scan, labels[:0] if self._channel.profile.thin else labels)
+        if self._ground_m is not None:
+            self._recent.append((record, self._ground_m))
         self._waiting.append(record)
         self._share_waiting()
         return Scanned(record, begun.T_o_c)
+
+    def _withdraw(self, highest_m: float) -> None:
+        """Take back recent scans whose ground lies higher: nothing is seen through the ground, so it was a table."""
+        for record, ground_m in self._recent:
+            if ground_m > highest_m:
+                n = len(record.scan)
+                blank = replace(
+                    record.scan, free_from_m=np.zeros(n), free_m=np.zeros(n), obstacle_m=np.full(n, np.inf),
+                    bands=np.zeros(n, np.uint8), camera_height_m=float("nan"),
+                )  # fmt: skip
+                self._waiting.append(KeyframeScan(record.keyframe, blank, record.labels[:0]))
+        kept = [(record, ground_m) for record, ground_m in self._recent if ground_m <= highest_m]
+        self._recent = deque(kept, maxlen=_RECENT)
 
     def _share_waiting(self) -> None:
         """Share scans, newest first, while those before arrive: they never fill a link that is short of bytes."""
@@ -149,5 +167,7 @@ class ScanStage:
         self._under_way = [key for key in self._under_way if not self._channel.arrived(key)]
         while self._waiting and len(self._under_way) < _UNDER_WAY:
             record = self._waiting.pop()
+            others = [r for r in self._waiting if r.keyframe != record.keyframe]  # an older one was taken back
+            self._waiting = deque(others, maxlen=_WAITING)
             self._channel.put(record)
             self._under_way.append(record.key())

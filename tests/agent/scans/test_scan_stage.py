@@ -13,7 +13,7 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
 from kiteline_codec.schema import Key, KeyframeScan, Record, messages
 from kiteline_core.frame import Frame
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_hw.sources.open import open_source
 
 
@@ -86,3 +86,20 @@ def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
     told = [event for event in events if event.startswith("nearest obstacle")]
     assert told and len(told) <= len(channel.scans)
     assert np.isfinite([s.scan.up_c for s in channel.scans]).all()
+
+
+def test_scans_above_a_table_are_taken_back_once_the_floor_is_seen(recording: Path) -> None:
+    agent, channel, _, _ = flown(recording, eager())
+    stage = agent._scans
+    assert stage is not None
+    table, floor = (replace(channel.scans[k], keyframe=KeyframeId(10 + k)) for k in (0, 1))
+    stage._recent.extend([(table, 0.7), (floor, 0.02)])
+    channel.scans.clear()
+    stage._waiting.append(table)
+    stage._withdraw(0.4)
+    stage._share_waiting()
+    (sent,) = channel.scans
+    assert sent.keyframe == table.keyframe
+    assert np.isnan(sent.scan.camera_height_m) and not sent.scan.free_m.any() and not sent.scan.bands.any()
+    messages.encode(sent)
+    assert [record.keyframe for record, _ in stage._recent][-1] == floor.keyframe
