@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
 from tests.agent import room_flight as rendered
 
 
 @pytest.fixture(scope="session")
-def room_flight() -> rendered.RoomFlight:
-    """A flight through a room, rendered once in each process."""
-    return rendered.render()
+def room_flight() -> Iterator[rendered.RoomFlight]:
+    """A flight through a room, rendered once in each process, which no test changes."""
+    flight = rendered.render()
+    before = rendered.digest(flight)
+    yield flight
+    assert rendered.digest(flight) == before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,17 @@ class RoomFlight:
             self, frames=frames, samples=ImuBatch(s.t_ns[felt], s.gyro[felt], s.accel[felt]),
             driven=odometry.chosen(self.driven, driven), truth=self.truth[: len(frames)],
         )  # fmt: skip
+
+
+def digest(flight: RoomFlight) -> str:
+    """Of all images, samples and poses: a test that changes them would change what later tests fly."""
+    found = hashlib.blake2b()
+    arrays = [view for frame in flight.frames for view in (frame.left, frame.right)]
+    arrays += [flight.samples.t_ns, flight.samples.gyro, flight.samples.accel, flight.truth]
+    arrays += [flight.driven.t_ns, flight.driven.velocity, flight.driven.rate]
+    for array in arrays:
+        found.update(np.ascontiguousarray(array))
+    return found.hexdigest()
 
 
 def render() -> RoomFlight:

@@ -13,6 +13,7 @@ from kiteline_bench.vehicle import guided
 from kiteline_core.geometry import se3
 from kiteline_hw.calibration import own
 from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import calibrate
 from kiteline_lab.calibration.imu import NoImu
@@ -61,6 +62,11 @@ def test_a_recording_without_an_imu_is_refused(recording: Path, tmp_path: Path) 
     with pytest.raises(NoImu, match="has no IMU"):
         calibrate.main(["imu", str(recording), "--rig", str(tmp_path / "rig.toml")])
     assert not (tmp_path / "rig.toml").exists()
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anybody_moves(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="folder that exists"):
+        calibrate.main(["imu", str(recording), "--rig", str(tmp_path / "nowhere" / "rig.toml")])
 
 
 def test_the_camera_turns_as_asked() -> None:

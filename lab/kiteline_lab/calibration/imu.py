@@ -28,7 +28,7 @@ from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_lab.calibration.imu_guide import ImuProgress
 from kiteline_lab.calibration.verdict import overall
-from kiteline_lab.flights.out_file import whole_file
+from kiteline_lab.flights.out_file import expect_writable, whole_file
 
 _IDLE_NS = 50_000_000  # ns that a live camera is awaited at most
 _EVERY = 10  # frames between two looks
@@ -58,6 +58,7 @@ def add_parser(verbs: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Guide, calibrate, write; the exit status. Raises KitelineError."""
+    expect_writable(args.rig)
     options = AgentOptions(
         args.source, str(args.rig.parent), "", config=args.config, calibration=args.calibration, mavlink=args.mavlink,
         axes=args.axes, imu_of="controller" if args.mavlink else "", seconds=args.seconds,
