@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_bench.grid import maps, obstacles, robust, street
+from kiteline_bench.grid import costs, maps, obstacles, robust, street
 from kiteline_bench.grid.accuracy import objects_present
 from kiteline_bench.grid.flown import FlownGrid
 from kiteline_bench.grid.places import Place
@@ -25,8 +25,11 @@ from kiteline_bench.grid.sparse import (
     labels_by_height,
     log_odds_grid,
 )
+from kiteline_codec.channel import plain_pair
+from kiteline_codec.schema import CulledLandmarks, GridTile, KeyframeScan, messages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
+from kiteline_core.ids import KeyframeId
 from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sim.truth.box_files import read_boxes
 from kiteline_hw.sim.truth.occupancy import occupancy
@@ -225,3 +228,18 @@ def test_the_way_that_was_driven_is_looked_up_in_the_grid(monkeypatch: pytest.Mo
     assert free == 1.0 and 0.4 < known < 0.6 and solid == pytest.approx(200 * 0.05**2)
     picture = cv2.imdecode(np.frombuffer(street._picture(flight, np.zeros((37, 124), np.uint8)), np.uint8), 1)
     assert picture.shape[1] == 900 and ((picture[..., 2] > 180) & (picture[..., 0] < 90)).sum() > 100
+
+
+def test_only_scans_and_tiles_are_counted() -> None:
+    ours, theirs = plain_pair()
+    scans: list[int] = []
+    tiles: list[int] = []
+    counted = costs.ReceivedBytes(ours, scans, tiles)
+    scan = KeyframeScan(KeyframeId(5), maps.road_scan(np.random.default_rng(0)), np.zeros(3, np.uint8))
+    tile = GridTile(1, 2, 0, 0.05, np.zeros((64, 64), np.int8))
+    other = CulledLandmarks(KeyframeId(7), np.zeros(0, np.uint16), 1)
+    for record in (scan, tile, other):
+        theirs.put(record)
+    assert len(counted.receive([], 0)) == 3
+    assert scans == [len(messages.encode(scan))] and tiles == [len(messages.encode(tile))]
+    assert counted.profile is ours.profile

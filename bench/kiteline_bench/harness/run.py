@@ -107,14 +107,18 @@ def fly_recording(
     bytes_s: tuple[int, int] = (0, 0),
     profile: str = "wifi",
     each: Callable[[FlyingAgent], None] | None = None,
+    channels: Callable[[RecordChannel], RecordChannel] | None = None,
 ) -> RecordingRun:
     """Fly an agent with a base, in lock-step; packets arrive with the next frame. bytes_s: budget up and down.
 
-    each: is called with the agent after each of its steps.
+    each: is called with the agent after each of its steps. channels: wraps the two ends of the link.
     """
-    station = Station(base or BaseConfig(), lambda _: coded_channel(1, bytes_s[1], profile), shipped_vocabulary())
+    wrapped = channels or (lambda channel: channel)
+    station = Station(
+        base or BaseConfig(), lambda _: wrapped(coded_channel(1, bytes_s[1], profile)), shipped_vocabulary()
+    )
     jobs, number = LockstepJobs(), AgentId(0)
-    channel = coded_channel(1, bytes_s[0], profile)
+    channel = wrapped(coded_channel(1, bytes_s[0], profile))
     flying = FlyingAgent(recording.rig, recording.imu, agent, channel=channel, identity=Identity(number, 0))
     first_ns = recording.items[0].frame.t_ns
     down: tuple[bytes, ...] = ()
