@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.grid_view import dense, grid_files
+from kiteline_basestation.grid.kept_scan import keep
+from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_core.geometry import se3
+from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_hw.sim.truth.occupancy import FREE, OCCUPIED, UNKNOWN, TrueGrid, write_grid
 from kiteline_lab.grids.files import read_grid
 from tests.lab.grids.nav2_loader import Nav2Error, load_as_nav2
@@ -27,6 +34,38 @@ def test_true_grids_load(tmp_path: Path) -> None:
     assert np.array_equal(data, np.vectorize(STATES.get)(grid.image))
     assert resolution == 0.05 and origin == [-1.25, 0.4, 0.0]
     assert np.array_equal(read_grid(tmp_path / "true_0.1-0.5.yaml").state, data)
+
+
+def test_grids_of_the_base_load(tmp_path: Path) -> None:
+    n, step = 40, 0.03
+    azimuth = (np.arange(n) - 0.5 * (n - 1)) * step
+    obstacle = np.where(azimuth > 0.2, 2.0, np.inf)
+    free = np.where(azimuth > 0.2, 1.9, 3.0)
+    scan = ColumnScan(
+        np.array([0.0, -1.0, 0.0]), float(azimuth[0]), step, np.full(n, 1.0), free, obstacle,
+        np.where(azimuth > 0.2, 3, 0).astype(np.uint8), free.copy(), 1.2,
+    )  # fmt: skip
+    config = replace(GridConfig(), ground_m=0.0)
+    kept = keep(config, scan, 50.0)
+    assert kept is not None
+    grid = ScanGrid(config)
+    for k in range(3):
+        level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+        grid.put(k, kept, se3.from_rt(level, np.array([-0.7, 12.3, 1.2])))
+    files = grid_files(grid)
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    data, resolution, origin = load_as_nav2(tmp_path / "grid.yaml")
+    cells, corner, cell_m = dense(grid, grid.main_storey())
+    assert np.array_equal(data, np.where(cells > 0, 100, cells)) and resolution == cell_m == 0.05
+    assert np.allclose(origin, [*corner, 0.0], atol=1e-6)
+    assert {-1, 0, 100} == set(np.unique(data).tolist())
+    own = read_grid(tmp_path / "grid.yaml")
+    assert np.array_equal(own.state, data)
+    column, row = np.floor(
+        own.cells(np.array([[-0.7 + 1.9 * np.cos(0.4) + 0.08, 12.3 + 2.0 * np.sin(0.4)]]))[0]
+    ).astype(int)
+    assert 100 in data[row - 2 : row + 3, column - 2 : column + 3], "the obstacle is ahead and to the left"
 
 
 @pytest.mark.parametrize(
