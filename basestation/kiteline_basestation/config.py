@@ -305,7 +305,7 @@ class GridConfig:
         1.5  # interquartile ranges above the upper quartile: longer rays to the ground are cut (Segfloor eq. 5.3)
     )
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
-    accurate_m: float = 3.0  # m; up to here a view counts in full: the deviation of a range is about a cell
+    accurate_sigma_m: float = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
     log_hit: int = 8  # 1/16; log-odds of one near view of an obstacle (p = 0.62); in inverse proportion to the range
     log_free: int = (
         3  # 1/16; log-odds of one near view of free space (p = 0.45): a third, as an edge is seen beside itself

@@ -226,6 +226,11 @@ def test_a_table_leaves_the_floor_below_it_and_nothing_is_known_behind_a_wall() 
     odds = grid.log_odds(Place(0, 0, 0))
     assert odds[1, 2, 40] > 0 > odds[0, 2, 40], "top and floor at 2 m"
     assert odds[0, 2, 50] < 0 and odds[1, 2, 50] == odds[2, 2, 50] == 0
+    over = replace(under, bands=np.ones(84, np.uint8), free_from_m=np.full(84, 2.4))
+    grid.put(0, kept(over, config), camera(0.0, 0.0, 0.0))
+    odds = grid.log_odds(Place(0, 0, 0))
+    assert (odds[:, 2, 50] < 0).all() and not odds[:, 2, 43:46].any(), "seen over it, and hidden by it"
+    assert not odds[[0, 2], 2, :38].any()
     solid = replace(under, bands=np.full(84, 3, np.uint8))
     grid.put(0, kept(solid, config), camera(0.0, 0.0, 0.0))
     assert not grid.log_odds(Place(0, 0, 0))[:, 2, 42:].any()
@@ -260,6 +265,16 @@ def test_ground_that_was_seen_over_a_low_obstacle_is_free_and_what_it_hides_is_u
     assert odds[:, 2, 20].max() > 0 and not odds[0, 2, :20].any()
     assert not odds[0, 2, 23:35].any(), "hidden"
     assert (odds[0, 2, 38:50] < 0).all(), "seen behind it"
+
+
+def test_a_view_counts_by_how_accurate_it_is_not_by_how_far() -> None:
+    wall = scan_of(np.array(box(-12.03, -12.03, 12.03, 12.03)), 0.0, 0.0, 0.0)
+    for bf, expected in ((30.0, 0), (400.0, round(8 * np.sqrt(0.05 * 400.0 / 0.3) / 12.03)), (2000.0, 8)):
+        found = keep(CONFIG, wall, bf)
+        assert found is not None
+        grid = ScanGrid(CONFIG)
+        grid.put(0, found, camera(0.0, 0.0, 0.0))
+        assert grid.log_odds(Place(0, 0, 240 // 64))[0, 2, 240 % 64] == expected
 
 
 def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None:

@@ -50,6 +50,10 @@ class KeptScan:
     reach_m: float
     sigma_per_m2: float
 
+    def accurate_m(self, config: GridConfig) -> float:
+        """Range up to which a view counts in full."""
+        return math.sqrt(config.accurate_sigma_m / self.sigma_per_m2) if self.sigma_per_m2 > 0.0 else config.max_range_m
+
     def ranges(self) -> F64:
         """Obstacle, bands, free from, free to and clear (5, n), ranges in m; inf without an obstacle."""
         codes = np.frombuffer(zlib.decompress(self.rows), np.uint16).reshape(5, self.columns).astype(np.float64)

@@ -162,12 +162,12 @@ class ScanGrid:
         gap = np.maximum(1.0, 2.0 * scan.sigma_per_m2 * near_m**2 * scale / cell)
         before = np.where(bands > 0, obstacle - gap, np.inf)
         under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
-        over = start > obstacle  # the floor was seen over the obstacle, which hides what lies before the floor
-        floor = np.where(over, np.inf, before)
         # A ray to the ground passes low over the cells before it: only what stands lower would not have been seen.
-        low = np.where(over, start, start * max(0.0, 1.0 - config.free_below_m / max(scan.height_m, 1e-3)))
-        space = np.stack([low, start, np.minimum(free, floor), free, np.minimum(clear, before)], 1)
-        accurate_m = config.accurate_m
+        behind = start > obstacle  # ground that was seen over a low obstacle, which hides what lies before it
+        low = np.where(behind, start, start * max(0.0, 1.0 - config.free_below_m / max(scan.height_m, 1e-3)))
+        end = np.where(behind, free, np.minimum(free, before))
+        space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
+        accurate_m = scan.accurate_m(config)
         weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
 
         reach = max(float(np.max(space)), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
