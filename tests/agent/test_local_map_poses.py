@@ -143,6 +143,20 @@ def test_refined_landmarks_wait_with_the_poses() -> None:
     assert not held.apply_corrections()  # once
 
 
+def test_landmarks_that_waited_do_not_come_after_newer_ones() -> None:
+    """An IMU that is no longer initialised ends the waiting of a monocular map."""
+    held = local_map(camera=replace(CAMERA, stereo=False))
+    held.patient = True
+    held.share(KeyframeId(0), 30)
+    assert not refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
+    held.patient = False
+    assert refined(held, 0, 0.1 * CONFIG.local_map.moved_px)
+    newest = held.bearing.copy()
+    told(held, 1, 2.0 * LEAST_M)
+    assert held.apply_corrections()
+    assert np.array_equal(held.bearing, newest)
+
+
 def test_landmarks_that_only_the_base_could_triangulate_wait_for_nothing() -> None:
     held = local_map()
     held.share(KeyframeId(0), 30)

@@ -346,6 +346,7 @@ class LocalMap:
             record.inv_depth[keep].astype(np.float64),
             self._bearings(self.uv[slot, index] + record.offset[keep]),
         )
+        self._new_landmarks.pop(record.keyframe, None)  # older ones, that waited
         at_once = fresh | (not self.patient)
         any_at_once = bool(at_once.any())
         if any_at_once:
