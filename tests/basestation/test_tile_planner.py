@@ -130,3 +130,25 @@ def test_a_thin_link_is_never_filled_with_tiles(budget_bytes: int) -> None:
         assert flight.base.stats.backlog_bytes < 6 * 400
     assert flight.tiles
     assert Place(0, 0, 0) in flight.planner.sent(AGENT)
+
+
+def test_while_a_loop_is_drawn_no_tile_is_sent_and_then_those_that_changed() -> None:
+    flight = Flight(replace(TileConfig(), keyframe_bytes=1e6, most_credit_bytes=1e6))
+    for k in range(40):
+        flight.fly(0.1 * k)
+    flight.wait(5.0)
+    for keyframe in flight.map.submaps[SUBMAP]:
+        pose = flight.map.pose(keyframe)
+        assert pose is not None
+        pose[1, 3] += 0.5
+        flight.map.set_pose(keyframe, pose)
+    before = dict(flight.tiles)
+    flight.updates.update()
+    assert flight.updates.behind
+    flight.now_ns += 10 * S
+    flight.planner.update(AGENT, flight.live, flight.base, flight.now_ns)
+    assert flight.base.stats.dirty == 0
+    flight.wait(10.0)
+    assert not flight.updates.behind
+    changed = [p for p in before if p in flight.tiles and flight.tiles[p] is not before[p]]
+    assert len(changed) > 4

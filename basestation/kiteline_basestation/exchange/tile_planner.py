@@ -64,7 +64,7 @@ class TilePlanner:
     def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Plan the tiles of an agent at `live` once a period, and send the changes over its channel."""
         state = self._agents.setdefault(agent, _AgentTiles(self._config.most_credit_bytes))
-        if not self._config.max_tiles or live is None or now_ns < state.due_ns:
+        if not self._config.max_tiles or live is None or now_ns < state.due_ns or self._updates.behind:
             return
         submap = submap_of_keyframe(live.keyframe)
         S_w_m, T_m_k = self._placements.get(submap), self._map.pose(live.keyframe)

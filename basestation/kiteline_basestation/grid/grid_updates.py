@@ -95,6 +95,11 @@ class GridUpdates:
             del self._due[keyframe]
             drawn += self._draw(self.grid, keyframe)
 
+    @property
+    def behind(self) -> bool:
+        """True while scans wait to be drawn where their keyframes are now: parts of the grid are old."""
+        return bool(self._due)
+
     def settled(self) -> ScanGrid:
         """A grid in which all scans lie where their keyframes are now; a copy, if they do not in this one."""
         self._gather_moved()
