@@ -13,7 +13,7 @@ from kiteline_hw.mavlink.transport.sockets import MavlinkTcp, MavlinkUdp
 from kiteline_hw.mavlink.transport.url import MavlinkUrl
 from kiteline_hw.system.serial_port import SerialPort
 
-_MAX_READS = 64  # per tick; a flood must not keep messages from being sent
+_MAX_READS = 64  # of a TCP stream per tick; a flood must not keep messages from being sent
 
 Adopt = Callable[[], None]
 
@@ -22,8 +22,8 @@ class MavlinkConnection:
     """Sends messages, and calls back from a thread: `on_data` for received bytes, `on_tick` every `tick_s`.
 
     on_data: gets bytes, whether they are one whole datagram or the first after a gap, and, of a sender that is not
-    served yet, a function that serves it from now on. Both are called
-    without any lock held. max_queued: messages waiting for a slow serial port, the oldest are dropped; 0: no limit.
+    served yet, a function that serves it from now on. Both are called without any lock held. max_queued: messages
+    waiting for a slow serial port, the oldest are dropped; 0: no limit.
     """
 
     def __init__(
