@@ -248,7 +248,7 @@ def collect_scan(grounds, surface, azimuth, bf, lowest, sigma_px, gap_m, free_fr
         if obstacle[c] < np.inf:
             deviation = obstacle[c] * sigma_px / surface[c, 0]
             if free[c] > 0.0 and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
-                free[c] = max(obstacle[c] - deviation, free_from[c])  # up to its foot, as well as that is known
+                free[c] = max(obstacle[c] - 2.0 * deviation, free_from[c])  # up to its foot, as far as that is sure
             begin, end = _longest_ground(
                 grounds[c], obstacle[c] + 3.0 * deviation, np.inf, lowest, bf * along, sigma_px, gap_m
             )
