@@ -34,6 +34,9 @@ F64 = NDArray[np.float64]
 I8 = NDArray[np.int8]
 U16 = NDArray[np.uint16]
 
+_AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from the image's lower border on
+_HIDDEN = 1.25  # times that distance, from which on something hides the ground before
+
 
 class _Drawn(NamedTuple):
     lattice: Lattice
@@ -162,9 +165,13 @@ class ScanGrid:
         gap = np.maximum(1.0, 2.0 * scan.sigma_per_m2 * near_m**2 * scale / cell)
         before = np.where(bands > 0, obstacle - gap, np.inf)
         under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
-        # A ray to the ground passes low over the cells before it: only what stands lower would not have been seen.
         behind = start > obstacle  # ground that was seen over a low obstacle, which hides what lies before it
-        low = np.where(behind, start, start * max(0.0, 1.0 - config.free_below_m / max(scan.height_m, 1e-3)))
+        # A ray to the ground passes low over the cells before it: only what stands lower would not have been seen. But
+        # where the ground begins farther than at the image's lower border, something too near to be measured hides it.
+        ahead = start * np.cos(scan.first_rad + scan.step * (np.arange(scan.columns) + 0.5))
+        border = np.quantile(ahead[free > 0.0], _AT_BORDER) if (free > 0.0).any() else 0.0
+        hidden = behind | (ahead > _HIDDEN * border)
+        low = np.where(hidden, start, start * max(0.0, 1.0 - config.free_below_m / max(scan.height_m, 1e-3)))
         end = np.where(behind, free, np.minimum(free, before))
         space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
         accurate_m = scan.accurate_m(config)
