@@ -10,8 +10,8 @@ from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial_start_config import InertialStartConfig
 from kiteline_agent.known_rig import KnownRigConfig
-from kiteline_agent.scans.scan_config import LocalGridConfig as LocalGridConfig
-from kiteline_agent.scans.scan_config import ScanConfig as ScanConfig
+from kiteline_agent.scan_config import LocalGridConfig as LocalGridConfig
+from kiteline_agent.scan_config import ScanConfig as ScanConfig
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig

@@ -13,8 +13,8 @@ from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
+from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans.local_grid import LocalGrid
-from kiteline_agent.scans.scan_config import LocalGridConfig
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans import local_grid_kernels as kernels
-from kiteline_agent.scans.scan_config import LocalGridConfig
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_codec.schema import GridTile
 from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS

@@ -13,7 +13,7 @@ from kiteline_agent.governor.governor import Governor
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
-from kiteline_agent.scans.scan_config import ScanConfig
+from kiteline_agent.scan_config import ScanConfig
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Key, KeyframeScan
