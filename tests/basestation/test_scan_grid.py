@@ -313,6 +313,24 @@ def test_memory_goes_by_tiles_touched_and_a_far_outlier_costs_nothing() -> None:
     assert not grid.put(61, scan, camera(1e9, 0.0, 0.0)), "beyond all tiles"
 
 
+def test_a_far_outlier_makes_no_file_coarser_and_a_long_road_does() -> None:
+    scans = flight(10)
+    grid = drawn(scans)
+    before = dense(grid, 0)
+    grid.put(99, scans[0][0], camera(1e3, 1e3, 0.0))
+    after = dense(grid, 0)
+    assert np.array_equal(before[0], after[0]) and np.array_equal(before[1], after[1]) and after[2] == 0.05
+    road = ScanGrid(CONFIG)
+    for k in range(120):
+        road.put(k, scans[0][0], camera(10.0 * k, 10.0 * k, 0.0))
+    cells, corner, cell = dense(road, 0)
+    assert cell == 0.2 and cells.size <= 1 << 26
+    for k in (0, 60, 119):
+        c = np.floor((np.array([10.0 * k, 10.0 * k]) - corner) / cell).astype(int)
+        low = np.maximum(c - 20, 0)
+        assert (cells[low[1] : c[1] + 40, low[0] : c[0] + 40] == 0).any()
+
+
 def test_views_code_what_changed_and_stay_as_they_were() -> None:
     scans = flight(10)
     grid = drawn(scans)

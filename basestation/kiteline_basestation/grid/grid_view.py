@@ -16,9 +16,12 @@ from kiteline_codec.schema import GridTile, messages
 from kiteline_codec.schema.base.grid_tile import FREE, UNKNOWN
 
 I8 = NDArray[np.int8]
+I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 FREE_GREY, UNKNOWN_GREY, SOLID_GREY = 254, 205, 0  # as map_server writes them
+_BLOCK = 16  # tiles along a block; blocks without a neighbour lie apart
+_OUTLIERS = 0.5  # of the largest part's tiles: parts that hold fewer are left out of files that would be too large
 _MOST_PIXELS = 1 << 26  # of a file; larger maps are written with coarser cells
 
 
@@ -94,20 +97,23 @@ class GridViews:
 def dense(grid: ScanGrid, storey: int) -> tuple[I8, F64, float]:
     """A storey as one array: cells (rows, columns) int8, row 0 the lowest y, its corner (2,) in w and a cell's side, m.
 
-    A map of more pixels than a file can have gets coarser cells: occupied if any is, free if at least half are.
+    A map of more pixels than a file can have is written without outliers, and then with coarser cells: occupied if any
+    is, free if at least half are.
     """
     cell = grid.config.cell_m
     tiles = {p: cells for p in grid.places if p.storey == storey for cells, known in [grid.cells(p)] if known}
     if not tiles:
         return np.full((1, 1), UNKNOWN, np.int8), np.zeros(2), cell
     places = np.array([(p.row, p.column) for p in tiles], np.int64)
+    if np.prod(np.ptp(places, axis=0) + 1) * SIDE**2 > _MOST_PIXELS:
+        places = _without_outliers(places)
     first, last = places.min(axis=0), places.max(axis=0) + 1
     rows, columns = ((last - first) * SIDE).tolist()
     factor = 1
     while rows * columns > _MOST_PIXELS * factor**2 and factor < SIDE:
         factor *= 2
     side = SIDE // factor
-    # Tiles far from all others would make an image of any size: then only what lies around the median is shown.
+    # A map that is too large even so is shown around its middle.
     if (rows // factor) * (columns // factor) > _MOST_PIXELS:
         centre, reach = np.median(places, axis=0).astype(np.int64), int(np.sqrt(_MOST_PIXELS)) // (2 * side)
         first, last = np.maximum(first, centre - reach), np.minimum(last, centre + reach)
@@ -118,6 +124,27 @@ def dense(grid: ScanGrid, storey: int) -> tuple[I8, F64, float]:
         if r >= 0 and c >= 0 and (r + 1) * side <= out.shape[0] and (c + 1) * side <= out.shape[1]:
             out[r * side : (r + 1) * side, c * side : (c + 1) * side] = _coarser(cells, factor)
     return out, np.array([first[1], first[0]]) * (SIDE * cell), cell * factor
+
+
+def _without_outliers(places: I64) -> I64:
+    """The places (n,2) that do not lie with few others, far from the rest."""
+    blocks, of_place = np.unique(places // _BLOCK, axis=0, return_inverse=True)
+    tiles = np.bincount(of_place.reshape(-1), minlength=len(blocks))
+    open_ = {(int(r), int(c)): k for k, (r, c) in enumerate(blocks)}
+    groups: list[list[int]] = []
+    while open_:
+        group, front = [], [next(iter(open_))]
+        group.append(open_.pop(front[0]))
+        while front:
+            r, c = front.pop()
+            for near in ((r + dr, c + dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1)):
+                if near in open_:
+                    group.append(open_.pop(near))
+                    front.append(near)
+        groups.append(group)
+    sizes = [int(tiles[group].sum()) for group in groups]
+    large = [k for group, n in zip(groups, sizes, strict=True) if n >= _OUTLIERS * max(sizes) for k in group]
+    return places[np.isin(of_place.reshape(-1), large)]
 
 
 def _coarser(cells: I8, factor: int) -> I8:

@@ -76,8 +76,9 @@ def scans_of(recording: Recording, every: int, damage: Callable[[F32], F32] | No
 
 def grid_config(scans: Iterable[PosedScan]) -> GridConfig:
     """The base's options with a middle storey at the ground that the scans saw."""
-    ground = [s.T_w_c[2, 3] - s.scan.camera_height_m for s in scans if np.isfinite(s.scan.camera_height_m)]
-    return replace(GridConfig(), ground_m=float(np.median(ground)) if ground else 0.0)
+    ground = np.array([s.T_w_c[2, 3] - s.scan.camera_height_m for s in scans])
+    known = ground[np.isfinite(ground)]
+    return replace(GridConfig(), ground_m=float(np.median(known)) if len(known) else 0.0)
 
 
 def drawn(scans: Sequence[PosedScan], bf_px_m: float, config: GridConfig | None = None) -> ScanGrid:
