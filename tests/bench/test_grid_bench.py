@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_bench.grid import costs, maps, obstacles, robust, street
+from kiteline_bench.grid import costs, maps, obstacles, robust, scans, street
 from kiteline_bench.grid.accuracy import objects_present
 from kiteline_bench.grid.flown import FlownGrid
 from kiteline_bench.grid.places import Place
@@ -243,3 +243,14 @@ def test_only_scans_and_tiles_are_counted() -> None:
     assert len(counted.receive([], 0)) == 3
     assert scans == [len(messages.encode(scan))] and tiles == [len(messages.encode(tile))]
     assert counted.profile is ours.profile
+
+
+def test_a_pose_that_is_not_finite_does_not_move_the_storey() -> None:
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    scan = maps.road_scan(np.random.default_rng(0))
+    good = scans.PosedScan(scan, se3.from_rt(level, np.array([0.0, 0.0, 4.6])))
+    bad = scans.PosedScan(scan, np.full((4, 4), np.nan))
+    assert scans.grid_config([good, bad]).ground_m == pytest.approx(3.0)
+    assert np.array_equal(
+        scans.as_file(scans.drawn([good, bad], 175.0)).state, scans.as_file(scans.drawn([good], 175.0)).state
+    )

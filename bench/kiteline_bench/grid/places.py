@@ -42,7 +42,7 @@ def recorded(bench: Bench) -> Place:
 def simulated(bench: Bench, scene: str, rig: str, options: str = "objects=1", share: float = 1.0) -> Place:
     """A scene with objects, flown along a part of its own course; rendered unless the bench's folder has it."""
     seconds = _SCENES[scene] * share
-    name = f"{scene}_{options.replace('=', '').replace('&', '_')}_{rig}"
+    name = f"{scene}_{options.replace('=', '').replace('&', '_')}_{rig}_{seconds:g}s"
     command = [f"{scene}?{options}", "--seed", f"{_SEED}", "--seconds", f"{seconds:g}", "--rig", rig]
     file = render(bench, name, command)[0]
     world = open_sim(f"{scene}?{options}", seed=_SEED, seconds=seconds, texture_bits=7, imu=False).world
