@@ -104,12 +104,13 @@ class Agent:
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
             self._two_view_start, inertial_start, self._governor, channel,
         )  # fmt: skip
-        self._local_grid = LocalGrid(config.local_grid)
         self._scans = None
         if self._has_depth and config.scan.on:
             self._scans = ScanStage(
                 self._camera, self.map, maker, self._governor, channel, config.scan, config.ground, self.work
             )
+        certain_m = np.inf if self._scans is None else self._scans.certain_m(config.local_grid.sigma_m)
+        self._local_grid = LocalGrid(config.local_grid, certain_m)
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,

@@ -22,6 +22,9 @@ class LocalGridConfig:
 
     cell_m: float = 0.05  # m; the grid has 512 x 512 cells
     reach_m: float = 10.0  # m; farther obstacles are not told
+    sigma_m: float = (
+        0.1  # m; deviation of a range up to which the agent's own scans count: 4.9 m with 0.11 m of baseline
+    )
     scans: int = 48  # newest ones that are kept: 10 m of flight, or more than a turn
     slab_m: float = 0.25  # m that the vehicle climbs until scans made at other heights do not count
     seen_m: float = 0.2  # m above and below the camera that a scan's line of sight covers: `ground.slab_m`

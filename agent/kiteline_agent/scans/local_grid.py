@@ -72,8 +72,10 @@ class LocalGrid:
     Takes 1.2 MB. A scan is drawn when it comes; all are drawn again when the vehicle has moved on or climbed.
     """
 
-    def __init__(self, config: LocalGridConfig) -> None:
+    def __init__(self, config: LocalGridConfig, certain_m: float = np.inf) -> None:
+        """certain_m: range up to which scans are sure; beyond, they tell nothing."""
         self._config = config
+        self._seen_m = min(config.reach_m, certain_m)
         self._cells: I8 = np.zeros((_CELLS, _CELLS), np.int8)
         self._marks = np.zeros((_CELLS, _CELLS), np.int16)
         self._window: I8 = np.zeros((_WINDOW, _WINDOW), np.int8)
@@ -151,7 +153,7 @@ class LocalGrid:
         self._number += 1
         kernels.draw_rays(
             self._cells, self._marks, self._number, drawn.x_m - self._corner[0], drawn.y_m - self._corner[1],
-            drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, scan.clear_m, config.reach_m, config.cell_m,
+            drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, scan.clear_m, self._seen_m, config.cell_m,
         )  # fmt: skip
 
     def _place_window(self, T_w_f: F64, tiles: Mapping[tuple[int, int], GridTile], mask: int) -> tuple[float, F64]:

@@ -75,6 +75,10 @@ class ScanStage:
         self._waiting: deque[KeyframeScan] = deque(maxlen=_WAITING)
         self._recent: deque[tuple[KeyframeScan, float]] = deque(maxlen=_RECENT)  # and the height of their ground
 
+    def certain_m(self, sigma_m: float) -> float:
+        """Distance up to which ranges of scans deviate by less than sigma_m."""
+        return self._segmenter.certain_m(sigma_m)
+
     def step(self, ctx: FrameContext) -> Scanned | None:
         """Go on with the scan in work, or begin one if this frame became a keyframe that shows something new."""
         self._share_waiting()

@@ -29,6 +29,7 @@ _HEIGHT_STEP_M = 0.05  # of the v-disparity
 _HALF_COUNTS = 30.0  # pixels of a cell of the v-disparity that count half as much as many
 _STIFFNESS = 1e-3  # of the spline
 _ROUNDS = 5
+_REFINED = 0.4  # of a disparity's deviation that remains of a surface that is refined by all of its pixels
 _UNDER = 0.5  # pixels below the ground for one on it, at most: nothing is seen through it
 _BEYOND_PX = 0.5  # px of disparity beyond the spline's far end where pixels may still be ground
 _NEARER = 1.6  # the same at its near end, as a factor: the lowest rows of an image have none below to compare with
@@ -119,6 +120,10 @@ class GroundSegmenter:
         if ground is not None and expected_m is not None and certain:
             ground = ground if ground.height_m > expected_m - config.expected_m else None
         return self._scan(ground, view, expected_m)
+
+    def certain_m(self, sigma_m: float) -> float:
+        """Distance up to which a surface's deviation stays below sigma_m."""
+        return float(np.sqrt(sigma_m * self.bf / (_REFINED * self.sigma_px)))
 
     def label_of(self, uv: F64) -> U8:
         """Labels (n,) of pixels (n,2) of the full image."""
