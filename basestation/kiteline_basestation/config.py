@@ -321,6 +321,7 @@ class GridConfig:
     storey_m: float = 2.5  # m; between two storeys: less than those of houses
     storey_overlap_m: float = 0.4  # m; beyond its half a storey also holds what lies so near: ramps, drift of heights
     max_position_m: float = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
+    max_reach_m: float = 100.0  # m; scans that reach farther are not drawn: only a faulty scale makes them
     drawn_per_step: int = 16  # scans that one step draws, half a ms each: a loop's corrections wait for later steps
     sparse_lag: int = (
         5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then

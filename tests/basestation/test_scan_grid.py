@@ -363,3 +363,44 @@ def test_files_are_what_map_server_reads() -> None:
     text = files["plan.yaml"].decode()
     assert "resolution: 0.05\n" in text and f"origin: [{corner[0]:.6f}, {corner[1]:.6f}, 0.000000]" in text
     assert grid_files(ScanGrid(CONFIG))["grid.pgm"] == b"P5\n1 1\n255\n" + bytes([205])
+
+
+def test_scans_beyond_all_storeys_or_of_a_huge_scale_are_not_drawn() -> None:
+    grid, (scan, pose) = ScanGrid(CONFIG), flight(1)[0]
+    grid.put(0, scan, camera(*pose))
+    before = drawn(flight(1))
+    high, huge = camera(*pose), camera(*pose)
+    high[2, 3] = 1000.0
+    huge[:3, :3] *= 1e6
+    assert not grid.put(1, scan, high)
+    assert not grid.put(2, scan, huge)
+    assert_equal(grid, before)
+    assert grid.put(0, scan, high)  # it moved there, and is taken out
+    assert not len(grid)
+    assert not grid.places
+
+
+def test_ground_that_begins_beyond_the_range_needs_no_memory() -> None:
+    pose = circle(1)[0]
+    scan = scan_of(ROOM, *pose)
+    n = len(scan)
+    far = replace(
+        scan, free_from_m=np.full(n, 250.0), free_m=np.full(n, 252.0), obstacle_m=np.full(n, np.inf),
+        bands=np.zeros(n, np.uint8),
+    )  # fmt: skip
+    grid = ScanGrid(CONFIG)
+    grid.put(0, kept(far), camera(*pose))
+    assert grid.nbytes < 20e6
+
+
+def test_a_scan_in_a_unit_of_its_submap_is_drawn_in_metres() -> None:
+    pose = circle(1)[0]
+    found = keep(CONFIG, scan_of(ROOM, *pose), BF, 3.0)
+    assert found is not None
+    S_w_c = camera(*pose)
+    S_w_c[:3, :3] *= 3.0
+    scaled = ScanGrid(CONFIG)
+    scaled.put(0, found, S_w_c)
+    plain = ScanGrid(CONFIG)
+    plain.put(0, kept(scan_of(ROOM, *pose)), camera(*pose))
+    assert_equal(scaled, plain)

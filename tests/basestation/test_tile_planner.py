@@ -152,3 +152,26 @@ def test_while_a_loop_is_drawn_no_tile_is_sent_and_then_those_that_changed() -> 
     assert not flight.updates.behind
     changed = [p for p in before if p in flight.tiles and flight.tiles[p] is not before[p]]
     assert len(changed) > 4
+
+
+def test_an_agent_that_jumps_costs_no_more_than_one_that_flies() -> None:
+    flight = Flight()
+    flight.fly(0.0)
+    looked: list[Place] = []
+    planner = flight.planner
+    distance = planner._distance
+    planner._distance = lambda place, *ends: looked.append(place) or distance(place, *ends)  # type: ignore[method-assign,assignment,func-returns-value]
+    for x in (3000.0, -3000.0):
+        T_k_c = np.eye(4)
+        T_k_c[2, 3] = x
+        flight.live = replace(flight.live, t_ns=flight.now_ns, T_k_c=T_k_c)
+        flight.wait(1.0)
+    assert 0 < len(looked) < 1000
+
+
+@pytest.mark.parametrize("z", [1000.0, -1000.0])
+def test_a_drone_beyond_the_last_storey_gets_no_tiles(z: float) -> None:
+    flight = Flight()
+    flight.fly(0.0, z=z)
+    flight.wait(2.0)
+    assert not flight.tiles

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -80,6 +81,7 @@ class LocalGrid:
         self._marks = np.zeros((_CELLS, _CELLS), np.int16)
         self._window: I8 = np.zeros((_WINDOW, _WINDOW), np.int8)
         self._window_of: tuple[object, ...] = ()
+        self._window_tiles: tuple[GridTile, ...] = ()  # kept, so that no new tile takes the place of one in memory
         self._scans: deque[_Drawn] = deque(maxlen=config.scans)
         self._R_g_o: F64 | None = None
         self._corner = np.zeros(2)  # of the grid, m
@@ -124,7 +126,7 @@ class LocalGrid:
             cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.slab_m))
             tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
         else:
-            self._window[:], self._window_of = 0, ()
+            self._window[:], self._window_of, self._window_tiles = 0, (), ()
         out = np.empty(SECTORS)
         kernels.read_distances(
             self._cells, config.cell_m, own_at, self._window, cell_m, tile_at, config.vehicle_m, config.reach_m, _RAYS,
@@ -163,11 +165,12 @@ class LocalGrid:
         side_m = TILE_CELLS * cell_m
         column, row = (int(np.clip(v // side_m, -(1 << 23), 1 << 23)) for v in T_w_f[:2, 3])
         reach = _WINDOW // TILE_CELLS // 2
-        window_of = column, row, mask, cell_m, tuple(map(id, tiles.values()))
+        window_of, held = (column, row, mask, cell_m), tuple(tiles.values())
         corner = np.array([column - reach, row - reach]) * side_m
-        if window_of == self._window_of:
+        same = len(held) == len(self._window_tiles) and all(map(operator.is_, held, self._window_tiles))
+        if same and window_of == self._window_of:
             return cell_m, corner
-        self._window_of = window_of
+        self._window_of, self._window_tiles = window_of, held
         self._window[:] = 0
         for (c, r), tile in tiles.items():
             i, j = r - row + reach, c - column + reach

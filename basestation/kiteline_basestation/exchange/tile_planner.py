@@ -6,6 +6,7 @@ for each of the agent's keyframes. Tiles far away are removed again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -92,15 +93,14 @@ class TilePlanner:
     def _near(self, here: F64, ahead: F64, storey: int) -> dict[Place, float]:
         """Tiles of a storey within reach, and how far each lies from where the agent is or soon will be."""
         side, reach = SIDE * self._updates.grid.config.cell_m, self._config.reach_m
-        low = np.floor((np.minimum(here, ahead)[:2] - reach) / side).astype(int)
-        high = np.floor((np.maximum(here, ahead)[:2] + reach) / side).astype(int)
         out = {}
-        for row in range(low[1], high[1] + 1):
-            for column in range(low[0], high[0] + 1):
-                place = Place(storey, row, column)
-                distance = self._distance(place, here, ahead)
-                if distance <= reach and place in self._updates.grid.touched:
-                    out[place] = distance
+        for x, y in (here[:2], ahead[:2]):  # a box around both would have no bounds: an agent may jump
+            for row in range(math.floor((y - reach) / side), math.floor((y + reach) / side) + 1):
+                for column in range(math.floor((x - reach) / side), math.floor((x + reach) / side) + 1):
+                    place = Place(storey, row, column)
+                    distance = self._distance(place, here, ahead)
+                    if distance <= reach and place in self._updates.grid.touched:
+                        out[place] = distance
         return dict(sorted(out.items(), key=lambda item: (item[1], item[0]))[: self._config.max_tiles])
 
     def _distance(self, place: Place, here: F64, ahead: F64) -> float:

@@ -131,7 +131,7 @@ class GridUpdates:
         for other in siblings[: bisect_right(siblings, keyframe)][: -1 - self._config.ground_keyframes : -1]:
             scan, S_w_k = self._scans.get(other), self._pose(other)
             if scan is not None and S_w_k is not None:
-                return float(S_w_k[2, 3]) - sim3.scale_of(S_w_k) * scan.height_m
+                return float(S_w_k[2, 3]) - sim3.scale_of(S_w_k) / scan.unit_m * scan.height_m
         return None
 
     def labels(self, landmarks: I32) -> U8:
@@ -178,7 +178,8 @@ class GridUpdates:
         assert T_map_k is not None
         T_k_map = se3.inverse(se3.orthonormalise(T_map_k))
         scale = self._map.scale(submap)
-        local = (xyz @ T_k_map[:3, :3].T + T_k_map[:3, 3]) / scale
+        unit_m = sim3.scale_of(S_w_k)
+        local = (xyz @ T_k_map[:3, :3].T + T_k_map[:3, 3]) * (unit_m / scale)
         camera = self._map.cameras[agent_of_keyframe(keyframe)]
         made = sparse_scan(self._config, camera, S_w_k, local, np.isin(around, seen))
         if made is None:
@@ -190,7 +191,7 @@ class GridUpdates:
         here = (table.row[around] == self._map.rows[keyframe]) & (table.kind[around] == LANDMARK)
         mine[self._map.keypoint_of(around[here])] = labels[here]
         self._labels[keyframe] = mine
-        kept = keep(self._config, scan, camera.bf)
+        kept = keep(self._config, scan, camera.bf, unit_m)
         if kept is not None:
             self._scans[keyframe] = kept
             self._due[keyframe] = None

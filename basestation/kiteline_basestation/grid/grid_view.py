@@ -163,10 +163,12 @@ def grid_files(grid: ScanGrid, stem: str = "grid") -> dict[str, bytes]:
     The main storey is STEM.pgm; others STEM_storeyN.pgm, counted from the main one.
     """
     main, out = grid.main_storey(), {}
+    greys = np.full(256, SOLID_GREY, np.uint8)
+    greys[FREE], greys[UNKNOWN] = FREE_GREY, UNKNOWN_GREY
     for storey in sorted({main, *grid.separate_storeys()}):
         name = stem if storey == main else f"{stem}_storey{storey - main:+d}"
         cells, corner, cell = dense(grid, storey)
-        grey = np.where(cells == UNKNOWN, UNKNOWN_GREY, np.where(cells == FREE, FREE_GREY, SOLID_GREY)).astype(np.uint8)
+        grey = greys[cells.view(np.uint8)]
         out[f"{name}.pgm"] = f"P5\n{grey.shape[1]} {grey.shape[0]}\n255\n".encode() + grey[::-1].tobytes()
         out[f"{name}.yaml"] = (
             f"image: {name}.pgm\nmode: trinary\nresolution: {cell:.6g}\n"

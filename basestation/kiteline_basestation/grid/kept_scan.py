@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
+from kiteline_codec.schema.base.grid_tile import MAX_STOREY
 from kiteline_core.geometry import sim3
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 
@@ -29,7 +30,7 @@ class Lattice(NamedTuple):
     x: int  # in a quarter of a cell
     y: int
     heading: int  # in quarters of a cell at the scan's reach
-    storeys: tuple[int, ...]  # on which it is drawn
+    storeys: tuple[int, ...]  # on which it is drawn; none beyond those that tiles have
     scale: int  # of lengths, in 1/1024
 
 
@@ -38,7 +39,7 @@ class KeptScan:
     """A column scan. rows: deflated (5, n) uint16: obstacle, bands, free from, free to, clear; ranges in 1/256 m.
 
     first, step: azimuths in 1/2^16 rad. up_c: against gravity in the camera. reach_m: farthest range that is drawn.
-    sigma_per_m2: standard deviation of a range over its square.
+    sigma_per_m2: standard deviation of a range over its square. unit_m: metres in a unit of the keyframe's submap.
     """
 
     rows: bytes
@@ -49,6 +50,7 @@ class KeptScan:
     height_m: float
     reach_m: float
     sigma_per_m2: float
+    unit_m: float
 
     def accurate_m(self, config: GridConfig) -> float:
         """Range up to which a view counts in full."""
@@ -65,7 +67,7 @@ class KeptScan:
     def lattice(self, config: GridConfig, S_w_c: F64) -> Lattice:
         """The point of the lattice next to a camera's pose (4,4)."""
         ahead = S_w_c[:2, :3] @ level_rotation(np.array(self.up_c))[:, 0]
-        scale, cell = sim3.scale_of(S_w_c), config.cell_m / _LATTICE
+        scale, cell = sim3.scale_of(S_w_c) / self.unit_m, config.cell_m / _LATTICE
         storey = (S_w_c[2, 3] - scale * self.height_m - config.ground_m) / config.storey_m
         overlap = config.storey_overlap_m / config.storey_m
         low, high = round(storey - overlap), round(storey + overlap)
@@ -73,7 +75,7 @@ class KeptScan:
             round(S_w_c[0, 3] / cell),
             round(S_w_c[1, 3] / cell),
             round(math.atan2(ahead[1], ahead[0]) * self.reach_m / cell),
-            tuple(range(low, high + 1)),
+            tuple(range(max(low, -MAX_STOREY - 1), min(high, MAX_STOREY) + 1)),
             round(scale * _SCALE_STEPS),
         )
 
@@ -97,10 +99,11 @@ def scale_of(lattice: Lattice) -> float:
     return lattice.scale / _SCALE_STEPS
 
 
-def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float) -> KeptScan | None:
+def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1.0) -> KeptScan | None:
     """The part of a scan that is drawn; None without a known ground.
 
     bf_px_m: focal length times baseline: ranges are used up to where their deviation passes a limit. 0: it never does.
+    unit_m: metres in a unit of the keyframe's submap, as it is known now: the scan is rescaled with its submap.
     Free ranges are cut at the third quartile and `fence` interquartile ranges (Segfloor, equation 5.3).
     """
     if not math.isfinite(scan.camera_height_m):
@@ -133,5 +136,5 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float) -> KeptScan | Non
     up = tuple(float(v) for v in scan.up_c)
     return KeptScan(
         zlib.compress(codes.tobytes(), 6), codes.shape[1], first, float(scan.azimuth_step_rad), (up[0], up[1], up[2]),
-        float(scan.camera_height_m), reach, sigma_per_m2,
+        float(scan.camera_height_m), reach, sigma_per_m2, unit_m,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The placed part of the map in w: input of the grid and of exports."""
+"""The placed part of the map in w: input of exports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class PlacedMap:
-    """Keyframes and landmarks of placed submaps in w, as arguments of `grid.build`.
+    """Keyframes and landmarks of placed submaps in w.
 
     keyframes: (n,) ids of the rows of positions. landmark_ids: (m,). observations: (k,2) rows of positions
     and of points.

@@ -77,11 +77,15 @@ class ScanGrid:
     def put(self, keyframe: int, scan: KeptScan, S_w_c: F64) -> bool:
         """Draw a scan at its camera's pose (4,4), or anew if it or its pose changed. True if cells may have changed.
 
-        A scan with a pose that is not finite, or lies beyond the farthest tile, is not drawn.
+        A scan with a pose that is not finite, beyond the farthest tile or storey, or of a scale that makes it reach too
+        far, is not drawn.
         """
-        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > self.config.max_position_m:
+        config = self.config
+        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > config.max_position_m:
             return self.remove(keyframe)
-        new = _Drawn(scan.lattice(self.config, S_w_c), scan)
+        new = _Drawn(scan.lattice(config, S_w_c), scan)
+        if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > config.max_reach_m:
+            return self.remove(keyframe)
         held = self._drawn.get(keyframe)
         if new == held:
             return False
@@ -107,7 +111,9 @@ class ScanGrid:
 
     def main_storey(self) -> int:
         """The storey with most scans."""
-        scans = Counter(storey for storeys in self._storeys.elements() for storey in storeys)
+        scans: Counter[int] = Counter()
+        for storeys, n in self._storeys.items():
+            scans.update(dict.fromkeys(storeys, n))
         return min(scans, key=lambda s: (-scans[s], abs(s), s), default=0)
 
     def separate_storeys(self) -> list[int]:
@@ -177,7 +183,7 @@ class ScanGrid:
         accurate_m = scan.accurate_m(config)
         weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
 
-        reach = max(float(np.max(space)), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
+        reach = max(float(np.max(space[:, 2:])), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
         x, y = position_cells(lattice)
         first = scan.heading_rad(config, lattice) + scan.first_rad
         box = _box(x, y, first, scan.step, scan.columns, reach)

@@ -35,7 +35,7 @@ def sparse_scan(
 ) -> tuple[ColumnScan, U8] | None:
     """A scan of the landmarks that a keyframe sees, and the labels of all. None if they tell no ground.
 
-    S_w_k: (4,4), z of w up. points_k: (n,3) landmarks around it in its camera, in units of its submap. seen: (n,) those
+    S_w_k: (4,4), z of w up. points_k: (n,3) landmarks around it in its camera, in m. seen: (n,) those
     that the keyframe sees; the others only tell the ground.
     """
     up_c = S_w_k[2, :3] / np.linalg.norm(S_w_k[2, :3])

@@ -248,3 +248,14 @@ def test_distances_are_those_of_plain_arithmetic() -> None:
             known &= here == 0
         expected = expected if expected < 1.5 else np.inf if known else np.nan
         assert out[s] == pytest.approx(expected, nan_ok=True, abs=1e-9), s
+
+
+def test_a_tile_that_replaces_another_is_seen_at_once() -> None:
+    grid, T = LocalGrid(LocalGridConfig()), vehicle(3.2, 3.2, 0.0)
+    for state in (0, 7) * 4:  # a new record often lies where the one before lay in memory
+        cells = np.full((64, 64), state, np.int8)
+        tiles = {(0, 0): GridTile(0, 0, 0, CELL_M, cells)}
+        found = grid.around(T, T, tiles, BANDS_M)
+        assert found is not None
+        assert bool(np.isfinite(found.distance_m).all()) == (state > 0)
+        del tiles
