@@ -314,6 +314,9 @@ class GridConfig:
     occupied_from: int = 6  # 1/16; log-odds from which a band is occupied: one near view, two far ones
     free_from: int = 2  # 1/16; a cell is free if all bands lie below minus this: one near view, two far ones
     free_beside: int = 5  # 1/16; the same beside an occupied cell: two near views, as one may lie a cell off
+    hole_neighbours: int = (
+        6  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)
+    )
     opening: bool = True  # what is free is opened by three by three cells: gaps between two rays are no ways
     ground_m: float = (
         -1.2

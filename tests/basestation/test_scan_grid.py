@@ -113,7 +113,7 @@ def test_what_moves_less_than_the_lattice_is_not_drawn_again() -> None:
 
 def test_each_cell_of_a_scan_is_freed_once() -> None:
     """Sectors share no cell and leave none out, whatever the heading."""
-    config = replace(CONFIG, storey_overlap_m=0.0, opening=False, free_below_m=0.0)
+    config = replace(CONFIG, storey_overlap_m=0.0, opening=False, bands_m=(0.0, 0.5, 1.2, 2.0))
     rng = np.random.default_rng(3)
     for heading in [*np.arange(8) * np.pi / 4, *rng.uniform(-4, 4, 12)]:
         wide = ColumnScan(
@@ -190,12 +190,15 @@ def test_states_are_read_as_in_the_reference(seed: int, opening: bool) -> None:
     shifts = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
     beside = np.any([np.roll(mask > 0, s, (0, 1)) for s in shifts], axis=0)
     free &= ~beside | (whole <= -4).all(axis=0)
+    around = [s for s in shifts if s != (0, 0)]
+    neighbours = np.sum([np.roll(free, s, (0, 1)) for s in around], axis=0)
+    free |= (mask == 0) & (whole <= 0).all(axis=0) & ~beside & (neighbours >= 6)
     if opening:
         eroded = np.all([np.roll(free, s, (0, 1)) for s in shifts], axis=0)
         free &= np.any([np.roll(eroded, s, (0, 1)) for s in shifts], axis=0)
     expected = np.where(mask > 0, mask, np.where(free, 0, -1))[64:128, 64:128]
     cells = np.empty((64, 64), np.int8)
-    known = kernels.read_states(slots, pool, 6, 2, 4, int(opening), cells)
+    known = kernels.read_states(slots, pool, 6, 2, 4, 6, int(opening), cells)
     assert np.array_equal(cells, expected)
     assert known == np.count_nonzero(expected >= 0)
 
@@ -243,14 +246,14 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_if_tw
     )  # fmt: skip
     grid = ScanGrid(CONFIG)
     grid.put(0, kept(bare), camera(0.0, 0.0, 0.0))
-    near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.free_below_m / HEIGHT_M)
+    near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
     assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
     assert not odds[:, columns < first - 0.05].any()
-    assert grid.cells(near)[0][1, 30] == -1
+    assert grid.cells(near)[0][1, 37] == -1
     grid.put(1, kept(bare), camera(0.0, 0.0, 0.05))
-    assert grid.cells(near)[0][1, 30] == 0
+    assert grid.cells(near)[0][1, 37] == 0
 
 
 def test_ground_that_was_seen_over_a_low_obstacle_is_free_and_what_it_hides_is_unknown() -> None:

@@ -140,6 +140,7 @@ class ScanGrid:
             config.occupied_from,
             config.free_from,
             config.free_beside,
+            config.hole_neighbours,
             int(config.opening),
             cells,
         )
@@ -172,12 +173,12 @@ class ScanGrid:
         before = np.where(bands > 0, obstacle - gap, np.inf)
         under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
         behind = start > obstacle  # ground that was seen over a low obstacle, which hides what lies before it
-        # A ray to the ground passes low over the cells before it: only what stands lower would not have been seen. But
+        # Just before the nearest seen ground the ray to it passes below the lowest band: nothing stands there. But
         # where the ground begins farther than at the image's lower border, something too near to be measured hides it.
         ahead = start * np.cos(scan.first_rad + scan.step * (np.arange(scan.columns) + 0.5))
         border = np.quantile(ahead[free > 0.0], _AT_BORDER) if (free > 0.0).any() else 0.0
         hidden = behind | (ahead > _HIDDEN * border)
-        low = np.where(hidden, start, start * max(0.0, 1.0 - config.free_below_m / max(scan.height_m, 1e-3)))
+        low = np.where(hidden, start, start * max(0.0, 1.0 - config.bands_m[0] / max(scan.height_m, 1e-3)))
         end = np.where(behind, free, np.minimum(free, before))
         space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
         accurate_m = scan.accurate_m(config)

@@ -194,15 +194,18 @@ def _state(pool: I16, slots: I32, row: int, column: int, occupied_from: int) -> 
 
 @njit
 def read_states(
-    slots: I32, pool: I16, occupied_from: int, free_from: int, free_beside: int, opening: int, cells: I8
+    slots: I32, pool: I16, occupied_from: int, free_from: int, free_beside: int, hole: int, opening: int, cells: I8
 ) -> int:
     """States of the cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands.
 
     slots: (3,3) of the tile and those around it. occupied_from, free_from: log-odds from which a band is occupied, and
     minus which all bands must not exceed for the cell to be free. free_beside: the same beside an occupied cell.
+    hole: neighbours that must be free, none being occupied, for an unknown cell without sign of an obstacle to be free.
     opening: 1 keeps free only what lies in a square of three by three free cells. Returns the number of known cells.
     """
-    margin = 3  # what is read around the tile: a square reaches two cells far, and each of its cells has neighbours
+    margin = (
+        4  # what is read around the tile: a square reaches two cells far, holes in it one more, and all have neighbours
+    )
     wide = SIDE + 2 * margin
     states, odds = np.empty((wide, wide), np.int8), np.empty((wide, wide), np.int32)
     for row in range(wide):
@@ -217,11 +220,21 @@ def read_states(
                     for c in range(column - 1, column + 2):
                         if states[r, c] > 0:
                             states[row, column] = -1
+    held = states.copy()
+    for row in range(2, wide - 2):
+        for column in range(2, wide - 2):
+            if held[row, column] == -1 and odds[row, column] <= 0:
+                free = 0
+                for r in range(row - 1, row + 2):
+                    for c in range(column - 1, column + 2):
+                        free += (held[r, c] == 0) - 9 * (held[r, c] > 0)
+                if free >= hole:
+                    states[row, column] = 0
     known = 0
     if opening:
         kept = np.zeros((wide, wide), np.uint8)
-        for row in range(2, wide - 2):
-            for column in range(2, wide - 2):
+        for row in range(3, wide - 3):
+            for column in range(3, wide - 3):
                 whole = True
                 for r in range(row - 1, row + 2):
                     for c in range(column - 1, column + 2):
