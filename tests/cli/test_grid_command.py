@@ -19,3 +19,11 @@ def test_grid_reaches_its_actions(action: str, word: str, capsys: pytest.Capture
         cli.main(["grid", action, "--help"])
     assert left.value.code == 0
     assert word in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [["--seed", "-1"], ["--transform", "nan", "0", "0"], ["--robot-radius", "nan"]])
+def test_grid_eval_refuses_numbers_that_mean_nothing(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(["grid", "eval", "a.yaml", "b.yaml", *options])
+    assert left.value.code == 2
+    assert "expected" in capsys.readouterr().err

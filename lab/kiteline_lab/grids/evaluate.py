@@ -45,8 +45,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw estimate, truth and difference")
     parser.add_argument("--json", action="store_true", help="print JSON; it always does")
     args = parser.parse_args(argv)
-    if args.draws < 1 or args.nodes < 2 or args.opening < 0 or args.robot_radius < 0:
+    if args.draws < 1 or args.nodes < 2 or args.opening < 0 or not args.robot_radius >= 0.0:
         parser.error("expected at least 1 draw, 2 nodes, and no negative opening or radius")
+    if args.seed < 0 or not np.isfinite(args.transform).all():
+        parser.error("expected a seed that is not negative, and a transform of finite numbers")
     config = GridEvalConfig(args.draws, args.nodes, default.spacing, args.opening, args.robot_radius, args.seed)
     est, true, T_true_est = read_grid(args.est), read_grid(args.true), planar(*args.transform)
     if args.align:

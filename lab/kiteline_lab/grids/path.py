@@ -23,6 +23,9 @@ F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 
+_FARTHEST_M = 1e9  # beyond, numbers of cells would not be exact
+
+
 class GridPathError(KitelineError):
     """There is no path; the text says why."""
 
@@ -122,6 +125,8 @@ def _place(text: str) -> F64:
         x, y = (float(v) for v in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r}: expected X,Y in m") from None
+    if not max(abs(x), abs(y)) < _FARTHEST_M:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected X,Y in m, below {_FARTHEST_M:g}")
     return np.array([x, y])
 
 

@@ -6,12 +6,17 @@ import argparse
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.truth.box_files import read_boxes
 from kiteline_hw.sim.truth.occupancy import write_grid
 from kiteline_hw.sim.truth.sight import CELL_M, RANGE_M, SeenWorld, look
 from kiteline_hw.sources.open import open_source
+
+
+_LEAST_CELL_M = 0.005  # a room of 10 m has 4 million such cells
 
 
 def seen_world(source: str, boxes: Path | None = None, cell_m: float = CELL_M, range_m: float = RANGE_M) -> SeenWorld:
@@ -71,6 +76,8 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     if not args.cell > 0.0 or not args.range > 0.0:
         parser.error("expected a positive side of a cell and a positive range")
+    if not _LEAST_CELL_M <= args.cell < np.inf:
+        parser.error(f"expected a side of a cell of {_LEAST_CELL_M:g} m or more")
     for file in write_truth(seen_world(args.source, args.boxes, args.cell, args.range), args.out.with_suffix("")):
         print(f"{file}: true occupancy")
     return 0

@@ -149,3 +149,11 @@ def test_the_command_prints_metres_and_draws(tmp_path: Path, capsys: pytest.Capt
     found = json.loads(capsys.readouterr().out)
     assert found["length_m"] == pytest.approx(float(said.split()[0]), abs=0.01) and found["clearance_m"] >= 0.15
     assert found["corners_m"][0] == [-1.95, -0.95]
+
+
+@pytest.mark.parametrize("place", ["nan,0", "1e300,0", "0,inf"])
+def test_places_that_are_nowhere_are_refused_by_name(place: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["grid.yaml", "0,0", place])
+    assert left.value.code == 2
+    assert "expected X,Y in m" in capsys.readouterr().err

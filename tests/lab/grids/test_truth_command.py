@@ -34,3 +34,11 @@ def test_a_recording_needs_the_list_of_its_solids(tmp_path: Path) -> None:
     assert main([f"sim:{SCENE}", "--out", str(tmp_path / "s.yaml"), "--range", "1.0", "--cell", "0.1"]) == 0
     near = read_grid(tmp_path / "s_seen.yaml")
     assert near.cell_m == 0.1 and np.isin(near.state, (-1, 0, 100)).all()
+
+
+@pytest.mark.parametrize("cell", ["1e-5", "nan", "inf"])
+def test_cells_that_no_memory_holds_are_refused(cell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main([f"sim:{SCENE}", "--out", str(tmp_path / "t.yaml"), "--cell", cell])
+    assert left.value.code == 2
+    assert "side of a cell" in capsys.readouterr().err
