@@ -15,7 +15,6 @@ from kiteline_hw.sim.truth.occupancy import write_grid
 from kiteline_hw.sim.truth.sight import CELL_M, RANGE_M, SeenWorld, look
 from kiteline_hw.sources.open import open_source
 
-
 _LEAST_CELL_M = 0.005  # a room of 10 m has 4 million such cells
 
 
