@@ -7,15 +7,36 @@ import json
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from kiteline_lab.evaluation.metrics import MAX_DIFFERENCE_NS, truth_at
+from kiteline_lab.evaluation.trajectories import TrajectoryError
 from kiteline_lab.grids.align import aligned
 from kiteline_lab.grids.files import planar, read_grid
 from kiteline_lab.grids.picture import draw_comparison
 from kiteline_lab.grids.prm import GridEvalConfig, score
+from kiteline_lab.tools.evaluate import load
+
+
+def between_paths(estimate: str, truth: str) -> NDArray[np.float64]:
+    """(3,3) planar motion that maps the positions of a trajectory onto the true ones. Raises TrajectoryError."""
+    est, true = load(estimate, truth)
+    i, poses = truth_at(est.t_ns, true, MAX_DIFFERENCE_NS)
+    if len(i) < 3:
+        raise TrajectoryError(f"{estimate} against {truth}: fewer than three poses have a true pose at their time")
+    a, b = est.T_w_b[i, :2, 3], poses[:, :2, 3]
+    s, t = a - a.mean(axis=0), b - b.mean(axis=0)
+    yaw = float(np.arctan2((s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0]).sum(), (s * t).sum()))
+    T = planar(0.0, 0.0, float(np.degrees(yaw)))
+    T[:2, 2] = b.mean(axis=0) - T[:2, :2] @ a.mean(axis=0)
+    return T
 
 
 def main(argv: list[str]) -> int:
-    """Run `kiteline grid eval`, which prints one JSON object; the exit status. Raises GridFileError."""
+    """Run `kiteline grid eval`, which prints one JSON object; the exit status.
+
+    Raises GridFileError and TrajectoryError.
+    """
     parser = argparse.ArgumentParser(
         prog="kiteline grid eval",
         description="Precision and recall of an occupancy grid for path planning: roads drawn on EST that are free in "
@@ -32,9 +53,17 @@ def main(argv: list[str]) -> int:
         help="motion that maps EST onto TRUE: metres and degrees",
     )
     parser.add_argument(
+        "--paths",
+        nargs=2,
+        metavar=("EST", "GT"),
+        help="trajectory of the flight and the true one, as kiteline eval reads them: the motion between them is taken "
+        "instead of --transform",
+    )
+    parser.add_argument(
         "--align",
         action="store_true",
-        help="fit rotation and translation of EST to the obstacles of TRUE, from --transform on",
+        help="fit rotation and translation of EST to the obstacles of TRUE, within 0.8 m and 8 degrees of --transform "
+        "or --paths",
     )
     default = GridEvalConfig()
     parser.add_argument("--draws", type=int, default=default.draws)
@@ -51,6 +80,8 @@ def main(argv: list[str]) -> int:
         parser.error("expected a seed that is not negative, and a transform of finite numbers")
     config = GridEvalConfig(args.draws, args.nodes, default.spacing, args.opening, args.robot_radius, args.seed)
     est, true, T_true_est = read_grid(args.est), read_grid(args.true), planar(*args.transform)
+    if args.paths is not None:
+        T_true_est = between_paths(*args.paths)
     if args.align:
         T_true_est = aligned(est, true, T_true_est)
     found = score(est, true, T_true_est, config)

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_lab.grids.evaluate import main
+from kiteline_lab.evaluation.trajectories import TrajectoryError
+from kiteline_lab.grids.evaluate import between_paths, main
 from kiteline_lab.grids.files import GridFile, GridFileError, planar, read_grid
 from kiteline_lab.grids.prm import GridEvalConfig, draw_nodes, free_cells, score
 from kiteline_lab.grids.prm_kernels import roads_free
@@ -159,3 +160,19 @@ def test_command_prints_json_that_repeats(tmp_path: Path, capsys: pytest.Capture
     assert found["precision_percent"] == found["recall_percent"] == 100.0
     assert main([path, path, "--draws", "3", "--nodes", "20", "--transform", "1", "0", "0"]) == 0
     assert json.loads(capsys.readouterr().out)["precision_percent"] < 90.0
+
+
+def test_the_motion_between_two_paths_is_found(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack(
+        [np.linspace(0.0, 5.0, 40), 0.01 * rng.standard_normal(40), np.full(40, 1.3)]
+    )  # nearly straight
+    T = planar(1.0, -2.0, 150.0)
+    true = np.column_stack([xyz[:, :2] @ T[:2, :2].T + T[:2, 2], xyz[:, 2] + 4.0])
+    for name, places in (("est.tum", xyz), ("true.tum", true)):
+        rows = [f"{100 + 0.05 * k:.3f} {x} {y} {z} 0 0 0 1" for k, (x, y, z) in enumerate(places.tolist())]
+        (tmp_path / name).write_text("\n".join(rows) + "\n")
+    assert between_paths(str(tmp_path / "est.tum"), str(tmp_path / "true.tum")) == pytest.approx(T, abs=1e-6)
+    (tmp_path / "later.tum").write_text("900 0 0 0 0 0 0 1\n901 1 0 0 0 0 0 1\n902 1 0 0 0 0 0 1\n")
+    with pytest.raises(TrajectoryError, match="true pose"):
+        between_paths(str(tmp_path / "later.tum"), str(tmp_path / "true.tum"))
