@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -164,3 +164,20 @@ def _kitti(path: Path, numbered: list[tuple[int, str]]) -> TrajectoryFile:
     else:
         times = [i * KITTI_PERIOD_NS for i in range(len(poses))]
     return TrajectoryFile(_in_order(str(path), [n for n, _ in numbered], times, poses), timed)
+
+
+def read_pair(estimate: str, truth: str) -> tuple[Trajectory, Trajectory]:
+    """Read both trajectories. KITTI poses without times take the times of the other one, pose by pose."""
+    est, true = read(estimate), read(truth)
+    if not true.timed and est.timed:
+        true = _timed_by(true, est.trajectory)
+    elif not est.timed and true.timed:
+        est = _timed_by(est, true.trajectory)
+    return est.trajectory, true.trajectory
+
+
+def _timed_by(poses: TrajectoryFile, clock: Trajectory) -> TrajectoryFile:
+    """`poses` with the times of `clock` if both have as many; else at 10 Hz from 0, as KITTI's sources stamp them."""
+    if len(poses.trajectory.t_ns) != len(clock.t_ns):
+        return poses
+    return TrajectoryFile(replace(poses.trajectory, t_ns=clock.t_ns))

@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_lab.evaluation.metrics import MAX_DIFFERENCE_NS, truth_at
-from kiteline_lab.evaluation.trajectories import TrajectoryError
+from kiteline_lab.evaluation.trajectories import TrajectoryError, read_pair
 from kiteline_lab.grids.align import aligned
 from kiteline_lab.grids.files import planar, read_grid
 from kiteline_lab.grids.picture import draw_comparison
 from kiteline_lab.grids.prm import GridEvalConfig, score
-from kiteline_lab.tools.evaluate import load
 
 
 def between_paths(estimate: str, truth: str) -> NDArray[np.float64]:
     """(3,3) planar motion that maps the positions of a trajectory onto the true ones. Raises TrajectoryError."""
-    est, true = load(estimate, truth)
+    est, true = read_pair(estimate, truth)
     i, poses = truth_at(est.t_ns, true, MAX_DIFFERENCE_NS)
     if len(i) < 3:
         raise TrajectoryError(f"{estimate} against {truth}: fewer than three poses have a true pose at their time")

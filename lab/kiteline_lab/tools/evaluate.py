@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-from dataclasses import replace
 
 from kiteline_core.frame import Trajectory
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import Evaluation, Relative, TrajectoryAlignment
-from kiteline_lab.evaluation.trajectories import TrajectoryError, TrajectoryFile, read
+from kiteline_lab.evaluation.trajectories import TrajectoryError, read_pair
 
 
 def evaluate_files(
@@ -21,7 +20,7 @@ def evaluate_files(
     plot: str = "",
 ) -> Evaluation:
     """Compare two trajectory files. plot: a PNG to draw, empty for none. Raises TrajectoryError."""
-    est, true = load(estimate, truth)
+    est, true = read_pair(estimate, truth)
     try:
         result = metrics.evaluate(est, true, alignment, max_difference_ns)
     except ValueError as error:
@@ -33,23 +32,6 @@ def evaluate_files(
         line = Line("estimate", Trajectory(matched.t_ns, matched.estimate))
         plot_trajectories(plot, [line], true, f"ATE {result.ate_m.rmse:.3f} m rmse over {result.path_m:.0f} m")
     return result
-
-
-def load(estimate: str, truth: str) -> tuple[Trajectory, Trajectory]:
-    """Read both trajectories. KITTI poses without times take the times of the other one, pose by pose."""
-    est, true = read(estimate), read(truth)
-    if not true.timed and est.timed:
-        true = _timed_by(true, est.trajectory)
-    elif not est.timed and true.timed:
-        est = _timed_by(est, true.trajectory)
-    return est.trajectory, true.trajectory
-
-
-def _timed_by(poses: TrajectoryFile, clock: Trajectory) -> TrajectoryFile:
-    """`poses` with the times of `clock` if both have as many; else at 10 Hz from 0, as KITTI's sources stamp them."""
-    if len(poses.trajectory.t_ns) != len(clock.t_ns):
-        return poses
-    return TrajectoryFile(replace(poses.trajectory, t_ns=clock.t_ns))
 
 
 def table(e: Evaluation) -> str:
