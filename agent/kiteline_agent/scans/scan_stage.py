@@ -26,6 +26,7 @@ from kiteline_core.ids import KeyframeId
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+_MOST_PARTS = 2  # of a scan in one frame, after a gap too
 _UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
 _RECENT = 16  # scans that are taken back if a lower ground is seen
 _WAITING = 256  # scans kept while the link has no room, 1 MB
@@ -91,16 +92,25 @@ class ScanStage:
         if self._camera.reference.is_of(ctx.number) or not self._governor.may_scan():
             return None  # a keyframe is work enough for a frame
         begun = self._begun
-        if begun.disparity is None:
-            assert self._stripes is not None
-            if begun.stripe < self._stripes.stripes:
-                self._stripes.match(begun.stripe)
-                self._work.matched_px += self._stripes.stripe_px
-                begun.stripe += 1
-                return None
+        parts = min(_MOST_PARTS, max(1, round(ctx.dt_s / self._config.part_s)))
+        for _ in range(parts):
+            if begun.disparity is None and not self._match_stripe(begun):
+                continue
+            assert begun.disparity is not None
+            self._begun = None
+            return self._finish(begun, begun.disparity)
+        return None
+
+    def _match_stripe(self, begun: _Begun) -> bool:
+        """Match the next stripe; True if there was none left, and the disparity is whole."""
+        assert self._stripes is not None
+        if begun.stripe == self._stripes.stripes:
             begun.disparity = self._stripes.finish()
-        self._begun = None
-        return self._finish(begun, begun.disparity)
+            return True
+        self._stripes.match(begun.stripe)
+        self._work.matched_px += self._stripes.stripe_px
+        begun.stripe += 1
+        return False
 
     def _shows_more(self) -> bool:
         """True if the camera has moved or turned since the last scan by enough to see something else."""

@@ -34,12 +34,14 @@ class Heard(NoBaseChannel):
         return not self.busy
 
 
-def flown(path: Path, config: AgentConfig, busy: bool = False) -> tuple[Agent, Heard, list[int], list[str]]:
+def flown(
+    path: Path, config: AgentConfig, busy: bool = False, every: int = 1
+) -> tuple[Agent, Heard, list[int], list[str]]:
     source = open_source(str(path))
     channel = Heard(busy)
     agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), channel)
     matched, events = [], []
-    for frame in [item for item in source if isinstance(item, Frame)]:
+    for frame in [item for item in source if isinstance(item, Frame)][::every]:
         events += agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns).events
         matched.append(agent.work.matched_px)
     return agent, channel, matched, events
@@ -60,6 +62,13 @@ def test_a_scan_is_spread_over_frames_and_the_same_each_time(recording: Path) ->
     for scan in channel.scans:
         assert scan.keyframe in [scan.keyframe for scan in channel.scans]
         assert (scan.scan.free_m >= scan.scan.free_from_m - 1e-9).all()
+
+
+def test_a_slow_camera_matches_two_stripes_a_frame(recording: Path) -> None:
+    """Else a keyframe of every third frame at 10 Hz would come before the scan of the one before is made."""
+    (_, _, fast, _), (_, slow, matched, _) = flown(recording, eager()), flown(recording, eager(), every=2)
+    assert max(matched) == 2 * max(fast)
+    assert slow.scans
 
 
 def test_without_scans_nothing_is_matched(recording: Path) -> None:
