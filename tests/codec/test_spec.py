@@ -74,9 +74,9 @@ class Source:
         assert stream == 0
         return out
 
-    def pose(self) -> list[list[float]]:
-        t = [self.signed() / 10000 for _ in range(3)]
-        s = [self.signed() / 2**19 for _ in range(3)]
+    def pose(self, per_m: int = 10_000, per_rotation: int = 1 << 19) -> list[list[float]]:
+        t = [self.signed() / per_m for _ in range(3)]
+        s = [self.signed() / per_rotation for _ in range(3)]
         ss = sum(c * c for c in s)
         w, x, y, z = (1 - ss) / (1 + ss), *(2 * c / (1 + ss) for c in s)
         assert abs(sqrt(w * w + x * x + y * y + z * z) - 1) < 1e-12
@@ -205,7 +205,7 @@ def cells(data: bytes) -> list[int]:
     return out
 
 
-def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
+def read_code(kind: int, id_: int, data: bytes, part: int = 0) -> dict[str, Any]:
     s = Source(data)
     out: dict[str, Any] = {}
     if kind == 1:
@@ -244,7 +244,10 @@ def read_code(kind: int, id_: int, data: bytes) -> dict[str, Any]:
         out["since"], out["T_k_f"] = s.varint(), s.pose()
         out["sigma_m"], out["sigma_rad"] = deviation(s.u8()), deviation(s.u8())
     elif kind == 11:
-        out["up_c"] = direction(s.u8(), s.signed() / 8191, s.signed() / 8191)
+        if part:
+            out["T_k_s"], out["up_c"] = s.pose(256, 1 << 10), [0.0, -1.0, 0.0]
+        else:
+            out["up_c"] = direction(s.u8(), s.signed() / 8191, s.signed() / 8191)
         out["azimuth0_rad"], out["azimuth_step_rad"], z = s.signed() / 2**16, s.varint() / 2**20, s.varint() - 1
         out["camera_height_m"] = float("nan") if z < 0 else (-(z + 1) // 2 if z % 2 else z // 2) / 256
         obstacle, free, free_from, clear, out["bands"] = scan(s, s.varint())
@@ -326,9 +329,9 @@ def test_records() -> None:
     entries = json.loads((GOLDEN / "records.json").read_text())
     assert {entry["key"][0] for entry in entries} == set(RECORD_TYPES)
     for entry in entries:
-        kind, id_, _ = entry["key"]
+        kind, id_, part = entry["key"]
         code = bytes.fromhex(entry["code"])
-        assert_agree(read_code(kind, id_, code), messages.decode(Key(*entry["key"]), code))
+        assert_agree(read_code(kind, id_, code, part), messages.decode(Key(*entry["key"]), code))
 
 
 def test_a_recognised_placement_has_one_byte_more() -> None:

@@ -37,6 +37,10 @@ TRANSLATION_CODES = 1 << 40  # +-1.1e8 m
 
 ROTATION_STEPS = 1 << 19  # per unit of the modified Rodrigues parameters: error <= 2 sqrt(3) / 2^19 = 6.7e-6 rad
 _ROTATION_LIMIT = (1 << 38) - (1 << 12)  # squared length kept below that of half a turn, where two codes would meet
+COARSE_TRANSLATION_STEPS = 256  # per m: error <= 2 mm an axis, less than half of what a range's is
+COARSE_TRANSLATION_CODES = 1 << 18  # +-1024 m
+COARSE_ROTATION_STEPS = 1 << 10  # error <= 3.4e-3 rad, 1.4e-3 in the mean: 7 mm at 5 m
+_COARSE_ROTATION_LIMIT = (1 << 20) - 1
 
 MIN_SCALE, MAX_SCALE = 2.0**-20, 2.0**20  # of one unit of length over another; an IEEE single: error <= 6e-8 of it
 
@@ -95,14 +99,25 @@ def pose_codes(pose: F64) -> tuple[int, ...]:
     error of d in them turns the result by at most 4 d (J. Schaub, M. Junkins, "Stereographic orientation parameters
     for attitude dynamics", 1996). Raises ValueError when the matrix is no rigid motion or too far out.
     """
+    return _motion_codes(pose, TRANSLATION_STEPS, TRANSLATION_CODES, ROTATION_STEPS, _ROTATION_LIMIT)
+
+
+def coarse_pose_codes(pose: F64) -> tuple[int, ...]:
+    """The same in larger steps. Raises ValueError when the matrix is no rigid motion or too far out."""
+    return _motion_codes(
+        pose, COARSE_TRANSLATION_STEPS, COARSE_TRANSLATION_CODES, COARSE_ROTATION_STEPS, _COARSE_ROTATION_LIMIT
+    )
+
+
+def _motion_codes(pose: F64, steps: int, most: int, rotation_steps: int, rotation_limit: int) -> tuple[int, ...]:
     if not (np.isfinite(pose).all() and se3.is_rotation(pose[:3, :3], 1e-3)):
         raise ValueError(f"a rigid motion (4,4) is expected, found\n{pose}")
-    translation = [round(x * TRANSLATION_STEPS) for x in pose[:3, 3].tolist()]
-    if max(map(abs, translation)) >= TRANSLATION_CODES:
-        raise ValueError(f"a translation within +-1e8 m is expected, found {pose[:3, 3]}")
+    translation = [round(x * steps) for x in pose[:3, 3].tolist()]
+    if max(map(abs, translation)) >= most:
+        raise ValueError(f"a translation within +-{most / steps:g} m is expected, found {pose[:3, 3]}")
     w, x, y, z = se3.quaternion_numbers(pose[:3, :3])
-    rotated = [round(c / (1.0 + w) * ROTATION_STEPS) for c in (x, y, z)]
-    while sum(c * c for c in rotated) > _ROTATION_LIMIT:
+    rotated = [round(c / (1.0 + w) * rotation_steps) for c in (x, y, z)]
+    while sum(c * c for c in rotated) > rotation_limit:
         i = max(range(3), key=lambda k: abs(rotated[k]))
         rotated[i] -= 1 if rotated[i] > 0 else -1
     return (*translation, *rotated)
@@ -110,15 +125,24 @@ def pose_codes(pose: F64) -> tuple[int, ...]:
 
 def pose(codes: tuple[int, ...]) -> F64:
     """The rigid motion (4,4) of six integers. Raises ValueError when the rotation's are too large."""
-    x, y, z = (c / ROTATION_STEPS for c in codes[3:])
-    if sum(c * c for c in codes[3:]) > _ROTATION_LIMIT:
+    return _motion(codes, TRANSLATION_STEPS, ROTATION_STEPS, _ROTATION_LIMIT)
+
+
+def coarse_pose(codes: tuple[int, ...]) -> F64:
+    """The same of six integers of `coarse_pose_codes`."""
+    return _motion(codes, COARSE_TRANSLATION_STEPS, COARSE_ROTATION_STEPS, _COARSE_ROTATION_LIMIT)
+
+
+def _motion(codes: tuple[int, ...], steps: int, rotation_steps: int, rotation_limit: int) -> F64:
+    x, y, z = (c / rotation_steps for c in codes[3:])
+    if sum(c * c for c in codes[3:]) > rotation_limit:
         raise ValueError("a rotation of less than half a turn is expected")
     s = x * x + y * y + z * z
     n = 1.0 + s
     w, x, y, z = (1.0 - s) / n, 2.0 * x / n, 2.0 * y / n, 2.0 * z / n
     norm = sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    tx, ty, tz = (c / TRANSLATION_STEPS for c in codes[:3])
+    tx, ty, tz = (c / steps for c in codes[:3])
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx],

@@ -25,6 +25,22 @@ def read_pose(source: Reader) -> NDArray[np.float64]:
         raise WireError(str(e)) from None
 
 
+def write_coarse_pose(out: Writer, pose: NDArray[np.float64]) -> None:
+    """Append a rigid motion (4,4) in the steps of scans. Raises ValueError."""
+    for code in quantise.coarse_pose_codes(pose):
+        out.signed(code)
+
+
+def read_coarse_pose(source: Reader) -> NDArray[np.float64]:
+    """A rigid motion (4,4) in the steps of scans. Raises WireError."""
+    translation = [source.signed(quantise.COARSE_TRANSLATION_CODES - 1) for _ in range(3)]
+    rotation = [source.signed(quantise.COARSE_ROTATION_STEPS) for _ in range(3)]
+    try:
+        return quantise.coarse_pose((*translation, *rotation))
+    except ValueError as e:
+        raise WireError(str(e)) from None
+
+
 def write_scale(out: Writer, scale: float) -> None:
     """Append the ratio of two units of length. Raises ValueError."""
     if not quantise.MIN_SCALE <= scale <= quantise.MAX_SCALE:

@@ -109,6 +109,19 @@ def test_pose_bounds(axis: tuple[float, ...], angle: float, moved: tuple[float, 
     assert np.linalg.det(got[:3, :3]) > 0
 
 
+@given(ROTATION, ANGLE, st.tuples(*[st.floats(-1000.0, 1000.0)] * 3))
+@example((1.0, 0.0, 0.0), np.pi, (0.0, 0.0, 0.0))
+def test_coarse_pose_bounds(axis: tuple[float, ...], angle: float, moved: tuple[float, ...]) -> None:
+    w = np.array(axis) / np.linalg.norm(axis) * angle
+    pose = se3.from_rt(se3.so3_exp(w), np.array(moved))
+    codes = quantise.coarse_pose_codes(pose)
+    got = quantise.coarse_pose(codes)
+    assert quantise.coarse_pose_codes(got) == codes
+    assert np.abs(got[:3, 3] - pose[:3, 3]).max() <= 0.5 / 256 + 1e-9
+    if angle < 3.0:
+        assert np.linalg.norm(se3.so3_log(got[:3, :3].T @ pose[:3, :3])) <= 3.4e-3
+
+
 TURN = st.integers(-quantise.ROTATION_STEPS, quantise.ROTATION_STEPS)
 
 

@@ -47,7 +47,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ground.column_scan import ColumnScan
+from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "records.json"
@@ -72,7 +72,7 @@ def a_scan(seed: int, n: int) -> ColumnScan:
 
 
 def some_records(seed: int, n: int) -> list[Record]:
-    """One record of each kind, with n rows."""
+    """One record of each kind, two scans, with n rows."""
     rng, steps = np.random.default_rng(seed), np.random.default_rng(seed + 1)
     submap = submap_id(int(rng.integers(64)), int(rng.integers(1 << 14)), int(rng.integers(1 << 12)))
     keyframe = keyframe_id(submap, int(rng.integers(50, 1 << 20)))
@@ -136,6 +136,7 @@ def some_records(seed: int, n: int) -> list[Record]:
         ),
         SubmapTie(submap, KeyframeId(keyframe - 9), pose, 0.0123 * (n + 1), 0.0021),
         KeyframeScan(keyframe, a_scan(seed, n + 1), steps.integers(0, 3, n).astype(np.uint8)),
+        KeyframeScan(keyframe, a_scan(seed + 1, n + 1), np.zeros(0, np.uint8), 1 + n % 15, pose),
     ]  # fmt: skip
 
 
@@ -287,6 +288,30 @@ def test_a_scan_is_rounded_by_no_more_than_the_specification_says() -> None:
             up = 1.0 if name != "free_from_m" else 16.0  # where free ground begins is rounded up
             assert np.all(np.abs(held[near] - told[near]) <= (told[near] + 2.0) / 256.0 * up)
         assert np.all(got.free_from_m >= scan.free_from_m - (scan.free_from_m + 2.0) / 256.0)
+
+
+def test_a_scan_between_keyframes_keeps_its_place_in_a_level_frame() -> None:
+    """Rays, told by their direction and the camera's place in the keyframe, are within the errors of the code."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        scan = a_scan(seed, 72)
+        T_k_s = se3.exp(np.concatenate([rng.normal(0.0, 1.0, 3), rng.normal(0.0, 0.6, 3)]))
+        record = KeyframeScan(KeyframeId(5), scan, np.zeros(0, np.uint8), 1 + seed % 15, T_k_s)
+        key, code = messages.key(record), messages.encode(record)
+        read = messages.decode(key, code)
+        assert isinstance(read, KeyframeScan) and read.T_k_s is not None and read.part == record.part == key.part
+        assert messages.encode(read) == code
+        assert np.array_equal(read.scan.up_c, [0.0, -1.0, 0.0])
+        rotations = [T[:3, :3] @ level_rotation(s.up_c) for T, s in ((T_k_s, scan), (read.T_k_s, read.scan))]
+        assert np.linalg.norm(se3.so3_log(rotations[0].T @ rotations[1])) < 3.4e-3
+        assert np.abs(read.T_k_s[:3, 3] - T_k_s[:3, 3]).max() <= 0.5 / 256 + 1e-9
+
+
+def test_only_scans_of_later_frames_have_a_pose() -> None:
+    scan, no_labels = a_scan(0, 8), np.zeros(0, np.uint8)
+    for record in (KeyframeScan(KeyframeId(5), scan, no_labels, 1), KeyframeScan(KeyframeId(5), scan, no_labels, 0, np.eye(4))):
+        with pytest.raises(ValueError, match="has a pose"):
+            messages.encode(record)
 
 
 def test_a_scan_of_a_room_is_short() -> None:

@@ -1,4 +1,4 @@
-"""The column scan of a keyframe, and which of its keypoints lie on the ground."""
+"""The column scans of a keyframe and of frames after it, and which of its keypoints lie on the ground."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, WireError, Writer, unzigzag, zigzag
+from kiteline_codec.schema.poses import read_coarse_pose, write_coarse_pose
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
-from kiteline_core.ground.column_scan import MAX_COLUMNS, ColumnScan
+from kiteline_core.geometry import se3
+from kiteline_core.ground.column_scan import MAX_COLUMNS, ColumnScan, level_rotation
 from kiteline_core.ids import MAX_KEYPOINTS, KeyframeId
 
+F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _AZIMUTH_STEPS = 1 << 16  # codes in 1 rad: 15 microrad, of the first column
@@ -23,35 +26,47 @@ _HEIGHT_STEPS = 256  # codes in 1 m
 _MAX_HEIGHT = 1 << 18  # 1024 m
 _COARSE = 8  # range codes in a step of where free ground begins, which is rounded up: it depends on the image's border
 _LABELS = 3  # unknown, ground, obstacle
+_LEVEL_UP_C = np.array([0.0, -1.0, 0.0])  # against gravity in a level camera
 
 
 @register
 @dataclass(frozen=True, slots=True)
 class KeyframeScan(Record):
-    """Ground and obstacles that a keyframe saw.
+    """Ground and obstacles that a keyframe saw, or a frame between it and the next one.
 
-    labels: (m,) uint8 of its first m keypoints: 0 unknown, 1 ground, 2 obstacle.
+    labels: (m,) uint8 of the keyframe's first m keypoints: 0 unknown, 1 ground, 2 obstacle. part: 0 the keyframe's own
+    image, 1 and more: of later frames. T_k_s: (4,4) of the camera of a later frame in that of the keyframe, as the
+    agent tracked it; None in part 0. It is rounded in a level frame: as decoded, its scan has an up_c of (0, -1, 0).
     """
 
     KIND = 11
     ID = IdOf.KEYFRAME
     PRIORITY = Priority.GRID
+    PARTS = 16
+    FIRST_PARTS = PARTS
 
     keyframe: KeyframeId
     scan: ColumnScan
     labels: NDArray[np.uint8]
+    part: int = 0
+    T_k_s: F64 | None = None
 
     def write(self, out: Writer) -> None:
-        """Append direction of gravity, columns and labels. Raises ValueError for values that have no code."""
+        """Append direction of gravity or pose, columns and labels. Raises ValueError for values that have no code."""
         scan, n = self.scan, len(self.scan)
         if not 0 < n <= MAX_COLUMNS or len(self.labels) > MAX_KEYPOINTS or self.labels.max(initial=0) >= _LABELS:
             raise ValueError(
                 f"found {n} columns and {len(self.labels)} labels, expected 1..{MAX_COLUMNS} and known ones"
             )
-        half, a, b = quantise.direction_codes(scan.up_c)
-        out.u8(half)
-        out.signed(a)
-        out.signed(b)
+        if (self.T_k_s is None) != (self.part == 0):
+            raise ValueError("the scan of a frame after its keyframe has a pose, and only that")
+        if self.T_k_s is None:
+            half, a, b = quantise.direction_codes(scan.up_c)
+            out.u8(half)
+            out.signed(a)
+            out.signed(b)
+        else:
+            write_coarse_pose(out, _levelled(self.T_k_s, scan.up_c))
         first, step = round(scan.azimuth0_rad * _AZIMUTH_STEPS), round(scan.azimuth_step_rad * _STEP_STEPS)
         unknown = scan.camera_height_m != scan.camera_height_m
         height = 0 if unknown else 1 + zigzag(round(scan.camera_height_m * _HEIGHT_STEPS))
@@ -73,13 +88,7 @@ class KeyframeScan(Record):
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
         """The record of a key and a code. Raises WireError."""
-        half = source.u8()
-        if half > 1:
-            raise WireError(f"a half is 0 or 1, found {half}")
-        try:
-            up_c = quantise.direction(half, *(source.signed(quantise.DIRECTION_STEPS) for _ in range(2)))
-        except ValueError as e:
-            raise WireError(str(e)) from None
+        up_c, T_k_s = (_read_up(source), None) if key.part == 0 else (_LEVEL_UP_C.copy(), read_coarse_pose(source))
         first, step, height = source.signed(_MAX_AZIMUTH), source.varint(_STEP_STEPS), source.varint(_MAX_HEIGHT)
         n = source.varint(MAX_COLUMNS)
         if not step or not n:
@@ -97,7 +106,22 @@ class KeyframeScan(Record):
         labels = _LABELS - 1 - source.residual_columns(1, m)[0]
         if m and (labels.min() < 0 or labels.max() >= _LABELS):
             raise WireError("labels are 0, 1 or 2")
-        return cls(KeyframeId(key.id), scan, labels.astype(np.uint8))
+        return cls(KeyframeId(key.id), scan, labels.astype(np.uint8), key.part, T_k_s)
+
+
+def _read_up(source: Reader) -> F64:
+    half = source.u8()
+    if half > 1:
+        raise WireError(f"a half is 0 or 1, found {half}")
+    try:
+        return quantise.direction(half, *(source.signed(quantise.DIRECTION_STEPS) for _ in range(2)))
+    except ValueError as e:
+        raise WireError(str(e)) from None
+
+
+def _levelled(T_k_s: F64, up_c: F64) -> F64:
+    """The pose (4,4) of a camera after it was turned so that its up_c (3,) became (0, -1, 0)."""
+    return se3.from_rt(T_k_s[:3, :3] @ level_rotation(up_c) @ level_rotation(_LEVEL_UP_C).T, T_k_s[:3, 3])
 
 
 def _predicted(ranges: I64, bands: I64) -> I64:
