@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,13 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
 
+class _Hung(NamedTuple):
+    """A scan, and where its camera lies in that of its keyframe; None: there."""
+
+    scan: KeptScan
+    T_k_s: F64 | None
+
+
 class GridUpdates:
     """The grid of all placed submaps in metres. placements: S_w_m (4,4) of each, kept up to date by its owner.
 
@@ -35,7 +43,7 @@ class GridUpdates:
         self._map = sparse_map
         self._placements = placements
         self.grid = ScanGrid(config.grid)
-        self._scans: dict[KeyframeId, KeptScan] = {}
+        self._scans: dict[KeyframeId, dict[int, _Hung]] = {}  # by part
         self._labels: dict[KeyframeId, U8] = {}  # of keypoints
         self._scanning: set[AgentId] = set()  # agents that send scans
         self._due: dict[KeyframeId, None] = {}  # may have moved, or are new
@@ -49,14 +57,15 @@ class GridUpdates:
             for keyframe in [k for k in self._scans if agent_of_keyframe(k) == agent]:
                 self._drop(keyframe)
             self._unmade = {k: None for k in self._unmade if agent_of_keyframe(k) != agent}
-        self._labels[record.keyframe] = record.labels
+        if record.part == 0:
+            self._labels[record.keyframe] = record.labels
         camera = self._map.cameras.get(agent)
-        kept = keep(self._config, record.scan, 0.0 if camera is None else camera.bf)
-        if kept is None:
-            self._drop(record.keyframe)
-        else:
-            self._scans[record.keyframe] = kept
-            self._due[record.keyframe] = None
+        self._hang(
+            record.keyframe,
+            record.part,
+            keep(self._config, record.scan, 0.0 if camera is None else camera.bf),
+            record.T_k_s,
+        )
 
     def add_keyframe(self, keyframe: KeyframeId) -> None:
         """Take a new keyframe. Without scans, its landmarks are drawn now, and once more when they are better known."""
@@ -90,7 +99,7 @@ class GridUpdates:
             self._make(keyframe)
         drawn = 0
         for keyframe in sorted(self._due):
-            if drawn == self._config.drawn_per_step:
+            if drawn >= self._config.drawn_per_step:
                 break
             del self._due[keyframe]
             drawn += self._draw(self.grid, keyframe)
@@ -118,20 +127,26 @@ class GridUpdates:
                 self._due[keyframe] = None
         self._map.moved_rows.clear()
 
-    def _draw(self, grid: ScanGrid, keyframe: KeyframeId) -> bool:
-        scan = self._scans.get(keyframe)
-        if scan is None:
-            return False
-        S_w_k = self._pose(keyframe)
-        return grid.remove(keyframe) if S_w_k is None else grid.put(keyframe, scan, S_w_k)
+    def _draw(self, grid: ScanGrid, keyframe: KeyframeId) -> int:
+        """Draw the scans of a keyframe where it is now. Returns how many changed."""
+        S_w_k, changed = self._pose(keyframe), 0
+        for part, (scan, T_k_s) in self._scans.get(keyframe, {}).items():
+            if S_w_k is None:
+                changed += grid.remove((keyframe, part))
+            else:
+                changed += grid.put((keyframe, part), scan, S_w_k if T_k_s is None else S_w_k @ T_k_s)
+        return changed
 
     def ground_below(self, keyframe: KeyframeId) -> float | None:
         """Height in w of the ground below a keyframe, or the last one before it that knows; None if none does."""
         siblings = self._map.submaps.get(submap_of_keyframe(keyframe), [])
         for other in siblings[: bisect_right(siblings, keyframe)][: -1 - self._config.ground_keyframes : -1]:
-            scan, S_w_k = self._scans.get(other), self._pose(other)
-            if scan is not None and S_w_k is not None:
-                return float(S_w_k[2, 3]) - sim3.scale_of(S_w_k) / scan.unit_m * scan.height_m
+            S_w_k = self._pose(other)
+            if S_w_k is None:
+                continue
+            for scan, T_k_s in self._scans.get(other, {}).values():
+                z_m = (S_w_k if T_k_s is None else S_w_k @ T_k_s)[2, 3]
+                return float(z_m) - sim3.scale_of(S_w_k) / scan.unit_m * scan.height_m
         return None
 
     def labels(self, landmarks: I32) -> U8:
@@ -147,11 +162,19 @@ class GridUpdates:
                 out[known] = labels[index[known]]
         return out
 
+    def _hang(self, keyframe: KeyframeId, part: int, scan: KeptScan | None, T_k_s: F64 | None = None) -> None:
+        """Hang a scan on a keyframe, in place of the same part; None: take that away."""
+        if scan is not None:
+            self._scans.setdefault(keyframe, {})[part] = _Hung(scan, T_k_s)
+            self._due[keyframe] = None
+        elif self._scans.get(keyframe, {}).pop(part, None) is not None:
+            self.grid.remove((keyframe, part))
+
     def _drop(self, keyframe: KeyframeId) -> None:
-        self._scans.pop(keyframe, None)
+        for part in self._scans.pop(keyframe, {}):
+            self.grid.remove((keyframe, part))
         self._due.pop(keyframe, None)
         self._unmade.pop(keyframe, None)
-        self.grid.remove(keyframe)
 
     def _pose(self, keyframe: KeyframeId) -> F64 | None:
         """S_w_k (4,4) of a keyframe; None if its submap is not placed, or not in metres."""
@@ -193,5 +216,4 @@ class GridUpdates:
         self._labels[keyframe] = mine
         kept = keep(self._config, scan, camera.bf, unit_m)
         if kept is not None:
-            self._scans[keyframe] = kept
-            self._due[keyframe] = None
+            self._hang(keyframe, 0, kept)

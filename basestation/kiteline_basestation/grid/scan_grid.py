@@ -2,8 +2,8 @@
 
     grid = ScanGrid(GridConfig())
     kept = keep(grid.config, scan, bf_px_m)
-    grid.put(keyframe, kept, S_w_c)  # draws a scan, or draws it anew where its keyframe is now
-    grid.remove(keyframe)
+    grid.put(name, kept, S_w_c)  # draws a scan, or draws it anew where its keyframe is now
+    grid.remove(name)
     grid.cells(Place(0, 2, -1))  # (64,64) int8: -1 unknown, 0 free, else the mask of occupied height bands
 
 Log-odds are sums of integers, and a scan is drawn at a pose on a lattice: to draw the scans that moved anew gives
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +44,7 @@ class _Drawn(NamedTuple):
 
 
 class ScanGrid:
-    """Tiles of log-odds, and the scans that are drawn in them, by keyframe."""
+    """Tiles of log-odds, and the scans that are drawn in them, by name."""
 
     def __init__(self, config: GridConfig) -> None:
         self.config = config
@@ -53,7 +53,7 @@ class ScanGrid:
             Place, int
         ] = {}  # revision of the last change, the oldest first; also of tiles that are gone
         self._store = TileStore(config.resident_tiles)
-        self._drawn: dict[int, _Drawn] = {}
+        self._drawn: dict[Hashable, _Drawn] = {}
         self._storeys: Counter[tuple[int, ...]] = Counter()  # scans by the storeys on which they are drawn
         self._hits: U16 = np.zeros((0, 0), np.uint16)  # zero between two draws
 
@@ -61,8 +61,8 @@ class ScanGrid:
         """Number of scans."""
         return len(self._drawn)
 
-    def __contains__(self, keyframe: int) -> bool:
-        return keyframe in self._drawn
+    def __contains__(self, name: Hashable) -> bool:
+        return name in self._drawn
 
     @property
     def places(self) -> list[Place]:
@@ -74,7 +74,7 @@ class ScanGrid:
         """Bytes of tiles and scans, without dictionaries."""
         return self._store.nbytes + sum(len(drawn.scan.rows) for drawn in self._drawn.values())
 
-    def put(self, keyframe: int, scan: KeptScan, S_w_c: F64) -> bool:
+    def put(self, name: Hashable, scan: KeptScan, S_w_c: F64) -> bool:
         """Draw a scan at its camera's pose (4,4), or anew if it or its pose changed. True if cells may have changed.
 
         A scan with a pose that is not finite, beyond the farthest tile or storey, or of a scale that makes it reach too
@@ -82,23 +82,23 @@ class ScanGrid:
         """
         config = self.config
         if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > config.max_position_m:
-            return self.remove(keyframe)
+            return self.remove(name)
         new = _Drawn(scan.lattice(config, S_w_c), scan)
         if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > config.max_reach_m:
-            return self.remove(keyframe)
-        held = self._drawn.get(keyframe)
+            return self.remove(name)
+        held = self._drawn.get(name)
         if new == held:
             return False
         self.revision += 1
         if held is not None:
             self._draw(held, -1)
-        self._drawn[keyframe] = new
+        self._drawn[name] = new
         self._draw(new, 1)
         return True
 
-    def remove(self, keyframe: int) -> bool:
+    def remove(self, name: Hashable) -> bool:
         """Take a scan out. True if it was there."""
-        held = self._drawn.pop(keyframe, None)
+        held = self._drawn.pop(name, None)
         if held is None:
             return False
         self.revision += 1

@@ -124,9 +124,13 @@ class Intake:
                     self.refused += 1
 
     def take_scans(self) -> list[KeyframeScan]:
-        """The scans that arrived since the last call."""
-        scans, self._scans = self._scans, []
-        return scans
+        """The scans that arrived since the last call, or before the camera of their agent was known."""
+        scans, early = self._scans, self._scans[:0]
+        for scan in scans:
+            if agent_of_keyframe(scan.keyframe) not in self._map.cameras:
+                early.append(scan)
+        self._scans = early[-self._config.max_pending :]
+        return [scan for scan in scans if scan not in early]
 
     def ready(self, now_ns: int) -> list[KeyframeId]:
         """Keyframes to use now, in order of id: complete ones, those past the patience, and late completions."""

@@ -309,7 +309,10 @@ def test_a_scan_between_keyframes_keeps_its_place_in_a_level_frame() -> None:
 
 def test_only_scans_of_later_frames_have_a_pose() -> None:
     scan, no_labels = a_scan(0, 8), np.zeros(0, np.uint8)
-    for record in (KeyframeScan(KeyframeId(5), scan, no_labels, 1), KeyframeScan(KeyframeId(5), scan, no_labels, 0, np.eye(4))):
+    for record in (
+        KeyframeScan(KeyframeId(5), scan, no_labels, 1),
+        KeyframeScan(KeyframeId(5), scan, no_labels, 0, np.eye(4)),
+    ):
         with pytest.raises(ValueError, match="has a pose"):
             messages.encode(record)
 
