@@ -7,7 +7,7 @@ from typing import Any
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.system.compile_time import measure
-from kiteline_bench.system.older_build import REVISION, older_build, todays_build
+from kiteline_bench.system.older_build import REVISION, Build, older_build, todays_build
 from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circles
 
 _MODULES, _LINES, _ALL_LINES = 14, 400, 38_000  # in a folder, in a file, in all rooms
@@ -42,8 +42,11 @@ def _structure(bench: Bench) -> list[Bar]:
 
 
 def _cpu(bench: Bench) -> list[Bar]:
-    """CPU of this build over that of an older one, flown in alternation."""
-    builds = {"older": older_build(bench), "today": todays_build(bench)}
+    """CPU of this build over that of an older one, flown in alternation; also without the scans the older one lacks."""
+    older, today = older_build(bench), todays_build(bench)
+    builds: dict[str, tuple[Build, list[str]]] = {
+        "older": (older, []), "today": (today, []), "without scans": (today, ["--grid", "off"]),
+    }  # fmt: skip
     bars = []
     for name in ("room_flight.mcap", "kitti_straight"):
         source, rounds = bench.source(name), []
@@ -51,15 +54,17 @@ def _cpu(bench: Bench) -> list[Bar]:
             reports = {}
             for kind in sorted(builds, reverse=bool(k % 2)):
                 bench.say(f"flying {name}, round {k}: {kind}")
-                reports[kind] = builds[kind].fly([source], bench.folder.resolve() / f"cpu_{kind}")
+                build, options = builds[kind]
+                reports[kind] = build.fly([source], bench.folder.resolve() / f"cpu_{kind.split()[0]}", *options)
             rounds.append(reports)
-        for half, cpu_ms in (("agent, CPU a frame", _agent_ms), ("base, CPU a step", _base_ms)):
-            pairs = [(cpu_ms(reports["today"]), cpu_ms(reports["older"])) for reports in rounds[1:]]
-            listed = ", ".join(f"{ours:.2f} / {theirs:.2f}" for ours, theirs in pairs)
-            bench.more.append(f"{name}, {half}, ms: {listed}.")
-            ratio = median(ours / theirs for ours, theirs in pairs)
-            bars.append(at_most(f"{name}: {half}, over that of {REVISION[:8]}, median of {_ROUNDS}", ratio, _CPU_RATIO,
-                                "", 3))  # fmt: skip
+        for kind in ("without scans", "today"):
+            for half, cpu_ms in (("agent, CPU a frame", _agent_ms), ("base, CPU a step", _base_ms)):
+                what = f"{name}: {half}" + (", without scans" if kind == "without scans" else "")
+                pairs = [(cpu_ms(reports[kind]), cpu_ms(reports["older"])) for reports in rounds[1:]]
+                bench.more.append(f"{what}, ms: " + ", ".join(f"{ours:.2f} / {old:.2f}" for ours, old in pairs) + ".")
+                ratio = median(ours / old for ours, old in pairs)
+                bars.append(at_most(f"{what}, over that of {REVISION[:8]}, median of {_ROUNDS}", ratio, _CPU_RATIO,
+                                    "", 3))  # fmt: skip
     return bars
 
 
