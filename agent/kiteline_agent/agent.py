@@ -66,7 +66,6 @@ class Agent:
         vocabulary: Vocabulary | None = None,
     ) -> None:
         """vocabulary: of the place index; without it only the reference keyframe is tried in relocalisation."""
-        self._identity = identity
         self._channel = channel
         self._full_config = self._config = config  # the latter at the governor's effort
         self._rectifier = Rectifier(rig)
@@ -122,7 +121,7 @@ class Agent:
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
-        self._told_t_ns = 0  # when the log was last told of the nearest obstacle
+        self._obstacle_event_ns = 0  # stamp of the last event about the nearest obstacle
         channel.put(CameraIntrinsics(identity.agent, camera))
         if self.right_camera is not None:
             self.right_camera.begin_with(config.known_rig)
@@ -152,7 +151,7 @@ class Agent:
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
 
     def predict(self, t_ns: int) -> PredictedPose | None:
-        """PoseReport.predict, by the samples since the last processed frame."""
+        """The pose at a time after the last processed frame; None before there is a map, and too long after it."""
         return self._report.predict(t_ns, joined(self._skipped_imu), self._full_config.prediction.max_s)
 
     def _process(self, frame: Frame, imu: ImuBatch | None) -> tuple[Estimate, list[str]]:
@@ -168,16 +167,9 @@ class Agent:
         stuck = has_map and self._stuck_camera.update(frame.left, camera.pose.T_o_m @ T_m_c)
         self._frame_number += 1
         ctx = FrameContext(
-            self._frame_number,
-            frame.t_ns,
-            dt_s,
-            imu,
-            images,
-            T_m_c,
-            self._stuck_camera.repeated,
-            config,
-            self._shutter(frame.t_ns, dt_s),
-        )
+            self._frame_number, frame.t_ns, dt_s, imu, images, T_m_c, config=config,
+            repeated=self._stuck_camera.repeated, shutter=self._shutter(frame.t_ns, dt_s),
+        )  # fmt: skip
         # 3. Track the landmarks of the local map.
         track = self._track(ctx) if has_map and not stuck else None
         if track is None:
@@ -254,7 +246,7 @@ class Agent:
         return track
 
     def _retry_with_image_shift(self, ctx: FrameContext, track: Track) -> Track:
-        """The better of a track and another one from where the whole image seems to have rotated."""
+        """The better of a track and another one that starts from the rotation that the image-shift estimate gives."""
         guess = self._image_shift.rotated_pose(ctx.images.sampled)
         if guess is None:
             return track
@@ -281,20 +273,23 @@ class Agent:
         return [f"submap tilted by {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees"]
 
     def _scan(self, ctx: FrameContext) -> list[str]:
-        """Go on with a scan of ground and obstacles; a finished one is drawn into the local grid. Returns events."""
+        """Continue a scan of ground and obstacles; draw a finished one into the local grid. Returns events."""
         scanned = None if self._scans is None else self._scans.step(ctx)
         if scanned is None:
             return []
         self._local_grid.add(scanned)
-        if ctx.t_ns - self._told_t_ns < self._full_config.scan.told_s * 1e9:
+        if ctx.t_ns - self._obstacle_event_ns < self._full_config.scan.told_s * 1e9:
             return []
-        self._told_t_ns = ctx.t_ns
+        self._obstacle_event_ns = ctx.t_ns
         pose = self._camera.pose
         around = self._local_grid.around(pose.T_o_m @ pose.T_m_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)
         return [] if around is None else [around.line]
 
     def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
-        """Whether to track the frame, at the effort that the governor decides; its IMU samples are kept. And events."""
+        """Set the effort that the governor chooses, and buffer the step's IMU samples.
+
+        Returns whether to track the frame, and events.
+        """
         if step_input.imu is not None:
             self._skipped_imu.append(step_input.imu)
         decision = self._governor.frame(
@@ -308,10 +303,10 @@ class Agent:
         return decision.track, list(decision.events)
 
     def _take_corrections(self, records: list[Record]) -> list[str]:
-        """Apply the records of the base; the odometry frame stays. Returns events."""
+        """Apply the records of the base; the odometry frame does not move. Returns events."""
         last, anchor = self._last_track, None
         if not self._has_depth:
-            self.map.patient = self._camera.motion.running  # an IMU holds the scale of its depths
+            self.map.holds_landmarks = self._camera.motion.running  # the IMU fixes the scale of the agent's own depths
         if records and last is not None:
             anchor = MapAnchor(self.map, last, self._config, inertial=self._camera.motion.running)
         moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)

@@ -119,7 +119,7 @@ def refined(held: LocalMap, k: int, offset_px: float) -> bool:
 @pytest.mark.parametrize("with_imu", [False, True])
 def test_a_monocular_camera_takes_refined_landmarks_at_once_unless_an_imu_holds_its_scale(with_imu: bool) -> None:
     held = local_map(camera=replace(CAMERA, stereo=False))
-    held.patient = held.patient or with_imu
+    held.holds_landmarks = held.holds_landmarks or with_imu
     held.share(KeyframeId(0), 30)
     before = held.bearing.copy()
     assert refined(held, 0, 0.5 * CONFIG.local_map.moved_px) != with_imu
@@ -146,10 +146,10 @@ def test_refined_landmarks_wait_with_the_poses() -> None:
 def test_landmarks_that_waited_do_not_come_after_newer_ones() -> None:
     """An IMU that is no longer initialised ends the waiting of a monocular map."""
     held = local_map(camera=replace(CAMERA, stereo=False))
-    held.patient = True
+    held.holds_landmarks = True
     held.share(KeyframeId(0), 30)
     assert not refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
-    held.patient = False
+    held.holds_landmarks = False
     assert refined(held, 0, 0.1 * CONFIG.local_map.moved_px)
     newest = held.bearing.copy()
     told(held, 1, 2.0 * LEAST_M)

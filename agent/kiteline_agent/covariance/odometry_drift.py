@@ -1,4 +1,4 @@
-"""What the map says of the odometry frame: how far it has gone astray since the flight began."""
+"""Drift of the odometry frame since the flight began, as the map measures it."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class PoseCovariance:
         self._camera_rotation_rad = 0.0  # found against the IMU
         self._extrinsic = self._extrinsic_cov()
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))  # of the camera in m
-        self._T_o_left: dict[SubmapId, F64] = {}  # T_o_m of earlier submaps, while all motion since was measured
+        self._T_o_m_before: dict[SubmapId, F64] = {}  # of submaps that were left, while all motion since was measured
         self._has_imu_motion = False  # an IMU measures all motion
         self._metric = has_depth
         self._far_relocalisation = False  # the last relocalisation is far from the predicted pose
@@ -232,7 +232,7 @@ class PoseCovariance:
     def before_map_change(self, pose: PoseState, T_c_b: F64, submap: SubmapId) -> None:
         """Move the covariance into the odometry frame, before the map of the active submap changes."""
         if self._has_imu_motion or self._metric:
-            self._T_o_left[submap] = pose.T_o_m
+            self._T_o_m_before[submap] = pose.T_o_m
         T_m_b = pose.T_m_c @ T_c_b
         left, out = np.empty((6, 6)), np.empty((6, 6))
         self._propagate(pose.T_o_m, T_m_b, np.eye(4), left, out)
@@ -296,7 +296,7 @@ class PoseCovariance:
         """Covariances (6,6) of T_m_b relative to the start of its submap and of T_o_b relative to that of the flight.
 
         Each is [translation in m or o, rotation about the body's axes]. in_first: the submap is that in which the
-        flight began, so that it tells how far the odometry frame has gone astray.
+        flight began, so that the drift of the odometry frame is measured in it.
         """
         left, cov_m = np.empty((6, 6)), np.empty((6, 6))
         carried, self._carried = self._carried, self._zero
@@ -318,23 +318,23 @@ class PoseCovariance:
             np.ascontiguousarray(T_a_m), np.ascontiguousarray(T_m_b), np.ascontiguousarray(T_a_b0), left, out,
         )  # fmt: skip
 
-    def set_imu_motion(self, measured: bool) -> None:
+    def set_imu_motion(self, *, measured: bool) -> None:
         """Set whether an IMU has measured the motion since the last frame."""
         self._has_imu_motion = measured
         if not measured and not self._metric:
-            self._T_o_left = {}  # monocular maps differ in scale
+            self._T_o_m_before = {}  # monocular maps differ in scale
 
     def is_consistent(
         self, T_c_m: F64, submap: SubmapId, predicted_T_m_c: F64, pose: PoseState, T_c_b: F64, active: SubmapId,
-        *, found: bool,
+        *, relocalised: bool,
     ) -> bool:  # fmt: skip
         """Test if T_c_m (4,4) in a submap agrees with the measured path since the vehicle was there.
 
-        Without a sensor for the path, tests if a vehicle can fly there in the time. found: the pose comes from
+        Without a sensor for the path, tests if a vehicle can fly there in the time. relocalised: the pose comes from
         relocalisation, not from tracking.
         """
-        T_o_m = pose.T_o_m if submap == active else self._T_o_left.get(submap)
-        if T_o_m is None or not (self._has_imu_motion or (found and self._metric)):
+        T_o_m = pose.T_o_m if submap == active else self._T_o_m_before.get(submap)
+        if T_o_m is None or not (self._has_imu_motion or (relocalised and self._metric)):
             return True
         self._far_relocalisation = False
         c = self._config

@@ -15,7 +15,7 @@ class CorrectionBatches:
 
     def __init__(self) -> None:
         self._held: dict[Key, Record] = {}  # the newest value of each key, in order of arrival
-        self._batch: CorrectionBatch | None = None  # the newest one that was heard of
+        self._batch: CorrectionBatch | None = None  # the newest one of which the record has arrived
         self._applied = 0  # number of the newest batch that was applied
 
     def __len__(self) -> int:
@@ -27,7 +27,7 @@ class CorrectionBatches:
         ready = []
         for record in records:
             if isinstance(record, CorrectionBatch):
-                self._hear(record)
+                self._set_batch(record)
                 continue
             waits = getattr(record, "batch", 0) > self._applied
             if waits or self._held:
@@ -41,9 +41,9 @@ class CorrectionBatches:
             self._held.pop(key, None)
         return ready + self._complete()
 
-    def _hear(self, batch: CorrectionBatch) -> None:
+    def _set_batch(self, batch: CorrectionBatch) -> None:
         if self._batch is not None and batch.number < self._batch.number:
-            self._applied = 0  # the base has forgotten its numbers
+            self._applied = 0  # another base, which counts from the start
         self._batch = batch
 
     def _complete(self) -> list[Record]:

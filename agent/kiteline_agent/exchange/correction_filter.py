@@ -1,8 +1,8 @@
-"""Weighs corrections of the live pose by the deviation of the base's scale and by that of what was reported before.
+"""Filters corrections of the live pose in a monocular map, whose scale is uncertain.
 
-The scale of a monocular map is uncertain to a percent, and the base finds it anew with every bundle: each time the
-vehicle moves in w by as much of its distance from the origin. A Kalman filter of the vehicle's place in w takes over of
-each correction what it is worth beside those before.
+The base estimates the scale anew with every bundle, to about a percent. Each estimate moves the vehicle in w by that
+share of its distance from the origin. A Kalman filter of the vehicle's position in w weighs each correction by the
+deviation of the base's scale and that of the position reported so far.
 """
 
 from __future__ import annotations
@@ -17,49 +17,51 @@ F64 = NDArray[np.float64]
 
 
 class CorrectionFilter:
-    """The pose of the odometry frame in w, by all corrections so far; later ones contain what earlier ones knew."""
+    """The pose of the odometry frame in w, by all corrections so far. A later correction replaces the earlier ones."""
 
     def __init__(self, config: SmoothingConfig) -> None:
         self._config = config
-        self._told: F64 | None = None  # T_w_o as the base corrected it last
-        self._kept = np.zeros(3)  # m in w: by how much of the corrections the vehicle was not moved
-        self._variance = 0.0  # m^2, of the vehicle's place in w after the last correction
-        self._place = np.zeros(3)  # of the vehicle in w then
-        self._scale_sigma = config.scale_sigma  # relative deviation of what it has flown since
+        self._T_w_o: F64 | None = None  # as the base corrected it last
+        self._withheld = np.zeros(3)  # m in w: part of the corrections that the filter does not apply
+        self._variance = 0.0  # m^2, of the vehicle's position in w after the last correction
+        self._position = np.zeros(3)  # m in w, of the vehicle at the last correction
+        self._scale_sigma = config.scale_sigma  # relative deviation of lengths flown since the last correction
 
     def clear(self) -> None:
         """Take over the next correction as it is."""
-        self._told = None
+        self._T_w_o = None
 
     def weigh(self, T_w_o: F64, here_o: F64, scale_sigma: float) -> F64:
-        """The pose (4,4) of o to report if the base says T_w_o. here_o: (3,) m, vehicle in o.
+        """The pose (4,4) of o to report for the base's T_w_o. here_o: (3,) m, vehicle in o.
 
-        scale_sigma: relative deviation of lengths in w, 0 if they are certain or the base does not tell.
+        scale_sigma: relative deviation of lengths in w, 0 if they are certain or it is unknown.
         """
-        before, self._told = self._told, T_w_o
+        before, self._T_w_o = self._T_w_o, T_w_o
         if before is None or scale_sigma <= 0.0:
             self._take_over()
         elif not np.array_equal(before, T_w_o):
             self._fuse(before, T_w_o, here_o, scale_sigma)
-        if not self._kept.any():
+        if not self._withheld.any():
             return T_w_o
         out = T_w_o.copy()
-        out[:3, 3] -= self._kept
+        out[:3, 3] -= self._withheld
         return out
 
     def _take_over(self) -> None:
-        self._kept = np.zeros(3)
-        self._variance, self._place = 0.0, np.zeros(3)
+        """Apply the whole correction."""
+        self._withheld = np.zeros(3)
+        self._variance, self._position = 0.0, np.zeros(3)
         self._scale_sigma = self._config.scale_sigma
 
     def _fuse(self, before: F64, T_w_o: F64, here_o: F64, scale_sigma: float) -> None:
+        """Update the position by a correction, with the variances (m^2) of the reported and the corrected position."""
         old, new = (se3.transform(T, here_o[None])[0] for T in (before, T_w_o))
-        moved = new - old + self._kept  # from where it was reported
+        moved = new - old + self._withheld  # from the reported position
         if float(np.linalg.norm(moved)) > self._config.snap_m:
             self._take_over()
             return
-        reported = self._variance + (self._scale_sigma * float(np.linalg.norm(new - self._place))) ** 2
-        told = (scale_sigma * float(np.linalg.norm(new))) ** 2
-        share = reported / max(reported + told, 1e-12)
-        self._kept = (1.0 - share) * moved
-        self._variance, self._place, self._scale_sigma = share * told, new, scale_sigma
+        reported = self._variance + (self._scale_sigma * float(np.linalg.norm(new - self._position))) ** 2
+        corrected = (scale_sigma * float(np.linalg.norm(new))) ** 2
+        gain = reported / max(reported + corrected, 1e-12)
+        self._withheld = (1.0 - gain) * moved
+        self._variance, self._position, self._scale_sigma = gain * corrected, new, scale_sigma

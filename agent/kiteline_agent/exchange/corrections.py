@@ -37,8 +37,7 @@ from kiteline_core.ids import SubmapId
 F64 = NDArray[np.float64]
 
 _SAME_TILT = 0.9999  # cosine of the angle, 0.8 degrees, between verticals that agree: gravity is known to half a degree
-
-_METRES = 0.2  # difference of two scales in metres that IMU and base estimate: more is another unit
+_SAME_UNIT = 0.2  # difference of the scale from 1 up to which w is in metres too, as IMU and base estimate them
 
 
 class Corrections:
@@ -113,7 +112,7 @@ class Corrections:
         """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
         if not self._map.due:
             return False
-        if anchor is not None and self._map.patient:
+        if anchor is not None and self._map.holds_landmarks:
             before = self._map.save()
             self._map.try_corrections(anchor.keyframes)
             self._map.compose_unplaced()
@@ -187,8 +186,9 @@ class Corrections:
         if S_w_m is None:
             held = self._smoothing.held
             self._smoothing.hold(t_ns)
-            near = held is not None and abs(sim3.scale_of(held) - 1.0) < _METRES
-            return self._body_in_world(held, T_o_m @ T_m_b) if held is not None and near and metric else None
+            if held is None or not metric or abs(sim3.scale_of(held) - 1.0) >= _SAME_UNIT:
+                return None
+            return self._body_in_world(held, T_o_m @ T_m_b)
         if not self._smoothing.on:
             return self._body_in_world(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b

@@ -24,6 +24,12 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 
+_NEARLY = 1.3  # times the deviation of a known scale: below it the landmarks are aligned again, to know it sooner
+_MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
+_LOWER_COST = 1.0  # by which a solution from nothing must be better: a deviation of the scale is worth 0.5
+_MIN_COMMON = 3  # keyframes of two windows whose distances are compared
+_MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera
+
 
 @dataclass(frozen=True, slots=True)
 class InertialMap:
@@ -77,14 +83,14 @@ class InertialStart:
         self._before: _Window | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
         self._tried_ns: int | None = None
-        self._heard_ns: int | None = None  # frame with the last samples
+        self._last_samples_ns: int | None = None  # stamp of the last frame with samples
 
-    def hears(self, ctx: FrameContext) -> bool:
-        """Take in the samples of a frame. False if none has come for `silent_s`."""
+    def add_samples(self, ctx: FrameContext) -> bool:
+        """Buffer the IMU samples of a frame. False if none has come for `silent_s`."""
         self._buffer.push(ctx.imu)
-        if self._heard_ns is None or (ctx.imu is not None and len(ctx.imu.t_ns)):
-            self._heard_ns = ctx.t_ns
-        return (ctx.t_ns - self._heard_ns) * 1e-9 <= self._config.inertial.silent_s
+        if self._last_samples_ns is None or (ctx.imu is not None and len(ctx.imu.t_ns)):
+            self._last_samples_ns = ctx.t_ns
+        return (ctx.t_ns - self._last_samples_ns) * 1e-9 <= self._config.inertial.silent_s
 
     def clear(self) -> None:
         """A map is tracked: begin anew after it."""
@@ -135,12 +141,12 @@ class InertialStart:
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
-        if sigma < 1.3 * config.scale_sigma:
+        if sigma < _NEARLY * config.scale_sigma:
             self._noise = noise
             aligned = realigned(
                 keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
             )
-            keep = aligned.seen.sum(axis=0) >= 3
+            keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
             again = self._bundle(aligned.part(keep), intervals, prior)
             solution = again.solve(WarmStart(solution.state, found.xyz[keep])) or solution
             noise, sigma = self._seen_noise(solution)
@@ -176,7 +182,7 @@ class InertialStart:
         Else that solution is the one to start from.
         """
         cold = self._solve(corners, intervals, prior, None)
-        if cold is None or cold.solution.cost > found.solution.cost - 1.0:
+        if cold is None or cold.solution.cost > found.solution.cost - _LOWER_COST:
             return True
         assert self._before is not None
         self._before = replace(self._before, xyz=cold.xyz, solution=cold.solution)
@@ -211,7 +217,7 @@ class InertialStart:
     def _agrees(self, before: _Window, now: _Window) -> bool:
         """True if later frames confirm the scale: the keyframes of both solutions are as far apart in both."""
         common = [t for t in now.t_ns if t in set(before.t_ns)]
-        if len(common) < 3:
+        if len(common) < _MIN_COMMON:
             return False
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
         length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
@@ -225,7 +231,7 @@ class InertialStart:
     ) -> MetricPoints | None:
         """The corners of the newest keyframe whose depth is known."""
         config = self._config.inertial_start
-        seen = corners.seen[-1] & (solution.depth_m > 0.1) & (solution.depth_sigma < config.depth_sigma)
+        seen = corners.seen[-1] & (solution.depth_m > _MIN_DEPTH_M) & (solution.depth_sigma < config.depth_sigma)
         fits = bool(seen.any()) and np.isfinite(solution.depth_sigma[seen]).all()
         if not fits:
             return None

@@ -26,13 +26,16 @@ from kiteline_core.ids import KeyframeId
 
 F64 = NDArray[np.float64]
 
+_MAX_RETURN_PX = 1.0  # px between a corner and where it lies when it is followed back
+_MARGIN_PX = 4.0  # px to the border, within which the flow's window hangs over it
+
 
 @dataclass(frozen=True, slots=True)
 class TwoViewMap:
     """The first keyframe of a map, triangulated from a second view.
 
     images, t_ns: of the first frame. frames: from there to the second one. T_a_b: (4,4) second camera in the first.
-    points: new landmarks in the first frame. median_depth_m: theirs. flat: the scene was taken for a plane.
+    points: new landmarks in the first frame. median_depth_m: theirs.
     """
 
     images: FrameImages
@@ -41,7 +44,6 @@ class TwoViewMap:
     T_a_b: F64
     points: NewPoints
     median_depth_m: float
-    flat: bool
 
     def set_sigma(self, local_map: LocalMap, keyframe: KeyframeId, sigma_px: float) -> None:
         """Write the deviations of the triangulated depths into the local map. sigma_px: of a pixel at octave 0."""
@@ -125,8 +127,9 @@ class TwoViewStart:
             size = {"winSize": (window, window), "maxLevel": 3}
             after, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, image, before, None, **size)  # type: ignore[call-overload]
             back, ok_back, _ = cv2.calcOpticalFlowPyrLK(image, self._last, after, None, **size)  # type: ignore[call-overload]
-            same = np.linalg.norm(back - before, axis=1) < 1.0
-            inside = (after >= 4.0).all(axis=1) & (after < np.array([image.shape[1], image.shape[0]]) - 4.0).all(axis=1)
+            same = np.linalg.norm(back - before, axis=1) < _MAX_RETURN_PX
+            most = np.array([image.shape[1], image.shape[0]]) - _MARGIN_PX
+            inside = (after >= _MARGIN_PX).all(axis=1) & (after < most).all(axis=1)
             keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & same & inside
             self._uv, self._uv0 = after[keep].astype(np.float64), self._uv0[keep]
             self._octave, self._index = self._octave[keep], self._index[keep]
@@ -153,7 +156,7 @@ class TwoViewStart:
         angle, descriptor = features.describe(first.left, place, octave)
         disparity = self._camera.bf / (seen.points[rows, 2] * factor)
         points = NewPoints(place, disparity, octave, angle, descriptor)
-        return TwoViewMap(first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m, seen.flat)
+        return TwoViewMap(first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m)
 
     def _mean_warp(self) -> F64:
         """Linear part (2,2) of the affine map that fits the corners of the first frame to those of the last."""

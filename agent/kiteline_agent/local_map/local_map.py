@@ -33,6 +33,8 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _SEED_DEPTH_M = 1e4  # stands for infinity in landmarks without depth
+_MIN_TRIES = 12  # frames that must have searched a landmark before it is given up
+_TRIES_A_HIT = 5  # frames that search a landmark for one that finds it; with more it is given up
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,8 @@ class LocalMap:
         self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
-        self.patient = camera.stereo  # landmarks wait like poses, until they matter: own depths are as good
+        # True: refined landmarks wait, as poses do, until they move the image: the agent's own depths are as good.
+        self.holds_landmarks = camera.stereo
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._row = np.zeros(capacity, np.int64)
@@ -230,7 +233,7 @@ class LocalMap:
         self.hits[good] += 1
         self.last_hit[good] = frame_number
         self.last_seen[good // self.slot_size] = frame_number
-        hopeless = rows[(self.tried[rows] >= 12) & (self.hits[rows] * 5 < self.tried[rows])]
+        hopeless = rows[(self.tried[rows] >= _MIN_TRIES) & (self.hits[rows] * _TRIES_A_HIT < self.tried[rows])]
         self.usable.reshape(-1)[hopeless] = False
 
     # landmarks without depth (seeds)
@@ -347,7 +350,7 @@ class LocalMap:
             self._bearings(self.uv[slot, index] + record.offset[keep]),
         )
         self._new_landmarks.pop(record.keyframe, None)  # older ones, that waited
-        at_once = fresh | (not self.patient)
+        at_once = fresh | (not self.holds_landmarks)
         any_at_once = bool(at_once.any())
         if any_at_once:
             self._set_landmarks(slot, index[at_once], rho[at_once], bearing[at_once])

@@ -62,13 +62,13 @@ class CameraState:
     def predict(self, t_ns: int, dt_s: float, imu: ImuBatch | None) -> F64:
         """T_m_c (4,4) of the next frame: from the IMU, else an odometer, else the last motion."""
         predicted = self.motion.predict(t_ns, imu, dt_s)
-        self.covariance.set_imu_motion(self.motion.running)
+        self.covariance.set_imu_motion(measured=self.motion.running)
         return predicted
 
     def is_consistent(self, ctx: FrameContext, T_c_m: F64, submap: SubmapId, *, relocalised: bool) -> bool:
         """True if the camera can be at T_c_m (4,4) in a submap, by the motion since it was last measured there."""
         return self.covariance.is_consistent(
-            T_c_m, submap, ctx.T_m_c, self.pose, self.T_c_b, self.submaps.active, found=relocalised
+            T_c_m, submap, ctx.T_m_c, self.pose, self.T_c_b, self.submaps.active, relocalised=relocalised
         )
 
     def fuse(self, ctx: FrameContext, track: Track) -> tuple[Track, list[str]]:

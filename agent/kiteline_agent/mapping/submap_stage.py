@@ -40,6 +40,20 @@ class OpenedSubmap:
     events: list[str]
 
 
+@dataclass(frozen=True, slots=True)
+class _Loss:
+    """The loss of images before the newest submap.
+
+    since: the last keyframe before it. T_k_c: (4,4) camera in that keyframe when images were lost, by dead reckoning to
+    the submap's first frame. R_m_c: (3,3) camera in the submap at that frame.
+    """
+
+    since: KeyframeId
+    T_k_c: F64
+    submap: SubmapId
+    R_m_c: F64
+
+
 class SubmapStage:
     """Changes of the active submap. The starts are None with stereo or depth, inertial_start also without IMU."""
 
@@ -59,9 +73,7 @@ class SubmapStage:
         self._inertial_start = inertial_start
         self._governor = governor
         self._channel = channel
-        # of the loss before the newest submap: the last keyframe and the camera in it, and how the submap begins
-        self._left: tuple[KeyframeId, F64] | None = None
-        self._first: tuple[SubmapId, F64] = SubmapId(-1), np.eye(3)
+        self._loss: _Loss | None = None
 
     def may_open(self, ctx: FrameContext, failed_searches: int) -> bool:
         """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
@@ -73,43 +85,45 @@ class SubmapStage:
 
     def open(self, ctx: FrameContext) -> OpenedSubmap | None:
         """Begin a submap with this frame; None if it shows too little."""
-        if self._inertial_start is not None and self._inertial_start.hears(ctx) and not self._camera.motion.drives:
-            return self._open_from_inertial_window(ctx, self._inertial_start)
+        inertial = self._inertial_start
+        if inertial is not None and inertial.add_samples(ctx) and not self._camera.motion.odometer.has_samples:
+            return self._open_from_inertial_window(ctx, inertial)
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
         points = self._maker.first_points(ctx)
         if points is None:
             return None
         camera = self._camera
-        since, T_k_c, R_o_m = camera.reference.keyframe, camera.reference.T_k_c, camera.pose.T_o_m[:3, :3]
-        self._left = None
-        if not camera.submaps.any:
-            camera.set_first_pose(ctx.imu)
-        else:
-            self._left = since, T_k_c.copy()
+        since, T_k_c = camera.reference.keyframe, camera.reference.T_k_c.copy()
+        R_o_m = camera.pose.T_o_m[:3, :3]  # of the old submap
+        after_loss = camera.submaps.any
+        if after_loss:
             camera.leave_submap()
             self._relocaliser.start_joining(ctx.t_ns)
+        else:
+            camera.set_first_pose(ctx.imu)
         submap = camera.open_submap()
         camera.pose.reset_motion()
         self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)
-        if self._left is not None and camera.motion.over_loss is not None:
-            self._first = submap, camera.pose.T_m_c[:3, :3].copy()
-            self._tie(camera.motion.over_loss.begin(ctx.t_ns, camera.T_m_b, R_o_m))
+        if after_loss and camera.motion.loss_motion is not None:
+            self._loss = _Loss(since, T_k_c, submap, camera.pose.T_m_c[:3, :3].copy())
+            self._share_tie(self._loss, camera.motion.loss_motion.begin(ctx.t_ns, camera.T_m_b, R_o_m))
         return OpenedSubmap(True, ["submap: opened"])
 
     def _measure_loss(self, ctx: FrameContext) -> None:
-        """Tell the base again how the submap lies to the one before it, once images have shown the velocity."""
-        over_loss = self._camera.motion.over_loss
-        if over_loss is not None and self._camera.submaps.active == self._first[0]:
-            self._tie(over_loss.update(ctx.t_ns, self._camera.T_m_b))
+        """Share the motion over the loss again, once images in the new submap have shown the velocity."""
+        estimator, loss = self._camera.motion.loss_motion, self._loss
+        if estimator is not None and loss is not None and self._camera.submaps.active == loss.submap:
+            self._share_tie(loss, estimator.update(ctx.t_ns, self._camera.T_m_b))
 
-    def _tie(self, motion: LossMotion | None) -> None:
-        if motion is None or self._left is None or self._left[0] == NO_KEYFRAME:
+    def _share_tie(self, loss: _Loss, motion: LossMotion | None) -> None:
+        """Tell the base how the new submap lies to the one before it; None: unknown."""
+        if motion is None or loss.since == NO_KEYFRAME:
             return
-        (since, T_k_c), (submap, R_m_c) = self._left, self._first
-        T_k_f = T_k_c.copy()
-        T_k_f[:3, 3] += T_k_c[:3, :3] @ R_m_c.T @ motion.shift
-        self._channel.put(SubmapTie(submap, since, se3.orthonormalise(T_k_f), motion.sigma_m, motion.sigma_rad))
+        T_k_f = loss.T_k_c.copy()
+        T_k_f[:3, 3] += loss.T_k_c[:3, :3] @ loss.R_m_c.T @ motion.shift
+        tie = SubmapTie(loss.submap, loss.since, se3.orthonormalise(T_k_f), motion.sigma_m, motion.sigma_rad)
+        self._channel.put(tie)
 
     def _open_from_inertial_window(self, ctx: FrameContext, start: InertialStart) -> OpenedSubmap | None:
         """Begin a monocular submap in metres at this frame; None until its scale is known."""

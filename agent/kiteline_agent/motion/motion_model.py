@@ -62,9 +62,9 @@ class MotionModel:
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
         self._steps = None if imu is None or metric else StepRecorder(imu, config.scale_filter.interval_s)
-        self.over_loss: LossMotionEstimator | None = None
+        self.loss_motion: LossMotionEstimator | None = None
         if self.tracker is not None and imu is not None and metric:
-            self.over_loss = LossMotionEstimator(self.tracker, imu, config.loss_motion, config.gravity_m_s2)
+            self.loss_motion = LossMotionEstimator(self.tracker, imu, config.loss_motion, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
         self._watch = ImuWatch(config.silent_s)
         self._events: list[str] = []
@@ -84,10 +84,6 @@ class MotionModel:
         """True if the map's lengths are in metres."""
         return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
 
-    @property
-    def drives(self) -> bool:
-        """True if an odometer gives samples."""
-        return self.odometer.has_samples
 
     def known_imu(self) -> KnownImuConfig | None:
         """What is known of the IMU, for the next flight; None before anything was measured."""
@@ -169,8 +165,8 @@ class MotionModel:
         """Process a frame without a pose from images, predicted at T_m_c (4,4)."""
         if self._steps is not None:
             self._steps.clear()
-        if self.over_loss is not None:
-            self.over_loss.clear()
+        if self.loss_motion is not None:
+            self.loss_motion.clear()
         state = None if self.tracker is None else self.tracker.dead_reckon(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
             cov = self.odometer.dead_reckon(predicted, t_ns)
