@@ -84,7 +84,6 @@ class MotionModel:
         """True if the map's lengths are in metres."""
         return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
 
-
     def known_imu(self) -> KnownImuConfig | None:
         """What is known of the IMU, for the next flight; None before anything was measured."""
         return None if self.tracker is None else self.tracker.known
