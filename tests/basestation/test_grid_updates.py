@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, messages
+from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import level_rotation
 from kiteline_core.ids import KEYPOINT_BITS, submap_of_keyframe
 from tests.basestation.flat_rooms import box, scan_of
@@ -39,6 +41,24 @@ def scans(flight: Any, first: int = 0, last: int | None = None) -> list[Keyframe
         decoded = messages.decode(messages.key(record), messages.encode(record))
         assert isinstance(decoded, KeyframeScan)
         out.append(decoded)
+    return out
+
+
+def between(flight: Any) -> list[KeyframeScan]:
+    """What a camera truly saw after each keyframe, ahead of it and turned, as scans that hang on the keyframe."""
+    out = []
+    for n, (keyframe, T_w_k) in enumerate(zip(flight.keyframes, flight.true_T_w_k, strict=True)):
+        for part in (1, 2 + n % 3):
+            T_k_s = se3.exp(np.array([0.02, 0.01, 0.1 * part, 0.02, 0.1 * part, -0.03]))
+            T_w_s = T_w_k @ T_k_s
+            up = T_w_s[2, :3]
+            ahead = T_w_s[:3, :3] @ level_rotation(up)[:, 0]
+            scan = scan_of(ROOM, T_w_s[0, 3], T_w_s[1, 3], float(np.arctan2(ahead[1], ahead[0])))
+            scan = replace(scan, up_c=up, camera_height_m=HEIGHT_M + T_w_s[2, 3])
+            record = KeyframeScan(keyframe, scan, np.zeros(0, np.uint8), part, T_k_s)
+            decoded = messages.decode(messages.key(record), messages.encode(record))
+            assert isinstance(decoded, KeyframeScan)
+            out.append(decoded)
     return out
 
 
@@ -70,7 +90,8 @@ def from_scratch(mapper: Mapper, records: Sequence[KeyframeScan]) -> ScanGrid:
         camera = mapper.map.cameras[next(iter(mapper.map.cameras))]
         kept = keep(grid.config, record.scan, camera.bf)
         if pose is not None and S_w_m is not None and kept is not None:
-            grid.put(record.keyframe, kept, S_w_m @ pose)
+            pose = pose if record.T_k_s is None else pose @ record.T_k_s
+            grid.put((record.keyframe, record.part), kept, S_w_m @ pose)
     return grid
 
 
@@ -115,6 +136,53 @@ def test_a_loop_that_moves_keyframes_by_half_a_metre_is_drawn_over_several_steps
         steps += 1
     assert steps >= 40 // mapper.config.grid.drawn_per_step
     assert_equal(mapper.grid, expected)
+
+
+def test_scans_between_keyframes_are_drawn_and_move_with_their_keyframe(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=24, turns=0.9)
+    mapper, every = Mapper(BaseConfig()), [*scans(flight), *between(flight)]
+    groups = [*with_scans(flight)[:-1], [*with_scans(flight)[-1], *between(flight)]]
+    feed(mapper, flight, groups)
+    assert len(mapper.grid) == len(every)
+    assert_equal(mapper.grid, from_scratch(mapper, every))
+    cells, inside, outside = known(mapper.grid)
+    assert not (cells[outside] == 0).any()
+    assert (cells[inside] == 0).sum() > (known(from_scratch(mapper, scans(flight)))[0][inside] == 0).sum()
+
+    turn = se3.exp(np.array([0.4, -0.3, 0.0, 0.0, 0.0, 0.2]))
+    for submap in list(mapper.placements):
+        mapper.placements[submap] = turn @ mapper.placements[submap]  # type: ignore[index]
+    mapper.grid_updates.rebuild()
+    while mapper.grid_updates.behind:
+        mapper.grid_updates.update()
+    assert_equal(mapper.grid, from_scratch(mapper, every))
+
+
+def test_a_scan_between_keyframes_is_taken_back_alone(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=12, turns=0.5)
+    mapper, later = Mapper(BaseConfig()), between(flight)
+    feed(mapper, flight, [*with_scans(flight), later])
+    taken, kept = later[4], [*later[:4], *later[5:]]
+    n = len(taken.scan)
+    blank = replace(
+        taken.scan, free_from_m=np.zeros(n), free_m=np.zeros(n), obstacle_m=np.full(n, np.inf),
+        bands=np.zeros(n, np.uint8), camera_height_m=float("nan"),
+    )  # fmt: skip
+    feed(mapper, flight, [[replace(taken, scan=blank)]])
+    assert_equal(mapper.grid, from_scratch(mapper, [*scans(flight), *kept]))
+    mapper.grid_updates.remove([taken.keyframe])
+    rest = [r for r in [*scans(flight), *kept] if r.keyframe != taken.keyframe]
+    assert_equal(mapper.grid, from_scratch(mapper, rest))
+
+
+def test_scans_that_come_before_their_camera_wait_for_it(make_flight: MakeFlight) -> None:
+    """Without a camera nobody knows how far their ranges can be used."""
+    flight = make_flight(keyframes=12, turns=0.5)
+    mapper, groups = Mapper(BaseConfig()), with_scans(flight)
+    mapper.step(MapperInput(((flight.agent, tuple(scans(flight))),), ()), 0)
+    assert len(mapper.grid) == 0
+    feed(mapper, flight, [[r for r in group if not isinstance(r, KeyframeScan)] for group in groups])
+    assert_equal(mapper.grid, from_scratch(mapper, scans(flight)))
 
 
 def test_two_runs_are_equal_whatever_the_order_of_scans(make_flight: MakeFlight) -> None:

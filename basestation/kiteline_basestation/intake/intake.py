@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import compress
 
 import numpy as np
 
@@ -125,12 +126,11 @@ class Intake:
 
     def take_scans(self) -> list[KeyframeScan]:
         """The scans that arrived since the last call, or before the camera of their agent was known."""
-        scans, early = self._scans, self._scans[:0]
-        for scan in scans:
-            if agent_of_keyframe(scan.keyframe) not in self._map.cameras:
-                early.append(scan)
+        known = [agent_of_keyframe(scan.keyframe) in self._map.cameras for scan in self._scans]
+        scans = list(compress(self._scans, known))
+        early = [scan for scan, is_known in zip(self._scans, known, strict=True) if not is_known]
         self._scans = early[-self._config.max_pending :]
-        return [scan for scan in scans if scan not in early]
+        return scans
 
     def ready(self, now_ns: int) -> list[KeyframeId]:
         """Keyframes to use now, in order of id: complete ones, those past the patience, and late completions."""
