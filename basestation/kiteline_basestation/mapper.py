@@ -38,7 +38,7 @@ from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 
-_SAMPLES = 10_000
+_TIMED_UPDATES = 10_000  # newest updates of the grid whose CPU times are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class Mapper:
         self.names: dict[SubmapId, str] = {}  # of maps, by map id
         self.counts = MapperCounts()
         self.cpu_ns: Callable[[], int] = lambda: 0  # clock of `grid_ns`, which no output depends on
-        self.grid_ns: deque[int] = deque(maxlen=_SAMPLES)  # time of the updates of the grid
+        self.grid_ns: deque[int] = deque(maxlen=_TIMED_UPDATES)  # time of the updates of the grid
         job_ids = itertools.count(1)
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map)
@@ -117,8 +117,8 @@ class Mapper:
             self.grid_updates.rebuild()
         if self.merger is not None:
             changes += self.merger.requery()
-            while (tie := self._intake.ties.take()) is not None:
-                changes += self.merger.tie(tie)
+            while (tie := self._intake.inertial_ties.take()) is not None:
+                changes += self.merger.merge_tied(tie)
         # 4. Apply what merges and corrections of whole maps changed.
         withdrawn = self._apply_merges(changes)
         # 5. Draw the grid where keyframes are new or moved.
@@ -292,11 +292,13 @@ class Mapper:
         """Send new disparity offsets to the agents, which track on corrected disparities."""
         for agent, offset in sorted(self.map.disparity_offset_px.items(), key=lambda item: item[0]):
             sent = self._sent_offsets.get(agent)
-            if sent is None or not np.array_equal(sent, offset):
-                self._sent_offsets[agent] = offset
-                if agent not in self.map.told_sigma_px or offset is not self.map.known_offset_px[agent]:
-                    sigma_px = self.map.disparity_sigma_px.get(agent)
-                    self._publisher.send(agent, DisparityCalibration(agent, offset, sigma_px))
+            if sent is not None and np.array_equal(sent, offset):
+                continue
+            self._sent_offsets[agent] = offset
+            if self.map.is_onboard_offset(agent):
+                continue  # the agent found it itself
+            sigma_px = self.map.disparity_sigma_px.get(agent)
+            self._publisher.send(agent, DisparityCalibration(agent, offset, sigma_px))
 
     def _delete(self, submaps: Collection[SubmapId]) -> None:
         """Cull submaps, publish it, and ignore later records of them."""

@@ -74,5 +74,5 @@ def restore_map(sparse_map: SparseMap, state: MapState) -> None:
     sparse_map.disparity_offset_px.update(state.disparity_offset_px)
     sparse_map.disparity_calibrated.update(state.disparity_calibrated)
     sparse_map.disparity_sigma_px.update(state.disparity_sigma_px)
-    told = sparse_map.told_sigma_px  # on board: what the agent found itself stays the prior
+    told = sparse_map.onboard_sigma_px  # on board: what the agent found itself stays the prior
     sparse_map.known_offset_px.update({a: px for a, px in state.disparity_offset_px.items() if a not in told})

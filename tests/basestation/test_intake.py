@@ -51,7 +51,7 @@ def new_intake() -> Intake:
 
 
 def holds_nothing(intake: Intake) -> bool:
-    held = (intake.live, intake.last_pose, intake.tracked_ns, intake.gravity, intake.loss_ties, intake.metres_per_unit)
+    held = (intake.live, intake.last_pose, intake.tracked_ns, intake.gravity, intake.loss_ties)
     known = intake._map
     tables = (
         known.rows,
@@ -59,6 +59,7 @@ def holds_nothing(intake: Intake) -> bool:
         known.rows_px,
         known.disparity_offset_px,
         known.inertial_steps,
+        known.metres_per_unit,
         intake._pending,
     )
     return not any(held) and not any(tables)

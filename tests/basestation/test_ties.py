@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.inertial.ties import Tie, Ties, moved
+from kiteline_basestation.inertial.ties import InertialTie, InertialTies, moved
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -49,12 +49,12 @@ def a_map(told: float = UNIT) -> SparseMap:
     sparse_map.add_keyframe(keyframe_id(OLD, 0), 0, NO_KEYFRAME, np.eye(4), 0)
     sparse_map.add_keyframe(LAST, 1, keyframe_id(OLD, 0), T_W_LAST, 0)
     sparse_map.add_keyframe(FIRST, 2, NO_KEYFRAME, T_M_FIRST, 0)
-    sparse_map.told_metres = {OLD: told, NEW: 1.0}
+    sparse_map.metres_per_unit = {OLD: told, NEW: 1.0}
     return sparse_map
 
 
-def the_tie(sparse_map: SparseMap) -> Tie:
-    ties = Ties(sparse_map)
+def the_tie(sparse_map: SparseMap) -> InertialTie:
+    ties = InertialTies(sparse_map)
     ties.add(a_record())
     tie = ties.take()
     assert tie is not None
@@ -97,7 +97,7 @@ def test_nothing_is_tied_that_is_one_map_already_or_has_no_metre() -> None:
         else:
             fields = (record.dt_s, record.turn, record.moved, record.velocity, record.position)
             record = InertialSteps(LAST, keyframe_id(OLD, 0), 2e-3, *fields)
-        ties = Ties(sparse_map)
+        ties = InertialTies(sparse_map)
         ties.add(record)
         assert ties.take() is None, change
 
@@ -106,7 +106,7 @@ def test_a_record_waits_for_its_keyframes() -> None:
     late = a_map()
     sparse_map = SparseMap()
     sparse_map.cameras, sparse_map.metric_submaps = late.cameras, late.metric_submaps
-    ties = Ties(sparse_map)
+    ties = InertialTies(sparse_map)
     ties.add(a_record())
     assert ties.take() is None
     sparse_map.add_keyframe(LAST, 1, NO_KEYFRAME, T_W_LAST, 0)

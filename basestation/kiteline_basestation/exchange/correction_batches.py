@@ -42,7 +42,7 @@ class CorrectionBatches:
         arrived = channel.arrived(self._key) and all(channel.arrived(key) for key in self._members)
         self._overdue = not arrived and now_ns - self._made_ns >= self._config.batch_wait_s * 1e9
         if self._overdue:
-            return None  # nobody listens: the values are for the store, and for whoever comes back
+            return None  # the agent is out of reach: the values go to the store, and to the agent when it returns
         if not arrived:
             return 0
         rate = channel.rate_bytes_s()

@@ -84,7 +84,7 @@ def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tup
         out.append(
             Segment(
                 number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depths[i]),
-                sparse_map.told_metres.get(submap, 1.0) / sparse_map.scale(submap),
+                sparse_map.metres_per_unit.get(submap, 1.0) / sparse_map.scale(submap),
                 replace(records[-1], since=at, **fields),
             )
         )  # fmt: skip

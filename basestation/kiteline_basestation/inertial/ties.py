@@ -1,7 +1,7 @@
-"""Ties between submaps that one agent flew without a break: it opened the later one in the middle of its steps.
+"""Inertial ties: relative poses of two submaps between which inertial steps lead without a break.
 
-That is how a monocular agent corrects its metre. The steps from the last keyframe of the one to the first of the other
-say how the two lie, and the agent says how long the old unit was; images need not recognise anything.
+A monocular agent begins such a submap to correct its scale. The steps from the last keyframe of the old submap to the
+first one of the new submap give the relative pose, the agent's record the scale; images need not recognise anything.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Tie:
-    """S_older_newer: (4,4) moves the newer map in w. metre: factor on the older map's lengths in w, before."""
+class InertialTie:
+    """How two maps lie to each other.
+
+    S_older_newer: (4,4) moves the newer map in w. metre: factor by which the older map is scaled in w before.
+    """
 
     newer: SubmapId
     older: SubmapId
@@ -29,23 +32,23 @@ class Tie:
     metre: float
 
 
-class Ties:
-    """Records that lead from one submap to another one, until both of their keyframes are in the map."""
+class InertialTies:
+    """Inertial steps that lead from one submap to another one, until both of their keyframes are in the map."""
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
         self._waiting: list[InertialSteps] = []
 
     def add(self, record: InertialSteps) -> None:
-        """Let a record wait if it leads to another submap."""
+        """Keep a record if it leads to another submap."""
         if submap_of_keyframe(record.since) != submap_of_keyframe(record.keyframe):
             self._waiting.append(record)
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Drop the records that are kept."""
         self._waiting.clear()
 
-    def take(self) -> Tie | None:
+    def take(self) -> InertialTie | None:
         """The next tie between two maps; one that joins nothing is dropped."""
         for record in list(self._waiting):
             if record.keyframe in self._map and record.since in self._map:
@@ -55,7 +58,7 @@ class Ties:
                     return tie
         return None
 
-    def _tie(self, record: InertialSteps) -> Tie | None:
+    def _tie(self, record: InertialSteps) -> InertialTie | None:
         sparse_map = self._map
         before, after = submap_of_keyframe(record.since), submap_of_keyframe(record.keyframe)
         T_w_a, T_w_k = sparse_map.world_pose(record.since), sparse_map.world_pose(record.keyframe)
@@ -64,15 +67,15 @@ class Ties:
         if T_w_a is None or T_w_k is None or not known or older == newer:
             return None
         # Where the older map was never scaled by the base, the agent's new metre replaces its old one.
-        unit = sparse_map.told_metres.get(before, 1.0)
+        unit = sparse_map.metres_per_unit.get(before, 1.0)
         held = sparse_map.scale(before)
         metre = unit if held == 1.0 else 1.0
         T_b_c = sparse_map.cameras[agent_of_keyframe(record.keyframe)].T_b_c
         T_a_k = sim3.with_scaled_translation(se3.inverse(T_b_c) @ moved(record) @ T_b_c, held)
         S_older_newer = sim3.of(held / unit / sparse_map.scale(after), T_w_a @ T_a_k) @ se3.inverse(T_w_k)
         if newer < older:
-            return Tie(older, newer, sim3.inverse(S_older_newer), 1.0)
-        return Tie(newer, older, sim3.normalise(S_older_newer), metre)
+            return InertialTie(older, newer, sim3.inverse(S_older_newer), 1.0)
+        return InertialTie(newer, older, sim3.normalise(S_older_newer), metre)
 
 
 def moved(record: InertialSteps) -> F64:

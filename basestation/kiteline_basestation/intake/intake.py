@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import compress
+from typing import Any
 
 import numpy as np
 
 from kiteline_basestation.config import IntakeConfig
-from kiteline_basestation.inertial.ties import Ties
+from kiteline_basestation.inertial.ties import InertialTies
 from kiteline_basestation.map.map_tables import NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import (
@@ -70,12 +71,24 @@ class Intake:
         self.gravity: dict[SubmapId, GravityAlignment] = {}
         self.loss_ties: dict[SubmapId, SubmapTie] = {}  # how a submap lies to the one before it, over a loss
         self.fresh_ties: set[SubmapId] = set()  # of those, the ones that no placement follows yet
-        self.metres_per_unit: dict[SubmapId, float] = {}  # of submaps whose agent knows it
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
         self._scans: list[KeyframeScan] = []  # that arrived and were not taken yet
-        self.ties = Ties(sparse_map)
+        self.inertial_ties = InertialTies(sparse_map)
         self.refused = 0  # records that contradict the map, or are of another agent than the one that wrote them
+        self._handlers: dict[type[Record], Callable[[Any, int], None]] = {
+            CameraIntrinsics: lambda record, now_ns: sparse_map.set_camera(record.agent, record.camera),
+            StereoAlignment: lambda record, now_ns: sparse_map.set_stereo_alignment(record),
+            LivePose: self._take_live_pose,
+            KeyframeHeader: self._take_header,
+            NewLandmarks: self._take_section,
+            Observations: self._take_section,
+            KeyframeScan: lambda record, now_ns: self._scans.append(record),
+            InertialSteps: self._take_steps,
+            GravityAlignment: self._take_gravity,
+            SubmapScale: self._take_scale,
+            SubmapTie: self._take_tie,
+        }
 
     def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int) -> None:
         """Put an agent's records into the map."""
@@ -86,43 +99,9 @@ class Intake:
                 continue
             if self.deleted and _submap_of(record) in self.deleted:
                 continue
-            if isinstance(record, CameraIntrinsics):
-                self._map.set_camera(record.agent, record.camera)
-            elif isinstance(record, LivePose):
-                held = self.live.get(record.agent)
-                if held is None or _order(record) >= _order(held):
-                    self.live[record.agent] = record
-                    submap = submap_of_keyframe(record.keyframe)
-                    self.last_pose[submap] = record
-                    if record.quality > 0:
-                        self.tracked_ns[submap] = record.t_ns
-            elif isinstance(record, KeyframeHeader):
-                self._take_header(record, now_ns)
-            elif isinstance(record, GravityAlignment):
-                self.gravity[record.submap] = record
-            elif isinstance(record, StereoAlignment):
-                self._map.set_stereo_alignment(record)
-            elif isinstance(record, SubmapScale):
-                self.metres_per_unit[record.submap] = self._map.told_metres[record.submap] = record.metres
-                if record.metres == 1.0:
-                    self._map.metric_submaps.add(record.submap)
-            elif isinstance(record, SubmapTie):
-                self.loss_ties[record.submap] = record
-                self.fresh_ties.add(record.submap)
-            elif isinstance(record, InertialSteps):
-                self._map.inertial_steps[record.keyframe] = record
-                self.ties.add(record)
-            elif isinstance(record, KeyframeScan):
-                self._scans.append(record)
-            elif isinstance(record, NewLandmarks | Observations):
-                if record.keyframe in self._map:
-                    self._take_section(record)
-                elif self._pending_count < self._config.max_pending:
-                    sections = self._pending.setdefault(record.keyframe, {})
-                    sections[isinstance(record, NewLandmarks), record.part] = record
-                    self._pending_count += 1
-                else:
-                    self.refused += 1
+            handler = self._handlers.get(type(record))
+            if handler is not None:
+                handler(record, now_ns)
 
     def take_scans(self) -> list[KeyframeScan]:
         """The scans that arrived since the last call, or before the camera of their agent was known."""
@@ -171,7 +150,7 @@ class Intake:
         self.tracked_ns.update(state.tracked_ns)
         unused = set(state.unused)
         self._waiting = {k: t for k, t in self._waiting.items() if k in unused}
-        self.ties.clear()  # they were used, or undone
+        self.inertial_ties.clear()  # they were used, or undone
         self.fresh_ties.clear()
         self.deleted.update(state.deleted)
 
@@ -179,6 +158,34 @@ class Intake:
         """True if a keyframe has a pose and a camera."""
         has_pose = self._map.keyframes.pose_source[self._map.rows[keyframe]] != NO_POSE
         return bool(has_pose) and agent_of_keyframe(keyframe) in self._map.cameras
+
+    # handlers of records
+
+    def _take_live_pose(self, record: LivePose, now_ns: int) -> None:
+        held = self.live.get(record.agent)
+        if held is not None and _order(record) < _order(held):
+            return
+        self.live[record.agent] = record
+        submap = submap_of_keyframe(record.keyframe)
+        self.last_pose[submap] = record
+        if record.quality > 0:
+            self.tracked_ns[submap] = record.t_ns
+
+    def _take_gravity(self, record: GravityAlignment, now_ns: int) -> None:
+        self.gravity[record.submap] = record
+
+    def _take_scale(self, record: SubmapScale, now_ns: int) -> None:
+        self._map.metres_per_unit[record.submap] = record.metres
+        if record.metres == 1.0:
+            self._map.metric_submaps.add(record.submap)
+
+    def _take_tie(self, record: SubmapTie, now_ns: int) -> None:
+        self.loss_ties[record.submap] = record
+        self.fresh_ties.add(record.submap)
+
+    def _take_steps(self, record: InertialSteps, now_ns: int) -> None:
+        self._map.inertial_steps[record.keyframe] = record
+        self.inertial_ties.add(record)
 
     def _take_header(self, header: KeyframeHeader, now_ns: int) -> None:
         fresh = header.keyframe not in self._map
@@ -194,9 +201,20 @@ class Intake:
         sections = self._pending.pop(header.keyframe, {})
         self._pending_count -= len(sections)
         for _, section in sorted(sections.items(), key=lambda item: item[0]):
-            self._take_section(section)
+            self._put_section(section)
 
-    def _take_section(self, section: NewLandmarks | Observations) -> None:
+    def _take_section(self, section: NewLandmarks | Observations, now_ns: int) -> None:
+        """Put a section into the map; one whose header has not come waits for it."""
+        if section.keyframe in self._map:
+            self._put_section(section)
+        elif self._pending_count < self._config.max_pending:
+            sections = self._pending.setdefault(section.keyframe, {})
+            sections[isinstance(section, NewLandmarks), section.part] = section
+            self._pending_count += 1
+        else:
+            self.refused += 1
+
+    def _put_section(self, section: NewLandmarks | Observations) -> None:
         if isinstance(section, NewLandmarks):
             self._map.put_new_landmarks(
                 section.keyframe, section.part, section.index, section.uv, section.inv_depth, section.octave,

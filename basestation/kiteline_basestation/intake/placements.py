@@ -66,7 +66,7 @@ class SubmapPlacements:
     def make_metric(self) -> bool:
         """Rescale w to metres when the agent of the first submap reports its scale. Returns True if it changed."""
         first = self.first
-        metres = None if first is None else self._intake.metres_per_unit.get(first)
+        metres = None if first is None else self._map.metres_per_unit.get(first)
         if first is None or metres is None or not self._map.is_up_to_scale(self._map.map_id(first)):
             return False
         if sim3.scale_of(self.S_w_m[first]) != 1.0 or metres == 1.0:

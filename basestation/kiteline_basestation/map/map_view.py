@@ -44,16 +44,15 @@ class MapView:
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.metric_submaps: set[SubmapId] = set()  # monocular submaps of known metric scale
         self.inertial_steps: dict[KeyframeId, InertialSteps] = {}  # from the keyframe before to this one
-        self.up: dict[
-            KeyframeId, tuple[F64, float]
-        ] = {}  # (3,) against gravity in its camera, and its deviation in rad
-        self.told_metres: dict[SubmapId, float] = {}  # of a monocular submap's unit, as its agent knows them
+        # Unit vector (3,) against gravity in the keyframe's camera, and its deviation in rad.
+        self.up: dict[KeyframeId, tuple[F64, float]] = {}
+        self.metres_per_unit: dict[SubmapId, float] = {}  # of monocular submaps, as far as their agents know it
         self.measures_depth: set[AgentId] = set()  # agents that measure depth in each observation (stereo, RGB-D)
         self.disparity_offset_px: dict[AgentId, F64] = {}  # (5,) by agent, see disparity_calibration
         self.disparity_calibrated: set[AgentId] = set()  # agents with an accurate disparity offset
         self.disparity_sigma_px: dict[AgentId, float] = {}  # its deviation, rms over the image, if the rig is worn
         self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: that of earlier flights, or found on board
-        self.told_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
+        self.onboard_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self.moved_rows: set[int] = set()  # keyframes whose pose changed, by row, since a reader cleared it
@@ -220,6 +219,10 @@ class MapView:
     def has_metric_scale_by_imu(self, submap: SubmapId) -> bool:
         """True for a monocular submap in metres: its scale is as good as the agent's IMU knew it."""
         return submap in self.metric_submaps and not self.is_ranged(submap)
+
+    def is_onboard_offset(self, agent: AgentId) -> bool:
+        """True if the disparity offset of an agent is the one that it found on board, unchanged."""
+        return agent in self.onboard_sigma_px and self.disparity_offset_px[agent] is self.known_offset_px[agent]
 
     def map_id(self, submap: SubmapId) -> SubmapId:
         """The root submap of the map that a submap belongs to."""

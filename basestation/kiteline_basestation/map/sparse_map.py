@@ -65,7 +65,7 @@ class SparseMap(MapView):
             self.rows_px.pop(agent, None)
             self.rows_read.discard(agent)
             self.known_offset_px.pop(agent, None)
-            self.told_sigma_px.pop(agent, None)
+            self.onboard_sigma_px.pop(agent, None)
             self.disparity_sigma_px.pop(agent, None)
             if agent in self.disparity_offset_px:
                 self.disparity_offset_px[agent] = disparity_offset.none()
@@ -91,12 +91,12 @@ class SparseMap(MapView):
             self.disparity_offset_px[agent] = self.known_offset_px[agent] = record.disparity_px
         if record.sigma_px is None:
             return
-        known = self.known_offset_px.get(agent) if agent not in self.told_sigma_px else None
+        known = self.known_offset_px.get(agent) if agent not in self.onboard_sigma_px else None
         if known is not None and np.abs(record.disparity_px - known).max() < _REPAIRED_PX:
             return
         if known is not None:
             self.disparity_sigma_px.pop(agent, None)
-        self.known_offset_px[agent], self.told_sigma_px[agent] = record.disparity_px, record.sigma_px
+        self.known_offset_px[agent], self.onboard_sigma_px[agent] = record.disparity_px, record.sigma_px
         if self.disparity_sigma_px.get(agent, np.inf) > record.sigma_px:
             self.disparity_offset_px[agent], self.disparity_sigma_px[agent] = record.disparity_px, record.sigma_px
             self.disparity_calibrated.discard(agent)

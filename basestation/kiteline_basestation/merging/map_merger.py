@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Publisher
-from kiteline_basestation.inertial.ties import Tie
+from kiteline_basestation.inertial.ties import InertialTie
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -184,8 +184,8 @@ class MapMerger:
         self._corrections.request_bundle(older)
         return result
 
-    def tie(self, tie: Tie) -> MergeResult:
-        """Merge two maps between which an agent flew without a break."""
+    def merge_tied(self, tie: InertialTie) -> MergeResult:
+        """Merge two maps between which inertial steps lead."""
         if self.detector.is_kept_apart(tie.newer, tie.older):
             return NOTHING
         S_new_old, units = scale_map(self._map, tie.older, tie.metre)

@@ -13,6 +13,8 @@ from kiteline_basestation.refinement.landmark_matching import predict_projection
 from kiteline_codec.schema import CulledLandmarks
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 
+_MIN_SHARED = 15  # landmarks that a keyframe shares with the new one, to be tested
+
 
 def cull_weak_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher) -> int:
     """Test the landmarks first observed `landmark_age` keyframes before this one. Returns how many were culled."""
@@ -40,7 +42,7 @@ def cull_redundant_keyframes(
 ) -> list[KeyframeId]:
     """Cull covisible keyframes whose landmarks other keyframes observe as well. Returns them."""
     out: list[KeyframeId] = []
-    for other in sparse_map.covisible_keyframes(keyframe, 15):
+    for other in sparse_map.covisible_keyframes(keyframe, _MIN_SHARED):
         same = sparse_map.submaps[submap_of_keyframe(other)]
         at = same.index(other)
         if at == 0 or len(same) - at <= config.keyframe_age or not sparse_map.is_complete(other):
@@ -55,6 +57,7 @@ def cull_redundant_keyframes(
 
 
 def _redundant(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig) -> bool:
+    """True if enough other keyframes observe most of its landmarks, at a scale at most one octave coarser."""
     table, row = sparse_map.keypoints, sparse_map.rows[keyframe]
     mine = sparse_map.observations_of(keyframe)
     landmarks = table.root[mine]

@@ -57,7 +57,7 @@ def with_border(
     measured[ranged, 2] = (sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots])[ranged]
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
     prior = _prior_px(focal, config)
-    told = [sparse_map.told_sigma_px.get(a) for a in agents]
+    told = [sparse_map.onboard_sigma_px.get(a) for a in agents]
     sigma = np.stack([prior if s is None else np.full(TERMS, s) for s in told])
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
     mean = np.stack([prior_mean(sparse_map, a, config) for a in agents])
@@ -81,7 +81,7 @@ def prior_mean(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -
     known, camera = sparse_map.known_offset_px.get(agent), sparse_map.cameras.get(agent)
     if known is None or camera is None:
         return none()
-    return known if agent in sparse_map.told_sigma_px or _is_worn(known, camera.fx, config) else none()
+    return known if agent in sparse_map.onboard_sigma_px or _is_worn(known, camera.fx, config) else none()
 
 
 def _is_worn(offset: F64, focal: float, config: DisparityConfig) -> bool:
@@ -122,8 +122,8 @@ def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...], config: Di
         if agent in sparse_map.disparity_offset_px:
             sparse_map.disparity_offset_px[agent] = prior_mean(sparse_map, agent, config)
             sparse_map.disparity_sigma_px.pop(agent, None)
-            if agent in sparse_map.told_sigma_px:
-                sparse_map.disparity_sigma_px[agent] = sparse_map.told_sigma_px[agent]
+            if agent in sparse_map.onboard_sigma_px:
+                sparse_map.disparity_sigma_px[agent] = sparse_map.onboard_sigma_px[agent]
 
 
 def is_significant(problem: BundleProblem, result: BundleResult, config: DisparityConfig) -> bool:
@@ -145,7 +145,7 @@ def set_offsets(
     if border is None or not (np.isfinite(result.offset).all() and np.isfinite(result.offset_cov).all()):
         return
     for g, agent in enumerate(agents):
-        if agent in sparse_map.told_sigma_px and (border.mean is None or not border.mean[g].any()):
+        if agent in sparse_map.onboard_sigma_px and (border.mean is None or not border.mean[g].any()):
             continue  # the bundle began before the agent told its own
         sparse_map.disparity_offset_px[agent] = result.offset[g].copy()
         at = border.terms[border.group == g]
@@ -154,7 +154,7 @@ def set_offsets(
         if sigma_px < config.calibrated_px:
             sparse_map.disparity_calibrated.add(agent)
         sparse_map.disparity_sigma_px.pop(agent, None)
-        if agent in sparse_map.told_sigma_px or _is_worn(result.offset[g], sparse_map.cameras[agent].fx, config):
+        if agent in sparse_map.onboard_sigma_px or _is_worn(result.offset[g], sparse_map.cameras[agent].fx, config):
             sparse_map.disparity_sigma_px[agent] = sigma_px
 
 

@@ -48,13 +48,13 @@ class LocalBundles:
         return {submap: tuple(sorted(out[submap])) for submap in sorted(out)}
 
     def restore(self, waiting: Mapping[SubmapId, Collection[KeyframeId]]) -> None:
-        """Let keyframes wait again that waited in an earlier process."""
+        """Queue the keyframes that waited in an earlier process."""
         for submap, keyframes in waiting.items():
             if here := [k for k in keyframes if k in self._map]:
                 self._waiting[submap] = here
 
     def add(self, keyframe: KeyframeId) -> None:
-        """Let a keyframe wait for a bundle around it."""
+        """Queue a keyframe for a bundle around it."""
         self._waiting.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
 
     def cancel(self, map_id: SubmapId) -> None:
