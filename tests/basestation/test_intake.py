@@ -94,3 +94,9 @@ def test_every_kind_of_an_agent_names_its_owner() -> None:
     kinds = {t for t in RECORD_TYPES.values() if t.written_by_agent()}
     assert {type(r) for r in RECORDS} <= kinds
     assert all(t.ID.name in ("AGENT", "SUBMAP", "KEYFRAME") for t in kinds)
+
+
+def test_every_record_of_agents_has_a_handler() -> None:
+    written = {kind for kind in RECORD_TYPES.values() if kind.__module__.startswith("kiteline_codec.schema.agent.")}
+    assert len(written) > 5
+    assert new_intake()._handlers.keys() == written

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig, MapCacheConfig
+from kiteline_basestation.exchange.agent_velocity import AgentVelocity
 from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -35,21 +36,12 @@ class _Cached:
     scale: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Fix:
-    """Where an agent was at its last plan. position: (3,) in w."""
-
-    t_ns: int
-    submap: SubmapId
-    position: F64
-
-
 @dataclass(slots=True)
 class _AgentCache:
     """State of one agent's cache."""
 
+    velocity: AgentVelocity
     due_ns: int = 0  # time of the next plan
-    last: _Fix | None = None
     cached: dict[KeyframeId, _Cached] = field(default_factory=dict)  # in order of sending
 
 
@@ -68,7 +60,7 @@ class MapCachePlanner:
 
     def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Plan the cache of an agent at `live` once a period, and send the changes over its channel."""
-        cache = self._caches.setdefault(agent, _AgentCache())
+        cache = self._caches.setdefault(agent, _AgentCache(AgentVelocity(self._config.period_s)))
         if not self._config.max_keyframes or live is None or now_ns < cache.due_ns:
             return
         T_w_k = self._map.world_pose(live.keyframe)
@@ -78,23 +70,13 @@ class MapCachePlanner:
         T_w_c = se3.orthonormalise(T_w_k @ live.T_k_c)
         submap = submap_of_keyframe(live.keyframe)
         predicted = T_w_c.copy()
-        predicted[:3, 3] += self._config.horizon_s * self._velocity(cache, live, submap, T_w_c[:3, 3])
+        predicted[:3, 3] += self._config.horizon_s * cache.velocity.update(live.t_ns, submap, T_w_c[:3, 3])
         needed = self._needed(agent, cache, T_w_c, predicted, submap)
         self._remove(cache, needed, submap, channel)
         self._send_moved(cache, submap, channel)
         self._send_new(agent, cache, needed, submap, channel)
 
     # -- inside ------------------------------------------------------------------------------------------------------
-
-    def _velocity(self, cache: _AgentCache, live: LivePose, submap: SubmapId, position: F64) -> F64:
-        """Velocity (3,) in w, m/s, from the last two plans in one submap; zero if they are too far apart in time."""
-        last, cache.last = cache.last, _Fix(live.t_ns, submap, position.copy())
-        if last is None or last.submap != submap:
-            return np.zeros(3)
-        dt_s = (live.t_ns - last.t_ns) * 1e-9
-        if not 0.0 < dt_s <= 4.0 * self._config.period_s:
-            return np.zeros(3)
-        return (position - last.position) / dt_s
 
     def _needed(
         self, agent: AgentId, cache: _AgentCache, T_w_c: F64, predicted: F64, submap: SubmapId

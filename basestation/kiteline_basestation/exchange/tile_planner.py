@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import TileConfig
+from kiteline_basestation.exchange.agent_velocity import AgentVelocity
 from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_basestation.grid.scan_kernels import SIDE
 from kiteline_basestation.grid.tile_store import Place
@@ -40,9 +41,9 @@ class _AgentTiles:
     """State of one agent. credit_bytes: what may be sent now."""
 
     credit_bytes: float
+    velocity: AgentVelocity
     due_ns: int = 0  # time of the next plan
     keyframes: int = 0
-    last: tuple[int, SubmapId, F64] | None = None  # time stamp, submap and position at the last plan
     sent: dict[Place, _Sent] = field(default_factory=dict)
 
 
@@ -64,7 +65,8 @@ class TilePlanner:
 
     def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Plan the tiles of an agent at `live` once a period, and send the changes over its channel."""
-        state = self._agents.setdefault(agent, _AgentTiles(self._config.most_credit_bytes))
+        velocity = AgentVelocity(self._config.period_s)
+        state = self._agents.setdefault(agent, _AgentTiles(self._config.most_credit_bytes, velocity))
         if not self._config.max_tiles or live is None or now_ns < state.due_ns or self._updates.behind:
             return
         submap = submap_of_keyframe(live.keyframe)
@@ -74,7 +76,7 @@ class TilePlanner:
             return
         state.due_ns = now_ns + round(self._config.period_s * 1e9)
         here = sim3.place(S_w_m, T_m_k @ live.T_k_c)[:3, 3]
-        ahead = here + self._config.horizon_s * self._velocity(state, live.t_ns, submap, here)
+        ahead = here + self._config.horizon_s * state.velocity.update(live.t_ns, submap, here)
         keyframes = sum(len(k) for s, k in self._map.submaps.items() if agent_of_submap(s) == agent)
         earned = self._config.keyframe_bytes * (keyframes - state.keyframes)
         state.credit_bytes = min(state.credit_bytes + earned, self._config.most_credit_bytes)
@@ -82,13 +84,6 @@ class TilePlanner:
         near = self._near(here, ahead, self._updates.grid.storey_of(ground_m))
         self._remove_far(state, here, ahead, near, channel)
         self._send(state, near, channel)
-
-    def _velocity(self, state: _AgentTiles, t_ns: int, submap: SubmapId, here: F64) -> F64:
-        """Velocity (3,) in w, m/s, since the last plan; zero if it was long ago or in another submap."""
-        last, state.last = state.last, (t_ns, submap, here)
-        if last is None or last[1] != submap or not 0 < t_ns - last[0] <= 4e9 * self._config.period_s:
-            return np.zeros(3)
-        return (here - last[2]) / ((t_ns - last[0]) * 1e-9)
 
     def _near(self, here: F64, ahead: F64, storey: int) -> dict[Place, float]:
         """Tiles of a storey within reach, and how far each lies from where the agent is or soon will be."""
