@@ -249,6 +249,7 @@ def coded_channel(
     seal_bytes: int = 0,
     link: LinkTraits | None = None,
     spill: Spill | None = None,
+    *,
     bounded: bool = False,
 ) -> CodedChannel:
     """One end of a channel over a link. budget_bytes: on the wire in any second; 0: unlimited. profile: wifi, radio, or

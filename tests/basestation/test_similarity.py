@@ -64,7 +64,7 @@ def test_views_are_aligned_among_outliers(with_scale: bool) -> None:
     b[bad], uv_b[bad] = b[np.roll(bad, 1)], uv_b[np.roll(bad, 1)]
     octave = np.zeros(80, np.uint8)
     noisy = a + rng.normal(0, 0.004, a.shape)
-    fit = align_views(noisy, uv_a, octave, CAMERA, b, uv_b, octave, CAMERA, with_scale, 1)
+    fit = align_views(noisy, uv_a, octave, CAMERA, b, uv_b, octave, CAMERA, with_scale=with_scale, seed=1)
     assert fit is not None
     assert fit.inliers >= 43 and not fit.inlier[bad].any()
     assert abs(fit.scale - scale) < 0.01 * scale

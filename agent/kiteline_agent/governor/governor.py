@@ -176,7 +176,7 @@ class Governor:
         events: list[str] = []
         self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
         self._choose_row(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
-        track = (self._is_due(lost) or self._early(t_ns)) and self._affordable(t_ns, lost)
+        track = (self._is_due(lost=lost) or self._early(t_ns)) and self._affordable(t_ns, lost=lost)
         if not track and not lost and self._gap_exceeds(t_ns, self._gap_s):  # the last reserve, before tracking is lost
             track = self._window_ns + (1.0 + 0.5 * self._safety) * self._frame_ns <= self._budget_ns
             if not track and self._gap_exceeds(t_ns, self._config.blind_s):
@@ -293,7 +293,7 @@ class Governor:
             self._keyframes_s += (1e9 / apart_ns - self._keyframes_s) * self._config.keyframe_learning
         self._keyframe_t_ns, self._asked_t_ns = t_ns, None
 
-    def _affordable(self, t_ns: int, lost: bool) -> bool:
+    def _affordable(self, t_ns: int, *, lost: bool) -> bool:
         """True if the budget of the last second allows the frame, and if lost, also a relocalisation attempt."""
         if lost:
             return self._room_for(self._waiting or Extra.SEARCH, 1.0 + self._safety)
@@ -326,7 +326,7 @@ class Governor:
         """True at the start of a map: nothing is booked, and the IMU initialisation needs frames."""
         return t_ns < self._first_t_ns + self._config.grace_s * 1e9
 
-    def _is_due(self, lost: bool) -> bool:
+    def _is_due(self, *, lost: bool) -> bool:
         """True if the frame is due, with tracked frames spread evenly."""
         self._due = min(self._due, 2.0)
         return lost or self._due >= 1.0 - 1e-6

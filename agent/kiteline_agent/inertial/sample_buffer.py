@@ -18,7 +18,9 @@ Bools = NDArray[np.bool_]
 
 _NOISE_MEMORY_S = 0.5  # over which the noise is averaged: rotors change speed faster than biases do
 _AT_ONCE = 20  # samples whose noise is measured together
-_ATTACK = 4.0  # factor of variance above which new noise is believed at once: motors start
+_ATTACK = 4.0  # factor of variance above which new noise replaces the average at once: motors start
+_BEFORE = 5  # samples before new ones, for their differences
+_STEP_GAIN = 0.1  # with which the usual time between samples follows
 _RECENT = 10  # samples whose mean is without vibration
 _EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
 _GAP = 2.5  # of the usual step: a longer one misses samples
@@ -156,11 +158,12 @@ class SampleBuffer:
                 self._clipped[-len(size) :, sensor] |= at_end
 
     def _measure_noise(self, new: int) -> None:
-        t, values = self._t[-new - 5 :], self._values[-new - 5 :]
+        """Update the usual step and the variances of the noise by the newest samples."""
+        t, values = self._t[-new - _BEFORE :], self._values[-new - _BEFORE :]
         if len(t) < 3:
             return
         usual = median((t[1:] - t[:-1]).astype(np.float64))
-        self._step_ns = usual if self._step_ns is None else self._step_ns + 0.1 * (usual - self._step_ns)
+        self._step_ns = usual if self._step_ns is None else self._step_ns + _STEP_GAIN * (usual - self._step_ns)
         sums = np.empty((2, 2))
         count, pairs = imu_kernels.second_differences(t, values, self._step_ns, _EVEN, _GAP, sums)
         if count == 0:

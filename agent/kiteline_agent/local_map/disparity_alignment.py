@@ -24,6 +24,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _LEAST_RHO = 1e-4  # 1/m
+_LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for `growth`
 
 
 class DisparityAlignment:
@@ -34,18 +35,21 @@ class DisparityAlignment:
         camera = local_map.camera
         slots = len(local_map.keyframe)
         self._keyframe = np.full(slots, NO_KEYFRAME, np.int64)  # whose pairs these are
-        self._parallax, self._told = np.zeros(slots), np.zeros(slots)
+        self._parallax = np.zeros(slots)  # of the last pair of each keyframe
+        self._score = np.zeros(slots)  # of its best pair: minus the sum of the offset's variances over the image
         self._moved = np.zeros((slots, 3))  # m, translation of the best pair in the camera, squared
+        # Information about the offset, and its product with the estimate: of the best pair of each keyframe, of
+        # keyframes that were evicted, and of earlier flights.
         self._pair_h, self._pair_b = np.zeros((slots, TERMS, TERMS)), np.zeros((slots, TERMS))
-        self._old_h, self._old_b, self._old_moved = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(3)
-        self._kept_h, self._kept_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)  # of earlier flights
-        self._refuted = False  # they were of another rig; the map still has their offset
+        self._evicted_h, self._evicted_b, self._evicted_moved = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(3)
+        self._earlier_h, self._earlier_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
+        self._refuted = False  # earlier flights were of another rig; the map still has their offset
         self._prior = np.diag(np.array([config.prior_px, *[config.prior_slope_px] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
-        self._odds = float(np.log(config.worn_share / (1.0 - config.worn_share)))  # logarithm, by disparities alone
+        self._log_odds = float(np.log(config.worn_share / (1.0 - config.worn_share)))  # worn rig, by disparities alone
         self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
         self._row_evidence = 0.0  # see add_row_evidence
         self.applied = False  # the rig is worn: an offset found here was applied
@@ -59,8 +63,8 @@ class DisparityAlignment:
         sigma_px: its standard deviation, rms over the image.
         """
         of_each = sigma_px / float(np.sqrt(np.mean(np.sum(self._grid**2, axis=1))))  # number, if all have the same
-        self._kept_h = np.eye(TERMS) / (self._config.known_px**2 + of_each**2)
-        self._kept_b = self._kept_h @ offset
+        self._earlier_h = np.eye(TERMS) / (self._config.known_px**2 + of_each**2)
+        self._earlier_b = self._earlier_h @ offset
         self._solve()
         self.applied = bool(offset.any())
         self.expected_cov = self._expected_cov()
@@ -127,12 +131,12 @@ class DisparityAlignment:
         return events
 
     def _begin(self, slot: int) -> None:
-        """A keyframe took this slot: what the one before told stays."""
-        self._old_h += self._pair_h[slot]
-        self._old_b += self._pair_b[slot]
-        self._old_moved += self._moved[slot]
+        """A new keyframe took this slot: keep the information of the one before, which was evicted."""
+        self._evicted_h += self._pair_h[slot]
+        self._evicted_b += self._pair_b[slot]
+        self._evicted_moved += self._moved[slot]
         self._pair_h[slot], self._pair_b[slot], self._moved[slot] = 0.0, 0.0, 0.0
-        self._keyframe[slot], self._parallax[slot], self._told[slot] = self._map.keyframe[slot], 0.0, 0.0
+        self._keyframe[slot], self._parallax[slot], self._score[slot] = self._map.keyframe[slot], 0.0, 0.0
 
     def _parallax_of(self, slot: int, T_c_m: F64) -> float:
         """Distance from a keyframe over the depth of its landmarks."""
@@ -141,7 +145,8 @@ class DisparityAlignment:
         return float(np.linalg.norm(T[:3, 3]) * median(self._map.rho[slot, usable])) if usable.any() else 0.0
 
     def _grown(self, slot: int, T_c_m: F64) -> float:
-        return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), 0.02)
+        """Parallax to a keyframe over that of its last pair."""
+        return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), _LEAST_PARALLAX)
 
     def _add_pair(self, slot: int, T_c_m: F64, rows: I64, observed: F64) -> bool:
         """Compare a frame with a keyframe. Returns True if it tells more than the pairs of that keyframe before."""
@@ -181,10 +186,10 @@ class DisparityAlignment:
         scale = config.inflation * max(square, 1.0)
         information = (system[6:, 6:-1] - to_pose[:TERMS] @ system[:6, 6:-1]) / scale
         side = (system[6:, -1] - to_pose[:TERMS] @ system[:6, -1]) / scale + information @ offset
-        told = -float(np.trace(self._grid @ np.linalg.solve(information + self._prior, self._grid.T)))
-        if not np.isfinite(told) or (self._told[slot] != 0.0 and told <= self._told[slot]):
+        score = -float(np.trace(self._grid @ np.linalg.solve(information + self._prior, self._grid.T)))
+        if not np.isfinite(score) or (self._score[slot] != 0.0 and score <= self._score[slot]):
             return False
-        self._told[slot], self._pair_h[slot], self._pair_b[slot] = told, information, side
+        self._score[slot], self._pair_h[slot], self._pair_b[slot] = score, information, side
         self._moved[slot] = (T[:3, :3].T @ T[:3, 3]) ** 2
         return True
 
@@ -194,29 +199,29 @@ class DisparityAlignment:
         What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
         """
         config, good = self._config, np.eye(TERMS) / self._config.good_px**2
-        h, b = self._old_h + self._pair_h.sum(0), self._old_b + self._pair_b.sum(0)
+        h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
         odds = np.log(config.worn_share / (1.0 - config.worn_share))
-        if self._kept_h.any() and self._moves_sideways():
+        if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
             unknown = np.logaddexp(odds + worn, usual) - np.logaddexp(odds, 0.0)
-            if unknown - _log_evidence(h, b, self._prior + self._kept_h, self._kept_b) > config.refuted:
-                self._kept_h, self._kept_b = np.zeros_like(self._kept_h), none()
+            if unknown - _log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > config.refuted:
+                self._earlier_h, self._earlier_b = np.zeros_like(self._earlier_h), none()
                 self._refuted, self.applied = True, False
                 self._events.append("disparities are not those of the rig file: estimated anew")
-        h, b = h + self._kept_h, b + self._kept_b
+        h, b = h + self._earlier_h, b + self._earlier_b
         self.cov = np.linalg.inv(h + self._prior)
         self._estimate = self.cov @ b
         odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
-        self._odds = float(odds)
-        self.worn = _probability(self._odds)
+        self._log_odds = float(odds)
+        self.worn = _probability(self._log_odds)
         self._set_rig_worn()
 
     def _set_rig_worn(self) -> None:
-        self.rig_worn = _probability(self._odds + self._row_evidence)
+        self.rig_worn = _probability(self._log_odds + self._row_evidence)
 
     def _moves_sideways(self) -> bool:
-        """True if enough of the motion was across the optical axis for the estimate to be believed."""
-        moved = self._old_moved + self._moved.sum(0)
+        """True if enough of the motion was across the optical axis: else errors of a lens pass for an offset."""
+        moved = self._evicted_moved + self._moved.sum(0)
         return bool(moved[:2].sum() >= self._config.min_sideways * moved.sum())
 
     def _expected_cov(self) -> F64:

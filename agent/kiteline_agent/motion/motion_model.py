@@ -192,7 +192,7 @@ class MotionModel:
 
     def begin_unscaled_map(self) -> None:
         """Begin a map of unknown scale."""
-        self.odometer.set_metric(False)
+        self.odometer.set_metric(metric=False)
         if self._steps is not None:
             self._steps.clear()
         if self.tracker is not None:
@@ -204,7 +204,7 @@ class MotionModel:
         assert self.tracker is not None
         self.tracker.start(t_ns, self._pose.T_m_c @ self._T_c_b, state)
         self._restart_steps(t_ns)
-        self.odometer.set_metric(True)
+        self.odometer.set_metric(metric=True)
         self.odometer.restart(self._pose.T_m_c, t_ns)
 
     def metres_per_unit(self, sigma: float) -> float | None:
@@ -235,7 +235,7 @@ class MotionModel:
         if self.tracker is not None:
             self.tracker.rescale(metres_per_unit)
             self.tracker.move_map(T_new_old)
-        self.odometer.set_metric(True)
+        self.odometer.set_metric(metric=True)
         self._restart_steps(t_ns)
 
     def _restart_steps(self, t_ns: int) -> None:

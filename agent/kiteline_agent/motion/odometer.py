@@ -240,7 +240,7 @@ class Odometer:
         self._path = r @ self._path
         self._path_cov, self._path_cross = r @ self._path_cov @ r.T, r @ self._path_cross @ r.T
 
-    def set_metric(self, metric: bool) -> None:
+    def set_metric(self, *, metric: bool) -> None:
         """Change the map's unit to metres, or to an unknown one."""
         self.metric = metric
         self._anchor = self._last = None

@@ -50,7 +50,7 @@ class Publisher:
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
             self.mark_changed(kind, KeyframeId(keyframe))
 
-    def publish_placement(self, submap: SubmapId, S_w_m: F64, recognised: bool, scale_sigma: float) -> None:
+    def publish_placement(self, submap: SubmapId, S_w_m: F64, *, recognised: bool, scale_sigma: float) -> None:
         """Send where a submap lies in w, as a similarity (4,4), and how certain lengths there are; see the record."""
         record = SubmapPlacement(submap, S_w_m, recognised, scale_sigma=scale_sigma)
         self._records.append((agent_of_submap(submap), record))

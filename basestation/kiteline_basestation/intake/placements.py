@@ -220,7 +220,7 @@ class SubmapPlacements:
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
         self.S_w_m[submap] = S_w_m
         sigma = self._scale_sigma.get(submap, 0.0)
-        self._publisher.publish_placement(submap, S_w_m, submap in self._recognised, sigma)
+        self._publisher.publish_placement(submap, S_w_m, recognised=submap in self._recognised, scale_sigma=sigma)
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
         """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale."""

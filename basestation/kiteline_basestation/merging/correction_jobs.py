@@ -91,7 +91,7 @@ class CorrectionJobs:
         """Make a pose graph of a map due."""
         self._graphs_due.add(map_id)
 
-    def request_bundle(self, map_id: SubmapId, calibrate: bool = True) -> None:
+    def request_bundle(self, map_id: SubmapId, *, calibrate: bool = True) -> None:
         """Make a full bundle of a map due. calibrate: estimate disparity offsets as well, if that may succeed."""
         self._bundles_due.add(map_id)
         if not calibrate:

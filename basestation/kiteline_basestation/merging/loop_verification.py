@@ -159,7 +159,7 @@ def _solve_similarity(
     fit = align_views(
         se3.transform(se3.inverse(T_old), theirs.xyz[b]), theirs.uv[b], theirs.octave[b], lens_old,
         se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
-        True, _seed(new, old), config.ransac,
+        with_scale=True, seed=_seed(new, old), config=config.ransac,
     )  # fmt: skip
     if fit is None or fit.inliers < config.min_inliers or not np.isfinite(fit.S_a_b).all():
         return None

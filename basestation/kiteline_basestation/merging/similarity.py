@@ -35,7 +35,7 @@ def align_points(a: F64, b: F64, with_scale: bool = False) -> F64 | None:
 def align_views(
     a: F64, uv_a: F64, octave_a: NDArray[np.uint8], camera_a: F64,
     b: F64, uv_b: F64, octave_b: NDArray[np.uint8], camera_b: F64,
-    with_scale: bool, seed: int, config: RansacConfig | None = None,
+    *, with_scale: bool, seed: int, config: RansacConfig | None = None,
 ) -> SimilarityFit | None:  # fmt: skip
     """Similarity between two cameras from common points: three-point RANSAC, with inliers counted in both images.
 

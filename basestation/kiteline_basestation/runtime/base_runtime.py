@@ -90,7 +90,7 @@ class BaseRuntime:
         if options.log_name:
             self._folder.mkdir(parents=True, exist_ok=True)
             cap_bytes = make_room(self._folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
-            about = metadata_of(options, self.config, plain)
+            about = metadata_of(options, self.config, plain_channels=plain)
             self._log = LogWriter(self._folder / options.log_name, about, cap_bytes=cap_bytes)
             self._log.text("/log", options.start_ns, "info", f"base, session {options.session}")
             self._log.flush()  # a base that dies at once leaves a log that can be read

@@ -29,7 +29,7 @@ from kiteline_core.places.place_index import Vocabulary
 STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/import", "/command", "/answer"
 
 
-def metadata_of(spec: BaseOptions, config: BaseConfig, plain_channels: bool) -> dict[str, str]:
+def metadata_of(spec: BaseOptions, config: BaseConfig, *, plain_channels: bool) -> dict[str, str]:
     """Metadata of a log that a replay needs."""
     unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet")
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}

@@ -135,6 +135,6 @@ def _rendered(bench: Bench, agent: int, start_s: float, seconds: float) -> str:
         bench.folder.mkdir(parents=True, exist_ok=True)
         path, also = (bench.source(f"trajectories/{n}.txt") for n in ("MH_01_easy", "MH_03_medium"))
         config = SimConfig("hall", trajectory=path, also=(also,), agent=agent, start=start_s, seconds=seconds)
-        with whole_file(out, True) as part:
+        with whole_file(out, force=True) as part:
             record(SimSource(config), part)
     return str(out)

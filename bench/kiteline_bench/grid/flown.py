@@ -65,7 +65,7 @@ def fly_grid(
     known = sorted(poses.keys() & truth.keys())
     ours = np.array([poses[t][:3, 3] for t in known]).reshape(-1, 3)
     theirs = np.array([(truth[t] @ T_b_c)[:3, 3] for t in known]).reshape(-1, 3)
-    T_true_w = metrics.umeyama(ours, theirs, False)[0]
+    T_true_w = metrics.umeyama(ours, theirs, with_scale=False)[0]
     error = ours @ T_true_w[:3, :3].T + T_true_w[:3, 3] - theirs
     rmse = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
     return FlownGrid(run, read_grid(folder / "grid.yaml"), T_true_w, rmse)

@@ -117,7 +117,7 @@ def _outlier(plain: _Case) -> list[Bar]:
 
 def _case(
     bench: Bench, name: str, source: SimSource, poses: Sequence[F64], damage: Callable[[F32], F32] | None = None,
-    took_off: bool = True,
+    *, took_off: bool = True,
 ) -> _Case:  # fmt: skip
     """Render and scan the poses T_w_b (4,4) of a case. took_off: the vehicle knows the ground from there."""
     bench.say(f"scanning: {name}")

@@ -64,7 +64,7 @@ class KeyframesInWorld:
         if any(len(ours) < 3 for ours, _ in found):
             return float("inf")
         a, b = (np.concatenate(sides) for sides in zip(*found))
-        T, scale = metrics.umeyama(a, b, with_scale)
+        T, scale = metrics.umeyama(a, b, with_scale=with_scale)
         return float(np.sqrt(np.mean(np.sum((se3.transform(sim3.of(scale, T), a) - b) ** 2, axis=1))))
 
     def live_m(self, agent: int, first: int = 0) -> float:

@@ -30,7 +30,7 @@ def run(bench: Bench) -> list[Bar]:
         for k, start_s in enumerate(_STARTS_S):
             eyes = "monocular" if k >= len(_STARTS_S) - _MONOCULAR else "stereo"
             pair = [flown(bench, f"flight {number} from {start_s:g} s, {eyes}, {what}",
-                          _part(recording, start_s, eyes == "monocular"))
+                          _part(recording, start_s, mono=eyes == "monocular"))
                     for what, recording in (("empty", empty), (f"{_PEOPLE} people", crowd))]  # fmt: skip
             found = _figures(*pair)
             figures[eyes].append(found)
@@ -53,7 +53,7 @@ def run(bench: Bench) -> list[Bar]:
     ]  # fmt: skip
 
 
-def _part(recording: Recording, start_s: float, mono: bool) -> Recording:
+def _part(recording: Recording, start_s: float, *, mono: bool) -> Recording:
     part = recording.seconds(start_s, 1e9)
     return part.left_only() if mono else part
 

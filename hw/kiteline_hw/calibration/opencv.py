@@ -135,7 +135,7 @@ def _is_fisheye(node: Node) -> bool:
     return any(key in node.keys and node.get(key).text().lower() in ("1", "true") for key in _FISHEYE_KEYS)
 
 
-def _storage(name: str, m: F64, tagged: bool = True) -> list[str]:
+def _storage(name: str, m: F64, *, tagged: bool = True) -> list[str]:
     rows, columns = m.shape
     data = ", ".join(repr(float(v)) for v in m.ravel())
     head = [f"{name}: !!opencv-matrix"] if tagged else [f"{name}:"]

@@ -65,7 +65,7 @@ def _value(kind: str, text: str) -> Any:
     return float(text) if kind == "float" else text
 
 
-def read_rig(scheme: str, options: LiveOptions, stereo: bool, told: ToldCalibration | None = None) -> CameraRig:
+def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, told: ToldCalibration | None = None) -> CameraRig:
     """The rig of a live camera. told: it goes first. Raises SourceError."""
     if told is not None and told.known:
         return told.rig_of_images(scheme, 1 + stereo, (told.cameras[0].height, told.cameras[0].width))
@@ -91,7 +91,7 @@ def read_rig(scheme: str, options: LiveOptions, stereo: bool, told: ToldCalibrat
         finally:
             recorded.close()
     if "fx" not in read_nodes(path).keys:
-        return read_rig(scheme, options, stereo, read_calibration(str(path)))
+        return read_rig(scheme, options, stereo=stereo, told=read_calibration(str(path)))
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
     camera = camera_from_yaml(table, path)
     if not stereo:

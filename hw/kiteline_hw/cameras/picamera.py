@@ -107,7 +107,7 @@ def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | No
     if not 1 <= len(numbers) <= 2 or not all(number.isdecimal() for number in numbers) or options.side_by_side:
         raise SourceError(f"picamera:{argument}: expected the number of a camera, or two (left,right), such as 0,1")
     stereo = len(numbers) == 2 and not mono
-    rig = live_options.read_rig("picamera", options, stereo, told)
+    rig = live_options.read_rig("picamera", options, stereo=stereo, told=told)
     models = [rig.left, rig.right or rig.left][: 1 + stereo]
     cameras = [
         PiCamera(int(number), PiSettings(model.width, model.height, options.fps, options.exposure_ms, options.gain))

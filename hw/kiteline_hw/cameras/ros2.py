@@ -186,7 +186,7 @@ def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | No
     if not 1 <= len(topics) <= 2 or (options.side_by_side and len(topics) == 2):
         raise SourceError(f"ros2:{argument}: expected one topic, or two (left,right) without side_by_side")
     stereo = (len(topics) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("ros2", options, stereo, told)
+    rig = live_options.read_rig("ros2", options, stereo=stereo, told=told)
     calibration = _imu_of(options, told) if imu and imu_topic and rig.has_body else None
     if imu and imu_topic and calibration is None:
         raise SourceError(

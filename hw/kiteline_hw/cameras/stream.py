@@ -23,7 +23,7 @@ def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | No
     if not 1 <= len(urls) <= 2 or (options.side_by_side and len(urls) == 2):
         raise SourceError(f"stream:{argument}: expected one URL, or two (left,right) without side_by_side")
     stereo = (len(urls) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("stream", options, stereo, told)
+    rig = live_options.read_rig("stream", options, stereo=stereo, told=told)
     cameras = [
         PipeCamera(url, ffmpeg_command(url), f"check its address, for instance with `ffplay {shlex.quote(url)}`")
         for url in (urls[:1] if mono else urls)

@@ -24,7 +24,7 @@ def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | No
     if not 1 <= len(devices) <= 2 or (options.side_by_side and len(devices) == 2):
         raise SourceError(f"v4l2:{argument}: expected one device, or two (left,right) without side_by_side")
     stereo = (len(devices) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("v4l2", options, stereo, told)
+    rig = live_options.read_rig("v4l2", options, stereo=stereo, told=told)
     if mono:
         devices = devices[:1]
     width = rig.left.width * (2 if options.side_by_side else 1)

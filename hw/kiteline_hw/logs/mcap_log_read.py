@@ -127,7 +127,7 @@ class LogReader(Closing):
         """Nothing is held open between two readings."""
 
 
-def read_frame(images: Sequence[EncodedImage], t_ns: int, has_depth: bool = False) -> Frame:
+def read_frame(images: Sequence[EncodedImage], t_ns: int, *, has_depth: bool = False) -> Frame:
     """The Frame of logged images: left, right if there is one, depth last if has_depth. Raises SourceError."""
     try:
         left, _ = decode_grey(images[0])

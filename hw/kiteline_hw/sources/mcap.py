@@ -165,9 +165,9 @@ class McapSource:
         images, calibrations, imu_channel, imu_frame = self._discover()
         tree = TransformTree(self._transforms())
         if told is None:
-            found = select_rig(self.name, images, calibrations, tree, imu_frame, mono)
+            found = select_rig(self.name, images, calibrations, tree, imu_frame, mono=mono)
         else:
-            found = select_told_rig(self.name, images, told, self._image_size, tree, imu_frame, mono)
+            found = select_told_rig(self.name, images, told, self._image_size, tree, imu_frame, mono=mono)
         self._truth_topic = None
         self._is_log = False
         self.rig, self._notes = found.rig, found.notes

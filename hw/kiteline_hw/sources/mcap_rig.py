@@ -99,6 +99,7 @@ def select_rig(
     calibrations: list[tuple[str, CameraCalibration]],
     tree: TransformTree,
     imu_frame: str | None,
+    *,
     mono: bool,
 ) -> Selection:
     """Choose the topics and build the rig. calibrations: (topic, calibration). Raises SourceError."""
@@ -133,6 +134,7 @@ def select_told_rig(
     size_of: Callable[[int], tuple[int, int]],
     tree: TransformTree,
     imu_frame: str | None,
+    *,
     mono: bool,
 ) -> Selection:
     """The topics of a calibration that was told: those that it names, else raw images by name, left before right.
@@ -181,7 +183,7 @@ def _cameras(
     return cameras
 
 
-def _one_a_camera(name: str, images: list[ImageTopic], rectified_first: bool) -> list[ImageTopic]:
+def _one_a_camera(name: str, images: list[ImageTopic], *, rectified_first: bool) -> list[ImageTopic]:
     """One topic a camera: rectified or raw first, encoded before raw pixels, then the one with most images."""
     topics = [i for i in images if not i.depth and i.count]
     if not topics:

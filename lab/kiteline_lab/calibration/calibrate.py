@@ -114,7 +114,7 @@ def _camera(args: argparse.Namespace) -> int:
     collector = ViewCollector(board, 1 + (source.rig.right is not None))
     # images without stamps are single pictures: each is looked at
     every_s = 0.0 if source.name.startswith("images:") else args.every
-    with whole_file(args.out, args.force) as part:
+    with whole_file(args.out, force=args.force) as part:
         try:
             with Progress("looking for the board", source.frame_count, "frames") as progress:
                 for done in collect(source, collector, every_s, args.until_complete):

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     findings = progress.findings()
     verdict = overall(findings)
     if verdict != "bad" and known is not None:
-        with whole_file(args.rig, True) as part:
+        with whole_file(args.rig, force=True) as part:
             part.write_text(rig_file.text_of(known))
     if args.json:
         imu = KnownImuConfig() if known is None else known.imu

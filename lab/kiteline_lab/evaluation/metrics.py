@@ -149,7 +149,7 @@ def _between_poses(a: F64, b: F64, part: float) -> F64:
     return se3.from_rt(a[:3, :3] @ rotation, (1.0 - part) * a[:3, 3] + part * b[:3, 3])
 
 
-def umeyama(source: F64, target: F64, with_scale: bool = False) -> tuple[F64, float]:
+def umeyama(source: F64, target: F64, *, with_scale: bool = False) -> tuple[F64, float]:
     """Align points (n,3), n >= 1: the T (4,4) and scale that minimise sum |target - (scale * R source + t)|^2.
 
     Raises ValueError if `with_scale` and all source points coincide.
@@ -184,7 +184,7 @@ def match(
     if alignment is TrajectoryAlignment.ORIGIN:
         t = true[0] @ se3.inverse(est[0])
     else:
-        t, scale = umeyama(est[:, :3, 3], true[:, :3, 3], alignment is TrajectoryAlignment.SIM3)
+        t, scale = umeyama(est[:, :3, 3], true[:, :3, 3], with_scale=alignment is TrajectoryAlignment.SIM3)
     aligned = est.copy()
     aligned[:, :3, :3] = t[:3, :3] @ est[:, :3, :3]
     aligned[:, :3, 3] = scale * est[:, :3, 3] @ t[:3, :3].T + t[:3, 3]

@@ -29,14 +29,14 @@ def check_contract(out: Path) -> list[str]:
     if not isinstance(agents, list) or not agents:
         return ["report.json: `agents` must be a list with an entry for each agent"]
     for k, agent in enumerate(agents):
-        breaches += _check_agent(out, k, agent, bool(report.get("base")))
+        breaches += _check_agent(out, k, agent, with_base=bool(report.get("base")))
     if report.get("base"):
         breaches += _check_base(out, report["base"])
     breaches += _starts_with(out / "trajectory.png", (b"\x89PNG",))
     return breaches
 
 
-def _check_agent(out: Path, k: int, agent: Report, with_base: bool) -> list[str]:
+def _check_agent(out: Path, k: int, agent: Report, *, with_base: bool) -> list[str]:
     where = f"agents[{k}]"
     breaches = [f"{where}.{key} is missing" for key in AGENT_KEYS if key not in agent]
     if breaches:

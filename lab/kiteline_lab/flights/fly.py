@@ -113,7 +113,7 @@ def fly(o: Options, quiet: bool = False) -> tuple[Report, FlightOutcome]:
     with contextlib.closing(made):
         clear(o.out)
         distributed = o.mode == "distributed"
-        outcome = fly_processes(made, o.link, o.realtime) if distributed else fly_in_process(made, o.mode)
+        outcome = fly_processes(made, o.link, realtime=o.realtime) if distributed else fly_in_process(made, o.mode)
         repair_logs(o.out)
         report = write_results(o.out, made, outcome)
     return report, outcome

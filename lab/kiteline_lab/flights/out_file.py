@@ -17,7 +17,7 @@ def expect_writable(path: Path) -> None:
 
 
 @contextmanager
-def whole_file(path: Path, force: bool) -> Iterator[Path]:
+def whole_file(path: Path, *, force: bool) -> Iterator[Path]:
     """Give a name to write to; the file becomes `path` when the block succeeds, and is removed when it fails.
 
     Raises SourceError when `path` is there already (unless force), or its folder is not or may not be written.

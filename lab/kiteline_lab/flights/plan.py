@@ -106,7 +106,7 @@ def flight_starts(sources: list[FrameSource]) -> list[int]:
     return [first for first, _ in spans]
 
 
-def _span_ns(source: FrameSource, several: bool) -> tuple[int, int]:
+def _span_ns(source: FrameSource, *, several: bool) -> tuple[int, int]:
     """First and (nearly) last stamp of a source; the last only where there are several sources."""
     stamps: list[int] = []
     for item in source:

@@ -29,7 +29,7 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{s.getsockname()[1]}"
 
 
-def link_ends(link: str, realtime: bool) -> tuple[str, str]:
+def link_ends(link: str, *, realtime: bool) -> tuple[str, str]:
     """LINK of the agents and of the base. Where the ends differ (always with `serial:` and `mavlink:`) both are named,
     the agent's first, with a comma between. Raises LinkError.
     """
@@ -46,10 +46,10 @@ def link_ends(link: str, realtime: bool) -> tuple[str, str]:
     return (f"zenoh:{endpoint}",) * 2 if realtime else (f"lockstep:{endpoint}",) * 2
 
 
-def fly_processes(plan: FlightPlan, link: str, realtime: bool) -> FlightOutcome:
+def fly_processes(plan: FlightPlan, link: str, *, realtime: bool) -> FlightOutcome:
     """Fly as one process an agent and one for the base. Raises LinkError when the base cannot begin."""
     assert plan.base is not None
-    up, down = link_ends(link, realtime)
+    up, down = link_ends(link, realtime=realtime)
     base = replace(plan.base, link=down)
     agents = [replace(spec, link=up) for spec in plan.agents]
     with contextlib.ExitStack() as stack:

@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
         source = SimSource(replace(config, agent=agent), o.workers, world)
         world = source.world
         out = o.out if agent == 0 else o.out.with_name(f"{o.out.stem}-{agent}{o.out.suffix}")
-        with whole_file(out, True) as part:
+        with whole_file(out, force=True) as part:
             samples = record(source, part, o.png)
         truth = out.with_suffix(".rig_truth.json")
         truth.write_text(

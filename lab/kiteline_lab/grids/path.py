@@ -39,7 +39,7 @@ class GridPath:
     clearance_m: float
 
 
-def find_path(grid: GridFile, start: F64, goal: F64, radius_m: float, through_unknown: bool = False) -> GridPath:
+def find_path(grid: GridFile, start: F64, goal: F64, radius_m: float, *, through_unknown: bool = False) -> GridPath:
     """The shortest path between two points (2,) in m for a vehicle of this radius. Raises GridPathError.
 
     A* over the cells whose centres are clear, then corners are cut where the straight line is clear too. Cells outside
@@ -149,7 +149,7 @@ def main(argv: list[str]) -> int:
     if not args.radius >= 0.0:
         parser.error("expected a radius that is not negative")
     grid = read_grid(args.grid)
-    found = find_path(grid, args.start, args.goal, args.radius, args.through_unknown)
+    found = find_path(grid, args.start, args.goal, args.radius, through_unknown=args.through_unknown)
     if args.plot is not None:
         draw_path(args.plot, grid, found.places, args.radius)
     if args.json:

@@ -39,7 +39,7 @@ def can_plot() -> bool:
 
 
 def plot_trajectories(
-    path: str | Path, lines: Sequence[Line], truth: Trajectory | None = None, title: str = "", align: bool = False
+    path: str | Path, lines: Sequence[Line], truth: Trajectory | None = None, title: str = "", *, align: bool = False
 ) -> None:
     """Write a PNG. truth: drawn in grey, and adds a panel of errors.
 
@@ -56,7 +56,7 @@ def plot_trajectories(
 
     figure = Figure(figsize=(11.0, 5.6), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
-    top, height, error = _panels(figure, truth is not None)
+    top, height, error = _panels(figure, with_error=truth is not None)
     if truth is not None and len(truth.t_ns):
         p = truth.T_w_b[:, :3, 3]
         top.plot(p[:, across], p[:, along], color=TRUTH_COLOUR, lw=2.6, label="truth", zorder=1)
@@ -86,7 +86,7 @@ def plot_trajectories(
     figure.savefig(path, metadata={"Software": None})  # no version inside: equal runs give equal files
 
 
-def _panels(figure: Figure, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
+def _panels(figure: Figure, *, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
     top = figure.add_subplot(grid[:, 0])
     height = figure.add_subplot(grid[0, 1] if with_error else grid[:, 1])

@@ -105,7 +105,7 @@ def agent_input(step: Step) -> StepInput:
                 f"step {step.number} of the log has no images: it was flown with every = 0 or more than 1 in "
                 "[agent.log]; only a log with all images can be replayed"
             )
-        frame = read_frame(images, step.head["frame_ns"], bool(step.of(DEPTH)))
+        frame = read_frame(images, step.head["frame_ns"], has_depth=bool(step.of(DEPTH)))
     imu = step.one_of(flight_log.IMU).imu() if step.head["imu"] else None
     odometry = step.one_of(flight_log.ODOMETER).odometry() if step.head.get("odometer") else None
     packets, predict_ns = step.blobs(flight_log.PACKETS_IN), step.head.get("predict_ns")

@@ -90,7 +90,7 @@ def replay_agent(
             out.counts.count(output.estimate, output.predicted)
             out.live.append(live_line(output.estimate))
             out.odometry.append(odometry_line(output.estimate or output.predicted))
-        if _finish_step(out, progress, stop_at_first):
+        if _finish_step(out, progress, stop_at_first=stop_at_first):
             break
     return out
 
@@ -113,7 +113,7 @@ def replay_base(
         _replay_base_step(out, station, step, jobs)
         if watch is not None:
             watch(station)
-        if _finish_step(out, progress, stop_at_first):
+        if _finish_step(out, progress, stop_at_first=stop_at_first):
             break
     return out
 
@@ -138,7 +138,7 @@ def _replay_base_step(out: ReplayResult, station: Station, step: Step, jobs: dic
         out.compare_packets(step, base_log.packets_out(agent), sent)
 
 
-def _finish_step(out: ReplayResult, progress: Progress | None, stop_at_first: bool) -> bool:
+def _finish_step(out: ReplayResult, progress: Progress | None, *, stop_at_first: bool) -> bool:
     """Count a step; whether the replay ends here."""
     out.steps += 1
     if progress is not None:

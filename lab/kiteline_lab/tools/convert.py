@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
     )
     p.add_argument("--force", action="store_true", help="overwrite OUT.mcap")
     o = p.parse_args(argv)
-    with whole_file(o.out, o.force) as part:
+    with whole_file(o.out, force=o.force) as part:
         source = open_source(o.source, mono=o.mono, imu=o.imu, calibration=o.calibration)
         try:
             frames, samples = record(source, part)

@@ -109,7 +109,7 @@ def _print(facts: dict[str, object], topics: list[dict[str, object]], file: Mcap
 
 def _recover(path: Path, out: Path, force: bool) -> int:
     file = McapFile(path)
-    with whole_file(out, force) as part:
+    with whole_file(out, force=force) as part:
         written = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
     print(f"{out}: {written} messages; {path} was {file.cut or 'whole'}")
     for note in file.notes:
@@ -127,7 +127,7 @@ def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> in
         raise SourceError(
             f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"
         )
-    with whole_file(out, force) as part:
+    with whole_file(out, force=force) as part:
         written = _write(part, [file], ((0, m) for m in _interval(file, begin_ns, end_ns)), [""])
     print(f"{out}: {written} messages")
     return 0
@@ -159,7 +159,7 @@ def _is_lasting(file: McapFile, channel: int) -> bool:
 def _merge(out: Path, paths: list[Path], force: bool) -> int:
     files = [McapFile(path) for path in paths]
     merged = heapq.merge(*map(_numbered, count(), files), key=lambda item: (item[1].log_ns, item[0]))
-    with whole_file(out, force) as part:
+    with whole_file(out, force=force) as part:
         written = _write(part, files, merged, _prefixes(files))
     print(f"{out}: {written} messages of {len(paths)} files")
     return 0

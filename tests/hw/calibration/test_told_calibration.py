@@ -168,7 +168,7 @@ def test_a_live_pair_by_a_calibration_file(tmp_path: Path) -> None:
     chain.write_text(CHAIN)
     options = LiveOptions(calibration=str(chain))
     by_option = read_rig("v4l2", options, stereo=True)
-    by_flag = read_rig("v4l2", LiveOptions(calibration="none.yaml"), True, read_calibration(str(chain)))
+    by_flag = read_rig("v4l2", LiveOptions(calibration="none.yaml"), stereo=True, told=read_calibration(str(chain)))
     for rig in (by_option, by_flag):
         assert rig.right is not None and rig.right.fx == 190.44236969414825 and rig.has_body
     assert read_rig("v4l2", options, stereo=False).right is None

@@ -68,8 +68,8 @@ class SelfCalibration:
         self._calibration, self._config, self._p_b_c = calibration, config, p_b_c
         self._gravity_m_s2 = gravity_m_s2
         self.gyro, self.accel = self._unknown_gyro(), self._unknown_accel()
-        self._doubt: GyroCalibration | None = None  # the gyro as if earlier flights were of another one
-        self._kept = KnownImuConfig()  # what earlier flights found
+        self._unprimed_gyro: GyroCalibration | None = None  # a second estimate, without what earlier flights found
+        self._earlier = KnownImuConfig()  # what earlier flights found
         self._turns = PoseChain(config.turn_window_s)
         self._moves = PoseChain(config.move_window_s)
         self._before: tuple[Window, Link, float] | None = None  # the last window of moves, its density
@@ -89,20 +89,20 @@ class SelfCalibration:
 
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found, as a prior; it is dropped if the flight refutes it: after repairs."""
-        config, self._kept = self._config, known
+        config, self._earlier = self._config, known
         if known.gyro and known.offset_s:
-            self._doubt = self._unknown_gyro()
+            self._unprimed_gyro = self._unknown_gyro()
             offset_s, offset_sigma_s = known.offset_s
             self.gyro.begin_with(
                 np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
                 offset_s, float(np.hypot(offset_sigma_s, config.kept_offset_sigma_s)),
             )  # fmt: skip
             self._follow_offset(np.inf)
-            self._judge_gyro()
+            self._test_gyro()
         if known.accel:
             sigma = np.hypot(known.accel_sigma, config.kept_axes_sigma)
             self.accel.begin_with(np.reshape(known.accel, (3, 3)), sigma)
-            self._judge_accel()
+            self._test_accel()
         self._gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
         self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
 
@@ -114,7 +114,7 @@ class SelfCalibration:
         offset = (round(gyro.offset_s, 6), max(round(gyro.offset_sigma_s, 6), 1e-6))
         out = KnownImuConfig(offset, *known_axes(gyro.matrix, gyro.axes_cov * max(gyro.excess, 1.0)))
         if not self._metric or not is_plausible(accel.matrix):
-            return replace(out, accel=self._kept.accel, accel_sigma=self._kept.accel_sigma)
+            return replace(out, accel=self._earlier.accel, accel_sigma=self._earlier.accel_sigma)
         axes, sigma = known_axes(accel.matrix, accel.axes_cov * max(accel.excess, 1.0))
         return replace(out, accel=axes, accel_sigma=sigma)
 
@@ -130,8 +130,8 @@ class SelfCalibration:
         camera_rotation_deg: (3,) rotation vector of the gyro's axes against those of the body, degrees.
         """
         return {
-            "gyro": _axes_report(self.gyro.matrix, self.gyro.axes_cov, self._corrects_gyro),
-            "accel": _axes_report(self.accel.matrix, self.accel.axes_cov, self._corrects_accel),
+            "gyro": _axes_report(self.gyro.matrix, self.gyro.axes_cov, applied=self._corrects_gyro),
+            "accel": _axes_report(self.accel.matrix, self.accel.axes_cov, applied=self._corrects_accel),
             "camera_rotation_deg": np.degrees(_measured(self.gyro.matrix)[1]).round(3).tolist(),
             "image_scale": [round(value, 5) for value in self.accel.scale],
         }
@@ -173,43 +173,44 @@ class SelfCalibration:
         turn = self._turns.take(buffer, self.gyro.offset_s)
         if isinstance(turn, Link):
             offset_s = self.gyro.offset_s
-            for gyro in (self.gyro, self._doubt):
+            for gyro in (self.gyro, self._unprimed_gyro):
                 if gyro is not None:
                     window = self._integrate(turn, gyro)
                     variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
                     gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance, offset_s)
-            self._doubt_earlier_flights()
-            self._judge_gyro()
+            self._drop_refuted_prior()
+            self._test_gyro()
         if gravity is not None:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
             move = self._moves.take(buffer, self.gyro.offset_s)
             if isinstance(move, Link):
                 self._add_move(move)
-                self._judge_accel()
+                self._test_accel()
             elif move:
                 self._before = None
         self._follow_offset(dt_s)
         return self._follow_axes(buffer, dt_s)
 
-    def _doubt_earlier_flights(self) -> None:
+    def _drop_refuted_prior(self) -> None:
         """Drop what earlier flights found if rotations are likelier without it. Applied axes follow the new ones."""
-        doubt = self._doubt
-        if doubt is not None and doubt.log_likelihood - self.gyro.log_likelihood > self._config.refuted:
-            self.gyro, self._doubt, self._kept = doubt, None, KnownImuConfig()
+        unprimed = self._unprimed_gyro
+        if unprimed is not None and unprimed.log_likelihood - self.gyro.log_likelihood > self._config.refuted:
+            self.gyro, self._unprimed_gyro, self._earlier = unprimed, None, KnownImuConfig()
             accel, self.accel = self.accel, self._unknown_accel()
             self.accel.continue_map(accel)
             self._events.append("the IMU is not the one of the rig file: calibrated anew")
 
-    def _judge_gyro(self) -> None:
+    def _test_gyro(self) -> None:
+        """Correct the gyro's samples from now on if its axes differ significantly from those of a true rig."""
         config = self._config
         self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, config.misalignment_sigma)
         if config.apply_axes and not self._corrects_gyro and self.gyro.significance() > config.significance:
             self._corrects_gyro = True
             self._events.append(_event("gyro", self.gyro.matrix))
 
-    def _judge_accel(self) -> None:
-        """Lengths of a monocular map come from the accelerometer itself: they do not calibrate it."""
+    def _test_accel(self) -> None:
+        """The same of the accelerometer; not by a monocular map, whose lengths come from the accelerometer itself."""
         config = self._config
         may = config.apply_axes and self._metric and not self._corrects_accel
         if may and self.accel.significance() > config.significance:
@@ -217,6 +218,7 @@ class SelfCalibration:
             self._events.append(_event("accelerometer", self.accel.matrix))
 
     def _follow_offset(self, dt_s: float) -> None:
+        """Move the applied time offset towards the estimate, once that is significant."""
         config = self._config
         if not config.apply_offset or self.gyro.offset_sigma_s >= config.offset_trusted_s:
             return
@@ -227,6 +229,7 @@ class SelfCalibration:
             self.offset_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
 
     def _follow_axes(self, buffer: SampleBuffer, dt_s: float) -> F64:
+        """Move the applied axes towards the estimates. Returns the change (3,) of the accelerometer bias, m/s^2."""
         change = np.zeros(3)
         share = 1.0 - float(np.exp(-dt_s / self._config.apply_s))
         if self._corrects_gyro:
@@ -255,9 +258,9 @@ class SelfCalibration:
 
     def _density(self, link: Link) -> F64:
         """(2,) noise density of gyro and accelerometer in a window."""
-        told = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
-        found = link.samples.density
-        return told if found is None else np.maximum(told, np.sqrt(np.mean(found**2, axis=0)))
+        calibrated = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
+        measured = link.samples.density
+        return calibrated if measured is None else np.maximum(calibrated, np.sqrt(np.mean(measured**2, axis=0)))
 
 
 def _measured(matrix: F64) -> tuple[F64, F64]:
@@ -289,7 +292,7 @@ def _event(sensor: str, matrix: F64) -> str:
     return f"{sensor}: scale off by up to {scale:.1f} %, camera rotated by {angle:.2f} degrees against it: corrected"
 
 
-def _axes_report(matrix: F64, cov: F64, applied: bool) -> dict[str, Any]:
+def _axes_report(matrix: F64, cov: F64, *, applied: bool) -> dict[str, Any]:
     measured, _ = _measured(matrix)
     sigma = np.sqrt(np.diag(cov)).reshape(3, 3)
     return {
