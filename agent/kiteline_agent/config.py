@@ -253,7 +253,7 @@ class CovarianceConfig:
     extrinsic_rad: float = 3e-4  # rad: error of the camera's rotation in the body, a hundredth of a degree or two
     extrinsic_m: float = 1e-3  # m: error of the camera's position in the body
     least_rms: float = 0.3  # whitened residual of a frame: its noise is never assumed to be smaller
-    inflation: float = 1.0  # factor on the variance of a measured pose
+
     imu_offset_frames: float = 10.0  # frames over which the difference between fused and image poses is averaged
     imu_offset_share: float = 1.0  # of the mean difference: standard deviation of its systematic part
     refined_share: float = 0.25  # of a keyframe's variance that remains when the base has optimised it

@@ -47,7 +47,7 @@ class InertialStartConfig:
     landmarks_each: int = 70  # in each keyframe: in fast turns no track is long
     min_flow: float = 0.02  # of the focal length, median: with less the camera has not moved
     scale_sigma: float = 0.02  # relative deviation of the scale below which it is metric
-    sigma_inflation: float = 1.0  # of that deviation: errors of corners are correlated over keyframes
+
     agreement: float = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
     max_reprojection_px: float = 0.9  # rms of a solution's inliers
     noise_prior: float = 6.0  # degrees of freedom of the calibrated noise beside those of a window

@@ -23,15 +23,12 @@ _MAX_PX = 8.0  # of a number that the link can carry
 class KnownRigConfig:
     """What is known of a rig beyond its calibration, from `kiteline agent --rig FILE`. It holds for one calibration."""
 
-    camera: tuple[
-        float, ...
-    ] = ()  # width, height, fx, fy, cx, cy in px, baseline in m, rectified; (): nothing is known
+    camera: tuple[float, ...] = ()  # width, height, fx, fy, cx, cy in px, baseline in m, rectified; (): unknown
     T_b_c: tuple[float, ...] = ()  # row-major 4x4: rectified left camera in the body, m
     rows_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x y, y^2 by which the right image is too low
     rows_read: bool = False  # disparities were measured in a right image that was read there
     disparity_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x^2, x y by which disparities are too large
-    disparity_sigma_px: float = 0.0  # px; standard deviation of disparity_px, rms over the image;
-    # 0: it rests on the prior of a good calibration, and is where the next flight begins, no knowledge
+    disparity_sigma_px: float = 0.0  # px; standard deviation, rms over the image; 0: disparity_px is a start, not known
     imu: KnownImuConfig = field(default_factory=KnownImuConfig)
 
     def __post_init__(self) -> None:

@@ -10,12 +10,12 @@ class ScanConfig:
     """When keyframes are scanned for ground and obstacles; `ground` says how."""
 
     on: bool = True  # False: the agent makes no scans
-    moved_m: float = 0.2  # m since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
-    turned_rad: float = 0.17  # rad since the last scan: a tenth of the field of view is new
+    moved_m: float = 0.2  # m; motion since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
+    turned_rad: float = 0.17  # rad; rotation since the last scan: a tenth of the field of view is new
     part_s: float = (
         0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned
     )
-    told_s: float = 1.0  # s between two lines of the log about the nearest obstacle
+    told_s: float = 1.0  # s; time between two lines of the log about the nearest obstacle
     doubted: int = 6  # scans without the expected ground, after which another height is believed
 
 

@@ -99,7 +99,8 @@ def test_two_runs_give_the_same_bits(data_dir: Path) -> None:
     for _ in range(2):
         source = open_source(str(data_dir / "room_flight.mcap"))
         runs.append(fly(source, first_frames(source, 15)))
-    for a, b in zip(*runs):
+    assert len(runs[0]) == 15
+    for a, b in zip(*runs, strict=True):
         assert a.T_o_b.tobytes() == b.T_o_b.tobytes()
 
 

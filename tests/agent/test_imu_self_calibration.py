@@ -252,7 +252,7 @@ def test_what_a_flight_cannot_tell_is_kept() -> None:
 
 
 def test_a_refuted_imu_leaves_nothing_behind() -> None:
-    """One eye, whose flights do not calibrate the accelerometer: what the file said of it was of another IMU."""
+    """Monocular, whose flights do not calibrate the accelerometer: what the file said of it was of another IMU."""
     known = calibrated(flight(25.0, 0, GYRO, ACCEL, 4_000_000)).known()
     assert known is not None and known.accel
     replaced = calibrated(flight(25.0, 1, np.linalg.inv(GYRO), late_ns=-3_000_000), known=known, metric=False)

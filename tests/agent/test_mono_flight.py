@@ -1,4 +1,4 @@
-"""One eye: it begins when two views give depth, follows at its own scale, and its bearings find their true depth."""
+"""A monocular flight: it begins when two views give depth, keeps its own scale, and landmarks find their true depth."""
 
 from __future__ import annotations
 

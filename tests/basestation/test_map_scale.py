@@ -234,7 +234,7 @@ UNIT = 0.96
 
 
 def a_flight_in_wrong_metres(make_flight: Callable[..., Any], scene: Any, *, with_steps: bool) -> Any:
-    """One eye around a room in 10 s, whose agent calls 0.96 m a metre."""
+    """A monocular flight around a room in 10 s, whose agent calls 0.96 m a metre."""
     turns, keyframes = 1.6, 40
     flight = make_flight(keyframes=keyframes, turns=turns, stereo=False, drift_m=0.002, scene=scene)
     submap = submap_of_keyframe(flight.keyframes[0])

@@ -1,4 +1,4 @@
-"""One eye's maps: loops take the drift of their unit of length back, and merges find how long it is."""
+"""Monocular maps: loops take the drift of their unit of length back, and merges find how long it is."""
 
 from __future__ import annotations
 

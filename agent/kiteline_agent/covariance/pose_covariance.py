@@ -155,7 +155,7 @@ class PoseCovariance:
             self._set_calibration()
         inverse = np.linalg.inv(self._h + 1e-6 * np.eye(6))
         a = adjoint(se3.inverse(track.T_c_m))
-        noise = max(track.rms, self._config.least_rms) ** 2 * self._config.inflation * inverse
+        noise = max(track.rms, self._config.least_rms) ** 2 * inverse
         seen = np.bincount(track.rows[track.inlier] // m.slot_size)
         slots = np.flatnonzero(seen)
         share = seen[slots] / max(int(seen.sum()), 1)

@@ -165,7 +165,7 @@ class InertialStart:
             return None
         cov = config.state_inflation**2 * solution.cov
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
-        return InertialMap(points, solution, cov, self._sigma(solution), duration_s, noise.accel)
+        return InertialMap(points, solution, cov, solution.scale_sigma, duration_s, noise.accel)
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
@@ -195,7 +195,7 @@ class InertialStart:
         config = self._config.inertial_start
         least = config.least_accel_noise * self._measured_noise().accel
         now = solution.evidence.updated(before, config.noise_prior, least)
-        return now, self._sigma(solution) * max(now.accel / before.accel, now.walk / before.walk)
+        return now, solution.scale_sigma * max(now.accel / before.accel, now.walk / before.walk)
 
     def _measured_noise(self) -> WindowNoise:
         """The noise of single samples: more than that of intervals, since much of it is vibration and motion.
@@ -222,9 +222,6 @@ class InertialStart:
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
         length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
         return bool(abs(np.log(length_b / length_a)) < self._config.inertial_start.agreement)
-
-    def _sigma(self, solution: WindowSolution) -> float:
-        return self._config.inertial_start.sigma_inflation * solution.scale_sigma
 
     def _points(
         self, ctx: FrameContext, newest: TrackedKeyframe, corners: CornerObservations, solution: WindowSolution

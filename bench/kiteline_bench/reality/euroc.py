@@ -1,4 +1,4 @@
-"""One eye and a real IMU: a real flight from its begin and from later starts, in motion."""
+"""Monocular with a real IMU: a real flight from its begin and from later starts, in motion."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def run(bench: Bench) -> list[Bar]:
         ).recording
         for start_s in _SIMULATED_STARTS_S:
             rows.append(_row(bench, f"{rig} {number}", start_s, flight.seconds(start_s, 1e9)))
-    table(bench, "One eye and IMU", ("flight", "start s", "metric after s", "scale off at worst %"), rows)
+    table(bench, "Monocular with IMU", ("flight", "start s", "metric after s", "scale off at worst %"), rows)
     wrong = sum(row[3] > 100.0 * _FALSE for row in rows)
     metric = sum(row[2] < 1e9 for row in rows)
     return [

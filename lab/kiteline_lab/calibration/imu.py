@@ -136,7 +136,7 @@ def follow(options: AgentOptions, config: AgentConfig) -> Generator[tuple[ImuPro
                 if known is not None:
                     known = replace(known, imu=_doubted(known.imu))
                 imu = None if known is None or not known.imu.gyro else known.imu
-                # of one eye the accelerometer tells the lengths: it cannot be compared with them
+                # a monocular camera has its lengths from the accelerometer: they cannot be compared
                 yield ImuProgress(imu, np.asarray(R_c_b), source.rig.right is not None, frames, tracked), known
 
 

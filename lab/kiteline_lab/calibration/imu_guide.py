@@ -113,7 +113,9 @@ class ImuProgress:
             level = "good" if sigma.max() <= c.turn else "poor"
             out.append(Finding(level, text, "" if level == "good" else "longer turns about all axes"))
         if not self.metric:
-            out.append(Finding("poor", "accelerometer: not compared", "one eye does not know lengths by itself"))
+            out.append(
+                Finding("poor", "accelerometer: not compared", "a single camera does not know lengths by itself")
+            )
             return out
         sigma = self._columns(known.accel_sigma)
         if not np.isfinite(sigma).all():
