@@ -9,12 +9,14 @@ from kiteline_codec.schema import (
     CameraIntrinsics,
     GridTile,
     KeyframeHeader,
+    KeyframeScan,
     NewLandmarks,
     Observations,
     RefinedLandmarks,
 )
 from kiteline_codec.schema.base.grid_tile import TILE_CELLS
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, keyframe_id, submap_id
 
 _TICK_NS = 50_000_000
@@ -45,6 +47,11 @@ def warm() -> None:
             base.put(RefinedLandmarks(first, index, depth, np.zeros((n, 2), np.float32)))
         if tick == 6:  # landmarks of two keyframes
             both = np.where(np.arange(n) < n // 2, landmark, landmark + ((second - first) << KEYPOINT_BITS))
+            ranges = np.full(4, 2.0)
+            scan = ColumnScan(
+                np.array([0.0, -1.0, 0.0]), 0.0, 0.1, ranges, ranges, ranges, zeros[:4] + np.uint8(7), ranges, 1.0
+            )
+            agent.put(KeyframeScan(second, scan, zeros))
             agent.put(KeyframeHeader(third, 2 * _TICK_NS, second, np.eye(4), n))
             agent.put(Observations(third, 0, index, uv + 1.0, depth, zeros, both))
         base.receive(agent.poll(tick * _TICK_NS), tick * _TICK_NS)

@@ -134,24 +134,6 @@ def direction(half: int, p: float, q: float) -> list[float]:
     return [2 * p / (1 + ss), (1 if half else -1) * (1 - ss) / (1 + ss), 2 * q / (1 + ss)]
 
 
-def scan(s: Source, n: int) -> list[list[int]]:
-    """Codes of obstacle, free, from, clear, and bands."""
-    codes = residual_columns(s, 5, n)
-    out: list[list[int]] = [[], [], [], []]
-    last = [0] * 4
-    for i in range(n):
-        for j in range(4):
-            z, here = codes[j][i] - 1, [column[i] for column in out if len(column) > i]
-            guess = last[j]
-            if j == 1:
-                guess = here[0] or last[1]
-            if j == 3:
-                guess = here[0] or here[1] or last[3]
-            out[j].append(0 if z < 0 else guess + (-(z + 1) // 2 if z % 2 else z // 2))
-            last[j] = out[j][i] or last[j]
-    return [*out, codes[4]]
-
-
 def inverse_depth(code: int) -> float:
     e, m = divmod(code, 1024)
     return float(((1 + m / 1024) * 2**e - 1) / 128)
@@ -170,23 +152,89 @@ def points(s: Source, n: int) -> list[int]:
     return [(table[p] << 11) + k for p, k in zip(place, keypoint, strict=True)]
 
 
-def cells(data: bytes) -> list[int]:
-    out: list[int] = []
-    p, r = [2048] * 226, [1] * 226
-    at, size, number = 4, 2**32 - 1, int.from_bytes(data[:4].ljust(4, b"\0"), "big")
+class Decisions:
+    """Reads decisions from a code."""
 
-    def decide(context: int) -> int:
-        nonlocal at, size, number
-        bound = (size >> 12) * p[context]
-        bit = int(number >= bound)
-        number, size = (number - bound, size - bound) if bit else (number, bound)
+    def __init__(self, data: bytes, first: list[int], rate: int) -> None:
+        self.data, self.p, self.r = data, first, [rate] * len(first)
+        self.at, self.size, self.number = 4, 2**32 - 1, int.from_bytes(data[:4].ljust(4, b"\0"), "big")
+
+    def __call__(self, context: int) -> int:
+        p, r = self.p, self.r
+        bit = self._take((self.size >> 12) * p[context])
         p[context] += -(p[context] >> r[context]) if bit else (4096 - p[context]) >> r[context]
         p[context] = min(max(p[context], 32), 4064)
         r[context] = min(r[context] + 1, 5)
-        while size < 2**24:
-            number, size, at = number << 8 | (data[at] if at < len(data) else 0), size << 8, at + 1
         return bit
 
+    def even(self) -> int:
+        return self._take(self.size >> 1)
+
+    def _take(self, bound: int) -> int:
+        bit = int(self.number >= bound)
+        self.number, self.size = (self.number - bound, self.size - bound) if bit else (self.number, bound)
+        while self.size < 2**24:
+            byte = self.data[self.at] if self.at < len(self.data) else 0
+            self.number, self.size, self.at = self.number << 8 | byte, self.size << 8, self.at + 1
+        return bit
+
+    def difference(self, c: int) -> int:
+        bits = 0
+        while bits < 10 and self(c + min(bits, 7)):
+            bits += 1
+        if not bits:
+            return 0
+        negative, size = self.even(), 1
+        for _ in range(bits - 1):
+            size = 2 * size + self.even()
+        return -size if negative else size
+
+
+def scan(data: bytes, n: int, m: int) -> tuple[dict[str, list[int]], list[int]]:
+    """Rows of codes by name, and labels."""
+    text = (Path(__file__).parents[2] / "codec" / "SPEC.md").read_text()
+    numbers = text.split("p is 64 times: ")[1].split(".")[0]
+    decide = Decisions(data, [64 * int(v) for v in numbers.split(",")], 3)
+    out: dict[str, list[int]] = {name: [] for name in ("obstacle", "clear", "free", "from", "bands")}
+    flags = {0: 1, 15: 1, 17: 1, 19: 1, 21: 0}
+    mask, before = 0, {"obstacle": (0, 0), "clear": (0, 0), "free": (0, 0), "from": (0, 0)}
+
+    def flag(context: int) -> int:
+        flags[context] = decide(context + flags[context])
+        return flags[context]
+
+    def of(name: str) -> int:
+        last, step = before[name]
+        step = decide.difference(39 if name == "from" else 31 if abs(step) >= 4 else 23)
+        before[name] = last + step, step
+        return last + step
+
+    for _ in range(n):
+        if flag(0):
+            bits, node = [decide(2 + k) for k in range(5)], 1
+            for _ in range(3):
+                node = 2 * node + decide(7 + node)
+            mask = sum(bit << 7 - k for k, bit in enumerate(bits)) + node - 8
+        row = {"bands": mask, "obstacle": of("obstacle") if mask else 0, "clear": 0, "free": 0, "from": 0}
+        for name, absent, other in (("clear", 15, 17), ("free", 19, 21)):
+            if not flag(absent):
+                differs = flag(other) if mask else 1
+                row[name] = of(name) if differs else row["obstacle"]
+                before[name] = row[name], before[name][1]
+        if row["free"]:
+            row["from"] = of("from")
+        for name, value in row.items():
+            out[name].append(value)
+    labels = [0, 0]
+    for _ in range(m):
+        one, two = labels[-1], labels[-2]
+        labels.append((one + 1 + decide(56 + one)) % 3 if decide(47 + 3 * one + two) else one)
+    return out, labels[2:]
+
+
+def cells(data: bytes) -> list[int]:
+    out: list[int] = []
+    decide = Decisions(data, [2048] * 226, 1)
     for i in range(4096):
         row, column = divmod(i, 64)
         places = [(row, column - 1), (row - 1, column), (row - 1, column - 1), (row - 1, column + 1)]
@@ -248,17 +296,13 @@ def read_code(kind: int, id_: int, data: bytes, part: int = 0) -> dict[str, Any]
             out["T_k_s"], out["up_c"] = s.pose(256, 1 << 10), [0.0, -1.0, 0.0]
         else:
             out["up_c"] = direction(s.u8(), s.signed() / 8191, s.signed() / 8191)
-        out["azimuth0_rad"], out["azimuth_step_rad"], z = s.signed() / 2**16, s.varint() / 2**20, s.varint() - 1
+        out["azimuth0_rad"], out["azimuth_step_rad"], z = s.signed() / 2**12, s.varint() / 2**18, s.varint() - 1
         out["camera_height_m"] = float("nan") if z < 0 else (-(z + 1) // 2 if z % 2 else z // 2) / 256
-        obstacle, free, free_from, clear, out["bands"] = scan(s, s.varint())
-        out["obstacle_m"] = [r or float("inf") for r in ranges(obstacle)]
-        out["free_m"], out["free_from_m"], out["clear_m"] = (
-            ranges(free),
-            ranges([8 * c for c in free_from]),
-            ranges(clear),
-        )
-        m = s.varint()
-        out["labels"] = [2 - code for code in residual_columns(s, 1, m)[0]]
+        n, m = s.varint(), s.varint()
+        rows, out["labels"] = scan(s.raw(len(data) - s.at), n, m)
+        out["obstacle_m"] = [r or float("inf") for r in ranges(rows["obstacle"])]
+        out["free_m"], out["clear_m"], out["bands"] = ranges(rows["free"]), ranges(rows["clear"]), rows["bands"]
+        out["free_from_m"] = ranges([8 * c for c in rows["from"]])
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())
@@ -392,7 +436,7 @@ def test_packets() -> None:
     for name, packet in wire:
         assert zlib.crc32(packet[:-4]) == int.from_bytes(packet[-4:], "little")
         s = Source(packet[:-4])
-        assert s.u8() == PROTOCOL_VERSION == 4
+        assert s.u8() == PROTOCOL_VERSION == 5
         flags = s.u8()
         assert s.varint() == {"agent": 5, "base": 700}[name]
         assert s.varint() in (0, {"agent": 700, "base": 5}[name])

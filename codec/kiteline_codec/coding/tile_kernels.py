@@ -1,6 +1,6 @@
-"""Cells of a grid tile as adaptive binary decisions of a range coder. The layout is described in SPEC.md, "Cells".
+"""Cells of a grid tile as adaptive binary decisions of a range coder. The layout is described in SPEC.md, "cells".
 
-Method: the range coder of G. N. N. Martin, 1979, in the binary form of LZMA; contexts from the neighbours, as in JBIG.
+Method: contexts from the neighbours, as in JBIG.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_codec.coding.range_coder_kernels import HALF, begin_reading, begin_writing, finish, get, put
 from kiteline_core.jit import helper, njit
 
 I8 = NDArray[np.int8]
@@ -19,10 +20,7 @@ MAX_MASK = 7  # of the height bands that are occupied
 CONTEXTS = 81 * 2 + 8 * 8  # known and occupied by four neighbours; masks by a neighbour's and by the bits so far
 MAX_CODE = 5 * SIDE * SIDE  # bytes; five decisions a cell, each of which takes less than eight bits
 
-_TOP = 1 << 24
-_RANGE = 0xFFFFFFFF
-_ONE = 1 << 12  # probabilities are in 1/4096
-_FIRST_RATE, _LAST_RATE = 1, 5  # probabilities move by 1/2^rate of what they lack
+_FIRST_RATE = 1
 
 
 @helper
@@ -61,53 +59,10 @@ def _near_mask(cells: I8, row: int, column: int) -> int:
 
 
 @helper
-def _adapt(model: I64, context: int, bit: int) -> None:
-    """Move the probability of 0 towards what was found, by ever smaller shares."""
-    rate = model[1, context]
-    if bit == 0:
-        model[0, context] += (_ONE - model[0, context]) >> rate
-    else:
-        model[0, context] -= model[0, context] >> rate
-    if rate < _LAST_RATE:
-        model[1, context] += 1
-    model[0, context] = min(max(model[0, context], 32), _ONE - 32)
-
-
-@helper
 def _reset(model: I64) -> None:
     for i in range(CONTEXTS):
-        model[0, i] = _ONE // 2
+        model[0, i] = HALF
         model[1, i] = _FIRST_RATE
-
-
-@helper
-def _carry(out: U8, at: int) -> None:
-    """Add one to the number before a position."""
-    k = at - 1
-    while out[k] == 255:
-        out[k] = 0
-        k -= 1
-    out[k] += np.uint8(1)
-
-
-@helper
-def _put(out: U8, state: I64, model: I64, context: int, bit: int) -> None:
-    """Code a decision. state: low (below 2^32), range, bytes written."""
-    bound = (state[1] >> 12) * model[0, context]
-    if bit == 0:
-        state[1] = bound
-    else:
-        state[0] += bound
-        state[1] -= bound
-        if state[0] > _RANGE:
-            state[0] &= _RANGE
-            _carry(out, state[2])
-    _adapt(model, context, bit)
-    while state[1] < _TOP:
-        out[state[2]] = np.uint8(state[0] >> 24)
-        state[2] += 1
-        state[0] = (state[0] << 8) & _RANGE
-        state[1] <<= 8
 
 
 @njit
@@ -117,65 +72,24 @@ def pack_cells(cells: I8, model: I64, out: U8) -> int:
     The code ends before its last zero bytes: the decoder goes on with zeros.
     """
     _reset(model)
-    state = np.zeros(3, np.int64)
-    state[1] = _RANGE
+    state = begin_writing()
     for row in range(SIDE):
         for column in range(SIDE):
             value = int(cells[row, column])
             context = _context(cells, row, column)
-            _put(out, state, model, context, 1 if value >= 0 else 0)
+            put(out, state, model, context, 1 if value >= 0 else 0)
             if value < 0:
                 continue
-            _put(out, state, model, 81 + context, 1 if value > 0 else 0)
+            put(out, state, model, 81 + context, 1 if value > 0 else 0)
             if value == 0:
                 continue
             base = 162 + 8 * _near_mask(cells, row, column)
             node = 1
             for k in range(2, -1, -1):
                 bit = (value >> k) & 1
-                _put(out, state, model, base + node, bit)
+                put(out, state, model, base + node, bit)
                 node = 2 * node + bit
-    # The number within the last range that has most zero bits at its end.
-    low, high = state[0], state[0] + state[1] - 1
-    shift = 32
-    while shift > 0 and ((high >> shift) << shift) < low:
-        shift -= 1
-    end = (high >> shift) << shift
-    at = int(state[2])
-    if end > _RANGE:
-        end &= _RANGE
-        _carry(out, at)
-    for k in range(4):
-        out[at + k] = np.uint8((end >> (24 - 8 * k)) & 255)
-    at += 4
-    while at > 0 and out[at - 1] == 0:
-        at -= 1
-    return at
-
-
-@helper
-def _next_byte(data: U8, state: I64) -> int:
-    k = state[2]
-    state[2] += 1
-    return int(data[k]) if k < data.size else 0
-
-
-@helper
-def _get(data: U8, state: I64, model: I64, context: int) -> int:
-    """Read a decision. state: number less low, range, bytes read."""
-    bound = (state[1] >> 12) * model[0, context]
-    if state[0] < bound:
-        bit = 0
-        state[1] = bound
-    else:
-        bit = 1
-        state[0] -= bound
-        state[1] -= bound
-    _adapt(model, context, bit)
-    while state[1] < _TOP:
-        state[0] = (state[0] << 8) | _next_byte(data, state)
-        state[1] <<= 8
-    return bit
+    return finish(out, state)
 
 
 @njit
@@ -185,23 +99,20 @@ def unpack_cells(data: U8, model: I64, cells: I8) -> bool:
     Takes any bytes; whether they are the code of the cells, only `pack_cells` tells.
     """
     _reset(model)
-    state = np.zeros(3, np.int64)
-    state[1] = _RANGE
-    for _ in range(4):
-        state[0] = (state[0] << 8) | _next_byte(data, state)
+    state = begin_reading(data)
     for row in range(SIDE):
         for column in range(SIDE):
             context = _context(cells, row, column)
-            if _get(data, state, model, context) == 0:
+            if get(data, state, model, context) == 0:
                 cells[row, column] = -1
                 continue
-            if _get(data, state, model, 81 + context) == 0:
+            if get(data, state, model, 81 + context) == 0:
                 cells[row, column] = 0
                 continue
             base = 162 + 8 * _near_mask(cells, row, column)
             node = 1
             for _ in range(3):
-                node = 2 * node + _get(data, state, model, base + node)
+                node = 2 * node + get(data, state, model, base + node)
             if node == 8:
                 return False
             cells[row, column] = node - 8

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
+from kiteline_codec.coding import scan_kernels as kernels
 from kiteline_codec.coding.packing import Reader, WireError, Writer, unzigzag, zigzag
 from kiteline_codec.schema.poses import read_coarse_pose, write_coarse_pose
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
@@ -19,12 +20,13 @@ from kiteline_core.ids import MAX_KEYPOINTS, KeyframeId
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_AZIMUTH_STEPS = 1 << 16  # codes in 1 rad: 15 microrad, of the first column
-_STEP_STEPS = 1 << 20  # codes in 1 rad: over 128 columns an error of 61 microrad
+_AZIMUTH_STEPS = 1 << 12  # codes in 1 rad, of the first column: an error of 0.12 mrad
+_STEP_STEPS = 1 << 18  # codes in 1 rad: over 128 columns an error of 0.25 mrad
 _MAX_AZIMUTH = 4 * _AZIMUTH_STEPS
 _HEIGHT_STEPS = 256  # codes in 1 m
 _MAX_HEIGHT = 1 << 18  # 1024 m
 _COARSE = 8  # range codes in a step of where free ground begins, which is rounded up: it depends on the image's border
+_MOST_FROM = (quantise.RANGE_CODES - 1) // _COARSE
 _LABELS = 3  # unknown, ground, obstacle
 _LEVEL_UP_C = np.array([0.0, -1.0, 0.0])  # against gravity in a level camera
 
@@ -37,6 +39,7 @@ class KeyframeScan(Record):
     labels: (m,) uint8 of the keyframe's first m keypoints: 0 unknown, 1 ground, 2 obstacle. part: 0 the keyframe's own
     image, 1 and more: of later frames. T_k_s: (4,4) of the camera of a later frame in that of the keyframe, as the
     agent tracked it; None in part 0. It is rounded in a level frame: as decoded, its scan has an up_c of (0, -1, 0).
+    Scans of later frames go without clear_m.
     """
 
     KIND = 11
@@ -78,12 +81,20 @@ class KeyframeScan(Record):
         out.varint(n)
         if not np.array_equal(np.isfinite(scan.obstacle_m), scan.bands > 0):
             raise ValueError("an obstacle reaches into at least one height band, and only an obstacle does")
-        obstacle = np.where(scan.bands > 0, quantise.range_codes(np.where(scan.bands > 0, scan.obstacle_m, 0.0)), 0)
-        free_from, free, clear = (quantise.range_codes(r) for r in (scan.free_from_m, scan.free_m, scan.clear_m))
-        free_from = -(-free_from // _COARSE)
-        out.residual_columns(_predicted(np.stack([obstacle, free, free_from, clear]), scan.bands.astype(np.int64)))
         out.varint(len(self.labels))
-        out.residual_columns(_LABELS - 1 - self.labels.astype(np.int64)[None])
+        out.raw(_packed(self._columns(), self.labels))
+
+    def _columns(self) -> I64:
+        """Codes of ranges, and bands, as rows."""
+        scan = self.scan
+        obstacle = np.where(
+            scan.bands > 0, np.maximum(quantise.range_codes(np.where(scan.bands > 0, scan.obstacle_m, 0.0)), 1), 0
+        )
+        free_from, free, clear = (quantise.range_codes(r) for r in (scan.free_from_m, scan.free_m, scan.clear_m))
+        if self.part:
+            clear = np.zeros_like(clear)
+        free_from = np.minimum(-(-free_from // _COARSE), _MOST_FROM)
+        return np.stack([obstacle, free, free_from, clear, scan.bands.astype(np.int64)])
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
@@ -93,20 +104,30 @@ class KeyframeScan(Record):
         n = source.varint(MAX_COLUMNS)
         if not step or not n:
             raise WireError("a scan has columns, and a step between them")
-        obstacle, free, free_from, clear, bands = _ranges(source.residual_columns(5, n))
+        m = source.varint(MAX_KEYPOINTS)
+        columns, labels = np.zeros((5, n), np.int64), np.zeros(m, np.uint8)
+        data = source.raw(source.left)
+        if len(data) > kernels.MAX_CODE:
+            raise WireError("the columns of a scan are expected")
+        if (
+            kernels.code_scan(columns, labels, quantise.RANGE_CODES - 1, True, np.frombuffer(bytearray(data), np.uint8))
+            < 0
+        ):
+            raise WireError("a range is out of range")
+        obstacle, free, free_from, clear, bands = columns
         free_from = free_from * _COARSE
         if free_from.max() >= quantise.RANGE_CODES:
             raise WireError("free ground begins too far away")
+        if not np.array_equal(obstacle > 0, bands > 0):
+            raise WireError("an obstacle reaches into at least one height band, and only an obstacle does")
+        if (key.part and clear.any()) or _packed(columns, labels) != data:
+            raise WireError("a scan in its shortest code is expected")
         scan = ColumnScan(
             up_c, first / _AZIMUTH_STEPS, step / _STEP_STEPS, quantise.ranges(free_from), quantise.ranges(free),
             np.where(obstacle > 0, quantise.ranges(obstacle), np.inf), bands.astype(np.uint8), quantise.ranges(clear),
             unzigzag(height - 1) / _HEIGHT_STEPS if height else float("nan"),
         )  # fmt: skip
-        m = source.varint(MAX_KEYPOINTS)
-        labels = _LABELS - 1 - source.residual_columns(1, m)[0]
-        if m and (labels.min() < 0 or labels.max() >= _LABELS):
-            raise WireError("labels are 0, 1 or 2")
-        return cls(KeyframeId(key.id), scan, labels.astype(np.uint8), key.part, T_k_s)
+        return cls(KeyframeId(key.id), scan, labels, key.part, T_k_s)
 
 
 def _read_up(source: Reader) -> F64:
@@ -124,48 +145,7 @@ def _levelled(T_k_s: F64, up_c: F64) -> F64:
     return se3.from_rt(T_k_s[:3, :3] @ level_rotation(up_c) @ level_rotation(_LEVEL_UP_C).T, T_k_s[:3, 3])
 
 
-def _predicted(ranges: I64, bands: I64) -> I64:
-    """Columns (5, n) to code: range codes (4, n) above 0 as 1 + zigzag of their difference from a guess; bands (n,)."""
-    out = np.zeros((5, ranges.shape[1]), np.int64)
-    last = [0, 0, 0, 0]
-    for i in range(ranges.shape[1]):
-        row = ranges[:, i].tolist()
-        for j in range(4):
-            if row[j]:
-                out[j, i] = 1 + zigzag(row[j] - _guess(j, row, last))
-                last[j] = row[j]
-    out[4] = bands
-    return out
-
-
-def _ranges(codes: I64) -> I64:
-    """The inverse of `_predicted`. Raises WireError."""
-    if codes.min() < 0 or codes.max() > 4 * quantise.RANGE_CODES or codes[4].max() > 255:
-        raise WireError("a range or band is out of range")
-    out = np.zeros_like(codes)
-    last = [0, 0, 0, 0]
-    for i in range(codes.shape[1]):
-        row = [0, 0, 0, 0]
-        for j in range(4):
-            code = int(codes[j, i])
-            if code:
-                row[j] = last[j] = unzigzag(code - 1) + _guess(j, row, last)
-                if not 0 < row[j] < quantise.RANGE_CODES:
-                    raise WireError(f"found the range code {row[j]}, expected 1..{quantise.RANGE_CODES - 1}")
-        out[:4, i] = row
-    out[4] = codes[4]
-    if not np.array_equal(out[0] > 0, out[4] > 0):
-        raise WireError("an obstacle reaches into at least one height band, and only an obstacle does")
-    return out
-
-
-def _guess(j: int, row: list[int], last: list[int]) -> int:
-    """Guess of range j of a column by the ranges before it, else by that of the columns before.
-
-    Ground is seen up to the obstacle, and the way is clear up to it or to the end of the ground.
-    """
-    if j == 1:
-        return row[0] or last[1]
-    if j == 3:
-        return row[0] or row[1] or last[3]
-    return last[j]
+def _packed(columns: I64, labels: NDArray[np.uint8]) -> bytes:
+    data = np.empty(kernels.MAX_CODE, np.uint8)
+    size = kernels.code_scan(columns.copy(), labels.copy(), quantise.RANGE_CODES - 1, False, data)
+    return data[:size].tobytes()
