@@ -70,11 +70,10 @@ def test_an_agent_holds_the_tiles_around_it_as_the_base_has_them() -> None:
     flight.wait(20.0)
     grid = flight.updates.grid
     near = [p for p in grid.places if np.hypot((p.column + 0.5) * 3.2 - 5.5, (p.row + 0.5) * 3.2) < 12.0]
-    assert len(near) > 8
-    for place in near:
-        cells, known = grid.cells(place)
-        if known and place.storey == 0:
-            assert np.array_equal(flight.tiles[place.column, place.row, 0].cells, cells)
+    held = [(place, cells) for place in near for cells, known in [grid.cells(place)] if known and place.storey == 0]
+    assert len(held) > 8
+    for place, cells in held:
+        assert np.array_equal(flight.tiles[place.column, place.row, 0].cells, cells)
     assert settled(flight.base)[1] and settled(flight.agent)[1], "digests are equal"
 
 
