@@ -54,7 +54,7 @@ def test_governed_flight_keeps_its_budget_and_accounts_for_every_frame(flight: R
     for governor in (True, False):
         found = fly_limited(flight, 0.4 * free.load, governor=governor, real=False)
         assert found.tracked + found.lost + found.dropped == found.frames == len(flight.items)
-        assert found.load < free.load
+        assert found.load < 0.5 * free.load
     assert fly_limited(flight, 0.4 * free.load, governor=True, real=False) == fly_limited(
         flight, 0.4 * free.load, governor=True, real=False
     )
@@ -74,12 +74,20 @@ def test_a_flight_backward_turns_the_other_way(data_dir: Path) -> None:
     assert abs(np.linalg.norm(force.mean(axis=0)) - 9.8) < 0.3
 
 
-def test_calm_part_begins_and_ends_at_rest(data_dir: Path) -> None:
+def speeds(flight: Recording) -> np.ndarray:
+    """Motion in m from frame to frame."""
+    assert flight.truth is not None
+    stamps = np.array([item.frame.t_ns for item in flight.items], np.float64)
+    positions = [np.interp(stamps, flight.truth.t_ns, flight.truth.T_w_b[:, i, 3]) for i in range(3)]
+    return np.asarray(np.linalg.norm(np.diff(positions, axis=1), axis=0))
+
+
+def test_calm_part_begins_and_ends_where_the_vehicle_is_slow(data_dir: Path) -> None:
     flight = load(str(data_dir / "room_flight.mcap"), frames=120)
     calm = flight.between_rests()
-    assert 60 <= len(calm.items) <= 120
-    assert calm.items[0].frame.t_ns >= flight.items[0].frame.t_ns
-    assert calm.items[-1].frame.t_ns <= flight.items[-1].frame.t_ns
+    assert 60 <= len(calm.items) < 120
+    whole, part = speeds(flight), speeds(calm)
+    assert part[0] < 0.6 * whole[0] and part[-1] < 0.6 * whole[-1]
 
 
 def test_saved_clip_is_read_again(flight: Recording, tmp_path: Path) -> None:

@@ -165,4 +165,4 @@ def test_a_store_s_rig_file_says_how_well_an_offset_is_known() -> None:
         if calibrated:
             mapper.map.disparity_calibrated.add(AgentId(0))
         text = exported(KnownCameras.of_base(mapper), None, "kiteline")["rig.toml"]
-        assert f"disparity_sigma_px = {sigma_px}" in text
+        assert f"disparity_sigma_px = {sigma_px}\n" in text

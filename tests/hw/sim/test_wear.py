@@ -89,8 +89,13 @@ def test_vibration_has_its_deviation_in_flight_and_less_at_rest() -> None:
 
 
 def test_saturation_clips_and_gaps_lose_samples() -> None:
-    _, clipped = samples(8.0, "range", "vibration")
-    assert np.abs(clipped.accel).max() <= 19.6 and np.abs(clipped.gyro).max() <= 4.36
+    source, shaken = samples(8.0, "range", "vibration")
+    assert (source.worn.imu.accel_range, source.worn.imu.gyro_range) == (19.6, 4.36)
+    assert np.abs(shaken.accel).max() > 12.0 and np.abs(shaken.gyro).max() > 0.4
+    narrow = replace(source.worn.imu, accel_range=12.0, gyro_range=0.4)
+    calibration = ImuCalibration(rate_hz=200.0)
+    clipped = imu.measure(source.path, shaken.t_ns, START_NS, calibration, 0, wear=narrow)
+    assert np.abs(clipped.accel).max() == 12.0 and np.abs(clipped.gyro).max() == 0.4
     _, whole = samples(40.0, "noise")
     _, holed = samples(40.0, "noise", "gaps")
     lost = 1.0 - len(holed.t_ns) / len(whole.t_ns)
