@@ -125,7 +125,7 @@ class PoseConfig:
 class KeyframeConfig:
     """When a frame becomes a keyframe; see keyframes.policy.RULES."""
 
-    max_gap_s: float = 3.0  # s: the base hears at least so often from a vehicle at rest
+    max_gap_s: float = 3.0  # s: longest time between two keyframes, at rest too
     min_share: float = 0.65  # inliers relative to those of the reference keyframe
     min_inliers: int = 90  # inliers of a comfortable track
     min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
@@ -341,7 +341,7 @@ class GovernorConfig:
 
 @dataclass(frozen=True, slots=True)
 class LogConfig:
-    """Images in the log; those of a source that delivers them encoded are logged as they are."""
+    """Images in the log. Images that the source delivers encoded are logged as they come."""
 
     every: int = 1  # frames; of so many, the images of one are logged, 0: none. Only a log with all can be replayed
     compressed: bool = True  # PNG of half an image's size for some 2.7 ms of a fast core, else stored for 0.25 ms

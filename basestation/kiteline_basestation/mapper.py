@@ -182,7 +182,7 @@ class Mapper:
     def restore(
         self, agent: AgentId, received: tuple[Record, ...], own: tuple[Record, ...], now_ns: int
     ) -> None:  # fmt: skip
-        """Take in the values that an earlier process had received from an agent, and those it had written for it."""
+        """Restore an agent's values: `received` by an earlier base process, and its `own`, written for the agent."""
         self._intake.take(agent, received, now_ns)
         self._intake.last_contact_ns.pop(agent, None)  # it was in contact with the earlier process
         for record in own:

@@ -24,7 +24,7 @@ def test_a_silence_is_told_once_and_its_end_too() -> None:
             told[k] = line
     assert told == {
         159: "imu: silent for 3.0 s, the images alone carry the pose",  # the last samples came at frame 99
-        200: "imu: heard again",
+        200: "imu: samples again",
     }
 
 

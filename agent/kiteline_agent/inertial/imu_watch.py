@@ -18,7 +18,7 @@ class ImuWatch:
         """Process a frame; returns the events for the log."""
         if imu is not None and len(imu.t_ns):
             was_silent, self._silent, self._last_ns = self._silent, False, t_ns
-            return ["imu: heard again"] if was_silent else []
+            return ["imu: samples again"] if was_silent else []
         if self._last_ns is None:
             self._last_ns = t_ns
         if self._silent or t_ns - self._last_ns < self._silent_ns:

@@ -86,7 +86,7 @@ class CornerTracks:
         self.keyframes = [k for k in self.keyframes if k.t_ns >= t_ns]
 
     def flow_px(self) -> float:
-        """Median motion of the corners that the newest keyframe shares with the oldest one that has half of them."""
+        """Median motion of corners since the oldest keyframe that has half of the newest one's; inf without one."""
         newest = self.keyframes[-1]
         for keyframe in self.keyframes[:-1]:
             _, a, b = np.intersect1d(keyframe.ids, newest.ids, assume_unique=True, return_indices=True)

@@ -40,7 +40,7 @@ class StepLog(Protocol):
 def write_step(
     log: StepLog, step_input: StepInput, output: StepOutput, now_ns: int, log_ns: int, with_images: bool = True
 ) -> None:
-    """Write one step. now_ns: the time that was handed to it. log_ns: the time under which it is logged.
+    """Write one step. now_ns: as passed to the step. log_ns: log time of the messages.
 
     with_images: else the frame's images are left out, and the log cannot be replayed.
     """

@@ -278,7 +278,7 @@ class MapMerger:
         return NOTHING if found is None else self._close(found, keyframe)
 
     def _close(self, closure: LoopClosure, keyframe: KeyframeId) -> MergeResult:
-        """Take an accepted closure in: merge its maps if they are two, and request the corrections that it needs."""
+        """Apply an accepted closure: merge the maps if there are two, and request a pose graph or a full bundle."""
         result = NOTHING
         if closure.newer == closure.older:
             self.loops += self._is_return(keyframe)

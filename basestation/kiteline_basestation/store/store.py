@@ -65,7 +65,7 @@ class Batch:
 
 
 def batch_of(saved: SavedMap, held: SavedMap) -> Batch:
-    """The changes that turn a store that holds `held` into one that holds `saved`."""
+    """The changes from the stored map `held` to the map `saved`."""
     out = Batch()
     for agent in sorted(saved.agents.keys() | held.agents.keys()):
         codes, before = (side.agents.get(agent, SavedValues({}, {})) for side in (saved, held))

@@ -74,7 +74,7 @@ class PacketsInFlight:
     def acknowledge(
         self, last: int, missing: int, arrived: Callable[[Key, int, int, int], None]
     ) -> Acknowledged | None:
-        """Take in that the peer has packet `last`, and those of the 64 before it whose bit in `missing` is not set.
+        """Process an acknowledgement: of packet `last`, and of those of the 64 before it whose bit in `missing` is 0.
 
         arrived: called for each value carried. Returns None if no packet was in flight that is acknowledged now.
         """

@@ -99,7 +99,7 @@ class Inbox:
         return values <= max_values and assemblies <= max_assemblies
 
     def raise_watermark(self, version: int) -> None:
-        """Take in that all versions up to this one have arrived: removals up to it are forgotten."""
+        """Note that all versions up to `version` have arrived, and drop the tombstones up to it."""
         if version <= self.watermark:
             return
         self.watermark = version

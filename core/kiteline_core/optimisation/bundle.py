@@ -112,7 +112,7 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     solver = _Solver(problem, config) if problem.border is None else _BorderSolver(problem, problem.border, config)
     squared = solver.squared_residuals()
     active = (squared < kernels.BEHIND).astype(np.uint8)
-    solver.let_priors_yield(active)
+    solver.relax_priors(active)
     cost = initial = solver.robust_cost(active)
     has_disparity = problem.measured[:, 2] >= 0
     limit = np.where(has_disparity, config.chi2_stereo, config.chi2_mono)
@@ -209,8 +209,8 @@ class _Solver:
         """Offsets (g,t) and their covariance; empty without a border."""
         return np.empty((0, 0)), np.empty((0, 0))
 
-    def let_priors_yield(self, active: U8) -> None:
-        """Nothing without a border."""
+    def relax_priors(self, active: U8) -> None:
+        """Do nothing: only unknowns of a border have priors."""
 
     def _linearise(self, active: U8) -> float:
         return float(
@@ -284,9 +284,10 @@ class _BorderSolver(_Solver):
         inverse = np.linalg.inv(factor)
         return self._c, inverse @ inverse.T
 
-    def let_priors_yield(self, active: U8) -> None:
-        """Widen the priors of groups that the data contradict, and let those of terms flatten that the data determine,
-        each beside all other unknowns.
+    def relax_priors(self, active: U8) -> None:
+        """Widen the priors of groups that contradict the data, and flatten those of terms that the data determine.
+
+        Each is judged with all other unknowns marginalised.
         """
         if np.isinf(self._border.tail) and self._border.contradicts is None:
             return

@@ -160,7 +160,7 @@ class ControllerSession:
             self._axes_hold |= not armed
         elif watch.axes_fit:  # not if nothing is known of them: the controller may have restarted
             self._axes_hold = False
-        watch.axes(held=self._axes_hold)
+        watch.report_axes(held=self._axes_hold)
         if self._axes_hold:
             self.counters.held += 1
             watch.compare(pose)
@@ -172,7 +172,7 @@ class ControllerSession:
             return []
         self._next_watch_ns = now_ns + self.config.watch_ns
         if self._start is not None:
-            self._watch.heading(held=self._start.holds(now_ns))
+            self._watch.report_heading(held=self._start.holds(now_ns))
         codec = self.codec
         link = LinkState(
             self._received,

@@ -71,7 +71,7 @@ class StartFrame:
         return self._T_s_o is None and self._first_ns is not None and now_ns - self._first_ns > self.config.said_ns
 
     def requests(self, m: Heartbeat, now_ns: int) -> Sequence[MessageInterval]:
-        """The controller is there: the requests for what it knows of its own pose."""
+        """The requests for messages about the controller's own pose, after its heartbeat `m`."""
         c = self.config
         self._autopilot = m
         if self.known:

@@ -137,7 +137,7 @@ def select_told_rig(
     *,
     mono: bool,
 ) -> Selection:
-    """The topics of a calibration that was told: those that it names, else raw images by name, left before right.
+    """The topics for a calibration from a file: those that it names, else raw images by name, left before right.
 
     size_of: height and width of a channel's images. Raises SourceError.
     """

@@ -163,7 +163,7 @@ def next_number(path: Path, least: int = 1) -> int:
 
 
 def kept_folder(name: str, folder: Path) -> Path:
-    """Where `name` keeps what must outlive its logs in `folder`: a service in its state folder, else there too."""
+    """The folder for files of `name` that outlive its logs: a service's state folder, else the logs' `folder`."""
     return state_folder() / name if os.environ.get("STATE_DIRECTORY") else folder
 
 

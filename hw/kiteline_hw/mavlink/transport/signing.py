@@ -35,7 +35,7 @@ def read_key(path: Path) -> bytes:
 
 
 class StampFile:
-    """Keeps a stamp on disk that is later than any in use, so that one after a loss of power is later still."""
+    """Keeps on disk a stamp later than all that were used, so that stamps increase even over a loss of power."""
 
     def __init__(self, path: Path, wall_s: Callable[[], float] = time.time) -> None:
         self._path = path
@@ -47,7 +47,7 @@ class StampFile:
         self.reserve(self.first)
 
     def reserve(self, stamp: int) -> None:
-        """Store a later stamp than this one, if the stored one is not. Raises LinkError if it cannot be written."""
+        """Store a stamp ahead of `stamp`, unless the stored one is ahead of it already. Raises LinkError."""
         if stamp < self._reserved - _AHEAD // 2:
             return
         part = self._path.with_name(f".{self._path.name}.part")
@@ -64,7 +64,7 @@ class StampFile:
 
 
 class SigningMavlink(common.MAVLink):  # type: ignore[misc]  # pymavlink's classes are untyped
-    """pymavlink's parser that verifies a signature before it believes its stamp: a forged one locks nobody out."""
+    """pymavlink's parser, which verifies a signature before it takes over the stamp: a forged stamp has no effect."""
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
         key: Any = self.signing.secret_key

@@ -98,7 +98,7 @@ class MavlinkTunnelLink(TunnelQueue, Closing):
 
 
 class TunnelHub:
-    """A LinkHub with one agent at the other end, which is there once anything of it came."""
+    """A LinkHub with one agent at the other end, known from its first packet on."""
 
     def __init__(self, link: MavlinkTunnelLink, agent: int) -> None:
         self._link, self._agent = link, agent

@@ -96,8 +96,8 @@ class ControllerWatch:
         """True if the axes in use fit the flight controller's attitude, but for a tilt."""
         return self._log.state(AXES) in ("good", "tilt")
 
-    def axes(self, *, held: bool) -> None:
-        """Say that poses are held back because the axes are wrong, and that they no longer are."""
+    def report_axes(self, *, held: bool) -> None:
+        """Report that poses are held back because the axes are wrong, or that they are sent again."""
         if held:
             self._log.say(
                 "held", True, Level.ERROR, "poses: held back, because --axes are wrong",
@@ -107,8 +107,8 @@ class ControllerWatch:
         elif self._log.state("held"):
             self._log.say("held", False, Level.INFO, "poses: the axes fit, they are sent", "kiteline: axes fit")
 
-    def heading(self, *, held: bool) -> None:
-        """Say that poses are held back because the heading is not known, and that it is."""
+    def report_heading(self, *, held: bool) -> None:
+        """Report that poses are held back until the heading is known, or that it is known now."""
         if held:
             self._log.say(
                 "heading", True, Level.WARNING,

@@ -84,7 +84,7 @@ def names(autopilot: int) -> list[str]:
 
 
 def compare(autopilot: int, values: Mapping[str, float]) -> list[Finding]:
-    """What is wrong with the parameters that were read, worst first; one finding that all is well if nothing is."""
+    """Findings about wrong parameters, worst first; a single one that says so if all are right."""
     rules = [rule for rule in RULES.get(autopilot, ()) if rule.name in values]
     wrong = [
         Finding(

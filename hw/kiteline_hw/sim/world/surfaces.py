@@ -26,7 +26,7 @@ def with_difficult_surfaces(world: World, seed: int, bits: int, repeated: float,
 
 
 def _joined(pool: TexturePool, other: TexturePool) -> TexturePool:
-    """The pool with the textures of another one behind its own, without that one's detail texture."""
+    """A pool with the textures of both, those of `other` last, without the detail texture of `other`."""
     table = other.table[1:].copy()
     table[:, 1 : 1 + LEVELS] += len(pool.atlas)
     atlas = np.concatenate([pool.atlas, other.atlas])
