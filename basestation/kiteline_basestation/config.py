@@ -326,6 +326,7 @@ class GridConfig:
     max_position_m: float = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
     max_reach_m: float = 100.0  # m; scans that reach farther are not drawn: only a faulty scale makes them
     drawn_per_step: int = 16  # scans that one step draws, half a ms each: a loop's corrections wait for later steps
+    scanless_keyframes: int = 8  # of a stereo agent without a scan, after which its landmarks are drawn: they tell less
     sparse_lag: int = (
         5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then
     )

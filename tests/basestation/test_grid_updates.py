@@ -242,6 +242,22 @@ def test_landmarks_draw_the_grid_until_scans_come(make_flight: MakeFlight) -> No
     assert_equal(mapper.grid, from_scratch(mapper, scans(flight, 5)))
 
 
+def test_landmarks_wait_until_a_stereo_agent_would_have_sent_a_scan(make_flight: MakeFlight) -> None:
+    """Scans tell more: tiles of landmarks, once sent, told walls half a metre too near until scans replaced them."""
+    flight = make_flight(keyframes=12, turns=0.6, points=1500, scene=floor_and_walls())
+    few = BaseConfig().grid.scanless_keyframes
+    mapper = Mapper()
+    feed(mapper, flight, flight.records[:few])
+    assert len(mapper.grid) == 0
+    mapper = Mapper()
+    feed(mapper, flight, flight.records)
+    assert len(mapper.grid) > few
+    mapper = Mapper()
+    one_eye = replace(flight.camera, stereo=False)
+    mapper.step(MapperInput(((flight.agent, (CameraIntrinsics(flight.agent, one_eye),)),), ()), 0)
+    assert mapper.grid_updates._is_scanless(flight.agent)
+
+
 def test_labels_of_the_agent_go_by_keypoint(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=6, turns=0.2)
     mapper = Mapper(BaseConfig())

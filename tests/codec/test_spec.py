@@ -302,7 +302,7 @@ def read_code(kind: int, id_: int, data: bytes, part: int = 0) -> dict[str, Any]
         rows, out["labels"] = scan(s.raw(len(data) - s.at), n, m)
         out["obstacle_m"] = [r or float("inf") for r in ranges(rows["obstacle"])]
         out["free_m"], out["clear_m"], out["bands"] = ranges(rows["free"]), ranges(rows["clear"]), rows["bands"]
-        out["free_from_m"] = ranges([8 * c for c in rows["from"]])
+        out["free_from_m"] = ranges([2 * c for c in rows["from"]])
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())

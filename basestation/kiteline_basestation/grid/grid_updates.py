@@ -18,7 +18,7 @@ from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -94,7 +94,9 @@ class GridUpdates:
     def update(self) -> None:
         """Draw as many keyframes as one step has time for, the oldest first."""
         self._gather_moved()
-        for keyframe in sorted(self._unmade)[: self._config.made_per_step]:
+        scanless = {a for a in map(agent_of_keyframe, self._unmade) if self._is_scanless(a)}
+        ready = [keyframe for keyframe in sorted(self._unmade) if agent_of_keyframe(keyframe) in scanless]
+        for keyframe in ready[: self._config.made_per_step]:
             del self._unmade[keyframe]
             self._make(keyframe)
         drawn = 0
@@ -103,6 +105,12 @@ class GridUpdates:
                 break
             del self._due[keyframe]
             drawn += self._draw(self.grid, keyframe)
+
+    def _is_scanless(self, agent: AgentId) -> bool:
+        """True if an agent's landmarks are to be drawn: it has one eye, or would have sent a scan by now."""
+        camera = self._map.cameras.get(agent)
+        own = (len(keyframes) for submap, keyframes in self._map.submaps.items() if agent_of_submap(submap) == agent)
+        return camera is None or not camera.stereo or sum(own) > self._config.scanless_keyframes
 
     @property
     def behind(self) -> bool:

@@ -16,7 +16,7 @@ def some_columns(seed: int, n: int, smooth: int) -> NDArray[np.int64]:
     """Rows (5,n): ranges that walk by up to `smooth`, none in places, and masks that hold for a while."""
     rng = np.random.default_rng(seed)
     walk = np.clip(np.cumsum(rng.integers(-smooth, smooth + 1, (4, n)), 1) + rng.integers(1, MOST, (4, 1)), 1, MOST)
-    walk[FREE_FROM] = np.clip(walk[FREE_FROM], 0, 111)
+    walk[FREE_FROM] = np.clip(walk[FREE_FROM], 0, 447)
     out = np.vstack([walk * (rng.random((4, n)) < 0.8), np.repeat(rng.integers(0, 256, n // 4 + 1), 4)[:n]])
     out[OBSTACLE] = np.where(out[BANDS] > 0, walk[OBSTACLE], 0)
     out[FREE] = np.where((rng.random(n) < 0.5) & (out[OBSTACLE] > 0), out[OBSTACLE], out[FREE])
@@ -47,7 +47,7 @@ def test_the_worst_scan_fits() -> None:
     """Ranges that jump from end to end, and masks and labels that always change."""
     n, m = 128, 2048
     jump = np.where(np.arange(n) % 2, 1, MOST)
-    columns = np.stack([jump, jump[::-1], np.where(jump > 1, 111, 0), np.where(jump > 1, 1, 700), 1 + 254 * (jump > 1)])
+    columns = np.stack([jump, jump[::-1], np.where(jump > 1, 447, 0), np.where(jump > 1, 1, 700), 1 + 254 * (jump > 1)])
     labels = (2 * np.arange(m) % 3).astype(np.uint8)
     data = np.zeros(MAX_CODE, np.uint8)
     assert 0 < code_scan(columns.astype(np.int64), labels, MOST, False, data) < MAX_CODE // 4

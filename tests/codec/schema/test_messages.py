@@ -287,7 +287,7 @@ def test_a_scan_is_rounded_by_no_more_than_the_specification_says() -> None:
             assert np.array_equal(told > 0.0, held > 0.0)
             assert np.array_equal(np.isinf(told), np.isinf(held))
             near = (told < 250.0) & (told > 0.02)
-            up = 1.0 if name != "free_from_m" else 16.0  # where free ground begins is rounded up
+            up = 1.0 if name != "free_from_m" else 4.0  # where free ground begins is rounded up
             assert np.all(np.abs(held[near] - told[near]) <= (told[near] + 2.0) / 256.0 * up)
         assert np.all(got.free_from_m >= scan.free_from_m - (scan.free_from_m + 2.0) / 256.0)
 
@@ -322,7 +322,7 @@ def test_only_scans_of_later_frames_have_a_pose() -> None:
 def test_a_scan_of_a_room_is_short() -> None:
     """Walls and the floor before them, with noise of 2 cm: at most 170 bytes with the labels of 150 keypoints.
 
-    40 of them are the labels, which are chance here; between keyframes a scan has 110 bytes.
+    40 of them are the labels, which are chance here; between keyframes a scan has 115 bytes.
     """
     rng = np.random.default_rng(3)
     azimuth = np.linspace(-0.7, 0.7, 72)
@@ -337,7 +337,7 @@ def test_a_scan_of_a_room_is_short() -> None:
     labels = rng.integers(0, 3, 150).astype(np.uint8)
     assert len(messages.encode(KeyframeScan(KeyframeId(5), scan, labels))) <= 170
     later = KeyframeScan(KeyframeId(5), scan, labels[:0], 1, se3.exp(np.full(6, 0.1)))
-    assert len(messages.encode(later)) <= 110
+    assert len(messages.encode(later)) <= 115
 
 
 def a_keyframe() -> tuple[KeyframeHeader, NewLandmarks, Observations]:

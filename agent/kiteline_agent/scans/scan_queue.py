@@ -1,0 +1,45 @@
+"""Scans that wait for room on the link."""
+
+from __future__ import annotations
+
+from kiteline_codec.channel import RecordChannel
+from kiteline_codec.schema import Key, KeyframeScan, messages
+
+_UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
+_WAITING = 1024  # scans kept while the link has no room, as codes: 0.3 MB
+
+
+class ScanQueue:
+    """Shares scans, newest first, while those before arrive: they never fill a link that is short of bytes.
+
+    When too many wait, the oldest between keyframes go first, then the oldest of keyframes.
+    """
+
+    def __init__(self, channel: RecordChannel) -> None:
+        self._channel = channel
+        self._under_way: list[Key] = []
+        self._waiting: dict[Key, bytes] = {}  # codes, the newest at the end
+
+    def __len__(self) -> int:
+        """Number of waiting scans."""
+        return len(self._waiting)
+
+    def put(self, record: KeyframeScan) -> None:
+        """Share a scan, in place of one that waits under the same key."""
+        key = record.key()
+        self._waiting.pop(key, None)
+        self._waiting[key] = messages.encode(record)
+        if len(self._waiting) > _WAITING:
+            oldest = next((k for k in self._waiting if k.part), next(iter(self._waiting)))
+            del self._waiting[oldest]
+        self.share()
+
+    def share(self) -> None:
+        """Share what waits, as far as there is room."""
+        if not self._waiting:
+            return
+        self._under_way = [key for key in self._under_way if not self._channel.arrived(key)]
+        while self._waiting and len(self._under_way) < _UNDER_WAY:
+            key, code = self._waiting.popitem()
+            self._channel.put(messages.decode(key, code))
+            self._under_way.append(key)
