@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ScanConfig:
-    """When keyframes are scanned for ground and obstacles; `ground` says how."""
+    """When images are scanned for ground and obstacles; `ground` says how."""
 
     on: bool = True  # False: the agent makes no scans
     moved_m: float = 0.2  # m; motion since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
@@ -16,7 +16,6 @@ class ScanConfig:
         0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned
     )
     told_s: float = 1.0  # s; time between two lines of the log about the nearest obstacle
-    doubted: int = 6  # scans without the expected ground, after which another height is believed
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ def _warm_scans(rig: CameraRig) -> None:
     image = np.zeros((view.height, view.width), np.uint8)
     up_c = np.array([0.0, -1.0, 0.0])
     scan = segmenter.segment(np.ascontiguousarray(disparity, np.float32), (image, image), up_c)
-    grid.add(Scanned(KeyframeScan(KeyframeId(0), scan, np.zeros(0, np.uint8)), np.eye(4)))
+    grid.add(Scanned(KeyframeScan(KeyframeId(0), scan, np.zeros(0, np.uint8)), np.eye(4), 1.0))
     grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
 

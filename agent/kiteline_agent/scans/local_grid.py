@@ -87,7 +87,7 @@ class LocalGrid:
         self._corner = np.zeros(2)  # of the grid, m
         self._z_m = 0.0  # at which scans are drawn
         self._number = 0
-        self._ground_m: float | None = None  # z of the ground of the newest scan that saw it
+        self._ground_m: float | None = None  # z of the ground; None while it is not known
 
     def add(self, scanned: Scanned) -> None:
         """Draw a new scan."""
@@ -99,8 +99,7 @@ class LocalGrid:
         ahead = self._R_g_o @ R_l_o.T[:, 0]
         drawn = _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan)
         self._scans.append(drawn)
-        if np.isfinite(scan.camera_height_m):
-            self._ground_m = drawn.z_m - scan.camera_height_m
+        self._ground_m = None if scanned.height_m is None else drawn.z_m - scanned.height_m
         if not self._moved_on(drawn.x_m, drawn.y_m, drawn.z_m):
             self._draw(drawn)
 

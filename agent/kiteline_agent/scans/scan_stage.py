@@ -1,9 +1,13 @@
-"""Makes column scans of keyframes, spread over frames: a stripe of the disparity image each, then ground and labels."""
+"""Makes column scans, spread over frames: a stripe of the disparity image each, then ground and labels.
+
+Keyframes are scanned, and frames between them in which something new is seen. The height of the ground is followed from
+scan to scan; those that saw another are held back or withdrawn.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,31 +24,40 @@ from kiteline_codec.schema import Key, KeyframeScan
 from kiteline_core.geometry import se3
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
+from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
 from kiteline_core.ground.segmentation import GroundSegmenter
-from kiteline_core.ids import KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _MOST_PARTS = 2  # of a scan in one frame, after a gap too
 _UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
-_RECENT = 16  # scans that are taken back if a lower ground is seen
 _WAITING = 256  # scans kept while the link has no room, 1 MB
 
 
 @dataclass(frozen=True, slots=True)
 class Scanned:
-    """A finished scan. T_o_c: (4,4) of its camera in the odometry frame, in which that does not move any more."""
+    """A finished scan. T_o_c: (4,4) of its camera in the odometry frame, in which that does not move any more.
+
+    height_m: of the camera above the ground; None while that is not known.
+    """
 
     record: KeyframeScan
     T_o_c: F64
+    height_m: float | None
 
 
 @dataclass(slots=True)
 class _Begun:
-    """A scan that is being made. uv: (n,2) keypoints to label. stripe: the next one; disparity: of a depth camera."""
+    """A scan that is being made. uv: (n,2) keypoints to label. stripe: the next one; disparity: of a depth camera.
+
+    part: 0 of the keyframe itself; else T_k_s (4,4) is the pose of a later camera in it.
+    """
 
     keyframe: KeyframeId
+    part: int
+    T_k_s: F64 | None
     up_c: F64
     T_o_c: F64
     uv: F64
@@ -70,11 +83,10 @@ class ScanStage:
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan
-        self._ground_m: float | None = None  # height of the ground along the vertical, in the odometry frame
-        self._without_ground = 0  # scans since ground was seen
+        self._ground: GroundHeight[KeyframeScan] = GroundHeight(ground)
+        self._part = 0  # of the keyframe's newest scan
         self._under_way: list[Key] = []
         self._waiting: deque[KeyframeScan] = deque(maxlen=_WAITING)
-        self._recent: deque[tuple[KeyframeScan, float]] = deque(maxlen=_RECENT)  # and the height of their ground
 
     def certain_m(self, sigma_m: float) -> float:
         """Distance up to which ranges of scans deviate by less than sigma_m."""
@@ -85,11 +97,14 @@ class ScanStage:
         self._share_waiting()
         if not ctx.config.scan.on:
             return None
+        of_keyframe = self._camera.reference.is_of(ctx.number)
+        if of_keyframe:
+            self._part = 0
         if self._begun is None:
-            if self._camera.reference.is_of(ctx.number) and self._shows_more():
-                self._begin(ctx)
+            if self._part < KeyframeScan.PARTS and self._shows_more():
+                self._begin(ctx, of_keyframe)
             return None
-        if self._camera.reference.is_of(ctx.number) or not self._governor.may_scan():
+        if of_keyframe or not self._governor.may_scan():
             return None  # a keyframe is work enough for a frame
         begun = self._begun
         parts = min(_MOST_PARTS, max(1, round(ctx.dt_s / self._config.part_s)))
@@ -123,9 +138,11 @@ class ScanStage:
     def _T_o_c(self) -> F64:
         return np.asarray(self._camera.pose.T_o_m @ self._camera.pose.T_m_c)
 
-    def _begin(self, ctx: FrameContext) -> None:
-        """Take what a scan of this keyframe needs of the frame."""
-        images, disparity = ctx.images, None
+    def _begin(self, ctx: FrameContext, of_keyframe: bool) -> None:
+        """Take what a scan of this frame needs."""
+        images, disparity, reference = ctx.images, None, self._camera.reference
+        if not of_keyframe and (reference.keyframe == NO_KEYFRAME or self._part == KeyframeScan.PARTS - 1):
+            return
         if images.depth_m is not None:
             disparity = self._segmenter.camera.disparity_of_depth(images.depth_m)
         elif images.right is None or self._stripes is None:
@@ -134,45 +151,37 @@ class ScanStage:
             self._stripes.begin(images.aligned[1], images.right.coarse()[1])
         up = self._camera.motion.up()
         up_c = self._camera.pose.T_m_c[2, :3].copy() if up is None else up[0]  # z of a submap points up
-        keyframe = self._camera.reference.keyframe
-        self._begun = _Begun(keyframe, up_c, self._T_o_c(), self._maker.new_uv, disparity)
-        self._last_T_o_c = self._begun.T_o_c
+        T_o_c = self._last_T_o_c = self._T_o_c()
+        if of_keyframe:
+            self._begun = _Begun(reference.keyframe, 0, None, up_c, T_o_c, self._maker.new_uv, disparity)
+        else:
+            self._part += 1
+            T_k_s, uv = reference.T_k_c.copy(), np.empty((0, 2))
+            self._begun = _Begun(reference.keyframe, self._part, T_k_s, up_c, T_o_c, uv, disparity)
 
     def _finish(self, begun: _Begun, disparity: F32) -> Scanned:
         segmenter, stereo = self._segmenter, self._stripes is not None
-        up_o = begun.T_o_c[:3, :3] @ begun.up_c
-        height_m = float(up_o @ begun.T_o_c[:3, 3])
-        expected_m = None if self._ground_m is None else height_m - self._ground_m
         scan = segmenter.segment(
             disparity, self._stripes.pair if self._stripes is not None else None, begun.up_c,
-            self._map.disparity_offset * (segmenter.camera.bf / self._map.camera.bf) if stereo else None, expected_m,
-            certain=self._without_ground < self._config.doubted,
+            self._map.disparity_offset * (segmenter.camera.bf / self._map.camera.bf) if stereo else None,
+            self._ground.expected(begun.T_o_c, begun.up_c),
         )  # fmt: skip
         self._work.segmented_px += disparity.size
-        self._without_ground += 1
-        if segmenter.saw_ground:
-            self._ground_m, self._without_ground = height_m - scan.camera_height_m, 0
-            self._withdraw(self._ground_m + segmenter.config.expected_m)
         labels = segmenter.label_of(begun.uv)
-        record = KeyframeScan(begun.keyframe, scan, labels[:0] if self._channel.profile.thin else labels)
-        if self._ground_m is not None:
-            self._recent.append((record, self._ground_m))
-        self._waiting.append(record)
-        self._share_waiting()
-        return Scanned(record, begun.T_o_c)
+        labels = labels[:0] if self._channel.profile.thin else labels
+        record = KeyframeScan(begun.keyframe, scan, labels, begun.part, begun.T_k_s)
+        seen = Seen(begun.T_o_c, scan, segmenter.saw_ground, segmenter.lowest_m)
+        self._take(self._ground.note(record, seen))
+        ground = self._ground.expected(begun.T_o_c, begun.up_c)
+        return Scanned(record, begun.T_o_c, None if ground is None else ground.height_m)
 
-    def _withdraw(self, highest_m: float) -> None:
-        """Take back recent scans whose ground lies higher: nothing is seen through the ground, so it was a table."""
-        for record, ground_m in self._recent:
-            if ground_m > highest_m:
-                n = len(record.scan)
-                blank = replace(
-                    record.scan, free_from_m=np.zeros(n), free_m=np.zeros(n), obstacle_m=np.full(n, np.inf),
-                    bands=np.zeros(n, np.uint8), camera_height_m=float("nan"),
-                )  # fmt: skip
-                self._waiting.append(KeyframeScan(record.keyframe, blank, record.labels[:0]))
-        kept = [(record, ground_m) for record, ground_m in self._recent if ground_m <= highest_m]
-        self._recent = deque(kept, maxlen=_RECENT)
+    def _take(self, verdict: Verdict[KeyframeScan]) -> None:
+        """Share scans that are believed, and take back those that are not any more."""
+        for wrong in verdict.withdrawn:
+            blank = without_ground(wrong.scan)
+            self._waiting.append(KeyframeScan(wrong.keyframe, blank, wrong.labels[:0], wrong.part, wrong.T_k_s))
+        self._waiting.extend(verdict.believed)
+        self._share_waiting()
 
     def _share_waiting(self) -> None:
         """Share scans, newest first, while those before arrive: they never fill a link that is short of bytes."""
@@ -181,7 +190,7 @@ class ScanStage:
         self._under_way = [key for key in self._under_way if not self._channel.arrived(key)]
         while self._waiting and len(self._under_way) < _UNDER_WAY:
             record = self._waiting.pop()
-            others = [r for r in self._waiting if r.keyframe != record.keyframe]  # an older one was taken back
+            others = [r for r in self._waiting if r.key() != record.key()]  # an older one was taken back
             self._waiting = deque(others, maxlen=_WAITING)
             self._channel.put(record)
             self._under_way.append(record.key())

@@ -179,7 +179,7 @@ class ScanGrid:
         border = np.quantile(ahead[free > 0.0], _AT_BORDER) if (free > 0.0).any() else 0.0
         hidden = behind | (ahead > _HIDDEN * border)
         low = np.where(hidden, start, start * max(0.0, 1.0 - config.bands_m[0] / max(scan.height_m, 1e-3)))
-        end = np.where(behind, free, np.minimum(free, before))
+        end = np.where(behind & (under == 0), free, np.minimum(free, before))
         space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
         accurate_m = scan.accurate_m(config)
         weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)

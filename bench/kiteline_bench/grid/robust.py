@@ -123,16 +123,15 @@ def _case(
     bench.say(f"scanning: {name}")
     ground_z = float(source.world.height(poses[0][None, :2, 3])[0])
     cameras, scanner = source.cameras(), Scanner(source.rig, damage, ground_z if took_off else None)
-    scans = []
     for k, pose in enumerate(poses):
         still = np.zeros(3)
         left, right = (
             camera.take_image(pose, still, still, _SHUTTER, _GAIN, _NOISE, (_SEED << 20) + 2 * k + side)
             for side, camera in enumerate(cameras)
         )
-        scans.append(scanner.scan(Frame(k, left, right), pose))
+        scanner.scan(Frame(k, left, right), pose)
     true = source.worn.true
-    return _Case(scans, look(source.world, true.left, np.array(poses) @ true.T_b_c), scanner.camera.bf)
+    return _Case(scanner.scans(), look(source.world, true.left, np.array(poses) @ true.T_b_c), scanner.camera.bf)
 
 
 def _along(source: SimSource) -> list[F64]:

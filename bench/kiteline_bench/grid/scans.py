@@ -18,6 +18,7 @@ from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
+from kiteline_core.ground.ground_height import GroundHeight, Seen, without_ground
 from kiteline_core.ground.segmentation import GroundSegmenter
 from kiteline_lab.grids.files import FREE, OCCUPIED, GridFile
 
@@ -36,42 +37,53 @@ class PosedScan:
 class Scanner:
     """Makes scans of the stereo pairs of a rig, each with the ground that the ones before saw, as an agent does.
 
-    damage: changes the disparity image first. ground_z: of the ground where the vehicle took off, None if it saw none.
+    damage: changes the disparity image first. ground_z: of the ground, where the vehicle knows it from the start.
     """
 
     def __init__(
         self, rig: CameraRig, damage: Callable[[F32], F32] | None = None, ground_z: float | None = None
     ) -> None:
-        self._ground_z = ground_z
+        self._ground: GroundHeight[int] = GroundHeight(GroundConfig())
+        self._start_z = ground_z
+        self._made: list[PosedScan] = []
+        self._believed: set[int] = set()
         self._rectifier = Rectifier(rig)
         self.camera = self._rectifier.camera
         self._segmenter = GroundSegmenter(self.camera, GroundConfig())
         self._stripes = DisparityStripes(self._segmenter.camera, GroundConfig())
         self._damage = damage
 
-    def scan(self, frame: Frame, T_w_b: F64) -> PosedScan:
-        """The scan of a frame whose true body pose (4,4) tells which way is up."""
+    def scan(self, frame: Frame, T_w_b: F64) -> None:
+        """Make the scan of a frame whose true body pose (4,4) tells which way is up."""
         assert frame.right is not None
         T_w_c = T_w_b @ self.camera.T_b_c
         disparity = self._stripes.measure(self._rectifier.half(0, frame.left), self._rectifier.half(1, frame.right))
         if self._damage is not None:
             disparity = self._damage(disparity)
-        z, up_c = float(T_w_c[2, 3]), np.ascontiguousarray(T_w_c[2, :3])
-        expected_m = None if self._ground_z is None else z - self._ground_z
-        scan = self._segmenter.segment(disparity, self._stripes.pair, up_c, None, expected_m)
-        if np.isfinite(scan.camera_height_m):
-            self._ground_z = z - scan.camera_height_m
-        return PosedScan(scan, T_w_c)
+        if self._start_z is not None and not self._made:
+            self._ground.start_at(np.array([*T_w_c[:2, 3], self._start_z]))
+        up_c = np.ascontiguousarray(T_w_c[2, :3])
+        segmenter, expected = self._segmenter, self._ground.expected(T_w_c, up_c)
+        scan = segmenter.segment(disparity, self._stripes.pair, up_c, None, expected)
+        self._made.append(PosedScan(scan, T_w_c))
+        verdict = self._ground.note(len(self._made) - 1, Seen(T_w_c, scan, segmenter.saw_ground, segmenter.lowest_m))
+        self._believed = (self._believed | set(verdict.believed)) - set(verdict.withdrawn)
+
+    def scans(self) -> list[PosedScan]:
+        """All scans; of those that are not believed, the line of sight alone."""
+        return [
+            posed if k in self._believed else replace(posed, scan=without_ground(posed.scan))
+            for k, posed in enumerate(self._made)
+        ]
 
 
 def scans_of(recording: Recording, every: int, damage: Callable[[F32], F32] | None = None) -> list[PosedScan]:
     """Scans of every n-th frame of a recording that has a right image and a true pose."""
     scanner = Scanner(recording.rig, damage)
-    return [
-        scanner.scan(item.frame, item.T_w_b)
-        for item in recording.items[::every]
-        if item.frame.right is not None and item.T_w_b is not None
-    ]
+    for item in recording.items[::every]:
+        if item.frame.right is not None and item.T_w_b is not None:
+            scanner.scan(item.frame, item.T_w_b)
+    return scanner.scans()
 
 
 def grid_config(scans: Iterable[PosedScan]) -> GridConfig:

@@ -28,7 +28,19 @@ class GroundConfig:
         0.4  # of what is neither upright nor unknown at these distances, that is ground: else it is noise
     )
     least_bins: int = 6  # quarter pixels of disparity over which ground is seen, at least: less may be a wall's foot
-    expected_m: float = 0.4  # m between the height found and the one expected: beyond, it is a table or a box
+    expected_m: float = 0.1  # m between the height found and the one expected, at most: beyond, it is a table or a box
+    expected_pixels: int = 30  # there, from which the height is that of these pixels
+    lowest_pixels: int = 60  # that must lie as low to tell that the ground lies no higher: fewer may be errors
+    lowest_ahead_m: float = 5.0  # m ahead up to which they count
+    lowest_sigma_m: float = 0.1  # m; deviation of their height, at most
+    lowest_slope: float = 0.06  # m a m that the ground may fall ahead
+    curve_slope: float = 0.25  # m a m of a curve that takes the place of level ground where its height is known
+    lower_m: float = 0.25  # m below the ground from which points refute it: their errors are half of that
+    climb: float = 0.1  # m a m that the ground may climb from one scan to another: ramps and hills
+    most_climb_m: float = 0.15  # m of that, at most: boxes are higher
+    agreeing_m: float = 0.1  # m between two cameras that saw the same ground, at least, until it is believed
+    ground_width_m: float = 3.0  # m that it is wide by then: tables are narrower
+    known_for_m: float = 8.0  # m of flight without a view of the ground after which its height is unknown
     ground_m: float = 0.06  # m above or below the curve that is still ground: half a door sill
     ground_sigmas: float = 2.5  # the same in standard deviations of the measured height
     columns: int = 64  # of a scan over the field of view: 1.3 degrees each, 0.1 m at 5 m; 200 bytes in all

@@ -14,6 +14,7 @@ _LOWER_M = 0.5  # below the ground where there may be ditches and lawns beside a
 _SAME_PX = 0.25  # px between two surfaces that are one
 _LEAST_ENERGY = 300.0  # grey levels^2 of a surface's gradients: 0.06 px for an error of one level
 _MOST_STEP_PX = 0.4  # px of a refinement: more is another surface
+_NEVER = 1 << 30  # pixels
 _OUTLIERS = 0.15  # share of a surface's pixels that are outliers
 
 
@@ -209,15 +210,26 @@ def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, lab
 
 
 @njit
-def _longest_ground(grounds, begin_m, end_m, lowest, bf, sigma_px, gap_m):  # type: ignore[no-untyped-def]
+def _longest_ground(grounds, obstacles, least, begin_m, end_m, lowest, bf, sigma_px, gap_m):  # type: ignore[no-untyped-def]
     """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
 
-    The longest part with gaps of at most gap_m, or three deviations of the range. bf: px m along the column.
+    And whether it ended before an obstacle. The longest part with gaps of at most gap_m, or three deviations of the range, and without `least` pixels of
+    obstacles (bins,) at the same range: those stand there, or hang above. bf: px m along the column.
     """
-    best_from, best, start, last = 0.0, 0.0, 0.0, 0.0
-    for j in range(len(grounds) - 1, lowest - 1, -1):
+    bins = len(grounds)
+    half = int(_PX / BIN_PX)
+    best_from, best, start, last, ended = 0.0, 0.0, 0.0, 0.0, False
+    for j in range(bins - 1, lowest - 1, -1):
         near, far = bf / ((j + 1) * BIN_PX), bf / ((j if j else 0.5) * BIN_PX)
-        if near < begin_m or grounds[j] < 2:
+        if near < begin_m:
+            continue
+        above = 0
+        for i in range(max(j - half, 0), min(j + half + 1, bins)):
+            above += obstacles[i]
+        if above >= least:
+            ended, last = ended or (last > 0.0 and last == best), 0.0
+            continue
+        if grounds[j] < 2:
             continue
         if near >= end_m:
             break
@@ -225,15 +237,18 @@ def _longest_ground(grounds, begin_m, end_m, lowest, bf, sigma_px, gap_m):  # ty
             start = near
         last = far
         if last - start > best - best_from:
-            best_from, best = start, last
-    return best_from, min(best, end_m)
+            best_from, best, ended = start, last, False
+    return best_from, min(best, end_m), ended
 
 
 @njit
-def collect_scan(grounds, surface, azimuth, bf, lowest, sigma_px, gap_m, free_from, free, obstacle, clear):  # type: ignore[no-untyped-def]
-    """Ranges (n,) in m of a column scan from ground counted over (n, bins) and disparities of surfaces (n,2).
+def collect_scan(  # type: ignore[no-untyped-def]
+    grounds, obstacles, least, surface, azimuth, bf, lowest, sigma_px, gap_m, free_from, free, obstacle, clear
+):
+    """Ranges (n,) in m of a column scan from ground and obstacles counted over (n, bins) and surfaces (n,2).
 
-    azimuth: (n,). lowest: least bin that counts. Free is the longest part of the ground, before the obstacle or behind.
+    surface: disparities. azimuth: (n,). lowest: least bin that counts. Free is the longest part of the ground, before
+    the obstacle or behind; there only where fewer than `least` pixels of obstacles have its range.
     """
     for c in range(len(grounds)):
         along = 1.0 / np.cos(azimuth[c])
@@ -244,14 +259,18 @@ def collect_scan(grounds, surface, azimuth, bf, lowest, sigma_px, gap_m, free_fr
             clear[c] = bf / surface[c, 1] * along
             if abs(surface[c, 1] - surface[c, 0]) < _SAME_PX:
                 clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
-        free_from[c], free[c] = _longest_ground(grounds[c], 0.0, obstacle[c], lowest, bf * along, sigma_px, gap_m)
+        free_from[c], free[c], _ = _longest_ground(
+            grounds[c], obstacles[c], _NEVER, 0.0, obstacle[c], lowest, bf * along, sigma_px, gap_m
+        )
         if obstacle[c] < np.inf:
             deviation = obstacle[c] * sigma_px / surface[c, 0]
             if free[c] > 0.0 and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
                 free[c] = max(obstacle[c] - 2.0 * deviation, free_from[c])  # up to its foot, as far as that is sure
-            begin, end = _longest_ground(
-                grounds[c], obstacle[c] + 3.0 * deviation, np.inf, lowest, bf * along, sigma_px, gap_m
-            )
-            end -= 2.0 * end * end / (bf * along) * sigma_px  # what stands there is not in the scan
+            begin, end, ended = _longest_ground(
+                grounds[c], obstacles[c], least, obstacle[c] + 3.0 * deviation, np.inf, lowest, bf * along, sigma_px,
+                gap_m,
+            )  # fmt: skip
+            if not ended:  # what else stands there is not in the scan
+                end -= 2.0 * end * end / (bf * along) * sigma_px
             if end - begin > free[c] - free_from[c]:  # seen over a low obstacle
                 free_from[c], free[c] = begin, end

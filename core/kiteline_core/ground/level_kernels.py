@@ -108,3 +108,19 @@ def count_heights(x, z, column, upright, bf, below, steepest, step_m, counts, di
                 counts[j, k] += 1
                 disparities[j, k] += d
                 slopes[j, k] += down / ahead
+
+
+@njit
+def count_depths(x, z, column, farthest, slope, height_px, step_m, counts):  # type: ignore[no-untyped-def]
+    """Count pixels by their depth below the camera in steps of step_m (depths,), zero before.
+
+    farthest: m ahead up to which pixels count, and m of their height's deviation at most: height_px is that of a pixel
+    1 m ahead and 1 m down. slope: m of depth taken off for each metre ahead: ground may fall.
+    """
+    for v in range(x.shape[0]):
+        for u in range(x.shape[1]):
+            if column[v, u] < 0 or x[v, u] > farthest[0] or abs(z[v, u]) * x[v, u] * height_px > farthest[1]:
+                continue
+            k = int((-z[v, u] - slope * x[v, u]) / step_m)
+            if 0 < k < len(counts):
+                counts[k] += 1

@@ -10,6 +10,7 @@ Beyond it, what a column of azimuth sees is one disparity for each surface, refi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +27,12 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
 _HEIGHT_STEP_M = 0.05  # of the v-disparity
+_DEPTH_STEP_M = 0.05  # of the pixels' depth below the camera
 _HALF_COUNTS = 30.0  # pixels of a cell of the v-disparity that count half as much as many
 _STIFFNESS = 1e-3  # of the spline
 _ROUNDS = 5
+_BETTER = 1.3  # times the pixels of level ground that make a curve the ground
+_HALF_SURE = 200.0  # pixels near the expected height that move it half of the way
 _REFINED = 0.4  # of a disparity's deviation that remains of a surface that is refined by all of its pixels
 _UNDER = 0.5  # pixels below the ground for one on it, at most: nothing is seen through it
 _BEYOND_PX = 0.5  # px of disparity beyond the spline's far end where pixels may still be ground
@@ -60,6 +64,13 @@ class _View:
     rotation: F64
     offset_px: F64
     pair: tuple[U8, U8] | None
+
+
+class ExpectedGround(NamedTuple):
+    """Height of a camera above ground that is known, and how far it may be from there."""
+
+    height_m: float
+    within_m: float
 
 
 class GroundSegmenter:
@@ -95,17 +106,19 @@ class GroundSegmenter:
         self._upright = np.empty((n, bins), np.bool_)
         self._in_band = np.empty((n, bins, len(self._bands) - 1), np.int32)
         self._heights = np.empty((bins, heights), np.int32)
+        self._depths = np.empty(round(config.largest_height_m / _DEPTH_STEP_M), np.int32)
+        self.lowest_m = float("nan")  # depth below the camera that many pixels of the last image reach
         self._height_sums = np.empty((2, bins, heights))
 
     def segment(
         self, disparity: F32, pair: tuple[U8, U8] | None, up_c: F64, offset_px: F64 | None = None,
-        expected_m: float | None = None, *, certain: bool = True,
+        expected: ExpectedGround | None = None,
     ) -> ColumnScan:  # fmt: skip
         """Label a disparity image (h,w) in px, 0 unknown, into `labels`, and make its column scan.
 
         pair: the images (h,w) of a stereo pair: ground must have texture, and ranges are refined; None with depth.
-        up_c: (3,) unit vector against gravity. offset_px: (5,) error of disparities. expected_m: of the camera above
-        the ground as scans saw it; while that is certain, ground that lies higher is taken for a table or a box.
+        up_c: (3,) unit vector against gravity. offset_px: (5,) error of disparities. expected: where the
+        height is known: what lies there is ground, however little of it is seen.
         """
         config = self.config
         offset_px = disparity_offset.none() if offset_px is None else offset_px
@@ -116,10 +129,14 @@ class GroundSegmenter:
         )  # fmt: skip
         if pair is not None:
             label_kernels.mark_texture(pair[0], config.texture, config.texture_px, self._textured)
-        ground = self._find_ground(up_c, expected_m)
-        if ground is not None and expected_m is not None and certain:
-            ground = ground if ground.height_m > expected_m - config.expected_m else None
-        return self._scan(ground, view, expected_m)
+        self._depths.fill(0)
+        level_kernels.count_depths(
+            self.x, self.z, self._column, (config.lowest_ahead_m, config.lowest_sigma_m), config.lowest_slope,
+            self.sigma_px / self.bf, _DEPTH_STEP_M, self._depths,
+        )  # fmt: skip
+        below = np.flatnonzero(np.cumsum(self._depths[::-1]) >= config.lowest_pixels)
+        self.lowest_m = (len(self._depths) - 1 - int(below[0])) * _DEPTH_STEP_M if len(below) else float("nan")
+        return self._scan(self._find_ground(up_c, expected), view, expected)
 
     def certain_m(self, sigma_m: float) -> float:
         """Distance up to which a surface's deviation stays below sigma_m."""
@@ -129,8 +146,9 @@ class GroundSegmenter:
         """Labels (n,) of pixels (n,2) of the full image."""
         return np.asarray(self.labels[self.camera.at(uv)])
 
-    def _find_ground(self, up_c: F64, expected_m: float | None) -> Ground | None:
-        """The ground by u- and v-disparity; None if too little of it is seen."""
+    def _find_ground(self, up_c: F64, expected: ExpectedGround | None) -> Ground | None:
+        """The ground by u- and v-disparity, and by what is expected; None if too little of it is seen."""
+        self.saw_ground = False
         config, counts, bf = self.config, self._counts[0], self.bf
         in_image = float(np.hypot(up_c[0], up_c[1]))
         if in_image < _LEAST_IN_IMAGE:  # the camera looks straight up or down
@@ -142,16 +160,50 @@ class GroundSegmenter:
         rows_m = float(self._camera[1]) / bf
         level_kernels.find_upright(counts, self._sums, self._widths, 0.5 * config.obstacle_rows, rows_m, self._upright)
         below = round(-_BELOW_PX * up_c[0] / in_image), round(-0.5 * _BELOW_PX * up_c[1] / in_image)
-        heights, (disparities, slopes) = self._heights, self._height_sums
-        heights.fill(0)
+        self._heights.fill(0)
         self._height_sums.fill(0.0)
         level_kernels.count_heights(
-            self.x, self.z, self._column, self._upright, bf, below, _STEEPEST, _HEIGHT_STEP_M, heights, disparities,
-            slopes,
+            self.x, self.z, self._column, self._upright, bf, below, _STEEPEST, _HEIGHT_STEP_M, self._heights,
+            *self._height_sums,
         )  # fmt: skip
+        curved = self._curved_ground(expected)
+        if expected is None:
+            if curved is None or curved.height_m < self.lowest_m - config.lower_m:
+                return self._lowest_ground()
+            self.saw_ground = True
+            return curved
+        level = self._expected_ground(expected)
+        if curved is None or abs(curved.height_m - expected.height_m) > expected.within_m:
+            return level
+        return curved if self._is_better(curved, level) else level
+
+    def _is_better(self, curved: Ground, level: Ground) -> bool:
+        """True if a curve without steep parts passes through many more pixels than level ground does."""
+        centres = (np.arange(self._bins) + 0.5) * level_kernels.BIN_PX
+        seen = (centres >= curved.low_px) & (centres <= curved.high_px)
+        slope = np.empty(self._bins)
+        profile_kernels.sample_spline(curved.coefficients, curved.low_px, curved.high_px, centres, slope)
+        ahead = self.bf / centres
+        heights = -slope * ahead
+        climb = np.abs(np.diff(heights[seen]) / np.diff(ahead[seen]))
+        if (climb > self.config.curve_slope).any():
+            return False
+        pixels = []
+        for height_m in (-heights, np.full(self._bins, level.height_m)):
+            rows = height_m / _HEIGHT_STEP_M - 0.5
+            spread = 1.5 + 2.0 * rows * self.sigma_px / centres
+            near = np.abs(np.arange(self._heights.shape[1]) - rows[:, None]) <= spread[:, None]
+            pixels.append(int((self._heights * near)[seen].sum()))
+        return pixels[0] > _BETTER * pixels[1]
+
+    def _curved_ground(self, expected: ExpectedGround | None) -> Ground | None:
+        """The ground as a curve over the distance; None if too little of it is seen."""
+        config, bf, heights = self.config, self.bf, self._heights
+        disparities, slopes = self._height_sums
         path = np.zeros(self._bins, np.int64)
-        first, near = (int(m / _HEIGHT_STEP_M) for m in (config.least_height_m, config.expected_m))
-        hint = -1 if expected_m is None else max(int(expected_m / _HEIGHT_STEP_M), 0)
+        first, hint, near = int(config.least_height_m / _HEIGHT_STEP_M), -1, 0
+        if expected is not None:
+            hint, near = (max(int(m / _HEIGHT_STEP_M), 0) for m in (expected.height_m, expected.within_m))
         profile_kernels.ground_path(
             heights, first, hint, near, bf, _HEIGHT_STEP_M, config.max_slope, self.sigma_px, _HALF_COUNTS, path
         )
@@ -176,18 +228,53 @@ class GroundSegmenter:
             coefficients, low, high, float(profile_kernels.spline_at(coefficients, low, high, high)) * bf / high
         )
 
-    def _scan(self, ground: Ground | None, view: _View, expected_m: float | None) -> ColumnScan:
+    def _lowest_ground(self) -> Ground | None:
+        """Level ground next to the lowest points; None if too little of it is seen."""
+        if np.isnan(self.lowest_m):
+            return None
+        config = self.config
+        rows = self._heights.sum(0)
+        first = max(int((self.lowest_m - config.expected_m) / _HEIGHT_STEP_M), 0)
+        last = int((self.lowest_m + config.lower_m) / _HEIGHT_STEP_M) + 1
+        some = np.convolve(rows, np.ones(3), "same")[first:last]
+        if not len(some) or some.max() < config.expected_pixels:
+            return None
+        height_m = (first + int(np.argmax(some)) + 0.5) * _HEIGHT_STEP_M
+        ground = self._expected_ground(ExpectedGround(height_m, config.expected_m))
+        return ground if self.saw_ground else None
+
+    def _expected_ground(self, expected: ExpectedGround) -> Ground:
+        """Level ground where it is expected, as high as pixels near it say."""
+        config, bf, bins = self.config, self.bf, self._bins
+        expected_m = expected.height_m
+        first = round((expected_m - expected.within_m) / _HEIGHT_STEP_M)
+        last = round((expected_m + expected.within_m) / _HEIGHT_STEP_M) + 1
+        near = slice(max(first, 0), max(last, 0))
+        centres = (np.arange(bins) + 0.5) * level_kernels.BIN_PX
+        sure = (centres >= self._lowest_px) & (expected_m * self.sigma_px / centres < 0.5 * config.expected_m)
+        n = self._heights[sure, near].sum(1)
+        disparities, slopes = (sums[sure, near].sum(1) for sums in self._height_sums)
+        some, height_m = n > 0, expected_m
+        self.saw_ground = bool(n.sum() >= config.expected_pixels)
+        if self.saw_ground:
+            found = np.repeat(self.bf * slopes[some] / disparities[some], n[some])
+            gain = n.sum() / (n.sum() + _HALF_SURE)
+            height_m += gain * (float(np.median(found)) - expected_m)
+        low, high = self._lowest_px, bins * level_kernels.BIN_PX
+        at = low + (np.arange(profile_kernels.COEFFICIENTS) - 1.0) * (high - low) / profile_kernels.SECTIONS
+        return Ground(at * (height_m / bf), low, high, height_m)
+
+    def _scan(self, ground: Ground | None, view: _View, expected: ExpectedGround | None) -> ColumnScan:
         """Label the pixels by the ground that was found, or obstacles by the one expected, and collect them."""
         config, bins, n = self.config, self._bins, self.config.columns
         borders = np.arange(bins + 1) * level_kernels.BIN_PX
-        self.saw_ground = ground is not None
         slope, seen, height_m = np.full(bins + 1, np.nan), np.zeros(bins, np.bool_), float("nan")
         if ground is not None:
             profile_kernels.sample_spline(ground.coefficients, ground.low_px, ground.high_px, borders, slope)
             seen = (borders[:-1] >= ground.low_px - _BEYOND_PX) & (borders[1:] <= ground.high_px * _NEARER)
             height_m = ground.height_m
-        elif expected_m is not None:
-            slope, height_m = borders * (expected_m / self.bf), expected_m
+        elif expected is not None:
+            slope, height_m = borders * (expected.height_m / self.bf), expected.height_m
         grounds, obstacles, slab = self._counts[1:]
         self.labels.fill(label_kernels.UNKNOWN)
         for counts in (self._counts[1:], self._sums, self._in_band, self._slab_sums, self._surface_sums):
@@ -198,7 +285,8 @@ class GroundSegmenter:
             self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
-            return self._scan(None, view, expected_m)
+            self.saw_ground = False
+            return self._scan(None, view, expected)
         lowest = round(self._lowest_px / level_kernels.BIN_PX)
         surface, bands = self._surface, np.empty(n, np.uint8)
         label_kernels.find_surfaces(
@@ -211,6 +299,7 @@ class GroundSegmenter:
             )  # fmt: skip
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
         label_kernels.collect_scan(
-            grounds, surface, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M, free_from, free, obstacle, clear
-        )
+            grounds, obstacles, config.column_pixels, surface, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M,
+            free_from, free, obstacle, clear,
+        )  # fmt: skip
         return ColumnScan(view.up_c, self._azimuth0, self._step, free_from, free, obstacle, bands, clear, height_m)

@@ -68,7 +68,7 @@ def scan_at(x: float, y: float, heading_rad: float, z: float = 1.0, noise_m: flo
         np.array([0.0, -1.0, 0.0]), azimuth[0], step, np.zeros(n), np.zeros(n), clear, np.full(n, 7, np.uint8), clear, z
     )
     record = KeyframeScan(KeyframeId(1), scan, np.zeros(0, np.uint8))
-    return Scanned(record, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])))
+    return Scanned(record, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])), z)
 
 
 TURN = se3.exp(np.array([4.0, -2.0, 0.3, 0.0, 0.0, 0.5]))
@@ -132,7 +132,7 @@ def test_a_vehicle_that_flies_on_takes_its_scans_along() -> None:
     far = [scan_at(2.0, 0.0, 0.0)]
     for k in range(60):  # 30 m away, and back
         moved = se3.from_rt(np.eye(3), np.array([0.5 * k, 0.0, 0.0]))
-        grid.add(Scanned(far[0].record, moved @ far[0].T_o_c))
+        grid.add(Scanned(far[0].record, moved @ far[0].T_o_c, far[0].height_m))
         assert grid.around(moved @ TURN @ vehicle(2.0, 0.0, 0.0), None, {}, BANDS_M) is not None
     back = grid.around(TURN @ vehicle(1.0, 0.0, 0.0), None, {}, BANDS_M)
     assert back is not None and back.distance_m[0] == pytest.approx(2.0, abs=0.1)

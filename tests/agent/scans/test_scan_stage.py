@@ -13,6 +13,7 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
 from kiteline_codec.schema import Key, KeyframeHeader, KeyframeScan, Record, messages
 from kiteline_core.frame import Frame
+from kiteline_core.ground.ground_height import Verdict
 from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_hw.sources.open import open_source
 
@@ -38,11 +39,13 @@ class Heard(NoBaseChannel):
 
 
 def flown(
-    path: Path, config: AgentConfig, busy: bool = False, every: int = 1
+    path: Path, config: AgentConfig, busy: bool = False, every: int = 1, known: bool = True
 ) -> tuple[Agent, Heard, list[int], list[str]]:
     source = open_source(str(path))
     channel = Heard(busy)
     agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), channel)
+    if known and agent._scans is not None:  # the recording shows a wall alone
+        agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
     matched, events = [], []
     for frame in [item for item in source if isinstance(item, Frame)][::every]:
         events += agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns).events
@@ -100,18 +103,33 @@ def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
     assert np.isfinite([s.scan.up_c for s in channel.scans]).all()
 
 
+def test_scans_are_not_shared_while_the_height_of_the_ground_is_unknown(recording: Path) -> None:
+    agent, channel, matched, _ = flown(recording, eager(), known=False)
+    assert any(matched) and not channel.scans
+    assert agent._local_grid._ground_m is None  # all height bands of tiles count
+
+
 def test_scans_above_a_table_are_taken_back_once_the_floor_is_seen(recording: Path) -> None:
     agent, channel, _, _ = flown(recording, eager())
     stage = agent._scans
     assert stage is not None
-    table, floor = (replace(channel.scans[k], keyframe=KeyframeId(10 + k)) for k in (0, 1))
-    stage._recent.extend([(table, 0.7), (floor, 0.02)])
+    table = replace(channel.scans[0], keyframe=KeyframeId(10))
     channel.scans.clear()
     stage._waiting.append(table)
-    stage._withdraw(0.4)
-    stage._share_waiting()
+    stage._take(Verdict([], [table]))
     (sent,) = channel.scans
     assert sent.keyframe == table.keyframe
     assert np.isnan(sent.scan.camera_height_m) and not sent.scan.free_m.any() and not sent.scan.bands.any()
     messages.encode(sent)
-    assert [record.keyframe for record, _ in stage._recent][-1] == floor.keyframe
+
+
+def test_frames_between_keyframes_are_scanned_and_hang_on_the_one_before(recording: Path) -> None:
+    _, channel, _, _ = flown(recording, eager())
+    later = [record for record in channel.scans if record.part]
+    assert later
+    assert len({record.key() for record in channel.scans}) == len(channel.scans)
+    for record in later:
+        assert record.T_k_s is not None and not len(record.labels)
+        messages.encode(record)
+    _, still, _, _ = flown(recording, AgentConfig())
+    assert len(still.scans) < len(channel.scans)

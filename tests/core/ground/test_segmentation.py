@@ -13,7 +13,7 @@ from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes, unlocked
 from kiteline_core.ground.label_kernels import GROUND, OBSTACLE, UNKNOWN
-from kiteline_core.ground.segmentation import GroundSegmenter
+from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter
 
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 375.0, 245.0, 0.11, True, np.eye(4))
 HEIGHT_M = 1.5
@@ -153,7 +153,7 @@ def test_a_camera_that_faces_a_wall_says_unknown() -> None:
     assert np.isnan(scan.camera_height_m)
     assert not scan.free_m.any()
     assert np.abs(scan.clear_m * np.cos(scan.azimuths_rad) - 0.9).max() < 0.1
-    expected = segmenter.segment(disparity, None, up(0.0, 0.0), expected_m=HEIGHT_M)
+    expected = segmenter.segment(disparity, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
     assert np.abs(expected.obstacle_m * np.cos(scan.azimuths_rad) - 0.9).max() < 0.1
     assert not expected.free_m.any()
 
@@ -162,7 +162,7 @@ def test_a_table_is_not_taken_for_the_ground_that_was_expected() -> None:
     segmenter, disparity = view(up(0.0, 20.0), lambda o, r: 0.5 * level_ground(o, r), wall(3.0))
     alone = segmenter.segment(disparity, None, up(0.0, 20.0))
     assert alone.camera_height_m == pytest.approx(0.5 * HEIGHT_M, abs=0.05)
-    scan = segmenter.segment(disparity, None, up(0.0, 20.0), expected_m=HEIGHT_M)
+    scan = segmenter.segment(disparity, None, up(0.0, 20.0), expected=ExpectedGround(HEIGHT_M, 0.1))
     assert scan.camera_height_m == HEIGHT_M and not segmenter.saw_ground
     assert not scan.free_m.any()
     assert np.isfinite(scan.obstacle_m).mean() > 0.9
@@ -242,8 +242,8 @@ def test_surfaces_are_refined_by_their_images() -> None:
     right = np.array([np.interp(at + true_px, np.arange(w + 80), row) for row in texture]) * 1.03 + 4.0
     pair = left.round().clip(0, 255).astype(np.uint8), right.round().clip(0, 255).astype(np.uint8)
     wrong = np.where(disparity > 0.0, disparity + 0.2, 0.0).astype(np.float32)
-    plain = segmenter.segment(wrong, None, up(0.0, 0.0), expected_m=HEIGHT_M)
-    refined = segmenter.segment(wrong, pair, up(0.0, 0.0), expected_m=HEIGHT_M)
+    plain = segmenter.segment(wrong, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
+    refined = segmenter.segment(wrong, pair, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
     seen = slice(8, -8)
     errors = [np.median(np.abs((s.obstacle_m * np.cos(s.azimuths_rad))[seen] - 3.0)) for s in (plain, refined)]
     assert errors[0] > 0.05

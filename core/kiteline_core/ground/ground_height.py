@@ -1,0 +1,176 @@
+"""Knows how high the ground lies, by the scans of a flight, and which of these scans may be believed."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_core.ground.column_scan import ColumnScan, level_rotation
+from kiteline_core.ground.config import GroundConfig
+from kiteline_core.ground.segmentation import ExpectedGround
+
+F64 = NDArray[np.float64]
+Tag = TypeVar("Tag")
+
+_HELD = 16  # scans that wait until the height is known
+_BELIEVED = 64  # newest ones that can be withdrawn
+_LOW = 32  # newest ones whose lowest points count
+_REFUTED = 2  # views of something lower, until the ground is no ground: one may be an error
+
+
+class Seen(NamedTuple):
+    """What `GroundSegmenter` saw in one image.
+
+    T_o_c: (4,4) of its camera in a frame that does not jump. ground: whether the scan saw ground. lowest_m: depth below
+    the camera that many pixels reach, less what ground may fall; NaN if it is not known.
+    """
+
+    T_o_c: F64
+    scan: ColumnScan
+    ground: bool
+    lowest_m: float
+
+
+class Verdict(NamedTuple, Generic[Tag]):
+    """Tags of scans that are believed from now on, and of those that are not any more."""
+
+    believed: list[Tag]
+    withdrawn: list[Tag]
+
+
+@dataclass(frozen=True, slots=True)
+class _Place(Generic[Tag]):
+    """A scan. camera, foot: (3,) in o, foot on the ground below the camera. ends: (n,3) of its free ground."""
+
+    tag: Tag
+    camera: F64
+    foot: F64
+    ends: F64
+
+
+class GroundHeight(Generic[Tag]):
+    """The height of the ground near the vehicle, unknown until scans from two places agree and none saw lower.
+
+    A box or a table that is all that was seen of a room looks like its floor. Scans are held back until the ground that
+    they saw is known to be as wide as no table is, and are withdrawn if something lower appears.
+    """
+
+    def __init__(self, config: GroundConfig) -> None:
+        self._config = config
+        self._foot: F64 | None = None  # (3,) in o, of the ground that was seen last
+        self._refuted = 0
+        self._held: deque[_Place[Tag]] = deque(maxlen=_HELD)
+        self._believed: deque[_Place[Tag]] = deque(maxlen=_BELIEVED)
+        self._low: deque[F64] = deque(maxlen=_LOW)  # (3,) in o: the ground lies no higher
+
+    def start_at(self, foot: F64) -> None:
+        """Begin with a known point (3,) of the ground in o."""
+        self._foot = foot
+
+    def expected(self, T_o_c: F64, up_c: F64) -> ExpectedGround | None:
+        """Where the ground lies below a camera; None if that is not known."""
+        if self._foot is None:
+            return None
+        along, across = _apart(T_o_c[:3, 3], self._foot, T_o_c[:3, :3] @ up_c)
+        if across > self._config.known_for_m:
+            self._foot = None
+            return None
+        return ExpectedGround(along, self._level_m(across))
+
+    def note(self, tag: Tag, seen: Seen) -> Verdict[Tag]:
+        """Take in a scan that was made with the height of `expected`."""
+        config, scan, T = self._config, seen.scan, seen.T_o_c
+        up = T[:3, :3] @ scan.up_c
+        camera = T[:3, 3].copy()
+        low = camera - seen.lowest_m * up
+        if np.isfinite(seen.lowest_m):
+            self._low.append(low)
+            if self._foot is not None:
+                self._refuted = self._refuted + 1 if self._is_above(self._foot, low, up) else 0
+                if self._refuted >= _REFUTED:
+                    self._foot, self._refuted = None, 0
+                    return Verdict([], self._withdraw(up))
+        if np.isnan(scan.camera_height_m):
+            return Verdict([], [])
+        foot = camera - scan.camera_height_m * up
+        place = _Place(tag, camera, foot, _ends(T, scan))
+        if self._foot is not None:
+            if not self._is_level(foot, self._foot, up):
+                return Verdict([], [])
+            if seen.ground:
+                self._foot = foot
+            self._believed.append(place)
+            return Verdict([tag], [])
+        if self._is_above(foot, low, up) or self._too_high(foot, up):
+            return Verdict([], [])
+        self._held.append(place)
+        same = [other for other in self._held if self._is_level(other.foot, foot, up)]
+        ends = np.concatenate([other.ends for other in same])
+        moved_m = max(float(np.linalg.norm(other.camera - camera)) for other in same)
+        if len(same) < 2 or moved_m < config.agreeing_m or _width(ends, up) < config.ground_width_m:
+            return Verdict([], [])
+        self._foot, self._refuted = foot, 0
+        self._held.clear()
+        withdrawn = self._withdraw(up)
+        self._believed.extend(same)
+        return Verdict([other.tag for other in same], withdrawn)
+
+    def _withdraw(self, up: F64) -> list[Tag]:
+        """Forget scans whose ground lies above what was seen. Returns their tags."""
+        high = [place for place in self._believed if self._too_high(place.foot, up)]
+        self._believed = deque((p for p in self._believed if not any(p is h for h in high)), maxlen=_BELIEVED)
+        self._held = deque((p for p in self._held if not self._too_high(p.foot, up)), maxlen=_HELD)
+        return [place.tag for place in high]
+
+    def _too_high(self, foot: F64, up: F64) -> bool:
+        """True if points were seen lower than this ground, in several images."""
+        return sum(self._is_above(foot, low, up) for low in self._low) >= _REFUTED
+
+    def _is_above(self, foot: F64, low: F64, up: F64) -> bool:
+        along, across = _apart(foot, low, up)
+        return along > self._config.lower_m + self._config.climb * across
+
+    def _is_level(self, a: F64, b: F64, up: F64) -> bool:
+        along, across = _apart(a, b, up)
+        return abs(along) < self._level_m(across) + 1e-9
+
+    def _level_m(self, across_m: float) -> float:
+        """By how much heights of ground may differ over a distance."""
+        return self._config.expected_m + min(self._config.climb * across_m, self._config.most_climb_m)
+
+
+def without_ground(scan: ColumnScan) -> ColumnScan:
+    """A scan of which only the line of sight at the camera's height is believed."""
+    n = len(scan)
+    return replace(
+        scan, free_from_m=np.zeros(n), free_m=np.zeros(n), obstacle_m=np.full(n, np.inf), bands=np.zeros(n, np.uint8),
+        camera_height_m=float("nan"),
+    )  # fmt: skip
+
+
+def _apart(a: F64, b: F64, up: F64) -> tuple[float, float]:
+    """How far point a lies above b, and how far beside it."""
+    apart = a - b
+    along = float(apart @ up)
+    return along, float(np.linalg.norm(apart - along * up))
+
+
+def _ends(T_o_c: F64, scan: ColumnScan) -> F64:
+    """Where free ground begins and ends (n,3), in o."""
+    seen = scan.free_m > 0.0
+    azimuth, height = np.tile(scan.azimuths_rad[seen], 2), scan.camera_height_m
+    range_m = np.concatenate([scan.free_from_m[seen], scan.free_m[seen]])
+    points = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), np.full(len(azimuth), -height)])
+    return points @ (T_o_c[:3, :3] @ level_rotation(scan.up_c)).T + T_o_c[:3, 3]
+
+
+def _width(points: F64, up: F64) -> float:
+    """Twice the distance of the outermost point (n,3) from the middle, seen from above."""
+    if not len(points):
+        return 0.0
+    apart = points - points.mean(0)
+    return 2.0 * float(np.linalg.norm(apart - np.outer(apart @ up, up), axis=1).max())

@@ -1,0 +1,109 @@
+"""The height of the ground over a flight: boxes and tables that look like a floor, ramps, and what is withdrawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kiteline_core.geometry import se3
+from kiteline_core.ground.column_scan import ColumnScan
+from kiteline_core.ground.config import GroundConfig
+from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
+
+UP_C = np.array([0.0, -1.0, 0.0])
+T_W_O = se3.exp(np.array([3.0, -2.0, 1.0, 0.4, -0.2, 0.9]))  # heights do not depend on the axes of o
+LOOKS_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def seen(x: float, z: float, ground_z: float | None, lowest_z: float | None, far_m: float = 4.0) -> Seen:
+    """A view along x from a height z of ground at ground_z up to far_m, and of points down to lowest_z."""
+    n = 21
+    azimuth = np.linspace(-0.6, 0.6, n)
+    free = np.full(n, 0.0 if ground_z is None else far_m)
+    height = float("nan") if ground_z is None else z - ground_z
+    scan = ColumnScan(
+        UP_C, azimuth[0], azimuth[1] - azimuth[0], np.minimum(free, 1.0), free, np.full(n, np.inf),
+        np.zeros(n, np.uint8), free, height,
+    )  # fmt: skip
+    T = T_W_O @ se3.from_rt(LOOKS_AHEAD, np.array([x, 0.0, z]))
+    return Seen(T, scan, ground_z is not None, float("nan") if lowest_z is None else z - lowest_z)
+
+
+def expected(ground: GroundHeight[int], x: float, z: float) -> float | None:
+    found = ground.expected(seen(x, z, None, None).T_o_c, UP_C)
+    return None if found is None else found.height_m
+
+
+def fly(ground: GroundHeight[int], *views: Seen, first: int = 0) -> list[Verdict[int]]:
+    return [ground.note(first + k, view) for k, view in enumerate(views)]
+
+
+def test_a_floor_is_believed_once_two_places_agree() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    one, same_place, two = fly(ground, *(seen(x, 1.2, 0.0, 0.1) for x in (0.0, 0.02, 0.5)))
+    assert not one.believed and not same_place.believed
+    assert two.believed == [0, 1, 2]
+    assert expected(ground, 1.0, 1.7) == pytest.approx(1.7)
+    (after,) = fly(ground, seen(1.0, 1.5, 0.02, 0.1), first=3)
+    assert after.believed == [3]
+
+
+def test_a_box_top_is_never_believed_however_often_it_is_seen() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    small = [seen(0.02 * k, 1.6, 0.9, 0.85, far_m=1.7) for k in range(30)]
+    assert not any(v.believed for v in fly(ground, *small))
+    wide_above_lower_points = [seen(0.1 * k, 1.6, 0.9, 0.2) for k in range(30)]
+    assert not any(v.believed for v in fly(ground, *wide_above_lower_points))
+    assert expected(ground, 0.0, 1.6) is None
+
+
+def test_the_floor_beside_a_box_is_believed_and_the_box_is_not() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    views = [seen(0.3 * k, 1.6, 0.9 if k % 2 else 0.0, 0.1) for k in range(8)]
+    believed = [tag for v in fly(ground, *views) for tag in v.believed]
+    assert believed and not any(tag % 2 for tag in believed)
+    assert expected(ground, 0.0, 1.6) == pytest.approx(1.6)
+
+
+def test_scans_of_a_large_table_are_withdrawn_when_something_lower_is_seen() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    table = fly(ground, *(seen(0.2 * k, 1.6, 0.8, None) for k in range(6)))
+    assert [tag for v in table for tag in v.believed] == list(range(6))
+    first, second = fly(ground, *(seen(x, 1.6, None, 0.1) for x in (1.2, 1.4)), first=6)
+    assert not first.withdrawn  # one view may be an error
+    assert second.withdrawn == list(range(6))
+    assert expected(ground, 1.4, 1.6) is None
+    floor = fly(ground, *(seen(1.4 + 0.2 * k, 1.6, 0.0, 0.1) for k in range(3)), first=8)
+    assert [tag for v in floor for tag in v.believed] == [8, 9, 10]
+    assert not any(v.withdrawn for v in floor)
+
+
+def test_a_single_wrong_point_below_the_floor_changes_nothing() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    views = [seen(0.2 * k, 1.2, 0.0, -2.0 if k == 5 else 0.1) for k in range(12)]
+    verdicts = fly(ground, *views)
+    assert not any(v.withdrawn for v in verdicts)
+    assert sum(len(v.believed) for v in verdicts) == 12
+
+
+def test_a_road_uphill_is_not_withdrawn() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    views = [seen(2.0 * k, 1.65 + 0.16 * k, 0.16 * k, 0.16 * k, far_m=15.0) for k in range(40)]
+    verdicts = fly(ground, *views)
+    assert not any(v.withdrawn for v in verdicts)
+    assert sum(len(v.believed) for v in verdicts) == 40
+
+
+def test_the_height_is_unknown_after_a_long_way_without_a_view_of_the_ground() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground.start_at((T_W_O @ [0.0, 0.0, 0.0, 1.0])[:3])
+    fly(ground, *(seen(0.3 * k, 1.2, None, 0.3) for k in range(20)))
+    assert expected(ground, 6.0, 1.2) == pytest.approx(1.2)
+    assert expected(ground, 8.5, 1.2) is None
+
+
+def test_a_scan_without_ground_keeps_its_line_of_sight_alone() -> None:
+    scan = seen(0.0, 1.2, 0.0, None).scan
+    blank = without_ground(scan)
+    assert np.isnan(blank.camera_height_m) and not blank.free_m.any() and not blank.bands.any()
+    assert np.isinf(blank.obstacle_m).all() and np.array_equal(blank.clear_m, scan.clear_m)
