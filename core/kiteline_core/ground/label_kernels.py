@@ -213,8 +213,9 @@ def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, lab
 def _longest_ground(grounds, obstacles, least, begin_m, end_m, lowest, bf, sigma_px, gap_m):  # type: ignore[no-untyped-def]
     """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
 
-    And whether it ended before an obstacle. The longest part with gaps of at most gap_m, or three deviations of the range, and without `least` pixels of
-    obstacles (bins,) at the same range: those stand there, or hang above. bf: px m along the column.
+    And whether it ended before an obstacle. The longest part with gaps of at most gap_m, or three deviations of the
+    range, and without `least` pixels of obstacles (bins,) at the same range: those stand there, or hang above.
+    bf: px m along the column.
     """
     bins = len(grounds)
     half = int(_PX / BIN_PX)
@@ -265,7 +266,7 @@ def collect_scan(  # type: ignore[no-untyped-def]
         if obstacle[c] < np.inf:
             deviation = obstacle[c] * sigma_px / surface[c, 0]
             if free[c] > 0.0 and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
-                free[c] = max(obstacle[c] - 2.0 * deviation, free_from[c])  # up to its foot, as far as that is sure
+                free[c] = obstacle[c]  # up to its foot
             begin, end, ended = _longest_ground(
                 grounds[c], obstacles[c], least, obstacle[c] + 3.0 * deviation, np.inf, lowest, bf * along, sigma_px,
                 gap_m,
