@@ -20,8 +20,8 @@ class ColumnScan:
     up_c: (3,) unit vector against gravity in c. Column i of n looks to azimuth0_rad + i azimuth_step_rad,
     counter-clockwise from x of l, seen from above.
     free_from_m, free_m: (n,) from where and up to where ground was seen, before the obstacle or, over a low one, behind
-    it; both 0 where none was. Up to an obstacle's foot free_m is obstacle_m: how far before it cells are free depends on
-    the error of its range. What was not seen is unknown, never free.
+    it; both 0 where none was. Up to an obstacle's foot free_m is obstacle_m: how far before it cells are free is up to
+    who draws them. What was not seen is unknown, never free.
     obstacle_m: (n,) to the nearest obstacle within the height bands above the ground; inf where none was seen.
     bands: (n,) uint8, bit i set if that obstacle reaches into height band i; 0 without an obstacle.
     clear_m: (n,) up to where nothing stands at the height of the camera; 0 if that was not seen.
