@@ -14,6 +14,7 @@ from numba.core import ir, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
+from numba.core.lowering import Lower
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
 from numba.np import arrayobj
@@ -91,6 +92,7 @@ _set_env = JITCPUCodegen.set_env
 _call_type = types.Dispatcher.get_call_type
 _resolve = BaseFunction.get_call_type
 _fix_index = arrayobj.fix_integer_index
+_arguments = Lower.extract_function_arguments
 _lowering = [False]  # whether the code that is being generated is a kernel's, innermost last
 
 
@@ -108,6 +110,40 @@ def lower(self: Any, state: Any) -> Any:
         return _lower(self, state)  # type: ignore[no-untyped-call]
     finally:
         _lowering.pop()
+
+
+def borrowed_arguments(self: Any) -> Any:
+    """Take a kernel's arrays without an owner: their caller holds them, so that no view of them need be counted.
+
+    Counting takes a locked instruction at each view, and stands in the way of other optimisations. A function that
+    returns an array counts, since its caller may give up the array that the result is a view of.
+    """
+    arguments = _arguments(self)  # type: ignore[no-untyped-call]
+    if _lowering[-1] and _holds_numbers(self.fndesc.restype):
+        kinds = self.fndesc.argtypes
+        self.fnargs = [_without_owner(self.context, self.builder, *one) for one in zip(kinds, arguments, strict=True)]
+    return self.fnargs
+
+
+def _is_tuple(kind: Any) -> bool:
+    return isinstance(kind, types.BaseTuple)
+
+
+def _holds_numbers(kind: Any) -> bool:
+    if _is_tuple(kind):
+        return all(map(_holds_numbers, kind.types))
+    return isinstance(kind, (types.Number, types.Boolean, types.NoneType))
+
+
+def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    if _is_tuple(kind):
+        for i, part in enumerate(kind.types):
+            inner = _without_owner(context, builder, part, builder.extract_value(value, i))
+            value = builder.insert_value(value, inner, i)
+    elif isinstance(kind, types.Array):
+        field = context.data_model_manager[kind].get_field_position("meminfo")
+        value = builder.insert_value(value, value.type.elements[field](None), field)
+    return value
 
 
 def plain_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
@@ -189,6 +225,7 @@ def install() -> dict[str, Any]:
         (JITCPUCodegen, "_library_class", KernelLibrary),
         (JITCPUCodegen, "set_env", set_env),
         (arrayobj, "fix_integer_index", plain_index),
+        (Lower, "extract_function_arguments", borrowed_arguments),
         (ir.Inst, "_rec_list_vars", variables_in),
     ):
         setattr(owner, name, value)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numba.core import ir
 from numba.core.compiler import run_frontend
+from numba.core.lowering import Lower
 from numba.core.registry import cpu_target
 from numba.core.types.functions import BaseFunction
 from numba.np import arrayobj
@@ -52,6 +53,7 @@ def _code(options: dict[str, Any]) -> str:
 
 def test_the_short_pipeline_makes_the_same_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrayobj, "fix_integer_index", kernel_compiler._fix_index)
+    monkeypatch.setattr(Lower, "extract_function_arguments", kernel_compiler._arguments)
     assert _code({"pipeline_class": KernelCompiler}) == _code({})
 
 
@@ -71,6 +73,56 @@ def test_a_kernel_takes_an_index_as_it_is() -> None:
     for k in (-1, 4):
         with pytest.raises(IndexError):
             checked(line, k)
+
+
+def _sum_of_views(levels: Any, rows: Any, out: Any) -> float:
+    scratch = np.zeros((4, 4))
+    total = 0.0
+    for i in range(rows.shape[0]):
+        line = levels[rows[i] % 2][rows[i]]
+        part = scratch[i % 4]
+        for k in range(part.shape[0]):
+            part[k] += line[k]
+        out[i] = part[0]
+        total += scratch[i % 4, 3]
+    return total
+
+
+def test_views_of_a_kernels_arguments_are_not_counted() -> None:
+    if not numba.__version__.startswith(kernel_compiler.TRIED):
+        pytest.skip("compiles as numba does")
+    levels, rows = (np.arange(40.0).reshape(10, 4), np.ones((10, 4), np.float64)), np.array([3, 4, 9, 1, 0, 2])
+    counted = []
+    for options in ({}, {"pipeline_class": KernelCompiler}):
+        compiled: Any = numba.njit(nogil=True, no_cfunc_wrapper=True, **options)(_sum_of_views)
+        ours, theirs = np.zeros(6), np.zeros(6)
+        held = [sys.getrefcount(one) for one in (*levels, rows, ours)]
+        assert compiled(levels, rows, ours) == _sum_of_views(levels, rows, theirs)
+        assert np.array_equal(ours, theirs)
+        assert [sys.getrefcount(one) for one in (*levels, rows, ours)] == held
+        (code,) = compiled.inspect_llvm().values()
+        counted.append(code.count("call void @NRT_incref"))
+    assert counted[1] < counted[0]
+
+
+@numba.njit(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True, pipeline_class=KernelCompiler)
+def _upper(a: Any, k: int) -> Any:
+    return a[k:]
+
+
+def _fill_views(n: int, out: Any) -> None:
+    for i in range(n):
+        view = _upper(np.full(512, float(i)), i % 7)
+        other = np.full(512, -1.0)  # takes the memory of the first array if that was given up too early
+        out[i] = view[0] + other[0]
+
+
+def test_a_view_that_a_helper_returns_keeps_its_array() -> None:
+    found, wanted = np.zeros(200), np.zeros(200)
+    numba.njit(nogil=True, pipeline_class=KernelCompiler)(_fill_views)(200, found)
+    for i in range(200):
+        wanted[i] = i - 1.0
+    assert np.array_equal(found, wanted)
 
 
 def test_no_kernel_counts_from_the_end_of_an_array() -> None:
