@@ -120,6 +120,21 @@ def test_a_rig_that_may_be_worn_is_less_certain_until_it_is_known() -> None:
     np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_c_m))[0], good)
 
 
+def test_rows_without_a_slope_rule_out_a_roll_and_nothing_else() -> None:
+    X, pose, T_c_m = scene(), PoseState(), se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
+    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
+    usual = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    covariance.set_roll(0.02)
+    level = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    assert np.linalg.eigvalsh(usual - level)[0] > -1e-12
+    assert np.linalg.matrix_rank(usual - level, tol=1e-6 * np.trace(usual - level)) == 1  # the slope along y
+    assert 0.0 < np.trace(usual - level) < 0.5 * np.trace(usual)
+    covariance.set_roll(0.5)  # of a worn rig, whose disparities are estimated
+    np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_c_m))[0], usual)
+
+
 def test_disparity_errors_that_cancel_cost_less_than_their_parts() -> None:
     X, pose, T_c_m = scene(), PoseState(), se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
     local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))

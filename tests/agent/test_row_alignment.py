@@ -127,8 +127,10 @@ def test_a_true_rig_is_left_alone(lens: Lens) -> None:
 @pytest.mark.parametrize(("turned", "least", "most"), [
     (TURNED, 10.0, np.inf),
     (np.array([0.0, 0.0, 2.5e-3]), 5.0, np.inf),  # twisted about the optical axis: the middle is right
-    (np.zeros(3), -0.7, -0.4),  # a good calibration: half of all worn ones show nothing, either
-    (np.array([2e-4, 0.0, 0.0]), -0.7, 0.0),  # a tenth of a pixel
+    (np.array([0.0, 1.6e-3, 0.0]), 5.0, np.inf),  # turned about y: corners are off, by half a pixel
+    (np.zeros(3), -1.25, -0.9),  # a good calibration: three of ten worn ones show nothing, either
+    (np.array([2e-4, 0.0, 0.0]), -1.25, 0.0),  # a tenth of a pixel
+    (np.array([0.0, 5e-3, 0.0]), -1.25, 0.5),  # corners are off by more than wear explains: another rectification
 ])  # fmt: skip
 def test_rows_tell_whether_a_rig_is_worn(lens: Lens, turned: NDArray[np.float64], least: float, most: float) -> None:
     rectifier, left, right = flight(lens, turned)
@@ -138,6 +140,8 @@ def test_rows_tell_whether_a_rig_is_worn(lens: Lens, turned: NDArray[np.float64]
     pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
     rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
     assert least < rows.worn_evidence < most
+    assert rows.roll_px is not None
+    assert abs(rows.roll_px - told_camera(lens).fx * abs(turned[2])) < 0.12
     fresh = Rectifier(CameraRig(told_camera(lens), told_camera(lens), np.eye(4), T_C_R))
     later = RowAlignment(fresh, RowConfig())
     later.begin_with(rows.estimate_px, read=False)  # from the rig file

@@ -67,6 +67,7 @@ class PoseCovariance:
         self._worn_cov = np.zeros((CALIBRATION, CALIBRATION))  # beyond a good calibration
         half = 0.5 * local_map.camera.width / local_map.camera.fx  # edge of the image, normalised
         self._at_edge = np.array([1.0, half, half, half**2, half**2])  # px there for a pixel of each term of an offset
+        self._roll = 1.0  # share of the variance of disparities along y that the right camera's rows allow
         self._has_body = has_body
         self._camera_rotation_rad = 0.0  # found against the IMU
         self._extrinsic = self._extrinsic_cov()
@@ -182,8 +183,7 @@ class PoseCovariance:
         sensor_cov: (6,6) of the pose by IMU or odometer, [translation in m, rotation about the body's axes]; None if
         no sensor measures the motion. moves: the velocity was known when images were lost.
         """
-        before = self._unmeasured_s or 0.0
-        self._unmeasured_s = before
+        before = self._unmeasured_s = self._unmeasured_s or 0.0
         if sensor_cov is not None:
             self._reckoned = sensor_cov
             return
@@ -285,8 +285,15 @@ class PoseCovariance:
             self._worn = worn
             self._set_calibration()
 
+    def set_roll(self, rms_px: float) -> None:
+        """Set the rms slope of the right camera's rows along x, px where x is 1: its roll tilts disparities as much."""
+        before, self._roll = self._roll, min((self._at_edge[2] * rms_px) ** 2 / self._good_variance[2], 1.0)
+        if before != self._roll:
+            self._set_calibration()
+
     def _set_calibration(self) -> None:
         good = np.diag(self._good_variance * self._evidence.level**2)
+        good[2, 2] *= self._roll
         self._calibration[:CALIBRATION, :CALIBRATION] = good + self._worn_cov
         self._extrinsic = self._extrinsic_cov()
 
@@ -364,9 +371,8 @@ class PoseCovariance:
         inliers: None if the pose comes from dead reckoning.
         """
         c = self._config
-        trust = 1.0
-        if inliers is not None:
-            trust = min(max((inliers - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
+        counted = c.many_inliers if inliers is None else inliers
+        trust = min(max((counted - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
         most = 100 if self._doubtful_s == 0.0 else c.flagged_below - 1
         return min(max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad))), most)
 

@@ -21,6 +21,8 @@ F64 = NDArray[np.float64]
 
 TERMS = 5
 _ROUNDS = 4  # of robust weighting
+_TURNS = np.array([0, 1, 3])  # terms of pitch, roll and yaw of the right camera
+_MOST_DEVIATIONS = 3.0  # of a worn rig's x y
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +40,12 @@ class RowConfig:
     min_significance: float = 4.0  # standard deviations of a change that is applied
     known_px: float = 0.1  # px; standard deviation of each number where an earlier flight measured it
     share_px: float = 0.1  # px; rms over points of a change that the base is told: a tenth of what a worn rig has
-    good_px: float = 0.1  # px; standard deviation of level and slope along x with a good calibration
+    sigma_share: float = 0.3  # of the standard deviations by sigma_px: what estimates of known rigs err by at most
+    good_px: float = 0.1  # px; standard deviation of level, slope along x and x y with a good calibration
     worn_px: float = 0.9  # px; standard deviation of the level with a worn rig: both centres moved
     worn_slope_px: float = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
-    shown: float = 0.5  # share of worn rigs whose rows are off; focal lengths and a turn about y do not move them
+    worn_turn_px: float = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
+    shown: float = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
 def terms(xy: F64) -> F64:
@@ -65,6 +69,7 @@ class RowAlignment:
         self._taken_read = False
         self._measured = False  # since take_change
         self.worn_evidence = 0.0  # logarithm of the likelihood of the rows with a worn rig over that with a good one
+        self.roll_px: float | None = None  # px where x is 1; rms of the slope along x, the roll of the right camera
         self.known = False  # something was measured, in this flight or an earlier one
         self._events: list[str] = []
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
@@ -154,11 +159,18 @@ class RowAlignment:
         return events
 
     def _weigh(self) -> None:
-        """Compare a worn rig with a good one by level and slope along x, which no depth and little distortion moves."""
+        """Compare a worn rig with a good one by level, slope along x and x y: pitch, roll and yaw of the right camera.
+
+        No depth moves them. An x y beyond any wear is what a rectification has left, and tells nothing.
+        """
         c = self._config
-        found, cov = self.estimate_px[:2], np.linalg.inv(self._information)[:2, :2]
-        good, worn = (_log_normal(found, cov + np.diag(np.array(s) ** 2))
-                      for s in ((c.good_px, c.good_px), (c.worn_px, c.worn_slope_px)))  # fmt: skip
+        at, worn_px = _TURNS, np.array([c.worn_px, c.worn_slope_px, c.worn_turn_px])
+        if abs(self.estimate_px[at[2]]) > _MOST_DEVIATIONS * c.worn_turn_px:
+            at, worn_px = at[:2], worn_px[:2]
+        found = self.estimate_px[at]
+        cov = c.sigma_share**2 * np.linalg.inv(self._information)[np.ix_(at, at)]
+        self.roll_px = math.sqrt(float(found[1] ** 2 + cov[1, 1]))
+        good, worn = (_log_normal(found, cov + np.diag(np.square(s))) for s in (np.full(len(at), c.good_px), worn_px))
         self.worn_evidence = float(np.logaddexp(math.log1p(-c.shown), math.log(c.shown) + worn - good))
 
     def _read_at(self, rows_px: F64) -> None:

@@ -54,6 +54,8 @@ class RightCamera:
             return []
         covariance, disparities = self._camera.covariance, self.disparities
         disparities.add_row_evidence(self.rows.worn_evidence)
+        if self.rows.roll_px is not None:
+            covariance.set_roll(self.rows.roll_px)
         change = disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
         if change is None:
             covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
