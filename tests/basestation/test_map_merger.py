@@ -17,35 +17,14 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import CameraIntrinsics, Key, Record, SubmapPlacement
+from kiteline_codec.schema import CameraIntrinsics, Key, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import submap_of_keyframe
+from tests.basestation.feeding import STEP_NS, feed
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
-STEP_NS = 250_000_000
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
-
-
-def feed(mapper: Mapper, flights: Sequence[Any], delays: Sequence[int] = ()) -> list[Record]:
-    """Fly together, one keyframe a step each; delays: steps by which each begins later."""
-    delays = delays or [0] * len(flights)
-    done: tuple[JobDone, ...] = ()
-    published: list[Record] = []
-    steps = max(d + len(f.records) for d, f in zip(delays, flights))
-    for n in range(steps + 60):
-        arrivals = []
-        for flight, delay in zip(flights, delays):
-            records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
-            if 0 <= n - delay < len(flight.records):
-                records += flight.records[n - delay]
-            arrivals.append((flight.agent, tuple(records)))
-        output = mapper.step(MapperInput(tuple(arrivals), done), n * STEP_NS)
-        done = tuple(run_job(job) for job in output.jobs)
-        for _, out in output.publish:
-            published.extend(out)
-    assert mapper.idle
-    return published
 
 
 def joint_error_m(mapper: Mapper, flights: Sequence[Any]) -> F64:

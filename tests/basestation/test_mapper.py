@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig, TriangulationConfig
 from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.job_kinds import run_job
-from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import (
@@ -33,22 +32,10 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
+from tests.basestation.feeding import STEP_NS, feed_groups
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
-STEP_NS = 250_000_000
-
-
-def feed(mapper: Mapper, flight: Any, groups: Sequence[Sequence[Record]]) -> list[Record]:
-    """Hand in one group of records a step, run every job at once, and collect all that is published."""
-    done: tuple[JobDone, ...] = ()
-    published: list[Record] = []
-    for n, records in enumerate([[CameraIntrinsics(flight.agent, flight.camera)], *groups, *[[]] * 12]):
-        output = mapper.step(MapperInput(((flight.agent, tuple(records)),), done), n * STEP_NS)
-        done = tuple(run_job(job) for job in output.jobs)
-        for _, out in output.publish:
-            published.extend(out)
-    return published
 
 
 def errors_m(mapper: Mapper, flight: Any) -> F64:
@@ -63,7 +50,7 @@ def drift_m(flight: Any) -> F64:
 def test_mapper_reduces_drift_over_two_rounds(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=2.0, memory=3)
     mapper = Mapper()
-    feed(mapper, flight, flight.records)
+    feed_groups(mapper, flight, flight.records)
     assert len(mapper.map) == 60
     assert np.sqrt(np.mean(errors_m(mapper, flight) ** 2)) < 0.5 * np.sqrt(np.mean(drift_m(flight) ** 2))
 
@@ -71,7 +58,7 @@ def test_mapper_reduces_drift_over_two_rounds(make_flight: MakeFlight) -> None:
 def test_landmark_matching_fuses_only_true_duplicates(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=2.0, memory=3)
     mapper = Mapper()
-    feed(mapper, flight, flight.records)
+    feed_groups(mapper, flight, flight.records)
     table = mapper.map.keypoints
     slots = np.flatnonzero((table.kind == LANDMARK) & (table.root != np.arange(len(table.root)))).astype(np.int32)
     aliases, roots = mapper.map.landmark_ids(slots).tolist(), mapper.map.landmark_ids(table.root[slots]).tolist()
@@ -86,10 +73,10 @@ def test_rounds_stay_unconnected_without_landmark_matching(make_flight: MakeFlig
     for seed in (0, 1):
         flight = make_flight(keyframes=60, turns=2.0, memory=3, seed=seed)
         mapper = Mapper(replace(BaseConfig(), landmark_matching=LandmarkMatchingConfig(max_hamming=-1)))
-        feed(mapper, flight, flight.records)
+        feed_groups(mapper, flight, flight.records)
         assert mapper.counts.found == 0
         joined = Mapper()
-        feed(joined, flight, flight.records)
+        feed_groups(joined, flight, flight.records)
         apart.append(np.mean(errors_m(mapper, flight)[40:]))
         together.append(np.mean(errors_m(joined, flight)[40:]))
     assert np.mean(together) < 0.7 * np.mean(apart)
@@ -98,7 +85,7 @@ def test_rounds_stay_unconnected_without_landmark_matching(make_flight: MakeFlig
 def test_outlier_observations_are_removed(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=20, outliers=0.05, turns=0.5)
     mapper = Mapper()
-    published = feed(mapper, flight, flight.records)
+    published = feed_groups(mapper, flight, flight.records)
     table = mapper.map.keypoints
     slots = np.flatnonzero(table.flags & REMOVED).astype(np.int32)
     keyframes = mapper.map.keyframes.id[table.row[slots]].tolist()
@@ -126,7 +113,7 @@ def test_landmarks_without_later_observations_are_culled(make_flight: MakeFlight
         )  # fmt: skip
         records.append([replace(head, keypoints=head.keypoints + 15), *part[1:], new_landmarks])
     mapper = Mapper()
-    published = feed(mapper, flight, records)
+    published = feed_groups(mapper, flight, records)
     last = {r.keyframe: r for r in published if isinstance(r, CulledLandmarks)}
     culled = {(k, int(i)) for k, r in last.items() for i in r.index}
     judged = {g for g in ghosts if g[0] <= flight.keyframes[-5]}
@@ -140,7 +127,7 @@ def test_landmarks_without_depth_are_triangulated(make_flight: MakeFlight, stere
     if not stereo:  # all new landmarks and observations without depth: the poses alone place the points
         flight = make_flight(keyframes=14, turns=0.4, no_depth=1.0, drift_m=0.0005)
     mapper = Mapper()
-    published = feed(mapper, flight, flight.records)
+    published = feed_groups(mapper, flight, flight.records)
     assert mapper.counts.triangulated > 40
     points = mapper.map.live_landmarks()
     seen = np.diff(mapper.map.observations(points)[0])
@@ -157,7 +144,7 @@ def test_landmarks_without_depth_are_triangulated(make_flight: MakeFlight, stere
 def test_no_triangulation_from_one_viewpoint(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=8, turns=0.2, no_depth=1.0)
     mapper = Mapper(replace(BaseConfig(), triangulation=TriangulationConfig(max_cosine=-1.0)))
-    feed(mapper, flight, flight.records)
+    feed_groups(mapper, flight, flight.records)
     assert mapper.counts.triangulated == 0
 
 
@@ -172,7 +159,7 @@ def test_intake_does_not_depend_on_order_of_records(make_flight: MakeFlight) -> 
             records = [records[i] for i in rng.permutation(len(records))]
             records += records[:10]
         # Everything in one step: the same work on the same knowledge, whatever the order.
-        published = feed(mapper, flight, [records])
+        published = feed_groups(mapper, flight, [records])
         maps.append((pickle.dumps(published), mapper.summary()["points"]))
     assert maps[0][1] == maps[1][1]
     assert maps[0][0] == maps[1][0]
@@ -182,7 +169,7 @@ def test_two_runs_publish_the_same_bytes(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=25, turns=1.2)
     runs = []
     for _ in range(2):
-        runs.append(pickle.dumps(feed(Mapper(), flight, flight.records)))
+        runs.append(pickle.dumps(feed_groups(Mapper(), flight, flight.records)))
     assert runs[0] == runs[1]
 
 
@@ -208,7 +195,7 @@ def test_incomplete_keyframe_is_used_after_the_patience(make_flight: MakeFlight)
 def test_published_values_match_the_map(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=20, turns=1.0)
     mapper = Mapper()
-    published = feed(mapper, flight, flight.records)
+    published = feed_groups(mapper, flight, flight.records)
     first = flight.keyframes[0]
     assert [r.submap for r in published if isinstance(r, SubmapPlacement)] == [submap_of_keyframe(first)]
     poses = {r.keyframe: r.T_m_k for r in published if isinstance(r, KeyframePose)}
@@ -268,7 +255,7 @@ def test_summary_describes_each_agent(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=5, turns=0.1, agent=3)
     mapper = Mapper()
     live = LivePose(flight.agent, 77, flight.keyframes[-1], np.eye(4), 80)
-    feed(mapper, flight, [*flight.records, [live]])
+    feed_groups(mapper, flight, [*flight.records, [live]])
     summary = mapper.summary()
     agents = summary["agents"]
     assert isinstance(agents, dict)
@@ -287,7 +274,7 @@ def test_summary_describes_each_agent(make_flight: MakeFlight) -> None:
 def test_mapper_continues_from_restored_state(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=24, turns=1.2, memory=3)
     first = Mapper()
-    published = feed(first, flight, flight.records[:20])
+    published = feed_groups(first, flight, flight.records[:20])
     received = (CameraIntrinsics(flight.agent, flight.camera), *(r for part in flight.records[:20] for r in part))
     own = {messages.key(r): r for r in published}
     second = Mapper()
@@ -309,7 +296,7 @@ def test_mapper_continues_from_restored_state(make_flight: MakeFlight) -> None:
     assert np.array_equal(
         first.map.positions(first.map.live_landmarks())[0], second.map.positions(second.map.live_landmarks())[0]
     )
-    feed(second, flight, flight.records[20:])
+    feed_groups(second, flight, flight.records[20:])
     assert second.counts.bundles > 2
     assert len(second.map) == 24
 
@@ -317,7 +304,7 @@ def test_mapper_continues_from_restored_state(make_flight: MakeFlight) -> None:
 def test_backlog_is_bundled_from_the_oldest_on(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=24, turns=1.2, memory=3)
     mapper = Mapper()
-    feed(mapper, flight, [[r for part in flight.records for r in part]])
+    feed_groups(mapper, flight, [[r for part in flight.records for r in part]])
     assert mapper.idle
     assert mapper.counts.bundles >= 4
     refined = [k for k in flight.keyframes if mapper.map.keyframes.pose_source[mapper.map.rows[k]] == REFINED_POSE]
@@ -329,8 +316,8 @@ def test_later_submap_is_placed_by_odometry(make_flight: MakeFlight) -> None:
     mapper = Mapper()
     seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, KeyframeHeader)) - 10**9
     live = LivePose(flight.agent, seen_ns, flight.keyframes[2], se3.exp(np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0])), 80)
-    feed(mapper, flight, [*flight.records, [live]])
-    published = feed(mapper, later, later.records)
+    feed_groups(mapper, flight, [*flight.records, [live]])
+    published = feed_groups(mapper, later, later.records)
     (placement,) = [r for r in published if isinstance(r, SubmapPlacement)]
     left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
     assert left is not None and begin is not None
@@ -344,6 +331,6 @@ def test_submap_after_a_long_gap_is_not_placed(make_flight: MakeFlight) -> None:
     seen_ns = next(r.t_ns for r in later.records[0] if isinstance(r, KeyframeHeader)) - 5 * 10**9
     tracked = LivePose(flight.agent, seen_ns, flight.keyframes[2], np.eye(4), 80)
     guessed = LivePose(flight.agent, seen_ns + 49 * 10**8, flight.keyframes[2], np.eye(4), -1)
-    feed(mapper, flight, [*flight.records, [tracked], [guessed]])
-    assert not any(isinstance(r, SubmapPlacement) for r in feed(mapper, later, later.records))
+    feed_groups(mapper, flight, [*flight.records, [tracked], [guessed]])
+    assert not any(isinstance(r, SubmapPlacement) for r in feed_groups(mapper, later, later.records))
     assert submap_of_keyframe(later.keyframes[0]) not in mapper.placements

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from kiteline_basestation.merging.loop_consistency import within_drift
 from kiteline_basestation.merging.loop_edges import LoopEdge, similarity
 from kiteline_basestation.merging.loop_verification import depth_scale
 from kiteline_basestation.merging.similarity import align_points
-from kiteline_basestation.refinement.bundle_job import BundleInputs
+from kiteline_basestation.refinement.bundle_job import LOCAL_BUNDLE, BundleInputs
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.channel import plain_pair
@@ -39,10 +39,10 @@ from kiteline_codec.schema import (
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
+from tests.basestation.feeding import STEP_NS, feed
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
-STEP_NS = 250_000_000
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 
 
@@ -58,36 +58,13 @@ def in_own_unit(flight: Any, unit: float, growth: float = 0.0) -> Any:
 
 
 def untouched(job: Job) -> JobDone:
-    """A bundle that changes nothing, so that what drifts keeps its drift until a loop takes it back."""
+    """Local bundles change nothing, so that what drifts keeps its drift until a loop takes it back."""
+    if job.kind != LOCAL_BUNDLE.name:
+        return run_job(job)
     assert isinstance(job.inputs, BundleInputs)
     problem = job.inputs.problem
     kept = np.ones(len(problem.camera), np.bool_)
     return JobDone(job.id, job.kind, BundleResult(problem.T_c_m, problem.points, kept, 1.0, 1.0, 0, 1), 1)
-
-
-def feed(
-    mapper: Mapper, flights: Sequence[Any], delays: Sequence[int] = (), drift: bool = False
-) -> list[Record]:  # fmt: skip
-    """Fly together, one keyframe a step each; delays: steps by which each begins later. drift: local bundles do not
-    help against it.
-    """
-    delays = delays or [0] * len(flights)
-    done: tuple[JobDone, ...] = ()
-    published: list[Record] = []
-    for n in range(max(d + len(f.records) for d, f in zip(delays, flights)) + 70):
-        arrivals = []
-        for flight, delay in zip(flights, delays):
-            records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
-            if 0 <= n - delay < len(flight.records):
-                records += flight.records[n - delay]
-            arrivals.append((flight.agent, tuple(records)))
-        output = mapper.step(MapperInput(tuple(arrivals), done), n * STEP_NS)
-        done = tuple(untouched(job) if drift and job.kind == "bundle" else run_job(job) for job in output.jobs)
-        for _, out in output.publish:
-            published.extend(out)
-    assert mapper.idle
-    assert contradictions(mapper) == []
-    return published
 
 
 def placed(mapper: Mapper, flight: Any) -> F64:
@@ -126,8 +103,8 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
         0.4, growth,
     )  # fmt: skip
     blind, mapper = Mapper(BaseConfig()), Mapper(BaseConfig(), words)
-    feed(blind, [flight], drift=True)
-    published = feed(mapper, [flight], drift=True)
+    feed(blind, [flight], run=untouched)
+    published = feed(mapper, [flight], run=untouched)
     assert mapper.summary()["loops"] >= 1
     before, after = (error_m(placed(m, flight), true_places(flight))[0] for m in (blind, mapper))
     assert after < 0.15 * before
