@@ -5,12 +5,15 @@ They reach into numba, so a version that they were not tried with compiles witho
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
 from typing import Any
 
 import llvmlite.binding as llvm
 import llvmlite.binding.ffi
 import numba
-from numba.core import ir, typed_passes, types, untyped_passes
+from numba.core import caching, ir, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
@@ -187,6 +190,24 @@ def call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     return _call_type(self, context, args, kws)
 
 
+def save(self: Any, key: Any, data: Any) -> None:
+    """Write a compiled function to the cache, one process at a time and the index last.
+
+    numba reads the index, adds to it and writes the code after it. Two processes that compile a function for different
+    types at once would lose one of them, or find the code of one under the types of the other.
+    """
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a file system without locks
+            folder = os.open(self._cache_path, os.O_RDONLY)
+            stack.callback(os.close, folder)
+            fcntl.flock(folder, fcntl.LOCK_EX)
+        overloads = self._load_index()
+        free = (name for k in range(1, len(overloads) + 2) if (name := self._data_name(k)) not in overloads.values())
+        name = overloads.get(key) or next(free)
+        self._save_data(name, data)
+        self._save_index({**overloads, key: name})
+
+
 _OTHER, _VARIABLE, _INSTRUCTION, _SEQUENCE, _MAPPING = range(5)
 _kinds: dict[type, int] = {}
 
@@ -227,6 +248,7 @@ def install() -> dict[str, Any]:
         (arrayobj, "fix_integer_index", plain_index),
         (Lower, "extract_function_arguments", borrowed_arguments),
         (ir.Inst, "_rec_list_vars", variables_in),
+        (caching.IndexDataCacheFile, "save", save),
     ):
         setattr(owner, name, value)
     llvmlite.binding.ffi.lib._lock._cblist.clear()  # events of each call of LLVM, to which nothing listens

@@ -12,13 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from kiteline_lab.evaluation.metrics import Evaluation
+from kiteline_lab.tools.doctor import WARMING
 from kiteline_lab.tools.evaluate import evaluate_files
 
 SCENE = "room"  # four walls, furniture, a window: similar to EuRoC's Vicon room
 SECONDS = 8.0  # long enough to see the room, short enough to wait for
 SEED = 7
-# Without garbage collection compiling takes a sixth less time, and 700 MiB instead of 500.
-_WARM = "import gc; gc.disable(); from kiteline_lab import demo; demo.{}()"
 
 
 def demo(folder: Path, seconds: float = SECONDS) -> str:
@@ -66,37 +65,15 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def warm_all() -> None:
-    """Compile the kernels of all rooms."""
-    from kiteline_lab.tools.doctor import warm
-
-    warm()
-
-
-def warm_base() -> None:
-    """Compile the kernels of the base."""
-    from kiteline_basestation.runtime.warm import warm
-    from kiteline_hw.system.vocabulary import shipped_vocabulary
-
-    warm(None, shipped_vocabulary())
-
-
 @contextlib.contextmanager
 def _compiling() -> Iterator[None]:
-    """Compile the kernels in two processes during the block, and wait for them at its end.
-
-    One process compiles everything in turn and finds the base's kernels done by the other. If one fails, the flight
-    compiles them itself.
-    """
-    compilers = [subprocess.Popen([sys.executable, "-c", _WARM.format(name)]) for name in ("warm_all", "warm_base")]
-    try:
-        yield
-        for compiler in compilers:
+    """Compile the kernels during the block, and wait for them at its end. If it fails, the flight compiles them."""
+    with subprocess.Popen([sys.executable, "-m", "kiteline_hw.system.kernel_compilation", *WARMING]) as compiler:
+        try:
+            yield
             compiler.wait()
-    finally:
-        for compiler in compilers:
+        finally:
             compiler.kill()
-            compiler.wait()
 
 
 def _step(text: str) -> None:

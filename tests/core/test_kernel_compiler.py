@@ -10,7 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
-from numba.core import ir
+from numba.core import caching, ir
 from numba.core.compiler import run_frontend
 from numba.core.lowering import Lower
 from numba.core.registry import cpu_target
@@ -190,6 +190,24 @@ def test_helpers_are_read_from_the_cache(tmp_path: Path) -> None:
         )
         lines.append(done.stdout.split())
     assert lines == [["3.0", "0", "0", "1"], ["3.0", "1", "0", "0"], ["4.0", "0", "1", "0"]]
+
+
+def test_processes_that_write_to_the_cache_at_once_lose_nothing(tmp_path: Path) -> None:
+    if not numba.__version__.startswith(kernel_compiler.TRIED):
+        pytest.skip("caches as numba does")
+    slow = (
+        "from numba.core.caching import IndexDataCacheFile as File\nimport time, sys\nfrom kiteline_core import jit\n"
+        "load = File._load_index\nFile._load_index = lambda self: (load(self), time.sleep(.02))[0]\n"
+        "file = File(sys.argv[1], 'kernel', 'source')\n"
+        "for k in range(8): file.save((sys.argv[2], k), sys.argv[2] * k)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    writers = [subprocess.Popen([sys.executable, "-c", slow, str(tmp_path), who], env=environment) for who in "ab"]
+    assert [writer.wait(60) for writer in writers] == [0, 0]
+    file: Any = caching.IndexDataCacheFile(str(tmp_path), "kernel", "source")  # type: ignore[no-untyped-call]
+    assert {(who, k): file.load((who, k)) for who in "ab" for k in range(8)} == {
+        (who, k): who * k for who in "ab" for k in range(8)
+    }
 
 
 def _listed(value: Any) -> list[Any]:

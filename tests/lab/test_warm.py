@@ -1,7 +1,8 @@
-"""No kernel is compiled in flight: `warm` has run each one on the types that flights use."""
+"""No kernel is compiled in flight: `warm` has run each one on the types that flights use, and the lists name them."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -9,11 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_hw.system.kernel_compilation import listed
+from kiteline_lab.tools.doctor import WARMING
+
 FLIGHT = """
 import json, sys
-from kiteline_agent.runtime.warm import warm
-from kiteline_codec import warm as codec_warm
+from kiteline_hw.system.kernel_compilation import called
 from kiteline_lab.flights.fly import main
+from kiteline_lab.tools.doctor import WARMING
 
 def compiled():
     kernels = {}
@@ -24,11 +28,11 @@ def compiled():
                     kernels[f"{name}.{kernel}"] = [str(one) for one in function.signatures]
     return kernels
 
-codec_warm.warm()
-warm()
+codec, agent, base = WARMING
+lines = called(codec) + called(agent)
 before = compiled()
 main(sys.argv[1:])
-print(json.dumps([before, compiled()]))
+print(json.dumps([before, compiled(), lines + called(base)]))
 """
 
 
@@ -38,6 +42,12 @@ def test_a_flight_compiles_nothing(recording: Path, tmp_path: Path, options: lis
         [sys.executable, "-c", FLIGHT, str(recording), *options, "--mode", "tracker", "--out", str(tmp_path)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    before, after = json.loads(done.stdout.splitlines()[-1])
+    before, after, lines = json.loads(done.stdout.splitlines()[-1])
     assert sum(map(len, before.values())) > 50
     assert after == before
+    lists = {name: set(listed(importlib.import_module(name))) for name in WARMING}
+    named = set().union(*lists.values())
+    remedy = "\n".join(
+        f"python -m kiteline_hw.system.kernel_compilation --list {name} > kernels.txt, beside it" for name in WARMING
+    )
+    assert named == set(lines), f"write the lists anew:\n{remedy}"

@@ -26,7 +26,7 @@ from kiteline_agent.runtime.options import (
     channel_for,
 )
 from kiteline_agent.runtime.rig_file import RigFile
-from kiteline_agent.runtime.warm import warm
+from kiteline_agent.runtime.warm import WARMING, warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
@@ -70,7 +70,7 @@ class AgentRuntime:
         config = config or agent_config(options.config, options.cpu_percent, options.rig, options.grid)
         self._rig_file = RigFile(options.rig) if options.rig else None
         if whole_process:
-            kernel_cache.fill("kiteline_agent.runtime.warm")
+            kernel_cache.fill(WARMING)
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(config)

@@ -23,6 +23,7 @@ from kiteline_agent.runtime.options import (
 )
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.runtime.terminal import StatusMessages, summary
+from kiteline_agent.runtime.warm import WARMING
 from kiteline_agent.step import StepOutput
 from kiteline_codec.channel import settled
 from kiteline_codec.transport.framing import StreamFramer
@@ -50,7 +51,7 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         source = with_controller_imu(options, source)
         if not kernel_cache.filled():
             with starting():
-                kernel_cache.fill("kiteline_agent.runtime.warm", stop)
+                kernel_cache.fill(WARMING, stop)
         if stop:
             return
         runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)

@@ -18,7 +18,6 @@ from kiteline_agent.scans.local_grid import LocalGrid
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_codec import warm as codec_warm
 from kiteline_codec.schema import KeyframeScan
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
@@ -29,6 +28,8 @@ from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_core.imaging.matching import MatchConfig, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pose.pnp import solve_pnp
+
+WARMING = ("kiteline_codec.warm", "kiteline_agent.runtime.warm")  # modules whose `warm` runs all kernels of an agent
 
 
 def warm(config: AgentConfig | None = None) -> None:
@@ -115,8 +116,3 @@ def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None
         build_pyramid(image, 4), NO_GRID, templates, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.eye(2)[None],
         place, place + 5.0, 0.7, 40, 0.7, 0.9, place.copy(), np.zeros(1, np.int8),
     )  # fmt: skip
-
-
-if __name__ == "__main__":
-    codec_warm.warm()
-    warm()

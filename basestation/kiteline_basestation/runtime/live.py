@@ -12,6 +12,7 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.base_runtime import BaseRuntime, report_restored
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.runtime.terminal import TerminalReporter
+from kiteline_basestation.runtime.warm import WARMING
 from kiteline_basestation.runtime.worker import Worker
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
@@ -22,7 +23,7 @@ from kiteline_hw.links.sealed_link import SealedHub
 from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.links.zenoh_queries import QueryServer
 from kiteline_hw.ports import LinkHub
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.key_store import read_keys
 from kiteline_hw.system.long_work import StoppedError, long_work, starting
@@ -38,6 +39,11 @@ _STEP_NS = 50_000_000  # ns between two steps without input: keeps acknowledgeme
 def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
     """Serve agents until `stop`. parent: the process that started this one, if it is a child of `kiteline fly`."""
     return_large_arrays()
+    if not kernel_cache.filled():
+        with starting():
+            kernel_cache.fill(WARMING, stop)
+    if stop:
+        return
     clock = MonotonicClock()
     with contextlib.ExitStack() as stack:
         link = open_link(options.link, "base", framer=StreamFramer, required=False)

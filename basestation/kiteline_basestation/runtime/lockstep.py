@@ -9,11 +9,12 @@ import threading
 
 from kiteline_basestation.runtime.base_runtime import BaseRuntime, report_restored
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
+from kiteline_basestation.runtime.warm import WARMING
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
 from kiteline_hw.ports import LinkError
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.memory import return_large_arrays
 
 _COLLECT_S = 120.0  # s that an agent may take for one tick before it counts as lost
@@ -22,6 +23,7 @@ _COLLECT_S = 120.0  # s that an agent may take for one tick before it counts as 
 def fly_lockstep(options: BaseOptions, parent: process.Parent) -> None:
     """Serve the barrier until the flight ends. An agent whose process ends is left out."""
     return_large_arrays()
+    kernel_cache.fill(WARMING)
     base = BaseRuntime(options, coded_channels(options, link_traits(options.link)))
     report_restored(base.restore_maps(0), parent)
     server = LockstepServer(options.link.removeprefix("lockstep:"))

@@ -17,8 +17,9 @@ from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, KeyframeScan
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
-from kiteline_core.places.place_index import Vocabulary
+from kiteline_core.places.place_index import Vocabulary, nodes
 
+WARMING = ("kiteline_codec.warm", "kiteline_basestation.runtime.warm")  # modules whose `warm` runs all its kernels
 _KEYFRAMES = 8  # enough for a bundle, a grid, and landmarks old enough to be culled
 _POINTS = 120
 _FAR = 20  # points without stereo depth
@@ -27,6 +28,9 @@ _STEP_M = 0.05  # m sideways between two keyframes
 
 def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None) -> None:
     """Run every kernel once, with the types of flights. Takes a fraction of a second if the kernel cache is filled."""
+    if vocabulary is None:
+        centres = np.random.default_rng(0).integers(0, 1 << 63, (nodes(4, 2), 4)).astype(np.uint64)
+        vocabulary = Vocabulary(4, 2, centres, np.ones(16, np.float32))
     agent, base = plain_pair()
     station = Station(config or BaseConfig(), lambda _: base, vocabulary)
     station.join(AgentId(0))
@@ -40,14 +44,13 @@ def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None)
     agent.put(_scan(_KEYFRAMES - 1))
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
     station.mapper.views.take()
-    if vocabulary is not None:
-        submap = submap_id(0, 0, 0)
-        easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
-        sparse_map, last, first = station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
-        verify_loop(sparse_map, last, first, easy)
-        sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))
-        sparse_map.measures_depth.clear()
-        verify_loop(sparse_map, last, first, easy)  # monocular, with a scale
+    submap = submap_id(0, 0, 0)
+    easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
+    sparse_map, last, first = station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
+    verify_loop(sparse_map, last, first, easy)
+    sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))
+    sparse_map.measures_depth.clear()
+    verify_loop(sparse_map, last, first, easy)  # monocular, with a scale
 
 
 def warm_graphs() -> None:

@@ -1,4 +1,4 @@
-"""CPU time to compile each room's numba kernels from an empty cache.
+"""CPU time to compile each room's numba kernels from an empty cache, and how long a start waits for them.
 
 Usage: python -m kiteline_bench.system.compile_time [ROOM...]
 """
@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -48,6 +49,23 @@ def measure(room: str) -> CompileTime:
         done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     seconds, signatures = json.loads(done.stdout.splitlines()[-1])
     return CompileTime(seconds, signatures)
+
+
+def waiting_s(modules: Sequence[str], cores: int) -> float:
+    """Seconds until a start with an empty cache has the kernels of modules, on so many of the cores.
+
+    Raises subprocess.CalledProcessError.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONWARNINGS": "ignore"}
+        command = [sys.executable, "-m", "kiteline_hw.system.kernel_compilation", *modules]
+        begin_s = time.monotonic()
+        subprocess.run(command, env=environment, check=True, preexec_fn=lambda: _use(cores))
+        return time.monotonic() - begin_s
+
+
+def _use(cores: int) -> None:
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
 
 
 def _compile_here(room: str) -> None:

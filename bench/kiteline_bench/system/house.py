@@ -5,8 +5,10 @@ from __future__ import annotations
 from statistics import median
 from typing import Any
 
+from kiteline_agent.runtime.warm import WARMING as agent_modules
+from kiteline_basestation.runtime.warm import WARMING as base_modules
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
-from kiteline_bench.system.compile_time import measure
+from kiteline_bench.system.compile_time import measure, waiting_s
 from kiteline_bench.system.older_build import REVISION, Build, older_build, todays_build
 from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circles
 
@@ -77,13 +79,15 @@ def _base_ms(report: dict[str, Any]) -> float:
 
 
 def _compile(bench: Bench) -> list[Bar]:
-    """CPU to compile the kernels of each half from an empty cache."""
+    """CPU to compile the kernels of each half from an empty cache; how long a start waits, on one core and on two."""
     bars = []
-    for room in ("agent", "base"):
+    for room, modules in (("agent", agent_modules), ("base", base_modules)):
         bench.say(f"compiling the kernels of the {room}")
         found = measure(room)
         slowest = sorted(found.seconds.items(), key=lambda item: -item[1])[:8]
         bench.more.append(f"{room}, slowest: " + ", ".join(f"`{name}` {s:.1f} s" for name, s in slowest) + ".")
+        one_s, two_s = (waiting_s(modules, cores) for cores in (1, 2))
+        bench.more.append(f"{room}, wait at a cold start: {one_s:.1f} s on one core, {two_s:.1f} s on two.")
         bars.append(at_most(f"compilation of all kernels of the {room}, CPU", found.total_s, _COMPILE_S, "s", 1))
     return bars
 

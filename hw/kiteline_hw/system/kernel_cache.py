@@ -11,18 +11,20 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from kiteline_hw.system.process import StopSignal
 
 _KERNELS = "_kernels"  # suffix of kernel modules
+_RECORD = "kiteline-compiled"  # file that lists compiled modules, beside their kernels
 _POLL_S = 0.1  # s between two looks at the compiler
 _TIMEOUT_S = 900.0  # s that a slow board may take to compile all
 
 
-def fill(module: str, stop: StopSignal | None = None) -> bool:
-    """Run `python -m module` to compile the kernels of all loaded modules, unless they are; True if they are now.
+def fill(modules: Sequence[str], stop: StopSignal | None = None) -> bool:
+    """Run `kernel_compilation` on modules unless all loaded kernels are compiled; True if they are now.
 
     If nothing can be written, the caller compiles in its own process. stop: ends the compilation.
     """
@@ -30,7 +32,7 @@ def fill(module: str, stop: StopSignal | None = None) -> bool:
         return True
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         compiler = subprocess.Popen(
-            [sys.executable, "-m", module],
+            [sys.executable, "-m", "kiteline_hw.system.kernel_compilation", *modules],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         with compiler:
@@ -57,43 +59,52 @@ def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None) -> bool:
 
 def filled() -> bool:
     """True if the present kernels of all loaded modules are compiled for this processor."""
-    path = _path()
     try:
-        return path is not None and _needed() <= set(path.read_text().splitlines())
+        needed = _needed()
+        return bool(needed) and all(lines <= _recorded(folder) for folder, lines in needed.items())
     except (OSError, ValueError):
         return False
 
 
 def mark() -> None:
     """Record that the kernels of all loaded modules are compiled."""
-    path = _path()
-    if path is not None:
-        with contextlib.suppress(OSError):
-            new = path.with_name(f"{path.name}.{os.getpid()}")
-            new.write_text("\n".join(sorted(_needed())) + "\n")
-            os.replace(new, path)
+    with contextlib.suppress(OSError, ValueError):
+        for folder, lines in _needed().items():
+            folder.mkdir(parents=True, exist_ok=True)
+            names = {line.split()[0] for line in lines}
+            others = {line for line in _recorded(folder) if line.split()[0] not in names}
+            new = folder / f"{_RECORD}.{os.getpid()}"
+            new.write_text("\n".join(sorted(lines | others)) + "\n")
+            os.replace(new, folder / _RECORD)
 
 
-def _path() -> Path | None:
-    """The file of the record: beside the first kernel of the first module."""
-    for _, module in _modules():
-        for value in vars(module).values():
-            folder = getattr(getattr(value, "stats", None), "cache_path", None)
-            if folder:
-                return Path(folder) / "kiteline-compiled"
+def folder_of(module: Any) -> Path | None:
+    """Folder where numba keeps the compiled kernels of a module; None if it has none."""
+    for value in vars(module).values():
+        if folder := getattr(getattr(value, "stats", None), "cache_path", None):
+            return Path(folder)
     return None
 
 
-def _needed() -> set[str]:
-    """One line per module, with everything its compiled code depends on."""
+def _recorded(folder: Path) -> set[str]:
+    path = folder / _RECORD
+    return set(path.read_text().splitlines()) if path.exists() else set()
+
+
+def _needed() -> dict[Path, set[str]]:
+    """One line per module, with everything its compiled code depends on, by the folder of its compiled kernels."""
     import llvmlite.binding as llvm
     import numba
 
     machine = f"{llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
     compiler = hashlib.blake2b(machine.encode(), digest_size=8).hexdigest()
     versions = f"{platform.python_version()} {numba.__version__} {compiler}"
-    about = [(name, os.stat(module.__file__)) for name, module in _modules()]
-    return {f"{name} {file.st_mtime_ns} {file.st_size} {versions}" for name, file in about}
+    needed: dict[Path, set[str]] = {}
+    for name, module in _modules():
+        folder, file = folder_of(module), os.stat(module.__file__)
+        if folder is not None:
+            needed.setdefault(folder, set()).add(f"{name} {file.st_mtime_ns} {file.st_size} {versions}")
+    return needed
 
 
 def _modules() -> list[tuple[str, Any]]:

@@ -14,11 +14,11 @@ from numba import njit
 def twice(x):
     return 2 * x
 """
-WARM = "import tiny_kernels\ntiny_kernels.twice(1)\n"
+WARM = "import tiny_kernels\n\ndef warm():\n    tiny_kernels.twice(1)\n"
 FLIGHT = """
 import sys, tiny_kernels
 from kiteline_hw.system import kernel_cache
-print(kernel_cache.filled(), kernel_cache.fill(sys.argv[1]))
+print(kernel_cache.filled(), kernel_cache.fill(sys.argv[1:]))
 tiny_kernels.twice(1)
 print(sum(tiny_kernels.twice.stats.cache_misses.values()))
 """
