@@ -51,6 +51,7 @@ def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None)
     sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))
     sparse_map.measures_depth.clear()
     verify_loop(sparse_map, last, first, easy)  # monocular, with a scale
+    station.mapper.grid_updates.update()  # without scans, landmarks are drawn
 
 
 def warm_graphs() -> None:
