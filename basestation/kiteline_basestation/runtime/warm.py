@@ -41,17 +41,21 @@ def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None)
             agent.put(record)
         output = station.step({}, done, k * 1_000_000_000)
         done = tuple(run_job(job) for job in output.jobs)
+    sparse_map = station.mapper.map
+    stereo = sparse_map.cameras[AgentId(0)]
+    sparse_map.set_camera(AgentId(0), replace(stereo, stereo=False))
+    station.mapper.grid_updates.update()  # of a camera that sends no scans, landmarks are drawn
+    sparse_map.set_camera(AgentId(0), stereo)
     agent.put(_scan(_KEYFRAMES - 1))
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
     station.mapper.views.take()
     submap = submap_id(0, 0, 0)
     easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
-    sparse_map, last, first = station.mapper.map, keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
+    last, first = keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
     verify_loop(sparse_map, last, first, easy)
-    sparse_map.set_camera(AgentId(0), replace(sparse_map.cameras[AgentId(0)], stereo=False))
+    sparse_map.set_camera(AgentId(0), replace(stereo, stereo=False))
     sparse_map.measures_depth.clear()
     verify_loop(sparse_map, last, first, easy)  # monocular, with a scale
-    station.mapper.grid_updates.update()  # without scans, landmarks are drawn
 
 
 def warm_graphs() -> None:
