@@ -21,6 +21,7 @@ from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 
+_UNMATCHED = 10  # windows without a sample, after which the stamps are reported to be wrong
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
 
 
@@ -90,7 +91,7 @@ class Odometer:
 
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""
-        if self._unmatched == 10:
+        if self._unmatched == _UNMATCHED:
             self._unmatched += 1
             return ["odometer: none of its stamps lies between those of frames, not used"]
         if self._trusted == self._reported_trust:
@@ -99,6 +100,11 @@ class Odometer:
         if self._trusted:
             return [f"odometer: agrees with what is seen, its scale is {self.scale:.3f}"]
         return [f"odometer: off by {np.sqrt(self._noise):.2f} m/s from what is seen, not used"]
+
+    @property
+    def _usable(self) -> bool:
+        """True if poses can be predicted: samples agree with the images, and the map is in metres."""
+        return self.has_samples and self._trusted and self.metric
 
     # per frame
 
@@ -110,7 +116,7 @@ class Odometer:
     def predict(self, T_m_c: F64, t_ns: int) -> F64 | None:
         """Predict T_m_c (4,4) at t_ns from that of the last frame; None if the odometer cannot be used."""
         self._carried = False
-        if not self.has_samples or not self._trusted or not self.metric or self._last is None:
+        if not self._usable or self._last is None:
             return None
         before_ns = self._last[0]
         mean = self._samples.between(before_ns, t_ns)
@@ -130,18 +136,14 @@ class Odometer:
 
     def extrapolate(self, T_m_b: F64, t_ns: int) -> Extrapolation | None:
         """The body at t_ns, after the last frame at T_m_b (4,4). No state changes; None if it cannot be used."""
-        if not self.has_samples or not self._trusted or not self.metric or self._last is None:
+        if not self._usable or self._last is None:
             return None
         c, dt = self._config, (t_ns - self._last[0]) * 1e-9
         mean = self._samples.between(self._last[0], t_ns)
         if mean is None or dt <= 0.0:
             return None
-        z, prior = self.scale * mean.velocity, self._velocity_cov + (c.accel_m_s2 * dt) ** 2 * np.eye(3)
-        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
-        update = _blend(self._velocity, prior, z, mean.velocity_cov, slow, c.surprise)
-        slow = (self._rate_noise + c.floor_rad_s**2) * np.eye(3)
-        rate_prior = self._rate_cov + (c.turn_rad_s2 * dt) ** 2 * np.eye(3)
-        rate = _blend(self._rate, rate_prior, mean.rate, mean.rate_cov, slow, np.inf)
+        update = self._updated_velocity(mean, self._velocity_cov + (c.accel_m_s2 * dt) ** 2 * np.eye(3))
+        rate = self._updated_rate(mean, self._rate_cov + (c.turn_rad_s2 * dt) ** 2 * np.eye(3))
         r, growth = T_m_b[:3, :3], np.zeros((6, 6))
         growth[:3, :3], growth[3:, 3:] = dt**2 * (r @ update.cov @ r.T), dt**2 * rate.cov
         twist = np.concatenate([update.value, rate.value])
@@ -149,12 +151,9 @@ class Odometer:
 
     def _correct_velocity(self, mean: MeanVelocity, prior: F64, rate_prior: F64) -> bool:
         """Kalman update of the velocity; False if the sample is rejected: a wheel slips or the sensor is dead."""
-        c = self._config
-        z = self.scale * mean.velocity
-        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
-        update = _blend(self._velocity, prior, z, mean.velocity_cov, slow, c.surprise)
-        jump = float(np.linalg.norm(z - self._velocity))
-        if not update.accepted or jump > c.settled * self._jump > 0.0:
+        update = self._updated_velocity(mean, prior)
+        jump = float(np.linalg.norm(self.scale * mean.velocity - self._velocity))
+        if not update.accepted or jump > self._config.settled * self._jump > 0.0:
             self._jump = max(self._jump, jump) if self.image_loss_s > 0.0 else 0.0
             return False
         self._jump = self._alone_s = 0.0
@@ -164,10 +163,20 @@ class Odometer:
             update.slow,
             update.gain,
         )
-        slow = (self._rate_noise + c.floor_rad_s**2) * np.eye(3)
-        update = _blend(self._rate, rate_prior, mean.rate, mean.rate_cov, slow, np.inf)  # a gust turns at once
+        update = self._updated_rate(mean, rate_prior)
         self._rate, self._rate_cov, self._rate_slow = update.value, update.cov, update.slow
         return True
+
+    def _updated_velocity(self, mean: MeanVelocity, prior: F64) -> _KalmanUpdate:
+        """The velocity (3,) in b by a sample. prior: (3,3) its covariance before."""
+        c, z = self._config, self.scale * mean.velocity
+        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
+        return _blend(self._velocity, prior, z, mean.velocity_cov, slow, c.surprise)
+
+    def _updated_rate(self, mean: MeanVelocity, prior: F64) -> _KalmanUpdate:
+        """The same of the rate (3,), never rejected: a gust turns the vehicle at once."""
+        slow = (self._rate_noise + self._config.floor_rad_s**2) * np.eye(3)
+        return _blend(self._rate, prior, mean.rate, mean.rate_cov, slow, np.inf)
 
     def update(self, T_m_c: F64, t_ns: int) -> None:
         """Process a frame that images (and an IMU) placed at T_m_c (4,4)."""

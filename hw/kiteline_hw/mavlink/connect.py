@@ -16,7 +16,7 @@ from kiteline_hw.mavlink.controller_odometry import (
     ControllerOdometryConfig,
     parse_odometry_option,
 )
-from kiteline_hw.mavlink.controller_session import OdometryConfig
+from kiteline_hw.mavlink.controller_session import SessionConfig
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import GlobalOrigin
 from kiteline_hw.mavlink.pose_memory import PoseMemory
@@ -81,8 +81,8 @@ def connect(
         raise LinkError(f"--axes or --odometry: {error}") from error
     if imu_rate_hz > 0.0:
         imu = ControllerImu(np.ascontiguousarray(T_b_f[:3, :3]), imu_rate_hz, report)
-    config = OdometryConfig(
-        rate_hz=pose_rate_hz if pose_rate_hz > 0.0 else OdometryConfig().rate_hz,
+    config = SessionConfig(
+        rate_hz=pose_rate_hz if pose_rate_hz > 0.0 else SessionConfig().rate_hz,
         vision=options.messages == "vision",
         origin=_origin(options.origin),
     )

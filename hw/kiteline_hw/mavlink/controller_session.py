@@ -1,7 +1,7 @@
 """The protocol with a flight controller: sends HEARTBEAT, poses, TIMESYNC answers and findings. Pure, without a clock.
 
 Poses are sent in the continuous odometry frame, turned once (`start_frame`). Map corrections are not sent, because the
-controller would see jumps. One system is served: the one told, else that of the first autopilot heard.
+controller would see jumps. One system is served: the configured one, else that of the first autopilot found.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ _MAX_POSITION_M = 1e6  # m; beyond it the estimate has failed, and a float32 can
 
 
 @dataclass(frozen=True, slots=True)
-class OdometryConfig:
-    """How poses are sent."""
+class SessionConfig:
+    """How often messages are sent, and with which covariances."""
 
     rate_hz: float = 30.0  # Hz; PX4 wants 30 to 50, ArduPilot at least 4; 245 bytes each
     rate_slack_ns: int = 4_000_000  # ns; a frame may be sent this much before it is due: cameras jitter
@@ -71,7 +71,7 @@ class OdometryConfig:
 
 
 @dataclass(slots=True)
-class OdometryCounters:
+class SessionCounters:
     """Messages sent, and poses that were not sent, by reason."""
 
     odometry: int = 0
@@ -94,16 +94,16 @@ class ControllerSession:
     """
 
     def __init__(
-        self, T_b_f: F64, config: OdometryConfig | None = None, codec: MavlinkCodec | None = None,
+        self, T_b_f: F64, config: SessionConfig | None = None, codec: MavlinkCodec | None = None,
         odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None, start: StartFrame | None = None,
         watch: ControllerWatch | None = None, system: int | None = None,
     ) -> None:  # fmt: skip
-        self.config = config or OdometryConfig()
+        self.config = config or SessionConfig()
         self.codec = codec or MavlinkCodec()
         self.codec.only_system = system or 0
         if system is not None:
             self.codec.system = system
-        self.counters = OdometryCounters()
+        self.counters = SessionCounters()
         self._T_b_f = T_b_f
         self._period_ns = round(1e9 / self.config.rate_hz)
         self._next_heartbeat_ns: int | None = None

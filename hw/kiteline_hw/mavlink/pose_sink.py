@@ -12,7 +12,7 @@ from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry
-from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryConfig, OdometryCounters
+from kiteline_hw.mavlink.controller_session import ControllerSession, SessionConfig, SessionCounters
 from kiteline_hw.mavlink.messages import ComputerStatus, Heartbeat, ObstacleDistance, RadioStatus, Tunnel
 from kiteline_hw.mavlink.pose_memory import PoseMemory
 from kiteline_hw.mavlink.start_frame import StartFrame
@@ -56,7 +56,7 @@ class MavlinkPoseSink(Closing):
     """
 
     def __init__(
-        self, url: str, T_b_f: F64, clock: Clock, *, required: bool = True, config: OdometryConfig | None = None,
+        self, url: str, T_b_f: F64, clock: Clock, *, required: bool = True, config: SessionConfig | None = None,
         odometry: ControllerOdometry | None = None, imu: ControllerImu | None = None,
         options: SinkOptions | None = None,
     ) -> None:  # fmt: skip
@@ -137,7 +137,7 @@ class MavlinkPoseSink(Closing):
             return self._watch.take()
 
     @property
-    def counters(self) -> OdometryCounters:
+    def counters(self) -> SessionCounters:
         """Messages sent, and poses that were not sent, by reason."""
         return self._session.counters
 

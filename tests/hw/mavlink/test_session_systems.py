@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry, OdometrySource
-from kiteline_hw.mavlink.controller_session import ControllerSession, OdometryConfig
+from kiteline_hw.mavlink.controller_session import ControllerSession, SessionConfig
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import (
     Attitude,
@@ -68,7 +68,7 @@ def test_a_system_that_was_told_is_the_only_one() -> None:
 
 
 def test_an_origin_is_set_while_disarmed_until_the_controller_has_one() -> None:
-    session = ControllerSession(FLU, OdometryConfig(origin=GlobalOrigin(473_566_100, 85_190_300, 408_000)))
+    session = ControllerSession(FLU, SessionConfig(origin=GlobalOrigin(473_566_100, 85_190_300, 408_000)))
     wire = MavlinkCodec(2, 1)
     assert session.receive(wire.encode(Heartbeat(2, 3, armed=True)), 0) == []
     sent = [len(session.receive(wire.encode(Heartbeat(2, 3)), i * S)) for i in range(1, 8)]
@@ -83,7 +83,7 @@ def test_the_older_messages_say_the_same_as_odometry() -> None:
     pose = PoseSample(S, np.eye(4), True, 80, velocity=np.array([1.0, 2.0, 0.5]), rate=np.zeros(3))
     pose.T_o_b[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # the nose to the left
     pose.T_o_b[:3, 3] = [3.0, 4.0, 1.0]
-    session = ControllerSession(FLU, OdometryConfig(vision=True))
+    session = ControllerSession(FLU, SessionConfig(vision=True))
     _, position, speed = read(session.step(pose, 0))
     assert position.get_type() == "VISION_POSITION_ESTIMATE" and speed.get_type() == "VISION_SPEED_ESTIMATE"  # type: ignore[attr-defined]
     assert [position.x, position.y, position.z] == [3.0, -4.0, -1.0]  # type: ignore[attr-defined]
