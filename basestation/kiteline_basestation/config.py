@@ -325,6 +325,9 @@ class GridConfig:
     storey_overlap_m: float = 0.4  # m; beyond its half a storey also holds what lies so near: ramps, drift of heights
     max_position_m: float = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
     max_reach_m: float = 100.0  # m; scans that reach farther are not drawn: only a faulty scale makes them
+    view_m: float = 0.5  # m; scans of an agent whose cameras lie in a square of this side ...
+    view_rad: float = 0.39  # rad; ... and head the same way within this, a quarter of the field of view, are one view
+    views: int = 8  # scans of one view that are drawn, the newest: log-odds of 16 bits hold some thousand near views
     drawn_per_step: int = 16  # scans that one step draws, half a ms each: a loop's corrections wait for later steps
     scanless_keyframes: int = 8  # of a stereo agent without a scan, after which its landmarks are drawn: they tell less
     sparse_lag: int = (

@@ -111,6 +111,40 @@ def test_what_moves_less_than_the_lattice_is_not_drawn_again() -> None:
     assert not grid.put(0, scan, camera(np.nan, 0.0, 0.0)) or len(grid) == 0
 
 
+def test_a_vehicle_that_hovers_says_what_it_sees_a_few_times() -> None:
+    """Log-odds of 16 bits would saturate, and what leaves later would stay for as long as it was seen."""
+    rng = np.random.default_rng(5)
+    scan, (x, y, heading) = flight(1)[0]
+    poses = [camera(x + 0.2 * rng.random(), y + 0.2 * rng.random(), heading + 0.2 * rng.random()) for _ in range(300)]
+    hovering = ScanGrid(CONFIG)
+    for k, pose in enumerate(poses):
+        hovering.put(k, scan, pose)
+    views = len(hovering._views)
+    assert len(hovering) == 300 and views <= 8
+    most = max(int(np.abs(hovering.log_odds(place)).max()) for place in hovering.places)
+    assert most <= views * CONFIG.views * CONFIG.log_hit
+
+    # Any order, with scans of other agents and after some moved away and back, gives the same.
+    other = ScanGrid(CONFIG)
+    for k in rng.permutation(300).tolist():
+        other.put(k, scan, poses[k] if k % 7 else camera(-2.0, 0.0, 0.0))
+    for k in range(0, 300, 7):
+        other.put(k, scan, poses[k])
+    assert_equal(hovering, other)
+    for k in range(300):
+        other.put((k, 1), scan, poses[k], source=1)
+    assert max(int(np.abs(other.log_odds(place)).max()) for place in other.places) > most
+    for k in range(300):
+        other.remove((k, 1))
+    assert_equal(hovering, other)
+
+    # A wall that comes near is seen before it outvotes what was there.
+    gone = kept(scan_of(np.array(box(-8.0, -8.0, 8.0, 8.0)), x, y, heading))
+    for k in range(300, 330):
+        hovering.put(k, gone, poses[k - 300])
+    assert at(hovering, 2.0, 2.5) == 0
+
+
 def test_each_cell_of_a_scan_is_freed_once() -> None:
     """Sectors share no cell and leave none out, whatever the heading."""
     config = replace(CONFIG, storey_overlap_m=0.0, opening=False, bands_m=(0.0, 0.5, 1.2, 2.0))

@@ -142,7 +142,8 @@ class GridUpdates:
             if S_w_k is None:
                 changed += grid.remove((keyframe, part))
             else:
-                changed += grid.put((keyframe, part), scan, S_w_k if T_k_s is None else S_w_k @ T_k_s)
+                S_w_s = S_w_k if T_k_s is None else S_w_k @ T_k_s
+                changed += grid.put((keyframe, part), scan, S_w_s, agent_of_keyframe(keyframe))
         return changed
 
     def ground_below(self, keyframe: KeyframeId) -> float | None:

@@ -68,7 +68,7 @@ class KeptScan:
         """The point of the lattice next to a camera's pose (4,4)."""
         ahead = S_w_c[:2, :3] @ level_rotation(np.array(self.up_c))[:, 0]
         scale, cell = sim3.scale_of(S_w_c) / self.unit_m, config.cell_m / _LATTICE
-        storey = (S_w_c[2, 3] - scale * self.height_m - config.ground_m) / config.storey_m
+        storey = storey_at(config, float(S_w_c[2, 3]) - scale * self.height_m)
         overlap = config.storey_overlap_m / config.storey_m
         low, high = round(storey - overlap), round(storey + overlap)
         return Lattice(
@@ -87,6 +87,11 @@ class KeptScan:
     def heading_rad(self, config: GridConfig, lattice: Lattice) -> float:
         """Heading of the levelled camera in w."""
         return lattice.heading * config.cell_m / _LATTICE / self.reach_m
+
+
+def storey_at(config: GridConfig, ground_m: float) -> float:
+    """The storey of a height in w of the ground; its own is a whole number."""
+    return (ground_m - config.ground_m) / config.storey_m
 
 
 def position_cells(lattice: Lattice) -> tuple[float, float]:

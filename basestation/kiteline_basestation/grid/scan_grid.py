@@ -2,13 +2,14 @@
 
     grid = ScanGrid(GridConfig())
     kept = keep(grid.config, scan, bf_px_m)
-    grid.put(name, kept, S_w_c)  # draws a scan, or draws it anew where its keyframe is now
+    grid.put(name, kept, S_w_c)  # draws a scan, or draws it anew where its keyframe is now; names are in order of time
     grid.remove(name)
     grid.cells(Place(0, 2, -1))  # (64,64) int8: -1 unknown, 0 free, else the mask of occupied height bands
 
 Log-odds are sums of integers, and a scan is drawn at a pose on a lattice: to draw the scans that moved anew gives
 exactly the grid that all scans give when they are drawn from scratch. A storey holds the scans whose ground lies near
-its height; neighbouring storeys overlap.
+its height; neighbouring storeys overlap. Of scans of one source that look the same way from the same place, the last
+few are drawn: a vehicle that hovers says the same a thousand times, and does not outvote what it sees later.
 
 Method: log-odds of A. Hornung et al., "OctoMap", 2013, equation 2, in the sectors of a scan's columns; overlong rays
 and the opening of the result after "Segfloor", equation 5.3 and section 5.6.
@@ -17,8 +18,10 @@ and the opening of the result after "Segfloor", equation 5.3 and section 5.6.
 from __future__ import annotations
 
 import itertools
+from bisect import insort
 from collections import Counter
-from collections.abc import Hashable, Iterable
+from collections.abc import Iterable
+from math import floor
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +29,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import scan_kernels as kernels
-from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of
+from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of, storey_at
 from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
 from kiteline_basestation.grid.tile_store import Place, TileStore
 
@@ -38,9 +41,23 @@ _AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from 
 _HIDDEN = 1.25  # times that distance, from which on something hides the ground before
 
 
-class _Drawn(NamedTuple):
+Name = int | tuple[int, int]
+
+
+class _Placed(NamedTuple):
     lattice: Lattice
     scan: KeptScan
+    source: int
+
+
+class _View(NamedTuple):
+    """Place and heading of a camera, coarse."""
+
+    source: int
+    storeys: tuple[int, ...]
+    x: int
+    y: int
+    heading: int
 
 
 class ScanGrid:
@@ -53,16 +70,17 @@ class ScanGrid:
             Place, int
         ] = {}  # revision of the last change, the oldest first; also of tiles that are gone
         self._store = TileStore(config.resident_tiles)
-        self._drawn: dict[Hashable, _Drawn] = {}
+        self._placed: dict[Name, _Placed] = {}
+        self._views: dict[_View, list[Name]] = {}  # of the placed scans, in order of name; the last are drawn
         self._storeys: Counter[tuple[int, ...]] = Counter()  # scans by the storeys on which they are drawn
         self._hits: U16 = np.zeros((0, 0), np.uint16)  # zero between two draws
 
     def __len__(self) -> int:
-        """Number of scans."""
-        return len(self._drawn)
+        """Number of scans that are drawn, or would be if others did not show the same."""
+        return len(self._placed)
 
-    def __contains__(self, name: Hashable) -> bool:
-        return name in self._drawn
+    def __contains__(self, name: Name) -> bool:
+        return name in self._placed
 
     @property
     def places(self) -> list[Place]:
@@ -72,42 +90,64 @@ class ScanGrid:
     @property
     def nbytes(self) -> int:
         """Bytes of tiles and scans, without dictionaries."""
-        return self._store.nbytes + sum(len(drawn.scan.rows) for drawn in self._drawn.values())
+        return self._store.nbytes + sum(len(placed.scan.rows) for placed in self._placed.values())
 
-    def put(self, name: Hashable, scan: KeptScan, S_w_c: F64) -> bool:
+    def put(self, name: Name, scan: KeptScan, S_w_c: F64, source: int = 0) -> bool:
         """Draw a scan at its camera's pose (4,4), or anew if it or its pose changed. True if cells may have changed.
 
-        A scan with a pose that is not finite, beyond the farthest tile or storey, or of a scale that makes it reach too
-        far, is not drawn.
+        source: whose scan it is: an agent's replace its own. A scan with a pose that is not finite, beyond the farthest
+        tile or storey, or of a scale that makes it reach too far, is not drawn.
         """
         config = self.config
         if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > config.max_position_m:
             return self.remove(name)
-        new = _Drawn(scan.lattice(config, S_w_c), scan)
+        new = _Placed(scan.lattice(config, S_w_c), scan, source)
         if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > config.max_reach_m:
             return self.remove(name)
-        held = self._drawn.get(name)
-        if new == held:
+        if new == self._placed.get(name):
             return False
         self.revision += 1
-        if held is not None:
-            self._draw(held, -1)
-        self._drawn[name] = new
+        left = self._leave(name)
+        self._placed[name] = new
+        names = self._views.setdefault(self._view(new), [])
+        insort(names, name)
+        if name not in names[-config.views :]:
+            return left
+        if len(names) > config.views:
+            self._draw(self._placed[names[-config.views - 1]], -1)
         self._draw(new, 1)
         return True
 
-    def remove(self, name: Hashable) -> bool:
-        """Take a scan out. True if it was there."""
-        held = self._drawn.pop(name, None)
+    def remove(self, name: Name) -> bool:
+        """Take a scan out. True if cells may have changed."""
+        self.revision += name in self._placed
+        return self._leave(name)
+
+    def _leave(self, name: Name) -> bool:
+        held = self._placed.pop(name, None)
         if held is None:
             return False
-        self.revision += 1
-        self._draw(held, -1)
-        return True
+        view, views = self._view(held), self.config.views
+        names = self._views[view]
+        was_drawn = name in names[-views:]
+        names.remove(name)
+        if was_drawn:
+            self._draw(held, -1)
+            if len(names) >= views:
+                self._draw(self._placed[names[-views]], 1)
+        if not names:
+            del self._views[view]
+        return was_drawn
+
+    def _view(self, placed: _Placed) -> _View:
+        config, lattice = self.config, placed.lattice
+        x, y = (floor(v * config.cell_m / config.view_m) for v in position_cells(lattice))
+        heading = floor(placed.scan.heading_rad(config, lattice) / config.view_rad)
+        return _View(placed.source, lattice.storeys, x, y, heading)
 
     def storey_of(self, ground_m: float) -> int:
         """The storey whose ground lies nearest to a height in w."""
-        return round((ground_m - self.config.ground_m) / self.config.storey_m)
+        return round(storey_at(self.config, ground_m))
 
     def main_storey(self) -> int:
         """The storey with most scans."""
@@ -157,9 +197,9 @@ class ScanGrid:
             for c in (-1, 0, 1)
         }
 
-    def _draw(self, drawn: _Drawn, sign: int) -> None:
+    def _draw(self, placed: _Placed, sign: int) -> None:
         """Add a scan to its storeys (sign 1), or take it out (-1)."""
-        config, (lattice, scan) = self.config, drawn
+        config, (lattice, scan, _) = self.config, placed
         self._storeys[lattice.storeys] += sign
         if not self._storeys[lattice.storeys]:
             del self._storeys[lattice.storeys]
