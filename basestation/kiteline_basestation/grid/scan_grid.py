@@ -207,9 +207,9 @@ class ScanGrid:
         ranges = scan.ranges()
         bands = ranges[1].astype(np.uint8)
         obstacle, start, free, clear = (r * (scale / cell) for r in (ranges[0], ranges[2], ranges[3], ranges[4]))
-        # Cells before an obstacle are free up to two deviations of its range, and at least a cell, before it.
+        # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.
         near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
-        gap = np.maximum(1.0, 2.0 * scan.sigma_per_m2 * near_m**2 * scale / cell)
+        gap = np.maximum(1.0, config.gap_sigmas * scan.sigma_per_m2 * near_m**2 * scale / cell)
         before = np.where(bands > 0, obstacle - gap, np.inf)
         under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
         behind = start > obstacle  # ground that was seen over a low obstacle, which hides what lies before it
@@ -222,6 +222,7 @@ class ScanGrid:
         end = np.where(behind & (under == 0), free, np.minimum(free, before))
         space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
         accurate_m = scan.accurate_m(config)
+        weights = np.array([config.log_free, config.log_free_far, config.log_free_low], np.int64)
         weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
 
         reach = max(float(np.max(space[:, 2:])), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
@@ -243,8 +244,8 @@ class ScanGrid:
             touched, used = np.zeros((rows, columns), np.uint8), np.zeros(1, np.int64)
             kernels.draw_hits(hits, cells, found, sign, slots, spare, used, self._store.pool, touched)
             kernels.draw_free(
-                x, y, first, scan.step, space, under, camera_band, accurate_m / cell, config.log_free,
-                config.log_free_far, hits, sign, slots, spare, used, self._store.pool, touched,
+                x, y, first, scan.step, space, under, camera_band, accurate_m / cell, weights,
+                hits, sign, slots, spare, used, self._store.pool, touched,
             )  # fmt: skip
             for r, c in np.argwhere(touched).tolist():
                 place = Place(storey, box[0] + r, box[1] + c)
