@@ -219,6 +219,7 @@ class DisparityConfig:
     least_px: float = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
     least_change_px: float = 0.04  # px, rms over the image; of a later change that is applied
     min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
+    rows_sure: float = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
 
 
 @dataclass(frozen=True, slots=True)

@@ -211,6 +211,19 @@ def test_forward_motion_alone_changes_nothing() -> None:
     assert flight.map.disparity_offset.tolist() == [0.0] * 5
 
 
+def test_forward_motion_is_believed_where_rows_are_those_of_a_worn_rig() -> None:
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    for evidence, corrected in ((4.0, False), (9.0, True)):
+        flight = Flight(WORN, 1, AHEAD)
+        flight.alignment.add_row_evidence(evidence)
+        assert bool(flight.fly(60)) == corrected
+        left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
+        assert (left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))) == corrected
+    good = Flight(NOTHING, 1, AHEAD)
+    good.alignment.add_row_evidence(9.0)
+    assert good.fly(60) == []  # disparities have to tell, too
+
+
 def test_the_base_s_map_is_left_to_the_base() -> None:
     flight = Flight(WORN, 1, SIDEWAYS)
     assert flight.alignment.take_base(NOTHING, 0.001)

@@ -49,7 +49,8 @@ class DisparityAlignment:
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
-        self._log_odds = float(np.log(config.worn_share / (1.0 - config.worn_share)))  # worn rig, by disparities alone
+        self._prior_log_odds = math.log(config.worn_share / (1.0 - config.worn_share))  # of a worn rig
+        self._log_odds = self._prior_log_odds  # by disparities alone
         self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
         self._row_evidence = 0.0  # see add_row_evidence
         self.applied = False  # the rig is worn: an offset found here was applied
@@ -200,7 +201,7 @@ class DisparityAlignment:
         """
         config, good = self._config, np.eye(TERMS) / self._config.good_px**2
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
-        odds = np.log(config.worn_share / (1.0 - config.worn_share))
+        odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
             unknown = np.logaddexp(odds + worn, usual) - np.logaddexp(odds, 0.0)
@@ -224,6 +225,10 @@ class DisparityAlignment:
         moved = self._evicted_moved + self._moved.sum(0)
         return bool(moved[:2].sum() >= self._config.min_sideways * moved.sum())
 
+    def _rows_are_worn(self) -> bool:
+        """True if the right camera's rows alone tell a worn rig: then what passes for an offset is one."""
+        return _probability(self._prior_log_odds + self._row_evidence) >= self._config.rows_sure
+
     def _expected_cov(self) -> F64:
         """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
         if self._map.disparity_offset.any():
@@ -236,7 +241,7 @@ class DisparityAlignment:
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
         config, offset = self._config, self._estimate
-        if not self._moves_sideways():
+        if not self._moves_sideways() and not self._rows_are_worn():
             return None
         if not self.applied and self.worn < config.sure:
             if not self._refuted:
