@@ -322,6 +322,7 @@ class Mapper:
         self.grid_updates.rebuild()
 
     def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
+        """T_w_c (4,4) of an agent's last live pose in the world; None without one or while its keyframe is unknown."""
         live = self._intake.live.get(agent)
         pose = self.map.pose(live.keyframe) if live else None
         S_w_m = self.placements.get(submap_of_keyframe(live.keyframe)) if live else None

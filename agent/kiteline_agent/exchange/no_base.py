@@ -44,13 +44,13 @@ class NoBaseChannel:
         """Do nothing: nothing was shared."""
 
     def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
-        """Nothing."""
+        """No records: no base sends any."""
         return []
 
     def take_removed(self) -> list[Key]:
-        """Nothing."""
+        """No keys: no base removes records."""
         return []
 
     def poll(self, now_ns: int) -> list[bytes]:
-        """Nothing."""
+        """No packets: no base receives any."""
         return []

@@ -89,7 +89,7 @@ class AccelCalibration(AxesFilter):
         j[:, _AXES], j[:, _BIAS], j[:, _TILT], j[:, _SCALE] = force, -time, -se3.skew(fallen), -moved
         self._cov[np.diag_indices(16)] += self._walk * dt[1]
         update = robust_update(j, self._cov, error, variance)
-        self.excess += 0.05 * (min(update.square, 25.0) - self.excess)
+        self._count_excess(update.square)
         change = update.gain @ error
         self._gravity = se3.so3_exp(change[_TILT]) @ self._gravity
         change[_TILT] = 0.0

@@ -31,7 +31,7 @@ class GyroCalibration(AxesFilter):
         self._x[_OFFSET] = offset_s
         self._cov = np.diag(np.concatenate([axes_sigma, [offset_sigma_s], np.full(3, _BIAS_RAD_S)]) ** 2)
         self._walk = np.repeat([1e-5, 1e-4, walk_rad_s2], [9, 1, 3]) ** 2
-        self.excess = 0.0  # mean squared error of a rotation over what was expected
+        self.excess = 0.0
         self.log_likelihood = 0.0  # natural logarithm, of all rotations as they were predicted
 
     def begin_with(self, axes: F64, axes_sigma: F64, offset_s: float, offset_sigma_s: float) -> None:
@@ -64,7 +64,7 @@ class GyroCalibration(AxesFilter):
         error = se3.so3_log(back @ R_b0_b1) - j[:, _OFFSET] * (self._x[_OFFSET] - offset_s)
         self._cov[np.diag_indices(13)] += self._walk * window.duration_s
         update = robust_update(j, self._cov, error, turn_variance)
-        self.excess += 0.05 * (min(update.square, 25.0) - self.excess)
+        self._count_excess(update.square)
         self.log_likelihood += update.log_likelihood
         self._x += update.gain @ error
         self._cov -= update.gain @ update.s @ update.gain.T

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 _OUTLIER = 9.0  # squared error over its variance from which a window weighs less
+_EXCESS_GAIN = 0.05  # weight of a window in `excess`: the mean reaches over about 20
+_EXCESS_MAX = 25.0  # one wrong pose moves the mean by no more than an error of 5 deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,3 +66,7 @@ class AxesFilter:
     def significance(self) -> float:
         """Squared deviations of the axes from a true IMU; less where errors are larger than expected."""
         return float(self._x[:9] @ np.linalg.solve(self.axes_cov, self._x[:9])) / max(self.excess, 1.0)
+
+    def _count_excess(self, square: float) -> None:
+        """Take a window's mean squared error over its variance into `excess`."""
+        self.excess += _EXCESS_GAIN * (min(square, _EXCESS_MAX) - self.excess)
