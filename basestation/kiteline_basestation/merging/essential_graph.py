@@ -81,14 +81,6 @@ def optimise(inputs: GraphInputs) -> GraphResult:
 def _rigid(inputs: GraphInputs) -> GraphResult:
     import gtsam  # heavy, and needed only here
 
-    noises: dict[tuple[float, ...], gtsam.noiseModel.Base] = {}
-    for row in np.unique(np.column_stack([inputs.sigma, inputs.loop]), axis=0):
-        sigmas = np.array([row[1]] * 3 + [row[0]] * 3)  # gtsam has rotation first
-        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        if row[2]:
-            huber = gtsam.noiseModel.mEstimator.Huber.Create(inputs.config.huber)
-            noise = gtsam.noiseModel.Robust.Create(huber, noise)
-        noises[tuple(row.tolist())] = noise
     start = gtsam.Values()
     for i, pose in enumerate(inputs.T_w_k):
         start.insert(i, gtsam.Pose3(pose))
@@ -96,9 +88,9 @@ def _rigid(inputs: GraphInputs) -> GraphResult:
     fixed = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     for i in np.flatnonzero(inputs.held).tolist():
         graph.add(gtsam.PriorFactorPose3(i, gtsam.Pose3(inputs.T_w_k[i]), fixed))
-    keys = np.column_stack([inputs.sigma, inputs.loop]).tolist()
-    for (a, b), T, key in zip(inputs.edges.tolist(), inputs.T_a_b, keys):
-        graph.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T), noises[tuple(key)]))
+    noises = _edge_noises(inputs.sigma[:, [1, 1, 1, 0, 0, 0]], inputs)
+    for (a, b), T, noise in zip(inputs.edges.tolist(), inputs.T_a_b, noises):
+        graph.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T), noise))
     if inputs.level is not None:
         up_w = gtsam.Unit3(inputs.level.up_w)
         for i, sigma in zip(inputs.level.rows.tolist(), inputs.level.sigma.tolist()):
@@ -126,15 +118,6 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
     import gtsam
 
     config = inputs.config
-    noises: dict[tuple[float, ...], gtsam.noiseModel.Base] = {}
-    rows = np.column_stack([inputs.sigma, scaled.sigma, inputs.loop])
-    for row in np.unique(rows, axis=0):
-        sigmas = np.array([row[1]] * 3 + [row[0]] * 3 + [row[2]])  # gtsam: rotation, translation, scale
-        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        if row[3]:
-            huber = gtsam.noiseModel.mEstimator.Huber.Create(config.huber)
-            noise = gtsam.noiseModel.Robust.Create(huber, noise)
-        noises[tuple(row.tolist())] = noise
     start = gtsam.Values()
     graph = gtsam.NonlinearFactorGraph()
     fixed = gtsam.noiseModel.Isotropic.Sigma(7, 1e-6)
@@ -144,8 +127,9 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
         start.insert(i, S_w_k)
         if inputs.held[i] or not scaled.free[i]:
             graph.add(gtsam.PriorFactorSimilarity3(i, S_w_k, fixed if inputs.held[i] else unit_scale))
-    for (a, b), T, scale, key in zip(inputs.edges.tolist(), inputs.T_a_b, scaled.scale.tolist(), rows.tolist()):
-        graph.add(gtsam.BetweenFactorSimilarity3(a, b, _similarity(T, scale), noises[tuple(key)]))
+    noises = _edge_noises(np.column_stack([inputs.sigma[:, [1, 1, 1, 0, 0, 0]], scaled.sigma]), inputs)
+    for (a, b), T, scale, noise in zip(inputs.edges.tolist(), inputs.T_a_b, scaled.scale.tolist(), noises):
+        graph.add(gtsam.BetweenFactorSimilarity3(a, b, _similarity(T, scale), noise))
     if inputs.level is not None:
         for i, sigma in zip(inputs.level.rows.tolist(), inputs.level.sigma.tolist()):
             pose = inputs.T_w_k[i]
@@ -166,6 +150,24 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
     work = int(optimiser.iterations()) * (12_000 * len(inputs.edges) + 9_000 * len(poses))
     residual = residuals(inputs, poses, scale)
     return GraphResult(inputs.keyframes, poses, scale, residual, 300_000 + 9_000 * len(inputs.edges) + work // 4)
+
+
+def _edge_noises(sigmas: F64, inputs: GraphInputs) -> list[gtsam.noiseModel.Base]:
+    """Noise of each edge by its deviations (m,6 or 7) in the order of gtsam: rotation, translation, scale.
+
+    Loop edges get a Huber kernel. Equal edges share one object.
+    """
+    import gtsam
+
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(inputs.config.huber)
+    noises: dict[tuple[float, ...], gtsam.noiseModel.Base] = {}
+    of_edges = []
+    for row, loop in zip(map(tuple, sigmas.tolist()), inputs.loop.tolist()):
+        if (*row, loop) not in noises:
+            noise: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(np.array(row))
+            noises[(*row, loop)] = gtsam.noiseModel.Robust.Create(huber, noise) if loop else noise
+        of_edges.append(noises[(*row, loop)])
+    return of_edges
 
 
 def _tilt_noise(up_k: F64, sigma: float) -> gtsam.noiseModel.Base:
