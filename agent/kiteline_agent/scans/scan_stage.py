@@ -148,7 +148,7 @@ class ScanStage:
         elif images.right is None or self._stripes is None:
             return
         else:
-            self._stripes.begin(images.aligned[1], images.right.coarse()[1])
+            self._stripes.begin(images.half(), images.right.half())
         up = self._camera.motion.up()
         up_c = self._camera.pose.T_m_c[2, :3].copy() if up is None else up[0]  # z of a submap points up
         T_o_c = self._last_T_o_c = self._T_o_c()

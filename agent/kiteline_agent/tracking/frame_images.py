@@ -51,6 +51,12 @@ class RightImage:
                 self._coarse = (self._rectifier.blank, *build_pyramid(half, self._levels - 1))
         return self._coarse
 
+    def half(self) -> U8:
+        """Level 1 of the rectified image alone."""
+        if self._coarse is not None:
+            return self._coarse[1]
+        return self._rectifier.half(1, self._image) if self._raw is None else self._rectifier.halved(1, self._raw[1])
+
     def refine(
         self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig,
         search_px: float, disparity: F64, found: NDArray[np.bool_],
@@ -106,10 +112,14 @@ class FrameImages:
 
     @property
     def aligned(self) -> Pyramid:
-        """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates and
-        disparities.
-        """
+        """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates."""
         return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
+
+    def half(self) -> U8:
+        """The left image at level 1, rectified at half size, as the right one's: for disparities."""
+        if self.rectifier is None or self._coarse is not None:
+            return self.sampled[1] if self._coarse is None else self._coarse[0]
+        return self.rectifier.halved(0, self.sampled[1])
 
     def _halves(self, rectifier: Rectifier) -> Pyramid:
         """Level 1 of the raw pyramid, rectified, and its coarser levels."""

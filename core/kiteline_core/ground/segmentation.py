@@ -166,13 +166,16 @@ class GroundSegmenter:
             self.x, self.z, self._column, self._upright, bf, below, _STEEPEST, _HEIGHT_STEP_M, self._heights,
             *self._height_sums,
         )  # fmt: skip
-        curved = self._curved_ground(expected)
         if expected is None:
+            curved = self._curved_ground(expected)
             if curved is None or curved.height_m < self.lowest_m - config.lower_m:
                 return self._lowest_ground()
             self.saw_ground = True
             return curved
         level = self._expected_ground(expected)
+        if _BETTER * self._pixels_near(np.full(self._bins, level.height_m)).sum() > self._heights.sum():
+            return level  # no curve passes through so many more
+        curved = self._curved_ground(expected)
         if curved is None or abs(curved.height_m - expected.height_m) > expected.within_m:
             return level
         return curved if self._is_better(curved, level) else level
@@ -188,13 +191,18 @@ class GroundSegmenter:
         climb = np.abs(np.diff(heights[seen]) / np.diff(ahead[seen]))
         if (climb > self.config.curve_slope).any():
             return False
-        pixels = []
-        for height_m in (-heights, np.full(self._bins, level.height_m)):
-            rows = height_m / _HEIGHT_STEP_M - 0.5
-            spread = 1.5 + 2.0 * rows * self.sigma_px / centres
-            near = np.abs(np.arange(self._heights.shape[1]) - rows[:, None]) <= spread[:, None]
-            pixels.append(int((self._heights * near)[seen].sum()))
-        return pixels[0] > _BETTER * pixels[1]
+        on_curve, on_level = (
+            self._pixels_near(height_m)[seen].sum() for height_m in (-heights, np.full(self._bins, level.height_m))
+        )
+        return bool(on_curve > _BETTER * on_level)
+
+    def _pixels_near(self, height_m: F64) -> NDArray[np.int64]:
+        """Pixels (bins,) of the v-disparity near a height (bins,) of the camera."""
+        centres = (np.arange(self._bins) + 0.5) * level_kernels.BIN_PX
+        rows = height_m / _HEIGHT_STEP_M - 0.5
+        spread = 1.5 + 2.0 * rows * self.sigma_px / centres
+        near = np.abs(np.arange(self._heights.shape[1]) - rows[:, None]) <= spread[:, None]
+        return np.asarray((self._heights * near).sum(1), np.int64)
 
     def _curved_ground(self, expected: ExpectedGround | None) -> Ground | None:
         """The ground as a curve over the distance; None if too little of it is seen."""
