@@ -40,6 +40,8 @@ _NEARER = 1.6  # the same at its near end, as a factor: the lowest rows of an im
 _BELOW_PX = 16  # between two pixels of which one lies above the other: the ground's disparity changes by a pixel
 _LEAST_IN_IMAGE = 0.2  # part of the vertical direction that lies in the image
 _STEEPEST = 0.6  # of the difference in height of a wall's points, up to which they may lie on the ground
+_WIDER_RAD = 0.2  # to each side beyond the field of view of a level camera
+_WIDEST_RAD = 1.3  # of an azimuth
 _GAP_M = 0.25  # without seen ground that are free between free ones: beyond, a pit would fit
 
 
@@ -83,12 +85,14 @@ class GroundSegmenter:
         fx, cx, h, w = view.fx, view.cx, view.height, view.width
         self._camera, self.bf = np.array([fx, view.fy, cx, view.cy]), view.bf
         self.sigma_px = config.sigma_px if camera.stereo else config.depth_sigma * self.bf
-        n = config.columns
         right, left = np.arctan([(w - 1 - cx) / fx, cx / fx])
-        step = (left + right) / n
-        self._azimuth0, self._step = float(0.5 * step - right), float(step)
+        step = (left + right) / config.columns
+        # A camera that looks down or banks sees more azimuths at its lower corners than level.
+        beyond = [max(min(round(_WIDER_RAD / step), int((_WIDEST_RAD - side) / step)), 0) for side in (right, left)]
+        n = config.columns + sum(beyond)
+        self._azimuth0, self._step = float((0.5 - beyond[0]) * step - right), float(step)
         self._azimuths = self._azimuth0 + self._step * np.arange(n)
-        self._slopes = np.tan(np.append(self._azimuths - 0.5 * step, left))
+        self._slopes = np.tan(np.append(self._azimuths - 0.5 * step, self._azimuths[-1] + 0.5 * step))
         self._widths = fx * np.diff(self._slopes)
         self._bins = bins = round(config.disparities / level_kernels.BIN_PX)
         heights = round(config.largest_height_m / _HEIGHT_STEP_M)
@@ -274,7 +278,7 @@ class GroundSegmenter:
 
     def _scan(self, ground: Ground | None, view: _View, expected: ExpectedGround | None) -> ColumnScan:
         """Label the pixels by the ground that was found, or obstacles by the one expected, and collect them."""
-        config, bins, n = self.config, self._bins, self.config.columns
+        config, bins, n = self.config, self._bins, len(self._azimuths)
         borders = np.arange(bins + 1) * level_kernels.BIN_PX
         slope, seen, height_m = np.full(bins + 1, np.nan), np.zeros(bins, np.bool_), float("nan")
         if ground is not None:
@@ -310,4 +314,10 @@ class GroundSegmenter:
             grounds, obstacles, config.column_pixels, surface, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M,
             free_from, free, obstacle, clear,
         )  # fmt: skip
-        return ColumnScan(view.up_c, self._azimuth0, self._step, free_from, free, obstacle, bands, clear, height_m)
+        some = np.flatnonzero((free > 0.0) | (bands > 0) | (clear > 0.0))
+        first, last = (int(some[0]), int(some[-1]) + 1) if len(some) else (0, n)
+        free_from, free, obstacle, clear = (row[first:last].copy() for row in (free_from, free, obstacle, clear))
+        return ColumnScan(
+            view.up_c, float(self._azimuths[first]), self._step, free_from, free, obstacle, bands[first:last].copy(),
+            clear, height_m,
+        )  # fmt: skip
