@@ -343,6 +343,8 @@ class GridConfig:
     )
     noise_per_m: float = 0.01  # m/m; height noise of landmarks per distance
     ground_keyframes: int = 20  # newest keyframes among which one must know the height of the ground: 20 s
+    band_files: bool = False  # True: a file for each height band, too
+    binary_files: bool = False  # True: a file in which one view occupies a cell for good, too (Segfloor)
     resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
     ground: GroundConfig = field(default_factory=GroundConfig)
 

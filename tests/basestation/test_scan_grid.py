@@ -232,7 +232,7 @@ def test_states_are_read_as_in_the_reference(seed: int, opening: bool) -> None:
         free &= np.any([np.roll(eroded, s, (0, 1)) for s in shifts], axis=0)
     expected = np.where(mask > 0, mask, np.where(free, 0, -1))[64:128, 64:128]
     cells = np.empty((64, 64), np.int8)
-    known = kernels.read_states(slots, pool, 6, 2, 4, 6, int(opening), cells)
+    known = kernels.read_states(slots, pool, kernels.ALL, 6, 2, 4, 6, int(opening), cells)
     assert np.array_equal(cells, expected)
     assert known == np.count_nonzero(expected >= 0)
 
@@ -441,3 +441,41 @@ def test_a_scan_in_a_unit_of_its_submap_is_drawn_in_metres() -> None:
     plain = ScanGrid(CONFIG)
     plain.put(0, kept(scan_of(ROOM, *pose)), camera(*pose))
     assert_equal(scaled, plain)
+
+
+def read_pgm(data: bytes) -> NDArray[np.uint8]:
+    head, size, most, grey = data.split(b"\n", 3)
+    columns, rows = map(int, size.split())
+    assert (head, most) == (b"P5", b"255")
+    return np.frombuffer(grey, np.uint8).reshape(rows, columns)[::-1]
+
+
+def test_files_of_height_bands_and_of_binary_layers_lie_beside_the_grid() -> None:
+    """A shelf at head height leaves the lower bands free; a phantom seen once stays in the binary layers alone."""
+    config = replace(CONFIG, band_files=True, binary_files=True, storey_overlap_m=0.0)
+    plain = scan_of(np.array(box(-6.0, -6.0, 6.0, 6.0)), 0.0, 0.0, 0.0)
+    shelf = np.arange(len(plain)) < 30
+    high = replace(
+        plain, obstacle_m=np.where(shelf, 2.5, plain.obstacle_m), bands=np.where(shelf, 4, plain.bands).astype(np.uint8)
+    )
+    phantom = np.arange(len(plain)) > 70
+    wrong = replace(
+        high,
+        obstacle_m=np.where(phantom, 2.0, high.obstacle_m),
+        bands=np.where(phantom, 7, high.bands).astype(np.uint8),
+    )
+    grid = ScanGrid(config)
+    for k in range(6):
+        grid.put(k, kept(wrong if k == 0 else high, config), camera(0.3 * k, 0.0, 0.0))
+    files = grid_files(grid)
+    names = ("grid", "grid_0.1-0.5", "grid_0.5-1.2", "grid_1.2-2", "grid_binary")
+    assert set(files) == {f"{name}.{end}" for name in names for end in ("pgm", "yaml")}
+    images = {name: read_pgm(files[f"{name}.pgm"]) for name in names}
+    assert len({image.shape for image in images.values()}) == 1
+    assert b"image: grid_1.2-2.pgm" in files["grid_1.2-2.yaml"]
+    solid = {name: int((image == 0).sum()) for name, image in images.items()}
+    assert solid["grid_1.2-2"] > solid["grid_0.1-0.5"] == solid["grid_0.5-1.2"] > 0
+    assert (images["grid"] == 0).sum() == (np.minimum.reduce([images[n] for n in names[1:4]]) == 0).sum()
+    gone = (images["grid_binary"] == 0) & (images["grid"] == 254)
+    assert gone.sum() > 5
+    assert set(grid_files(ScanGrid(CONFIG))) == {"grid.pgm", "grid.yaml"}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ F64 = NDArray[np.float64]
 FREE_GREY, UNKNOWN_GREY, SOLID_GREY = 254, 205, 0  # as map_server writes them
 _BLOCK = 16  # tiles along a block; blocks without a neighbour lie apart
 _OUTLIERS = 0.5  # of the largest part's tiles: parts that hold fewer are left out of files that would be too large
+_NEVER = 1 << 20  # log-odds that no cell has
 _MOST_PIXELS = 1 << 26  # of a file; larger maps are written with coarser cells
 
 
@@ -94,9 +96,10 @@ class GridViews:
         return self._last
 
 
-def dense(grid: ScanGrid, storey: int) -> tuple[I8, F64, float]:
+def dense(grid: ScanGrid, storey: int, cells_of: Callable[[Place], I8] | None = None) -> tuple[I8, F64, float]:
     """A storey as one array: cells (rows, columns) int8, row 0 the lowest y, its corner (2,) in w and a cell's side, m.
 
+    cells_of: of a tile with known cells; None: those of the grid.
     A map of more pixels than a file can have is written without outliers, and then with coarser cells: occupied if any
     is, free if at least half are.
     """
@@ -119,7 +122,8 @@ def dense(grid: ScanGrid, storey: int) -> tuple[I8, F64, float]:
         first, last = np.maximum(first, centre - reach), np.minimum(last, centre + reach)
         rows, columns = ((last - first) * SIDE).tolist()
     out = np.full((rows // factor, columns // factor), UNKNOWN, np.int8)
-    for place, cells in tiles.items():
+    for place, own in tiles.items():
+        cells = own if cells_of is None else cells_of(place)
         r, c = place.row - int(first[0]), place.column - int(first[1])
         if r >= 0 and c >= 0 and (r + 1) * side <= out.shape[0] and (c + 1) * side <= out.shape[1]:
             out[r * side : (r + 1) * side, c * side : (c + 1) * side] = _coarser(cells, factor)
@@ -160,19 +164,45 @@ def _coarser(cells: I8, factor: int) -> I8:
 def grid_files(grid: ScanGrid, stem: str = "grid") -> dict[str, bytes]:
     """Images (binary PGM, highest y first: 254 free, 0 occupied, 205 unknown) and YAML files of map_server, by name.
 
-    The main storey is STEM.pgm; others STEM_storeyN.pgm, counted from the main one.
+    The main storey is STEM.pgm; others STEM_storeyN.pgm, counted from the main one. As the options say, beside each
+    lie those of its height bands, STEM_LOW-HIGH.pgm in m above the ground, and STEM_binary.pgm.
     """
-    main, out = grid.main_storey(), {}
-    greys = np.full(256, SOLID_GREY, np.uint8)
-    greys[FREE], greys[UNKNOWN] = FREE_GREY, UNKNOWN_GREY
+    config, main, out = grid.config, grid.main_storey(), dict[str, bytes]()
+    layers: dict[str, Callable[[Place], I8] | None] = {"": None}
+    if config.band_files:
+        for b, (low, high) in enumerate(pairwise(config.bands_m)):
+            layers[f"_{low:g}-{high:g}"] = lambda place, band=1 << b: grid.cells(place, band)[0]  # type: ignore[misc]
+    if config.binary_files:
+        layers["_binary"] = _binary(grid)
     for storey in sorted({main, *grid.separate_storeys()}):
         name = stem if storey == main else f"{stem}_storey{storey - main:+d}"
-        cells, corner, cell = dense(grid, storey)
-        grey = greys[cells.view(np.uint8)]
-        out[f"{name}.pgm"] = f"P5\n{grey.shape[1]} {grey.shape[0]}\n255\n".encode() + grey[::-1].tobytes()
-        out[f"{name}.yaml"] = (
-            f"image: {name}.pgm\nmode: trinary\nresolution: {cell:.6g}\n"
+        for layer, cells_of in layers.items():
+            out.update(_file(name + layer, *dense(grid, storey, cells_of)))
+    return out
+
+
+def _binary(grid: ScanGrid) -> Callable[[Place], I8]:
+    """Cells of a tile, occupied where any scan saw an obstacle, else free where any saw ground (Segfloor, 5.6)."""
+    config = replace(grid.config, hole_neighbours=9, free_from=1, free_beside=1)
+    hit = grid.redrawn(replace(config, log_free=0, log_free_far=0, log_free_low=0, occupied_from=1))
+    seen = grid.redrawn(replace(config, log_hit=0, log_free=1, log_free_far=1, log_free_low=0, occupied_from=_NEVER))
+
+    def cells_of(place: Place) -> I8:
+        occupied = hit.cells(place)[0]
+        return np.where(occupied > 0, occupied, seen.cells(place)[0])
+
+    return cells_of
+
+
+def _file(name: str, cells: I8, corner: F64, cell_m: float) -> dict[str, bytes]:
+    greys = np.full(256, SOLID_GREY, np.uint8)
+    greys[FREE], greys[UNKNOWN] = FREE_GREY, UNKNOWN_GREY
+    grey = greys[cells.view(np.uint8)]
+    return {
+        f"{name}.pgm": f"P5\n{grey.shape[1]} {grey.shape[0]}\n255\n".encode() + grey[::-1].tobytes(),
+        f"{name}.yaml": (
+            f"image: {name}.pgm\nmode: trinary\nresolution: {cell_m:.6g}\n"
             f"origin: [{corner[0]:.6f}, {corner[1]:.6f}, 0.000000]\n"
             "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
-        ).encode()
-    return out
+        ).encode(),
+    }

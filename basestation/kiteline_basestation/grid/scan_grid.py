@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import scan_kernels as kernels
 from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of, storey_at
-from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
+from kiteline_basestation.grid.scan_kernels import ALL, BANDS, SIDE
 from kiteline_basestation.grid.tile_store import Place, TileStore
 
 F64 = NDArray[np.float64]
@@ -169,14 +169,18 @@ class ScanGrid:
         planes = self._store.pool[slot]
         return np.asarray(planes[:1] + planes[1:])
 
-    def cells(self, place: Place) -> tuple[I8, int]:
-        """Cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands; and how many are known."""
+    def cells(self, place: Place, bands: int = ALL) -> tuple[I8, int]:
+        """Cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands; and how many are known.
+
+        bands: mask of the height bands that count.
+        """
         slots = self._store.open_box(place.storey, place.row - 1, place.column - 1, 3, 3)
         cells = np.empty((SIDE, SIDE), np.int8)
         config = self.config
         known = kernels.read_states(
             slots,
             self._store.pool,
+            bands,
             config.occupied_from,
             config.free_from,
             config.free_beside,
@@ -186,6 +190,13 @@ class ScanGrid:
         )
         self._store.close()
         return cells, int(known)
+
+    def redrawn(self, config: GridConfig) -> ScanGrid:
+        """The same scans where they lie now, all of them, drawn with other weights and thresholds."""
+        grid = ScanGrid(config)
+        for placed in self._placed.values():
+            grid._draw(placed, 1)
+        return grid
 
     def stale_since(self, revision: int) -> Iterable[Place]:
         """Tiles whose cells may have changed after a revision: those that were drawn on, and those around them."""

@@ -25,7 +25,7 @@ SIDE = 64  # cells along a side of a tile: the shape of a GridTile record
 BANDS = 3  # height bands
 PLANES = 1 + BANDS
 _SHIFT, _MASK = 6, SIDE - 1  # quotient and remainder by SIDE
-_ALL = (1 << BANDS) - 1
+ALL = (1 << BANDS) - 1
 _MOST = 32767  # log-odds saturate: a cell that was seen so often stays what it is
 
 
@@ -88,7 +88,7 @@ def draw_hits(
         slot = _tile(row, column, slots, spare, used)
         touched[row >> _SHIFT, column >> _SHIFT] = 1
         value = int(np.int64(hits[row, column]))  # unsigned and signed numbers would make a float
-        _add(pool, slot, row, column, value & _ALL, sign * (value >> 8))
+        _add(pool, slot, row, column, value & ALL, sign * (value >> 8))
 
 
 @njit
@@ -153,7 +153,7 @@ def draw_free(
                     distance2 = dx * dx + dy * dy
                     bands = 0
                     if begin2 <= distance2 <= low2:
-                        bands = _ALL if distance2 <= end2 else int(np.int64(under[i]))
+                        bands = ALL if distance2 <= end2 else int(np.int64(under[i]))
                     if distance2 <= clear2:
                         bands |= 1 << camera_band
                     bands &= ~int(np.int64(hits[row, column]))
@@ -168,7 +168,7 @@ def draw_free(
                         value = -sign * weights[2]
                     else:
                         value = -sign * weights[1]
-                    if bands == _ALL:
+                    if bands == ALL:
                         total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
                         pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
                     else:
@@ -184,27 +184,30 @@ def clear_hits(hits: U16, cells: I32, found: int) -> None:
 
 
 @helper
-def _state(pool: I16, slots: I32, row: int, column: int, occupied_from: int) -> tuple[int, int]:
-    """Mask of occupied bands, and the largest log-odds. row, column: from the corner of the tile in the middle."""
+def _state(pool: I16, slots: I32, row: int, column: int, bands: int, occupied_from: int) -> tuple[int, int]:
+    """Mask of occupied bands, and the largest log-odds, of some. row, column: from the corner of the middle tile."""
     slot = slots[(row + SIDE) >> _SHIFT, (column + SIDE) >> _SHIFT]
     if slot < 0:
         return 0, 0
     mask, most, common = 0, -2 * _MOST, int(pool[slot, 0, row & _MASK, column & _MASK])
     for b in range(BANDS):
-        value = common + int(pool[slot, 1 + b, row & _MASK, column & _MASK])
-        mask |= (value >= occupied_from) << b
-        most = max(most, value)
+        if bands >> b & 1:
+            value = common + int(pool[slot, 1 + b, row & _MASK, column & _MASK])
+            mask |= (value >= occupied_from) << b
+            most = max(most, value)
     return mask, most
 
 
 @njit
 def read_states(
-    slots: I32, pool: I16, occupied_from: int, free_from: int, free_beside: int, hole: int, opening: int, cells: I8
-) -> int:
+    slots: I32, pool: I16, bands: int, occupied_from: int, free_from: int, free_beside: int, hole: int, opening: int,
+    cells: I8,
+) -> int:  # fmt: skip
     """States of the cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands.
 
-    slots: (3,3) of the tile and those around it. occupied_from, free_from: log-odds from which a band is occupied, and
-    minus which all bands must not exceed for the cell to be free. free_beside: the same beside an occupied cell.
+    slots: (3,3) of the tile and those around it. bands: mask of those that count. occupied_from, free_from: log-odds
+    from which a band is occupied, and minus which all bands must not exceed for the cell to be free. free_beside: the
+    same beside an occupied cell.
     hole: neighbours that must be free, none being occupied, for an unknown cell without sign of an obstacle to be free.
     opening: 1 keeps free only what lies in a square of three by three free cells. Returns the number of known cells.
     """
@@ -215,7 +218,7 @@ def read_states(
     states, odds = np.empty((wide, wide), np.int8), np.empty((wide, wide), np.int32)
     for row in range(wide):
         for column in range(wide):
-            mask, most = _state(pool, slots, row - margin, column - margin, occupied_from)
+            mask, most = _state(pool, slots, row - margin, column - margin, bands, occupied_from)
             states[row, column] = mask if mask else 0 if most <= -free_from else -1
             odds[row, column] = most
     for row in range(1, wide - 1):
