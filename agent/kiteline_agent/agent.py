@@ -108,8 +108,7 @@ class Agent:
             self._scans = ScanStage(
                 self._camera, self.map, maker, self._governor, channel, config.scan, config.ground, self.work
             )
-        certain_m = np.inf if self._scans is None else self._scans.certain_m(config.local_grid.sigma_m)
-        self._local_grid = LocalGrid(config.local_grid, certain_m)
+        self._local_grid = LocalGrid(config.local_grid)
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,
@@ -274,15 +273,19 @@ class Agent:
 
     def _scan(self, ctx: FrameContext) -> list[str]:
         """Continue a scan of ground and obstacles; draw a finished one into the local grid. Returns events."""
+        pose = self._camera.pose
+        T_o_c = pose.T_o_m @ pose.T_m_c
+        cov_px = None if self.right_camera is None else self.right_camera.disparity_cov
+        error = None if self._scans is None else self._scans.range_error(cov_px)
+        self._local_grid.follow(T_o_c, error)
         scanned = None if self._scans is None else self._scans.step(ctx)
-        if scanned is None:
+        if scanned is None or error is None:
             return []
-        self._local_grid.add(scanned)
+        self._local_grid.add(scanned, error)
         if ctx.t_ns - self._obstacle_event_ns < self._full_config.scan.told_s * 1e9:
             return []
         self._obstacle_event_ns = ctx.t_ns
-        pose = self._camera.pose
-        around = self._local_grid.around(pose.T_o_m @ pose.T_m_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)
+        around = self._local_grid.around(T_o_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)
         return [] if around is None else [around.line]
 
     def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
@@ -332,14 +335,14 @@ class Agent:
         """Tiles of the base's grid, by column and row."""
         return self._corrections.tiles
 
-    def surroundings(self, estimate: Estimate, T_b_f: F64) -> Surroundings | None:
+    def surroundings(self, pose: Estimate | PredictedPose, T_b_f: F64) -> Surroundings | None:
         """Obstacles around the vehicle, by its own scans and the base's grid; None if nothing is known.
 
-        T_b_f: (4,4) vehicle (forward, right, down) in the body.
+        pose: of the last frame, or predicted since. T_b_f: (4,4) vehicle (forward, right, down) in the body.
         """
-        T_w_f = None if estimate.T_w_b is None else estimate.T_w_b @ T_b_f
-        bands_m = self._full_config.ground.bands_m
-        return self._local_grid.around(estimate.T_o_b @ T_b_f, T_w_f, self.tiles, bands_m)
+        T_w_b, bands_m = self._report.in_world(pose.T_o_b), self._full_config.ground.bands_m
+        T_w_f = None if T_w_b is None else T_w_b @ T_b_f
+        return self._local_grid.around(pose.T_o_b @ T_b_f, T_w_f, self.tiles, bands_m)
 
     @property
     def metric(self) -> bool:

@@ -24,11 +24,13 @@ class LocalGridConfig:
 
     cell_m: float = 0.05  # m; the grid has 512 x 512 cells
     reach_m: float = 10.0  # m; farther obstacles are not told
-    sigma_m: float = (
-        0.1  # m; deviation of a range up to which the agent's own scans count: 4.9 m with 0.11 m of baseline
-    )
+    near_m: float = 2.0  # m; nearer obstacles are told even if something before them is unknown
+    sigma_m: float = 0.07  # m; deviation of a range up to which own scans count: 4 m with 0.11 m of baseline
     scans: int = 48  # newest ones that are kept: 10 m of flight, or more than a turn
-    slab_m: float = 0.25  # m that the vehicle climbs until scans made at other heights do not count
+    slab_m: float = 0.1  # m that the camera climbs until scans are drawn anew
     seen_m: float = 0.2  # m above and below the camera that a scan's line of sight covers: `ground.slab_m`
+    body_m: float = 0.25  # m above and below the vehicle where an obstacle stands in its way: a small drone
+    doubt_px: float = 0.3  # px; deviation of disparities from which tiles of the base do not count: 6 cm at 3 m
+    gap_m: float = 1.0  # m along a ray that may be unknown before an obstacle is told: a turn between two scans
     vehicle_m: float = 0.15  # m about its middle where the vehicle is itself
     tiles: int = 512  # of the base's grid that are kept, 2 MiB: the farthest go

@@ -204,17 +204,25 @@ def test_the_judge_counts_right_wrong_unknown_and_phantoms(tmp_path: Path) -> No
     judge = obstacles.Judge(world, BANDS_M)
     _, far = obstacles.true_distances(world, posed(0.0, 0.0), 72, BANDS_M)
     only_ahead = np.where(np.abs((np.arange(72) + 36) % 72 - 36) <= 8, far, np.nan)
-    judge.compare(only_ahead, posed(0.0, 0.0), 0.05)
+    judge.compare(only_ahead, posed(0.0, 0.0), 0.05, 10.0)
     assert (judge.told, judge.right, judge.unknown, judge.unseen) == (17, 17, 55, 0)
     phantom = only_ahead.copy()
     phantom[3] = 0.4
     for _ in range(4):
-        judge.compare(phantom, posed(0.0, 0.0), 0.05)
+        judge.compare(phantom, posed(0.0, 0.0), 0.05, 10.0)
     assert judge.phantom_s == pytest.approx(0.3) and judge.told - judge.right == 4
-    judge.compare(far, posed(0.0, 0.0), 0.05)
+    judge.compare(far, posed(0.0, 0.0), 0.05, 10.0)
     assert judge.unseen == 72 - 23, "the vehicle has not turned yet"
-    judge.compare(only_ahead + 0.3, posed(0.0, 0.0), 0.05)
+    judge.compare(only_ahead + 0.3, posed(0.0, 0.0), 0.05, 10.0)
     assert judge.told - judge.right > 4 + 12
+
+
+def test_nothing_within_reach_is_right_where_the_wall_lies_beyond(tmp_path: Path) -> None:
+    judge = obstacles.Judge(box_room(tmp_path), BANDS_M)
+    judge.compare(np.full(72, np.inf), posed(0.0, 0.0), 0.05, 1.5)
+    assert judge.right == judge.told == 72
+    judge.compare(np.full(72, np.inf), posed(0.0, 0.0), 0.05, 3.5)
+    assert judge.right - 72 == np.sum(obstacles.true_distances(judge.world, posed(0.0, 0.0), 72, BANDS_M)[1] > 3.4) > 0
 
 
 def test_the_way_that_was_driven_is_looked_up_in_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:

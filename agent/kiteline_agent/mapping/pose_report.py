@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.mapping.camera_state import CameraState
@@ -14,7 +15,10 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import LivePose
 from kiteline_core.frame import ImuBatch
+from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, AgentId
+
+F64 = NDArray[np.float64]
 
 
 class PoseReport:
@@ -63,6 +67,12 @@ class PoseReport:
     def odometry_quality(self, estimate: Estimate) -> int:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""
         return min(estimate.quality, self._camera.covariance.quality(estimate.cov_o, None))
+
+    def in_world(self, T_o_b: F64) -> F64 | None:
+        """T_w_b (4,4) of a pose since the last frame; None while that frame's is not known."""
+        if self._last is None or self._last.T_w_b is None:
+            return None
+        return np.asarray(self._last.T_w_b @ se3.inverse(self._last.T_o_b) @ T_o_b)
 
     def predict(self, t_ns: int, imu: ImuBatch | None, max_s: float) -> PredictedPose | None:
         """Predict the pose at t_ns. imu: samples since the last frame. Changes no state.

@@ -34,6 +34,7 @@ class RightCamera:
         self._channel = channel
         self.rows = RowAlignment(rectifier, config.rows)
         self.disparities = DisparityAlignment(local_map, config.disparities) if config.disparities.on else None
+        self._good_cov = np.eye(disparity_offset.TERMS) * config.disparities.good_px**2
         self._found_px = disparity_offset.none()  # error of disparities, without the base's part
         self._sigma_px: float | None = None  # of it, once this flight found it
 
@@ -67,6 +68,13 @@ class RightCamera:
         self._found_px, self._sigma_px = self._map.disparity_offset, self.disparities.sigma_px
         self._put(self.rows.estimate_px)
         return self.disparities.take_events()
+
+    @property
+    def disparity_cov(self) -> F64:
+        """(5,5) px^2: mean square of what the map's disparity offset is off by."""
+        if self.disparities is None:
+            return self._good_cov
+        return self.disparities.expected_cov + self._good_cov
 
     def share_rows(self) -> list[str]:
         """Tell the base of rows that have changed. Returns events."""

@@ -10,6 +10,7 @@ from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
 )
+from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.step import Estimate, PredictedPose, StepOutput
 from kiteline_hw.ports import ControllerLink, FrameSource, LinkError, PoseSample
 from kiteline_hw.sources.overrides import with_other_imu
@@ -77,11 +78,13 @@ def pose_sample(agent: Agent, output: StepOutput, t_ns: int, epoch: int) -> Pose
     return PoseSample(t_ns, pose.T_l_b, pose.tracked, agent.odometry_quality(pose), epoch, pose.cov_l)
 
 
-def push_obstacles(controller: ControllerLink, agent: Agent, output: StepOutput | None, now_ns: int) -> None:
-    """Send what stands around the vehicle, while it is tracked."""
-    estimate = None if output is None else output.estimate
-    if estimate is None or not estimate.tracked:
+def push_obstacles(
+    controller: ControllerLink, agent: Agent, output: StepOutput | None, due: PoseSchedule, now_ns: int
+) -> None:
+    """Send what stands around the vehicle if that is due, by the pose of a step, while the vehicle is tracked."""
+    pose = None if output is None else output.estimate or output.predicted
+    if pose is None or not pose.tracked or not due.take_due(now_ns):
         return
-    around = agent.surroundings(estimate, controller.T_b_f)
+    around = agent.surroundings(pose, controller.T_b_f)
     if around is not None:
         controller.push_obstacles(around.distance_m.tolist(), around.reach_m, now_ns)

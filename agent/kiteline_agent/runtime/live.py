@@ -75,11 +75,12 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         runtime.begin_at(begin_ns)
         if controller is not None:
             controller.take_imu(begin_ns)  # drop what was measured before the flight
-        schedule = PoseSchedule(0.0 if controller is None else pose_rate_hz(options), begin_ns)
-        around = PoseSchedule(OBSTACLES_HZ if controller is not None and options.obstacles else 0.0, begin_ns)
+        own_hz = 0.0 if controller is None else pose_rate_hz(options)
+        obstacles_hz = OBSTACLES_HZ if controller is not None and options.obstacles else 0.0
+        predictions, around = PoseSchedule(own_hz or obstacles_hz, begin_ns), PoseSchedule(obstacles_hz, begin_ns)
         shift_ns = runtime.options.start_ns - begin_ns
         while not stop and not runtime.over:
-            told = _wait(runtime, begin_ns, schedule.next_ns, clock, stop)
+            told = _wait(runtime, begin_ns, predictions.next_ns, clock, stop)
             if stop:
                 break
             now_ns = captured_ns = clock.now_ns()
@@ -96,18 +97,18 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                 # IMU samples that arrive late come with the next frame.
                 samples = None if controller is None else controller.take_imu(captured_ns)
                 imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
-            elif controller is not None and schedule.take_due(now_ns):
+            elif controller is not None and predictions.take_due(now_ns):
                 predict_ns = now_ns + shift_ns
                 samples = controller.take_imu(now_ns) if options.imu_of else None
                 imu = runtime.reader.take_imu(predict_ns)
                 imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
             push = None
-            if controller is not None and schedule.on == (frame is None):
+            if controller is not None and (own_hz > 0.0) == (frame is None):
                 push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
             for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push):
                 link.send(packet)
-            if controller is not None and frame is not None and around.take_due(now_ns):
-                push_obstacles(controller, runtime.agent, runtime.output, now_ns)
+            if controller is not None:
+                push_obstacles(controller, runtime.agent, runtime.output, around, now_ns)
             process.notify("WATCHDOG=1")
             if parent is None:
                 found = [] if controller is None else [f.line for f in controller.take_findings()]

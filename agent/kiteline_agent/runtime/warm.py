@@ -15,6 +15,7 @@ from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
 from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans.local_grid import LocalGrid
+from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
@@ -75,7 +76,8 @@ def _warm_scans(rig: CameraRig) -> None:
     image = np.zeros((view.height, view.width), np.uint8)
     up_c = np.array([0.0, -1.0, 0.0])
     scan = segmenter.segment(np.ascontiguousarray(disparity, np.float32), (image, image), up_c)
-    grid.add(Scanned(KeyframeScan(KeyframeId(0), scan, np.zeros(0, np.uint8)), np.eye(4), 1.0))
+    record = KeyframeScan(KeyframeId(0), scan, np.zeros(0, np.uint8))
+    grid.add(Scanned(record, np.eye(4), 1.0, np.zeros(5)), RangeError.of_noise(view.bf, segmenter.surface_sigma_px))
     grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
 

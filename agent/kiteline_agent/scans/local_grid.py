@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans import local_grid_kernels as kernels
+from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_codec.schema import GridTile
 from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS
@@ -25,18 +26,20 @@ _CELLS = 512  # along each side of the local grid
 _WINDOW = 512  # the same of the tiles around the vehicle
 _MOST_DRAWN = 8000  # scans between two drawings of all: marks are 16-bit numbers
 _RAYS = 5  # in each sector
+_NONE: I8 = np.zeros((0, 0), np.int8)
 _LEAST_HEADING = 0.3  # horizontal part of the vehicle's forward axis: less has no heading
 
 
 @dataclass(frozen=True, slots=True)
 class _Drawn:
-    """A scan in the grid's axes. x_m, y_m, z_m: of its camera. heading: of its azimuth 0."""
+    """A scan in the grid's axes. x_m, y_m, z_m: of its camera. heading: of its azimuth 0. offset_px: see `Scanned`."""
 
     x_m: float
     y_m: float
     z_m: float
     heading: float
     scan: ColumnScan
+    offset_px: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +66,23 @@ class Surroundings:
         if self.nearest is None:
             return f"nearest obstacle: none seen, {unknown:.0f} % unknown"
         distance_m, turn_rad = self.nearest
-        turn = f"{abs(np.degrees(turn_rad)):.0f} degrees {'right' if turn_rad >= 0.0 else 'left'}"
-        return f"nearest obstacle: {distance_m:.2f} m, {turn}, {unknown:.0f} % unknown"
+        turn_deg = round(float(np.degrees(turn_rad)))
+        side = f"{abs(turn_deg)} degrees {'right' if turn_deg > 0 else 'left'}"
+        where = {0: "ahead", 180: "behind"}.get(abs(turn_deg), side)
+        return f"nearest obstacle: {distance_m:.2f} m {where}, {unknown:.0f} % unknown"
 
 
 class LocalGrid:
     """The newest scans in a grid about the vehicle, in the odometry frame levelled by gravity: no correction moves it.
 
-    Takes 1.2 MB. A scan is drawn when it comes; all are drawn again when the vehicle has moved on or climbed.
+    Takes 1.2 MB. A scan is drawn when it comes, as far as its ranges are sure; all are drawn again when the camera has
+    moved on or climbed, and when more is known of the errors of ranges.
     """
 
-    def __init__(self, config: LocalGridConfig, certain_m: float = np.inf) -> None:
-        """certain_m: range up to which scans are sure; beyond, they tell nothing."""
+    def __init__(self, config: LocalGridConfig) -> None:
         self._config = config
-        self._seen_m = min(config.reach_m, certain_m)
+        self._error: RangeError | None = None  # by which scans are drawn
+        self._sure_scans = config.scans  # in a row, since the rig was in doubt
         self._cells: I8 = np.zeros((_CELLS, _CELLS), np.int8)
         self._marks = np.zeros((_CELLS, _CELLS), np.int16)
         self._window: I8 = np.zeros((_WINDOW, _WINDOW), np.int8)
@@ -89,19 +95,40 @@ class LocalGrid:
         self._number = 0
         self._ground_m: float | None = None  # z of the ground; None while it is not known
 
-    def add(self, scanned: Scanned) -> None:
-        """Draw a new scan."""
+    def add(self, scanned: Scanned, error: RangeError) -> None:
+        """Draw a new scan. error: of the ranges of all scans, as it is known now."""
+        self._sure_scans += 1
+        self._take(error)
         T, scan = scanned.T_o_c, scanned.record.scan
         R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
         if self._R_g_o is None:
             self._R_g_o = R_l_o
         p = self._R_g_o @ T[:3, 3]
         ahead = self._R_g_o @ R_l_o.T[:, 0]
-        drawn = _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan)
+        heading = float(np.arctan2(ahead[1], ahead[0]))
+        drawn = _Drawn(float(p[0]), float(p[1]), float(p[2]), heading, scan, scanned.offset_px)
         self._scans.append(drawn)
         self._ground_m = None if scanned.height_m is None else drawn.z_m - scanned.height_m
         if not self._moved_on(drawn.x_m, drawn.y_m, drawn.z_m):
             self._draw(drawn)
+
+    def _take(self, error: RangeError) -> None:
+        """Take over what is known of ranges."""
+        if error.common_px > self._config.doubt_px or (self._error is not None and error.moved(self._error)):
+            self._sure_scans = 0
+        if self._error is None or error.differs(self._error):
+            self._error, self._number = error, 0  # draws all anew
+
+    def follow(self, T_o_c: F64, error: RangeError | None = None) -> None:
+        """Keep the grid about the camera, at T_o_c (4,4). Questions never move it: a replay asks fewer of them.
+
+        error: see `add`; None: as before.
+        """
+        if error is not None:
+            self._take(error)
+        if self._R_g_o is not None:
+            p = self._R_g_o @ T_o_c[:3, 3]
+            self._moved_on(float(p[0]), float(p[1]), float(p[2]))
 
     def around(
         self, T_o_f: F64, T_w_f: F64 | None, tiles: Mapping[tuple[int, int], GridTile], bands_m: tuple[float, ...]
@@ -109,27 +136,30 @@ class LocalGrid:
         """Obstacles around the vehicle (forward, right, down) at T_o_f (4,4) in o, and T_w_f in w if that is known.
 
         bands_m: limits of the height bands of tiles. None without a scan or tile, and with the nose up or down.
+        Tiles hold what was told of a rig that was in doubt: they count once as many scans as are kept were sure.
         """
         config = self._config
+        tiles = tiles if self._sure_scans >= config.scans else {}
         if self._R_g_o is None and (not tiles or T_w_f is None):
             return None
         R = np.eye(3) if self._R_g_o is None else self._R_g_o
         p, ahead = R @ T_o_f[:3, 3], R @ T_o_f[:3, 0]
         if float(np.hypot(ahead[0], ahead[1])) < _LEAST_HEADING:
             return None
-        self._moved_on(float(p[0]), float(p[1]), float(p[2]))
         own_at = np.array([*(p[:2] - self._corner), np.arctan2(ahead[1], ahead[0])])
         cell_m, tile_at = config.cell_m, np.zeros(3)
         if tiles and T_w_f is not None:
             height_m = None if self._ground_m is None else float(p[2]) - self._ground_m
-            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.slab_m))
+            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.body_m))
             tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
         else:
             self._window[:], self._window_of, self._window_tiles = 0, (), ()
         out = np.empty(SECTORS)
+        climbed_m = abs(float(p[2]) - self._z_m)  # since the frame
+        own = self._cells if climbed_m < config.slab_m + config.body_m else _NONE
         kernels.read_distances(
-            self._cells, config.cell_m, own_at, self._window, cell_m, tile_at, config.vehicle_m, config.reach_m, _RAYS,
-            out,
+            own, self._marks, config.cell_m, own_at, self._window, cell_m, tile_at, config.vehicle_m, config.gap_m,
+            config.near_m, config.reach_m, _RAYS, out,
         )  # fmt: skip
         return Surroundings(out, config.reach_m)
 
@@ -147,14 +177,19 @@ class LocalGrid:
         return True
 
     def _draw(self, drawn: _Drawn) -> None:
-        """Draw a scan, unless it was made much higher or lower."""
+        """Draw a scan, if it was made at about this height: what is clear a little higher may not be clear here."""
         config, scan = self._config, drawn.scan
-        if abs(drawn.z_m - self._z_m) > config.slab_m + config.seen_m:
+        assert self._error is not None
+        away_m = abs(drawn.z_m - self._z_m)
+        if away_m > config.body_m:
             return
         self._number += 1
+        clear_m, certain_m = self._error.ranges(scan, drawn.offset_px, config.sigma_m)
+        seen_m = np.minimum(np.maximum(certain_m, config.near_m), config.reach_m)
         kernels.draw_rays(
             self._cells, self._marks, self._number, drawn.x_m - self._corner[0], drawn.y_m - self._corner[1],
-            drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, scan.clear_m, self._seen_m, config.cell_m,
+            drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, clear_m, seen_m, config.cell_m,
+            away_m <= config.seen_m - config.slab_m,
         )  # fmt: skip
 
     def _place_window(self, T_w_f: F64, tiles: Mapping[tuple[int, int], GridTile], mask: int) -> tuple[float, F64]:

@@ -18,6 +18,7 @@ from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.scan_config import ScanConfig
+from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Key, KeyframeScan
@@ -41,11 +42,13 @@ class Scanned:
     """A finished scan. T_o_c: (4,4) of its camera in the odometry frame, in which that does not move any more.
 
     height_m: of the camera above the ground; None while that is not known.
+    offset_px: (5,) the disparity offset that it was made with (`disparity_offset`).
     """
 
     record: KeyframeScan
     T_o_c: F64
     height_m: float | None
+    offset_px: F64
 
 
 @dataclass(slots=True)
@@ -88,9 +91,13 @@ class ScanStage:
         self._under_way: list[Key] = []
         self._waiting: deque[KeyframeScan] = deque(maxlen=_WAITING)
 
-    def certain_m(self, sigma_m: float) -> float:
-        """Distance up to which ranges of scans deviate by less than sigma_m."""
-        return self._segmenter.certain_m(sigma_m)
+    def range_error(self, cov_px: F64 | None) -> RangeError:
+        """What is known of errors of ranges. cov_px: (5,5) of the disparity offset; None of a camera without one."""
+        bf, at_scan = self._map.camera.bf, self._segmenter.camera.bf
+        sigma_px = self._segmenter.surface_sigma_px * bf / at_scan
+        if cov_px is None:
+            return RangeError.of_noise(bf, sigma_px)
+        return RangeError(bf, sigma_px, self._map.disparity_offset, cov_px)
 
     def step(self, ctx: FrameContext) -> Scanned | None:
         """Go on with the scan in work, or begin one if this frame became a keyframe that shows something new."""
@@ -173,7 +180,7 @@ class ScanStage:
         seen = Seen(begun.T_o_c, scan, segmenter.saw_ground, segmenter.lowest_m)
         self._take(self._ground.note(record, seen))
         ground = self._ground.expected(begun.T_o_c, begun.up_c)
-        return Scanned(record, begun.T_o_c, None if ground is None else ground.height_m)
+        return Scanned(record, begun.T_o_c, None if ground is None else ground.height_m, self._map.disparity_offset)
 
     def _take(self, verdict: Verdict[KeyframeScan]) -> None:
         """Share scans that are believed, and take back those that are not any more."""

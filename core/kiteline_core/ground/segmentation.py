@@ -142,9 +142,10 @@ class GroundSegmenter:
         self.lowest_m = (len(self._depths) - 1 - int(below[0])) * _DEPTH_STEP_M if len(below) else float("nan")
         return self._scan(self._find_ground(up_c, expected), view, expected)
 
-    def certain_m(self, sigma_m: float) -> float:
-        """Distance up to which a surface's deviation stays below sigma_m."""
-        return float(np.sqrt(sigma_m * self.bf / (_REFINED * self.sigma_px)))
+    @property
+    def surface_sigma_px(self) -> float:
+        """Deviation of a surface's disparity, in px of the disparity image."""
+        return _REFINED * self.sigma_px
 
     def label_of(self, uv: F64) -> U8:
         """Labels (n,) of pixels (n,2) of the full image."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,12 +13,15 @@ from hypothesis import strategies as st
 
 from kiteline_agent.config import LocalGridConfig
 from kiteline_agent.runtime.controller import push_obstacles
+from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.scans import local_grid_kernels as kernels
 from kiteline_agent.scans.local_grid import SECTORS, LocalGrid, Surroundings
+from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_codec.schema import GridTile, KeyframeScan
 from kiteline_core.geometry import se3
-from kiteline_core.ground.column_scan import ColumnScan
+from kiteline_core.geometry.disparity_offset import TERMS
+from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ids import KeyframeId
 
 CELL_M = 0.1
@@ -68,9 +72,10 @@ def scan_at(x: float, y: float, heading_rad: float, z: float = 1.0, noise_m: flo
         np.array([0.0, -1.0, 0.0]), azimuth[0], step, np.zeros(n), np.zeros(n), clear, np.full(n, 7, np.uint8), clear, z
     )
     record = KeyframeScan(KeyframeId(1), scan, np.zeros(0, np.uint8))
-    return Scanned(record, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])), z)
+    return Scanned(record, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])), z, np.zeros(TERMS))
 
 
+BF, EXACT = 50.0, RangeError.of_noise(50.0, 0.01)
 TURN = se3.exp(np.array([4.0, -2.0, 0.3, 0.0, 0.0, 0.5]))
 
 
@@ -89,7 +94,7 @@ def test_walls_of_a_room_lie_ahead_right_behind_and_left(x: float, y: float, qua
 def test_own_scans_show_walls_wherever_the_odometry_frame_lies() -> None:
     grid = LocalGrid(LocalGridConfig())
     for k in range(12):
-        grid.add(scan_at(0.1 * k, 0.0, 0.5 * k, noise_m=0.03, seed=k))
+        grid.add(scan_at(0.1 * k, 0.0, 0.5 * k, noise_m=0.03, seed=k), EXACT)
     found = grid.around(TURN @ vehicle(0.5, 0.2, np.pi / 2), None, {}, BANDS_M)
     assert found is not None
     for k, wall in enumerate([NORTH - 0.2, EAST - 0.5, 0.2 - SOUTH, 0.5 - WEST]):
@@ -101,7 +106,7 @@ def test_own_scans_show_walls_wherever_the_odometry_frame_lies() -> None:
 
 def test_what_was_not_seen_is_unknown_and_own_scans_count_before_tiles() -> None:
     grid = LocalGrid(LocalGridConfig())
-    grid.add(scan_at(0.0, 0.0, 0.0))
+    grid.add(scan_at(0.0, 0.0, 0.0), EXACT)
     T_w_f = vehicle(0.0, 0.0, 0.0)
     alone = grid.around(TURN @ T_w_f, None, {}, BANDS_M)
     assert alone is not None
@@ -117,9 +122,12 @@ def test_what_was_not_seen_is_unknown_and_own_scans_count_before_tiles() -> None
 
 def test_obstacles_far_above_or_below_do_not_count() -> None:
     grid = LocalGrid(LocalGridConfig())
-    grid.add(scan_at(0.0, 0.0, 0.0, z=1.0))
-    higher = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=2.5), None, {}, BANDS_M)
-    assert higher is not None and np.isnan(higher.distance_m).all()
+    grid.add(scan_at(0.0, 0.0, 0.0, z=1.0), EXACT)
+    for followed in (False, True):
+        if followed:
+            grid.follow(scan_at(0.0, 0.0, 0.0, z=2.5).T_o_c)
+        higher = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=2.5), None, {}, BANDS_M)
+        assert higher is not None and np.isnan(higher.distance_m).all()
     low = room(mask=1)  # walls that reach 0.5 m above the ground
     over = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=1.5), vehicle(0.0, 0.0, 0.0, z=1.5), low, BANDS_M)
     assert over is not None and np.isnan(over.distance_m[SECTORS // 2])
@@ -128,12 +136,13 @@ def test_obstacles_far_above_or_below_do_not_count() -> None:
 def test_a_vehicle_that_flies_on_takes_its_scans_along() -> None:
     grid = LocalGrid(LocalGridConfig(scans=200))
     for k in range(100):
-        grid.add(scan_at(-1.5 + 0.04 * k, 0.0, 0.0))
+        grid.add(scan_at(-1.5 + 0.04 * k, 0.0, 0.0), EXACT)
     far = [scan_at(2.0, 0.0, 0.0)]
     for k in range(60):  # 30 m away, and back
         moved = se3.from_rt(np.eye(3), np.array([0.5 * k, 0.0, 0.0]))
-        grid.add(Scanned(far[0].record, moved @ far[0].T_o_c, far[0].height_m))
+        grid.add(replace(far[0], T_o_c=moved @ far[0].T_o_c), EXACT)
         assert grid.around(moved @ TURN @ vehicle(2.0, 0.0, 0.0), None, {}, BANDS_M) is not None
+    grid.follow(far[0].T_o_c)
     back = grid.around(TURN @ vehicle(1.0, 0.0, 0.0), None, {}, BANDS_M)
     assert back is not None and back.distance_m[0] == pytest.approx(2.0, abs=0.1)
 
@@ -144,6 +153,81 @@ def test_the_grid_and_its_tiles_take_less_than_four_mib() -> None:
     arrays = [value for value in vars(grid).values() if isinstance(value, np.ndarray)]
     scans = config.scans * sum(v.nbytes for v in (scan_at(0, 0, 0).record.scan.clear_m,) * 5)
     assert sum(a.nbytes for a in arrays) + scans + config.tiles * (64 * 64 + 200) < 4 << 20
+
+
+def test_own_scans_that_disagree_are_not_decided_by_the_base() -> None:
+    """A single cell of the base's among those that own scans saw clear was an obstacle half a metre away."""
+    grid, T_w_f = LocalGrid(LocalGridConfig()), vehicle(0.0, 0.0, 0.0)
+    grid.add(scan_at(0.0, 0.0, 0.0), EXACT)
+    ahead = grid._R_g_o @ ((TURN @ T_w_f)[:3, 3] + 0.5 * (TURN @ T_w_f)[:3, 0])
+    j, i = ((ahead[:2] - grid._corner) / LocalGridConfig().cell_m).astype(int)
+    assert grid._marks[i, j] > 0
+    grid._cells[i - 3 : i + 4, j - 3 : j + 4] = 0
+    told = {at: GridTile(*at, 0, CELL_M, np.full((64, 64), 7, np.int8)) for at in ((0, 0), (0, -1))}
+    found = grid.around(TURN @ T_w_f, T_w_f, told, BANDS_M)
+    assert found is not None and found.distance_m[0] > 2.5
+
+
+def test_what_was_clear_at_another_height_is_not_free_here() -> None:
+    """A drone that descends saw over what stands before it."""
+    grid, config = LocalGrid(LocalGridConfig()), LocalGridConfig()
+    grid.add(scan_at(0.0, 0.0, 0.0, z=1.0), EXACT)
+    for z, told in ((1.0, True), (1.0 - 0.9 * config.slab_m, True), (0.7, False)):
+        grid.follow(scan_at(0.0, 0.0, 0.0, z=z).T_o_c)
+        found = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=z), None, {}, BANDS_M)
+        assert found is not None and bool(np.isfinite(found.distance_m[0])) == told
+
+
+@given(
+    clear=st.floats(0.6, 9.0), c0=st.floats(-0.9, 0.9), cx=st.floats(-0.3, 0.3), pitch=st.floats(-0.5, 0.5),
+    roll=st.floats(-0.3, 0.3),
+)  # fmt: skip
+def test_ranges_are_corrected_by_the_offset_that_is_found_later(
+    clear: float, c0: float, cx: float, pitch: float, roll: float
+) -> None:
+    """Against pixels: where each column's point lies in the image, and what its disparity is there."""
+    up_c = se3.so3_exp(np.array([pitch, 0.0, roll])) @ np.array([0.0, -1.0, 0.0])
+    scan = replace(scan_at(0.0, 0.0, 0.0).record.scan, up_c=up_c, clear_m=np.full(64, clear))
+    offset = np.array([c0, cx, 0.0, 0.0, 0.0])
+    cov = np.diag([0.04, 0.01, 0.0, 0.0, 0.0])
+    ranges, certain = RangeError(BF, 0.2, offset, cov).ranges(scan, np.zeros(TERMS), 0.07)
+    R_c_l = level_rotation(up_c)
+    for azimuth, found, sure in zip(scan.azimuths_rad, ranges, certain, strict=True):
+        x, _, depth = R_c_l @ np.array([clear * np.cos(azimuth), clear * np.sin(azimuth), 0.0])
+        wrong_by = c0 + cx * x / depth
+        true_depth = BF / (BF / depth - wrong_by) if BF / depth > wrong_by else np.inf
+        assert found == pytest.approx(clear * true_depth / depth, rel=1e-9)
+        sigma_px = np.sqrt(0.2**2 + 0.04 + 0.01 * (x / depth) ** 2)
+        assert sigma_px * (depth / clear) * sure**2 / BF == pytest.approx(0.07)
+    assert not RangeError.of_noise(BF, 0.2).ranges(replace(scan, clear_m=np.zeros(64)), offset, 0.07)[0].any()
+
+
+def test_scans_are_drawn_anew_once_the_rig_is_found_to_be_worn_and_only_near_ones_are_told_before() -> None:
+    grid, T = LocalGrid(LocalGridConfig()), TURN @ vehicle(0.0, 0.0, 0.0)
+    worn = np.array([0.4, 0.0, 0.0, 0.0, 0.0])
+    scan = scan_at(0.0, 0.0, 0.0)
+    true_m = scan.record.scan.clear_m
+    ahead = np.cos(scan.record.scan.azimuths_rad)  # of depth in a range
+    measured_m = BF / (BF / true_m + worn[0] * ahead)
+    scan = replace(scan, record=replace(scan.record, scan=replace(scan.record.scan, clear_m=measured_m)))
+    doubtful = RangeError(BF, 0.2, np.zeros(TERMS), np.diag([0.5, 0, 0, 0, 0]))
+    grid.add(scan, doubtful)
+    before = grid.around(T, None, {}, BANDS_M)
+    assert before is not None and np.isnan(before.distance_m[0]), "3 m away: unknown rather than wrong"
+    grid.add(scan, RangeError(BF, 0.05, worn, np.zeros((TERMS, TERMS))))
+    after = grid.around(T, None, {}, BANDS_M)
+    assert after is not None and after.distance_m[0] == pytest.approx(EAST, abs=0.08)
+    w = vehicle(0.0, 0.0, 0.0)
+    with_tiles = grid.around(T, w, room(), BANDS_M)
+    assert with_tiles is not None and np.isnan(with_tiles.distance_m[36]), "tiles were drawn by what was wrong"
+    for _ in range(LocalGridConfig().scans):
+        grid.add(scan, RangeError(BF, 0.05, worn, np.zeros((TERMS, TERMS))))
+    later = grid.around(T, w, room(), BANDS_M)
+    assert later is not None and np.isfinite(later.distance_m).all()
+    near = LocalGrid(LocalGridConfig())
+    near.add(scan_at(EAST - 1.5, 0.0, 0.0), doubtful)
+    seen = near.around(TURN @ vehicle(EAST - 1.5, 0.0, 0.0), None, {}, BANDS_M)
+    assert seen is not None and seen.distance_m[0] == pytest.approx(1.5, abs=0.1), "near ones never vanish"
 
 
 def test_what_is_not_known_is_not_free() -> None:
@@ -172,6 +256,31 @@ def test_any_size_of_cells_costs_little(cell_m: float) -> None:
     assert distances is not None and distances.shape == (SECTORS,)
 
 
+def test_asking_does_not_change_what_is_told_later() -> None:
+    """A replay asks for less than a flight with a controller: the log's lines must be equal."""
+    rng = np.random.default_rng(3)
+    asked, plain = LocalGrid(LocalGridConfig(scans=6)), LocalGrid(LocalGridConfig(scans=6))
+    for k in range(40):
+        x, turn = -1.0 + 0.08 * k, 0.3 * k
+        for grid in (asked, plain):
+            grid.add(scan_at(x, 0.1, turn, noise_m=0.05, seed=k), EXACT)
+            grid.follow(scan_at(x, 0.1, turn).T_o_c)
+        away = TURN @ vehicle(float(rng.uniform(-6.0, 6.0)), 0.0, turn, z=float(rng.uniform(0.0, 3.0)))
+        asked.around(away, None, {}, BANDS_M)
+        found = [grid.around(TURN @ vehicle(x, 0.1, turn), None, {}, BANDS_M) for grid in (asked, plain)]
+        assert found[0] is not None and found[1] is not None
+        assert np.array_equal(found[0].distance_m, found[1].distance_m, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "where"), [(0.0, "ahead"), (5.0, "5 degrees right"), (-90.0, "90 degrees left"), (180.0, "behind")]
+)
+def test_the_log_says_where_the_nearest_obstacle_is(turn_deg: float, where: str) -> None:
+    distances = np.full(SECTORS, np.nan)
+    distances[round(turn_deg / 5.0) % SECTORS] = 1.25
+    assert Surroundings(distances, REACH_M).line == f"nearest obstacle: 1.25 m {where}, 99 % unknown"
+
+
 class Heard:
     """Stands for the flight controller's link."""
 
@@ -189,65 +298,75 @@ def test_only_a_vehicle_that_is_tracked_tells_its_obstacles() -> None:
     heard = Heard()
 
     def push(*, tracked: bool, known: bool) -> int:
-        agent = SimpleNamespace(surroundings=lambda estimate, T_b_f: told if known else None)
-        estimate = SimpleNamespace(tracked=tracked)
-        push_obstacles(cast(Any, heard), cast(Any, agent), cast(Any, SimpleNamespace(estimate=estimate)), 5)
+        agent = SimpleNamespace(surroundings=lambda pose, T_b_f: told if known else None)
+        pose = SimpleNamespace(tracked=tracked)
+        for estimate, predicted in ((pose, None), (None, pose), (None, None)):
+            output, due = SimpleNamespace(estimate=estimate, predicted=predicted), PoseSchedule(10.0, 0)
+            for now_ns in (5, 6):  # due once
+                push_obstacles(cast(Any, heard), cast(Any, agent), cast(Any, output), due, now_ns)
         return len(heard.sent)
 
     assert push(tracked=False, known=True) == 0
     assert push(tracked=True, known=False) == 0
-    assert push(tracked=True, known=True) == 1
+    assert push(tracked=True, known=True) == 2  # of a frame, and predicted
     assert heard.sent[0][0] == 2.0
 
 
-def test_rays_clear_what_they_pass_and_mark_what_they_hit() -> None:
+@pytest.mark.parametrize("clears", [True, False])
+def test_rays_clear_what_they_pass_and_mark_what_they_hit(clears: bool) -> None:
     cells, marks = np.zeros((60, 60), np.int8), np.zeros((60, 60), np.int16)
     for number in (1, 2):
         kernels.draw_rays(
-            cells, marks, number, 1.025, 1.525, 0.0, np.zeros(1), 0.02, np.array([1.2]), 10.0, 0.05
+            cells, marks, number, 1.025, 1.525, 0.0, np.zeros(1), 0.02, np.array([1.2]), np.array([10.0]), 0.05, clears
         )  # fmt: skip
     expected = np.zeros((60, 60), np.int8)
-    expected[30, 20:43] = 2 * kernels.MISS  # up to a cell and a half before the surface
+    if clears:
+        expected[30, 20:43] = 2 * kernels.MISS  # up to a cell and a half before the surface
     expected[30, 44] = 2 * kernels.HIT
     assert np.array_equal(cells[:, :43], expected[:, :43])
     assert np.array_equal(cells[:, 44:], expected[:, 44:])
     assert cells[30, 43] <= 0
 
 
-def test_distances_are_those_of_plain_arithmetic() -> None:
+@pytest.mark.parametrize(("gap_m", "near_m"), [(0.12, 0.4), (10.0, 0.0), (0.04, 0.0)])
+def test_distances_are_those_of_plain_arithmetic(gap_m: float, near_m: float) -> None:
     rng = np.random.default_rng(5)
-    own = rng.choice([-2, 0, 4], (80, 80), p=[0.9, 0.05, 0.05]).astype(np.int8)
-    tiles = rng.choice([-2, 0, 4], (80, 80), p=[0.9, 0.05, 0.05]).astype(np.int8)
+    own = rng.choice([-2, 0, 4], (80, 80), p=[0.6, 0.37, 0.03]).astype(np.int8)
+    drawn = np.where((own != 0) | (rng.random((80, 80)) < 0.5), 3, 0).astype(np.int16)
+    tiles = rng.choice([-2, 0, 4], (80, 80), p=[0.6, 0.37, 0.03]).astype(np.int8)
     at, other, out = np.array([2.1, 1.9, 0.4]), np.array([2.3, 2.2, -1.0]), np.empty(36)
-    kernels.read_distances(own, 0.05, at, tiles, 0.05, other, 0.1, 1.5, 1, out)
+    kernels.read_distances(own, drawn, 0.05, at, tiles, 0.05, other, 0.1, gap_m, near_m, 1.5, 1, out)
 
-    def state(cells: np.ndarray, x: float, y: float) -> int:
+    def cell(cells: np.ndarray, x: float, y: float) -> int:
         i, j = int(np.floor(y / 0.05)), int(np.floor(x / 0.05))
-        if not (0 <= i < 80 and 0 <= j < 80):
-            return -1
-        value = cells[i, j]
-        return 1 if value >= kernels.OCCUPIED else 0 if value <= kernels.FREE else -1
+        return int(cells[i, j]) if 0 <= i < 80 and 0 <= j < 80 else 0
 
+    kinds = set()
     for s in range(36):
         turn = s * 2 * np.pi / 36
-        r, known, expected = 0.1, True, np.inf
         states = []
-        while r < 1.8:
-            here = state(own, at[0] + np.cos(at[2] - turn) * r, at[1] + np.sin(at[2] - turn) * r)
-            if here < 0:
-                here = state(tiles, other[0] + np.cos(other[2] - turn) * r, other[1] + np.sin(other[2] - turn) * r)
-            states.append((r, here))
-            r += 0.025
+        for r in 0.1 + 0.025 * np.arange(68):
+            x, y = at[0] + np.cos(at[2] - turn) * r, at[1] + np.sin(at[2] - turn) * r
+            value = cell(own, x, y)
+            if not cell(drawn, x, y):
+                value = cell(tiles, other[0] + np.cos(other[2] - turn) * r, other[1] + np.sin(other[2] - turn) * r)
+            states.append((r, 1 if value >= kernels.OCCUPIED else 0 if value <= kernels.FREE else -1))
+        expected, longest, gap = np.inf, 0.0, 0.0
         for k, (r, here) in enumerate(states):
             if r >= 1.5:
                 break
             if here > 0:
-                end = next((q for q, h in states[k + 1 :] if h <= 0 or q >= states[k][0] + 0.3), r)
+                end = next((q for q, h in states[k + 1 :] if h <= 0 or q >= r + 0.3), r)
                 expected = 0.5 * (r + end)
                 break
-            known &= here == 0
-        expected = expected if expected < 1.5 else np.inf if known else np.nan
+            gap = gap + 0.025 if here < 0 else 0.0
+            longest = max(longest, gap)
+        expected = expected if expected < 1.5 else np.inf
+        if longest > gap_m and expected > near_m:
+            expected = np.nan
         assert out[s] == pytest.approx(expected, nan_ok=True, abs=1e-9), s
+        kinds.add("nan" if np.isnan(expected) else "inf" if np.isinf(expected) else "finite")
+    assert "finite" in kinds and ("nan" in kinds) == (gap_m < 1.0)
 
 
 def test_a_tile_that_replaces_another_is_seen_at_once() -> None:
