@@ -21,6 +21,13 @@ settings.register_profile("ci", parent=settings.get_profile("default"), derandom
 settings.load_profile("ci" if IN_CI else "default")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m alone` only files that name the mark are imported: all of them take as long as some of those tests."""
+    if config.option.markexpr == "alone" and collection_path.match("test_*.py"):
+        return b"mark.alone" not in collection_path.read_bytes() or None
+    return None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests of whole programs come first: they wait most, and their files take long, which is no way to end a run."""
     items.sort(key=lambda item: item.path.parent != ROOT / "tests" / "system")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,12 +154,10 @@ def test_table_and_figure_of_flights(flight: Recording, tmp_path: Path) -> None:
     assert (tmp_path / "governor.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.alone
 def test_start_to_first_pose_is_measured(recording: Path) -> None:
     assert 0.05 < processes.start("first-pose", str(recording))["seconds"] < 60.0
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("options", [[], ["--link"]])
 def test_memory_is_measured_over_minutes(recording: Path, options: list[str]) -> None:
     found = processes.start("soak", str(recording), "--minutes", "0.03", *options)
@@ -170,7 +169,6 @@ def test_trial_that_fails_says_why(tmp_path: Path) -> None:
         processes.start("first-pose", str(tmp_path / "nothing"))
 
 
-@pytest.mark.alone
 @pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
 def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
     found = LimitedFlight(**processes.start("quota", str(recording), "--percent", "20", "--governor"))
@@ -182,7 +180,8 @@ def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
 def test_governor_keeps_a_real_flight_within_the_kernel_s_limit(data_dir: Path) -> None:
     source = str(data_dir / "room_flight.mcap")
     options = ("quota", source, "--percent", "3.5", "--frames", "140")
-    free = LimitedFlight(**processes.start(*options))  # how many frames this machine tracks in so little CPU time
-    found = LimitedFlight(**processes.start(*options, "--governor"))
+    with ThreadPoolExecutor() as pool:  # each leaves a core nearly idle
+        flights = pool.map(lambda more: processes.start(*options, *more), [(), ("--governor",)])
+        free, found = (LimitedFlight(**flight) for flight in flights)  # free: what so little CPU time tracks here
     assert found.peak <= 3.5 * 1.02 and found.lost == 0 and found.submaps == 1
     assert found.tracked > 0.7 * free.tracked > 0 and found.ate_m < 0.02

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -38,39 +39,19 @@ def pair(left: Image | None = None, right: Image | None = None, **of_right: floa
     return devices
 
 
-@pytest.fixture
-def checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
-    (tmp_path / "camera.yaml").write_text(
+Found = dict[str, DoctorCheck]
+
+
+def check(kernel: dict[str, ModelDevice], folder: Path, seconds: float) -> Found:
+    """The verdicts on a pair that is watched for some seconds."""
+    (folder / "camera.yaml").write_text(
         f"fx: 200\nfy: 200\ncx: 159.5\ncy: 119.5\nwidth: {W}\nheight: {H}\nbaseline_m: 0.1\n"
     )
-
-    def check(devices: list[ModelDevice], options: str = "fps=20", seconds: float = 1.5) -> dict[str, DoctorCheck]:
-        paths = ["/dev/video0", "/dev/video2"][: len(devices)]
-        monkeypatch.setattr(v4l2, "KERNEL", ModelKernel(dict(zip(paths, devices, strict=True))))
-        spec = f"v4l2:{','.join(paths)}?{options}&calibration={tmp_path / 'camera.yaml'}"
-        return {found.name: found for found in cameras.check_cameras(spec, seconds=seconds)}
-
-    return check
+    spec = f"v4l2:{','.join(kernel)}?fps=20&calibration={folder / 'camera.yaml'}"
+    return {found.name: found for found in cameras.check_cameras(spec, seconds=seconds)}
 
 
-def test_a_good_pair_is_good_in_all(checked) -> None:  # type: ignore[no-untyped-def]
-    found = checked(pair())
-    assert {name for name, check in found.items() if check.severity is not Severity.OK} <= {"camera stamps"}
-    assert list(found) == ["cameras", "camera rate", "camera stamps", "camera drops", "camera skew", "camera exposure",
-                           "camera sharpness"]  # fmt: skip
-    assert "320x240 GREY" in found["cameras"].text and found["cameras"].text.count("/dev/video") == 2
-    assert "20.0 Hz" in found["camera rate"].text
-
-
-def test_the_skew_of_a_pair_has_a_remedy(checked) -> None:  # type: ignore[no-untyped-def]
-    skew = checked(pair(offset_s=0.003))["camera skew"]
-    assert skew.severity is Severity.NOTE and "+3.0" in skew.text and "one signal" in skew.remedy
-    found = checked(pair(offset_s=0.008), seconds=2.0)
-    assert found["camera skew"].severity is Severity.FAIL and " ms apart" in found["camera skew"].text
-    assert found["cameras"].severity is Severity.OK and found["cameras"].text.count("/dev/video") == 2
-
-
-def test_lost_images_count(checked) -> None:  # type: ignore[no-untyped-def]
+def losing() -> list[ModelDevice]:
     devices = pair()
     show = devices[0].image
 
@@ -80,11 +61,73 @@ def test_lost_images_count(checked) -> None:  # type: ignore[no-untyped-def]
         return show(k)
 
     devices[0].image = image
-    drops = checked(devices)["camera drops"]
+    return devices
+
+
+def both(**values: float) -> list[ModelDevice]:
+    devices = pair(**values)
+    for name, value in values.items():
+        setattr(devices[0], name, value)
+    return devices
+
+
+CLIPPED = np.minimum(SHARP.astype(int) + 140, 255)
+PAIRS: dict[str, tuple[Callable[[], list[ModelDevice]], float]] = {  # what is watched, for how many seconds
+    "good": (pair, 1.5),
+    "a little apart": (lambda: pair(offset_s=0.003), 1.5),
+    "apart": (lambda: pair(offset_s=0.008), 2.0),
+    "losing": (losing, 1.5),
+    "slow": (lambda: both(fps=10.0), 1.5),
+    "another clock": (lambda: both(monotonic=False), 1.5),
+    "dark": (lambda: pair(still(SHARP // 8), still(SHARP // 8)), 0.5),
+    "bright": (lambda: pair(still(CLIPPED), still(CLIPPED)), 0.5),
+    "unequal": (lambda: pair(still(SHARP), still(SHARP // 2)), 0.5),
+    "clipped": (lambda: pair(still(np.where(SHARP > 165, 255, SHARP)), still(SHARP)), 0.5),
+    "blurred": (lambda: pair(right=still(cv2.GaussianBlur(SHARP, (0, 0), 2.0))), 0.5),
+    "bare": (lambda: pair(*[still(np.full((H, W), 128))] * 2), 0.5),
+}
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Found]:
+    """All pairs, three at a time: they are watched in real time, and mostly waited for."""
+    kernel = ModelKernel({})
+
+    def one(name: str) -> Found:
+        make, seconds = PAIRS[name]
+        first = 10 * list(PAIRS).index(name)
+        devices = {f"/dev/video{k}": device for k, device in enumerate(make(), first)}
+        kernel.devices.update(devices)
+        return check(devices, tmp_path_factory.mktemp("pair"), seconds)
+
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(3) as pool:
+        patch.setattr(v4l2, "KERNEL", kernel)
+        return dict(zip(PAIRS, pool.map(one, PAIRS), strict=True))
+
+
+def test_a_good_pair_is_good_in_all(watched: dict[str, Found]) -> None:
+    found = watched["good"]
+    assert {name for name, check in found.items() if check.severity is not Severity.OK} <= {"camera stamps"}
+    assert list(found) == ["cameras", "camera rate", "camera stamps", "camera drops", "camera skew", "camera exposure",
+                           "camera sharpness"]  # fmt: skip
+    assert "320x240 GREY" in found["cameras"].text and found["cameras"].text.count("/dev/video") == 2
+    assert "20.0 Hz" in found["camera rate"].text
+
+
+def test_the_skew_of_a_pair_has_a_remedy(watched: dict[str, Found]) -> None:
+    skew = watched["a little apart"]["camera skew"]
+    assert skew.severity is Severity.NOTE and "+3.0" in skew.text and "one signal" in skew.remedy
+    found = watched["apart"]
+    assert found["camera skew"].severity is Severity.FAIL and " ms apart" in found["camera skew"].text
+    assert found["cameras"].severity is Severity.OK and found["cameras"].text.count("/dev/video") == 2
+
+
+def test_lost_images_count(watched: dict[str, Found]) -> None:
+    drops = watched["losing"]["camera drops"]
     assert drops.severity is Severity.FAIL and "lost by camera or driver" in drops.text and "USB" in drops.remedy
 
 
-def test_looking_at_images_loses_none_on_a_slow_computer(checked, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+def test_looking_at_images_loses_none_on_a_slow_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ratio = cameras.edge_ratio
 
     def slow(view: np.ndarray) -> float:
@@ -92,7 +135,9 @@ def test_looking_at_images_loses_none_on_a_slow_computer(checked, monkeypatch: p
         return ratio(view)
 
     monkeypatch.setattr(cameras, "edge_ratio", slow)
-    gone, _, all_, *_ = checked(pair())["camera drops"].text.partition(":")[0].split()
+    devices = dict(zip(("/dev/video0", "/dev/video2"), pair(), strict=True))
+    monkeypatch.setattr(v4l2, "KERNEL", ModelKernel(devices))
+    gone, _, all_, *_ = check(devices, tmp_path, 1.5)["camera drops"].text.partition(":")[0].split()
     assert int(gone) < 0.1 * int(all_)  # a quarter, where images are looked at as they come
 
 
@@ -104,40 +149,36 @@ def test_a_program_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp
     assert found.severity is Severity.FAIL and "apt install ffmpeg" in found.text and "cable" not in found.remedy
 
 
-def test_a_rate_that_is_not_as_asked(checked) -> None:  # type: ignore[no-untyped-def]
-    devices = pair()
-    for device in devices:
-        device.fps = 10.0
-    rate = checked(devices)["camera rate"]
+def test_a_rate_that_is_not_as_asked(watched: dict[str, Found]) -> None:
+    rate = watched["slow"]["camera rate"]
     assert rate.severity is Severity.FAIL and "10.0 Hz, asked for 20" in rate.text
 
 
-def test_stamps_of_another_clock_are_told(checked) -> None:  # type: ignore[no-untyped-def]
-    devices = pair()
-    for device in devices:
-        device.monotonic = False
-    stamps = checked(devices)["camera stamps"]
+def test_stamps_of_another_clock_are_told(watched: dict[str, Found]) -> None:
+    stamps = watched["another clock"]["camera stamps"]
     assert stamps.severity is Severity.NOTE and "count from their arrival" in stamps.text
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "severity", "words"),
+    ("name", "severity", "words"),
     [
-        (SHARP // 8, SHARP // 8, Severity.FAIL, "too dark"),
-        (np.minimum(SHARP.astype(int) + 140, 255), np.minimum(SHARP.astype(int) + 140, 255), Severity.FAIL, "bright"),
-        (SHARP, SHARP // 2, Severity.NOTE, "differ"),
-        (np.where(SHARP > 165, 255, SHARP), SHARP, Severity.NOTE, "black or white"),
+        ("dark", Severity.FAIL, "too dark"),
+        ("bright", Severity.FAIL, "bright"),
+        ("unequal", Severity.NOTE, "differ"),
+        ("clipped", Severity.NOTE, "black or white"),
     ],
 )
-def test_exposure(checked, left, right, severity, words) -> None:  # type: ignore[no-untyped-def]
-    exposure = checked(pair(still(left), still(right)), seconds=0.5)["camera exposure"]
+def test_exposure(watched: dict[str, Found], name: str, severity: Severity, words: str) -> None:
+    exposure = watched[name]["camera exposure"]
     assert exposure.severity is severity and words in exposure.text and exposure.remedy
 
 
-def test_a_blurred_lens_is_found_on_its_side_and_a_blank_wall_is_not_called_blurred(checked) -> None:  # type: ignore[no-untyped-def]
-    blurred = checked(pair(right=still(cv2.GaussianBlur(SHARP, (0, 0), 2.0))), seconds=0.5)["camera sharpness"]
+def test_a_blurred_lens_is_found_on_its_side_and_a_blank_wall_is_not_called_blurred(
+    watched: dict[str, Found],
+) -> None:
+    blurred = watched["blurred"]["camera sharpness"]
     assert blurred.severity is Severity.FAIL and "right one" in blurred.text and "focus" in blurred.remedy
-    bare = checked(pair(*[still(np.full((H, W), 128))] * 2), seconds=0.5)["camera sharpness"]
+    bare = watched["bare"]["camera sharpness"]
     assert bare.severity is Severity.NOTE and "texture" in bare.remedy
 
 
@@ -150,8 +191,9 @@ def test_sharpness_is_of_the_lens_not_of_the_scene() -> None:
 
 
 def test_a_camera_that_is_away_fails_and_says_so_as_json(
-    checked, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "camera.yaml").write_text(f"fx: 200\nfy: 200\ncx: 159.5\ncy: 119.5\nwidth: {W}\nheight: {H}\n")
     monkeypatch.setattr(cameras, "_PATIENCE_S", 0.5)
     monkeypatch.setattr(doctor, "CHECKS", ())
     monkeypatch.setattr(v4l2, "KERNEL", ModelKernel({}))

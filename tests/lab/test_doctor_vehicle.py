@@ -13,9 +13,24 @@ import pytest
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.sim.autopilot import ModelledAutopilot
+from kiteline_hw.system import clock
 from kiteline_lab.tools import doctor
 from kiteline_lab.tools.checks import vehicle
 from kiteline_lab.tools.checks.check import Severity
+
+HURRY = 4  # how much faster than real time a survey's clock runs
+
+
+class HurriedClock:
+    """Real time, but faster: a survey listens for seconds."""
+
+    def now_ns(self) -> int:
+        return HURRY * time.monotonic_ns()
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "MonotonicClock", HurriedClock)
 
 
 def ask(model: ModelledAutopilot, *options: str) -> int:
@@ -32,7 +47,7 @@ def ask(model: ModelledAutopilot, *options: str) -> int:
                     data, peer = s.recvfrom(2048)
                 except TimeoutError:
                     data = b""
-                now_ns = time.monotonic_ns()
+                now_ns = HurriedClock().now_ns()
                 for answer in model.receive(data, now_ns) + model.poll(now_ns):
                     if peer is not None:
                         s.sendto(answer, peer)
