@@ -201,10 +201,10 @@ class DisparityAlignment:
         """
         config, good = self._config, np.eye(TERMS) / self._config.good_px**2
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
-        odds = self._prior_log_odds
+        log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
-            unknown = np.logaddexp(odds + worn, usual) - np.logaddexp(odds, 0.0)
+            unknown = np.logaddexp(log_odds + worn, usual) - np.logaddexp(log_odds, 0.0)
             if unknown - _log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > config.refuted:
                 self._earlier_h, self._earlier_b = np.zeros_like(self._earlier_h), none()
                 self._refuted, self.applied = True, False
@@ -212,8 +212,8 @@ class DisparityAlignment:
         h, b = h + self._earlier_h, b + self._earlier_b
         self.cov = np.linalg.inv(h + self._prior)
         self._estimate = self.cov @ b
-        odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
-        self._log_odds = float(odds)
+        log_odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
+        self._log_odds = float(log_odds)
         self.worn = _probability(self._log_odds)
         self._set_rig_worn()
 

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
@@ -18,9 +19,7 @@ from kiteline_agent.runtime.controller import (
     push_obstacles,
     with_controller_imu,
 )
-from kiteline_agent.runtime.options import (
-    AgentOptions,
-)
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_agent.runtime.warm import WARMING
@@ -28,6 +27,7 @@ from kiteline_agent.step import StepOutput
 from kiteline_codec.channel import settled
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
@@ -38,6 +38,7 @@ from kiteline_hw.system.cpu import CpuQuota
 from kiteline_hw.system.key_store import read_keys
 from kiteline_hw.system.long_work import starting
 
+_Batch = TypeVar("_Batch", ImuBatch, OdometryBatch)
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
 _QUIET_S = 1.0  # s that the link has to stay quiet: the base may still be working on the last keyframe
@@ -92,17 +93,15 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                     break
                 captured_ns = begin_ns + runtime.next_ns
                 frame, imu, odometry = runtime.reader.take()
-                measured = None if controller is None else controller.take_odometry(captured_ns)
-                odometry = odometry if measured is None else replace(measured, t_ns=measured.t_ns + shift_ns)
-                # IMU samples that arrive late come with the next frame.
-                samples = None if controller is None else controller.take_imu(captured_ns)
-                imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
+                if controller is not None:
+                    odometry = _measured(controller.take_odometry(captured_ns), odometry, shift_ns)
+                    imu = _measured(controller.take_imu(captured_ns), imu, shift_ns)  # late samples: next frame
             elif controller is not None and predictions.take_due(now_ns):
                 predict_ns = now_ns + shift_ns
-                samples = controller.take_imu(now_ns) if options.imu_of else None
                 imu = runtime.reader.take_imu(predict_ns)
-                imu = imu if samples is None else replace(samples, t_ns=samples.t_ns + shift_ns)
+                imu = _measured(controller.take_imu(now_ns) if options.imu_of else None, imu, shift_ns)
             push = None
+            # Poses have a rate of their own, or are those of the frames: predictions may be for obstacles alone.
             if controller is not None and (own_hz > 0.0) == (frame is None):
                 push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
             for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push):
@@ -122,6 +121,13 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         _drain_live(runtime, link, clock, parent, stop)
         if parent is not None:
             parent.send_event("result", report=runtime.report())
+
+
+def _measured(by_controller: _Batch | None, by_source: _Batch | None, shift_ns: int) -> _Batch | None:
+    """The flight controller's samples, else those of the source. shift_ns: from the clock to the stamps of frames."""
+    if by_controller is None:
+        return by_source
+    return replace(by_controller, t_ns=by_controller.t_ns + shift_ns)
 
 
 def _push(

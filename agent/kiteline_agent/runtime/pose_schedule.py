@@ -1,4 +1,4 @@
-"""When poses go to a flight controller. No clock."""
+"""When poses and obstacles go to a flight controller. No clock."""
 
 from __future__ import annotations
 
@@ -12,18 +12,13 @@ class PoseSchedule:
         self._next_ns = begin_ns
 
     @property
-    def on(self) -> bool:
-        """True if poses are sent at a rate of their own, else those of the frames are sent."""
-        return self._period_ns > 0
-
-    @property
     def next_ns(self) -> int | None:
         """The next time; None: never."""
-        return self._next_ns if self.on else None
+        return self._next_ns if self._period_ns else None
 
     def take_due(self, now_ns: int) -> bool:
-        """True if a pose is due, which then counts as sent."""
-        if not self.on or now_ns < self._next_ns:
+        """True if one is due, which then counts as sent."""
+        if not self._period_ns or now_ns < self._next_ns:
             return False
         self._next_ns += ((now_ns - self._next_ns) // self._period_ns + 1) * self._period_ns
         return True
