@@ -26,6 +26,7 @@ _CELLS = 512  # along each side of the local grid
 _WINDOW = 512  # the same of the tiles around the vehicle
 _MOST_DRAWN = 8000  # scans between two drawings of all: marks are 16-bit numbers
 _RAYS = 5  # in each sector
+_IN_A_FRAME = 8  # scans that are drawn again in a frame: 1 ms
 _NONE: I8 = np.zeros((0, 0), np.int8)
 _LEAST_HEADING = 0.3  # horizontal part of the vehicle's forward axis: less has no heading
 
@@ -72,27 +73,39 @@ class Surroundings:
         return f"nearest obstacle: {distance_m:.2f} m {where}, {unknown:.0f} % unknown"
 
 
+class _Canvas:
+    """Cells that scans are drawn into, about a place and at a height. number: of the last; fits: to what is known."""
+
+    def __init__(self) -> None:
+        self.cells: I8 = np.zeros((_CELLS, _CELLS), np.int8)
+        self.marks = np.zeros((_CELLS, _CELLS), np.int16)
+        self.begin(np.zeros(2), 0.0)
+        self.fits = False
+
+    def begin(self, corner: F64, z_m: float) -> None:
+        """Clear it. corner: in m; z_m: height at which scans are drawn."""
+        self.cells[:], self.marks[:] = 0, 0
+        self.corner, self.z_m, self.number = corner, z_m, 0
+
+
 class LocalGrid:
     """The newest scans in a grid about the vehicle, in the odometry frame levelled by gravity: no correction moves it.
 
-    Takes 1.2 MB. A scan is drawn when it comes, as far as its ranges are sure; all are drawn again when the camera has
-    moved on or climbed, and when more is known of the errors of ranges.
+    Takes 1.8 MB. A scan is drawn when it comes, as far as its ranges are sure. When the camera has moved on or climbed,
+    or more is known of the errors of ranges, all are drawn again on another canvas, some in each frame.
     """
 
     def __init__(self, config: LocalGridConfig) -> None:
         self._config = config
         self._error: RangeError | None = None  # by which scans are drawn
         self._sure_scans = config.scans  # in a row, since the rig was in doubt
-        self._cells: I8 = np.zeros((_CELLS, _CELLS), np.int8)
-        self._marks = np.zeros((_CELLS, _CELLS), np.int16)
+        self._canvas, self._next = _Canvas(), _Canvas()  # the latter while scans are drawn again
+        self._again: deque[_Drawn] | None = None  # scans that are still to be drawn on it; None: it is not in use
         self._window: I8 = np.zeros((_WINDOW, _WINDOW), np.int8)
         self._window_of: tuple[object, ...] = ()
         self._window_tiles: tuple[GridTile, ...] = ()  # kept, so that no new tile takes the place of one in memory
         self._scans: deque[_Drawn] = deque(maxlen=config.scans)
         self._R_g_o: F64 | None = None
-        self._corner = np.zeros(2)  # of the grid, m
-        self._z_m = 0.0  # at which scans are drawn
-        self._number = 0
         self._ground_m: float | None = None  # z of the ground; None while it is not known
 
     def add(self, scanned: Scanned, error: RangeError) -> None:
@@ -109,15 +122,17 @@ class LocalGrid:
         drawn = _Drawn(float(p[0]), float(p[1]), float(p[2]), heading, scan, scanned.offset_px)
         self._scans.append(drawn)
         self._ground_m = None if scanned.height_m is None else drawn.z_m - scanned.height_m
-        if not self._moved_on(drawn.x_m, drawn.y_m, drawn.z_m):
-            self._draw(drawn)
+        self._draw(self._canvas, drawn)
+        if self._again is not None:
+            self._again.append(drawn)
+        self._move_on(drawn.x_m, drawn.y_m, drawn.z_m)
 
     def _take(self, error: RangeError) -> None:
         """Take over what is known of ranges."""
         if error.common_px > self._config.doubt_px or (self._error is not None and error.moved(self._error)):
             self._sure_scans = 0
         if self._error is None or error.differs(self._error):
-            self._error, self._number = error, 0  # draws all anew
+            self._error, self._canvas.fits = error, False
 
     def follow(self, T_o_c: F64, error: RangeError | None = None) -> None:
         """Keep the grid about the camera, at T_o_c (4,4). Questions never move it: a replay asks fewer of them.
@@ -128,7 +143,7 @@ class LocalGrid:
             self._take(error)
         if self._R_g_o is not None:
             p = self._R_g_o @ T_o_c[:3, 3]
-            self._moved_on(float(p[0]), float(p[1]), float(p[2]))
+            self._move_on(float(p[0]), float(p[1]), float(p[2]))
 
     def around(
         self, T_o_f: F64, T_w_f: F64 | None, tiles: Mapping[tuple[int, int], GridTile], bands_m: tuple[float, ...]
@@ -146,51 +161,60 @@ class LocalGrid:
         p, ahead = R @ T_o_f[:3, 3], R @ T_o_f[:3, 0]
         if float(np.hypot(ahead[0], ahead[1])) < _LEAST_HEADING:
             return None
-        own_at = np.array([*(p[:2] - self._corner), np.arctan2(ahead[1], ahead[0])])
+        canvas, window = self._canvas, _NONE
+        own_at = np.array([*(p[:2] - canvas.corner), np.arctan2(ahead[1], ahead[0])])
         cell_m, tile_at = config.cell_m, np.zeros(3)
         if tiles and T_w_f is not None:
             height_m = None if self._ground_m is None else float(p[2]) - self._ground_m
             cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.body_m))
             tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
-        else:
-            self._window[:], self._window_of, self._window_tiles = 0, (), ()
+            window = self._window
         out = np.empty(SECTORS)
-        climbed_m = abs(float(p[2]) - self._z_m)  # since the frame
-        own = self._cells if climbed_m < config.slab_m + config.body_m else _NONE
+        climbed_m = abs(float(p[2]) - canvas.z_m)  # since the frame
+        own = canvas.cells if climbed_m < config.slab_m + config.body_m else _NONE
         kernels.read_distances(
-            own, self._marks, config.cell_m, own_at, self._window, cell_m, tile_at, config.vehicle_m, config.gap_m,
+            own, canvas.marks, config.cell_m, own_at, window, cell_m, tile_at, config.vehicle_m, config.gap_m,
             config.near_m, config.reach_m, _RAYS, out,
         )  # fmt: skip
         return Surroundings(out, config.reach_m)
 
-    def _moved_on(self, x_m: float, y_m: float, z_m: float) -> bool:
-        """Draw all scans anew about a place if it is no longer in the middle of the grid. True if they were."""
-        side_m = _CELLS * self._config.cell_m
-        centre = self._corner + 0.5 * side_m
-        near = bool(np.abs(centre - [x_m, y_m]).max() < 0.5 * side_m - self._config.reach_m - 0.2)
-        if 0 < self._number < _MOST_DRAWN and near and abs(z_m - self._z_m) < self._config.slab_m:
-            return False
-        self._corner, self._z_m, self._number = np.array([x_m, y_m]) - 0.5 * side_m, z_m, 0
-        self._cells[:], self._marks[:] = 0, 0
-        for drawn in self._scans:
-            self._draw(drawn)
-        return True
+    def _move_on(self, x_m: float, y_m: float, z_m: float) -> None:
+        """Draw scans again about a place if the canvas does not fit it any more, as many as a frame has time for."""
+        config, canvas = self._config, self._canvas
+        if self._again is None:
+            away_m = float(np.abs(canvas.corner + 0.5 * _CELLS * config.cell_m - [x_m, y_m]).max())
+            near = away_m < 0.5 * _CELLS * config.cell_m - config.reach_m - 0.2
+            fits = canvas.fits and near and abs(z_m - canvas.z_m) < config.slab_m and canvas.number < _MOST_DRAWN
+            if fits:
+                return
+            self._next.begin(np.array([x_m, y_m]) - 0.5 * _CELLS * config.cell_m, z_m)
+            self._again, canvas.fits = deque(self._scans), True
+        drawn = 0
+        while self._again and drawn < _IN_A_FRAME:
+            drawn += self._draw(self._next, self._again.popleft())
+        if not self._again:
+            self._next.fits = canvas.fits  # unless more is known of ranges since
+            self._canvas, self._next, self._again = self._next, canvas, None
 
-    def _draw(self, drawn: _Drawn) -> None:
-        """Draw a scan, if it was made at about this height: what is clear a little higher may not be clear here."""
+    def _draw(self, canvas: _Canvas, drawn: _Drawn) -> bool:
+        """Draw a scan, if it was made at about this height: what is clear a little higher may not be clear here.
+
+        Returns whether it was drawn.
+        """
         config, scan = self._config, drawn.scan
         assert self._error is not None
-        away_m = abs(drawn.z_m - self._z_m)
+        away_m = abs(drawn.z_m - canvas.z_m)
         if away_m > config.body_m:
-            return
-        self._number += 1
+            return False
+        canvas.number += 1
         clear_m, certain_m = self._error.ranges(scan, drawn.offset_px, config.sigma_m)
         seen_m = np.minimum(np.maximum(certain_m, config.near_m), config.reach_m)
         kernels.draw_rays(
-            self._cells, self._marks, self._number, drawn.x_m - self._corner[0], drawn.y_m - self._corner[1],
+            canvas.cells, canvas.marks, canvas.number, drawn.x_m - canvas.corner[0], drawn.y_m - canvas.corner[1],
             drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, clear_m, seen_m, config.cell_m,
             away_m <= config.seen_m - config.slab_m,
         )  # fmt: skip
+        return True
 
     def _place_window(self, T_w_f: F64, tiles: Mapping[tuple[int, int], GridTile], mask: int) -> tuple[float, F64]:
         """Copy the tiles around the vehicle together, if they have changed. Returns size of a cell and corner in w."""

@@ -110,6 +110,8 @@ def read_distances(  # type: ignore[no-untyped-def]
                 gap = gap + step_m if state < 0 else 0.0
                 if gap > gap_m:
                     unknown = min(unknown, r - gap)
+                    if r > near_m:
+                        break  # what lies behind is not told
                 r += step_m
         out[s] = nearest if nearest < reach_m else np.inf
         if unknown < min(nearest, reach_m) and nearest > near_m:
