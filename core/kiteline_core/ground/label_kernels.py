@@ -244,12 +244,14 @@ def _longest_ground(grounds, obstacles, least, begin_m, end_m, lowest, bf, sigma
 
 @njit
 def collect_scan(  # type: ignore[no-untyped-def]
-    grounds, obstacles, least, surface, azimuth, bf, lowest, sigma_px, gap_m, free_from, free, obstacle, clear
-):
+    grounds, obstacles, least, surface, bands, limits, height, azimuth, bf, lowest, sigma_px, gap_m, free_from, free,
+    obstacle, clear,
+):  # fmt: skip
     """Ranges (n,) in m of a column scan from ground and obstacles counted over (n, bins) and surfaces (n,2).
 
-    surface: disparities. azimuth: (n,). lowest: least bin that counts. Free is the longest part of the ground, before
-    the obstacle or behind; there only where fewer than `least` pixels of obstacles have its range.
+    surface: disparities. bands: (n,) of obstacles; limits: of bands. height: of the camera. azimuth: (n,). lowest:
+    least bin that counts. Free is the longest part of the ground, before the obstacle or behind; there only where fewer
+    than `least` pixels of obstacles have its range, and it was seen over the obstacle, not beside a leg or below a top.
     """
     for c in range(len(grounds)):
         along = 1.0 / np.cos(azimuth[c])
@@ -267,9 +269,15 @@ def collect_scan(  # type: ignore[no-untyped-def]
             deviation = obstacle[c] * sigma_px / surface[c, 0]
             if free[c] > 0.0 and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
                 free[c] = obstacle[c]  # up to its foot
+            top = 0
+            while bands[c] >> (top + 1):
+                top += 1
+            if height <= limits[top]:
+                continue
+            over = obstacle[c] / (1.0 - limits[top] / height)
             begin, end, ended = _longest_ground(
-                grounds[c], obstacles[c], least, obstacle[c] + 3.0 * deviation, np.inf, lowest, bf * along, sigma_px,
-                gap_m,
+                grounds[c], obstacles[c], least, max(obstacle[c] + 3.0 * deviation, over), np.inf, lowest, bf * along,
+                sigma_px, gap_m,
             )  # fmt: skip
             if not ended:  # what else stands there is not in the scan
                 end -= 2.0 * end * end / (bf * along) * sigma_px

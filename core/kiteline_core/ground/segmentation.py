@@ -42,6 +42,7 @@ _LEAST_IN_IMAGE = 0.2  # part of the vertical direction that lies in the image
 _STEEPEST = 0.6  # of the difference in height of a wall's points, up to which they may lie on the ground
 _WIDER_RAD = 0.2  # to each side beyond the field of view of a level camera
 _WIDEST_RAD = 1.3  # of an azimuth
+_NEARER_M = 0.15  # between obstacles of two columns that are not one surface
 _GAP_M = 0.25  # without seen ground that are free between free ones: beyond, a pit would fit
 
 
@@ -312,9 +313,14 @@ class GroundSegmenter:
             )  # fmt: skip
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
         label_kernels.collect_scan(
-            grounds, obstacles, config.column_pixels, surface, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M,
-            free_from, free, obstacle, clear,
+            grounds, obstacles, config.column_pixels, surface, bands, self._bands, height_m, self._azimuths, self.bf,
+            lowest, self.sigma_px, _GAP_M, free_from, free, obstacle, clear,
         )  # fmt: skip
+        # A column beside a nearer obstacle shows some of it: what is free there ends where that begins.
+        padded = np.concatenate([[np.inf], obstacle, [np.inf]])
+        nearer = np.minimum(padded[:-2], padded[2:])
+        ends = (free_from < nearer) & (nearer < np.minimum(free, obstacle - _NEARER_M))
+        free[ends] = nearer[ends]
         some = np.flatnonzero((free > 0.0) | (bands > 0) | (clear > 0.0))
         first, last = (int(some[0]), int(some[-1]) + 1) if len(some) else (0, n)
         free_from, free, obstacle, clear = (row[first:last].copy() for row in (free_from, free, obstacle, clear))

@@ -125,6 +125,10 @@ def test_a_box_on_the_ground_is_an_obstacle_of_its_height() -> None:
     assert (scan.bands[inside] == 1).all()
     beside = np.abs(np.tan(scan.azimuths_rad) * 3.0) > 0.4
     assert (scan.obstacle_m[beside] > 5.0).all()
+    at_box = np.flatnonzero(scan.obstacle_m < 4.0)
+    for i in (at_box[0] - 1, at_box[-1] + 1):  # they may show some of it
+        assert scan.free_m[i] < 3.2
+    assert (scan.free_m[: at_box[0] - 1] > 4.5).all() and (scan.free_m[at_box[-1] + 2 :] > 4.5).all()
 
 
 def test_ground_behind_a_low_obstacle_is_free() -> None:
@@ -137,6 +141,16 @@ def test_ground_behind_a_low_obstacle_is_free() -> None:
     assert np.abs((scan.obstacle_m * ahead)[middle] - 1.2).max() < 0.1
     assert ((scan.free_from_m * ahead)[middle] > 1.2 * HEIGHT_M / 0.9 - 0.15).all()  # what the box hides is unknown
     assert ((scan.free_m * ahead)[middle] > 4.0).mean() > 0.9 and (scan.free_m * ahead < 5.0).all()
+
+
+def test_ground_that_is_seen_beside_a_leg_is_not_seen_over_it() -> None:
+    leg = wall(2.0, -HEIGHT_M, -HEIGHT_M + 0.75, 0.025, 0.025)
+    segmenter, disparity = view(up(), level_ground, wall(5.0), leg)
+    scan = segmenter.segment(disparity, None, up())
+    at_leg = np.isfinite(scan.obstacle_m) & (scan.obstacle_m < 2.5)
+    assert at_leg.any()
+    before, over = scan.free_m[at_leg] < 2.2, scan.free_from_m[at_leg] > 2.9  # 0.5 m high is the band of its upper end
+    assert (before | over).all()
 
 
 def test_a_plain_floor_is_unknown() -> None:
