@@ -2,7 +2,7 @@
 
 A MODULE has `warm()`, which runs every kernel of its room, and beside it `kernels.txt`, the kernels that `warm` calls,
 with the types of their arguments. Several processes share the listed kernels out among them and compile them into
-numba's cache; then `warm` loads them from there, and compiles what is missing. `--list MODULE` prints the list.
+numba's cache; then `warm` loads them from there, and compiles what is missing. `--list MODULE...` writes the lists.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import ctypes
 import fcntl
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from importlib import import_module
@@ -28,9 +29,12 @@ _PR_SET_PDEATHSIG = 1  # of Linux' prctl
 
 
 def main(arguments: list[str]) -> None:
-    """Compile the kernels of the named modules, or print the list of one."""
+    """Compile the kernels of the named modules, or write their lists."""
     if arguments[0] == "--list":
-        print("\n".join(called(arguments[1])))
+        for name in arguments[1:]:
+            code = f"from {__spec__.name} import called; print(*called({name!r}), sep='\\n')"
+            text = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True).stdout
+            _list_of(import_module(name)).write_text(text)
         return
     modules = [import_module(name) for name in arguments]
     lines = {line for module in modules for line in listed(module)}
@@ -51,8 +55,12 @@ def processes(cores: int, computer: Computer) -> int:
 
 def listed(module: ModuleType) -> list[str]:
     """Lines of a module's list; none if it has no list."""
-    path = Path(module.__file__ or "").with_name("kernels.txt")
+    path = _list_of(module)
     return path.read_text().splitlines() if path.exists() else []
+
+
+def _list_of(module: ModuleType) -> Path:
+    return Path(module.__file__ or "").with_name("kernels.txt")
 
 
 def by_module(lines: Iterable[str]) -> list[list[str]]:
