@@ -18,6 +18,14 @@ from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 
+# Columns of the unknowns: first position, then these. With the length of gravity imposed, its two turns and q = 1 / s.
+_VELOCITY, _BIAS, _GRAVITY, _TURNS, _Q = slice(3, 6), slice(6, 9), slice(9, 12), slice(9, 11), 11
+_MIN_POSES = 5
+_ITERATIONS = 8  # of the direction of gravity, each one least-squares solve
+_RANK_TOL = 1e-10  # singular values below it, over the largest, leave an unknown open: poses at rest
+_GRAVITY_RANGE = 0.3, 3.0  # times the true length: beyond, poses and IMU do not belong together
+_MIN_RESIDUAL = 1e-5  # m: an exact fit of few poses does not make the scale exact
+
 
 @dataclass(frozen=True, slots=True)
 class ImuAlignment:
@@ -25,7 +33,7 @@ class ImuAlignment:
 
     velocities: (n,3) m/s in m of every pose. gravity: (3,) m/s^2 in m. accel_bias: (3,) m/s^2. scale: metres per unit
     of the map. scale_sigma: its standard deviation, 0 if not estimated. residual_m: rms of the positions.
-    gravity_error: relative error of gravity's length, found without imposing it.
+    gravity_error: relative error of gravity's length, found without imposing it; 0 where the scale is estimated.
     """
 
     velocities: F64
@@ -52,6 +60,33 @@ def gyro_bias(T_m_b: F64, motions: list[Preintegrated]) -> F64:
     return bias
 
 
+@dataclass(frozen=True, slots=True)
+class _Integrated:
+    """Accelerometer integrated from zero velocity at the first of n poses, in m, without gravity.
+
+    times: (n,) s. v, p: (n,3) m/s and m. jv, jp: (n,3,3) derivatives by the accelerometer's bias.
+    """
+
+    times: F64
+    v: F64
+    p: F64
+    jv: F64
+    jp: F64
+
+
+def _integrated(T_m_b: F64, motions: list[Preintegrated], bias: F64) -> _Integrated:
+    n = len(T_m_b)
+    times, v, p = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
+    jv, jp = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    for k, motion in enumerate(motions):
+        _, vp = motion.corrected(bias)
+        r, dt = T_m_b[k, :3, :3], motion.dt_s
+        times[k + 1] = times[k] + dt
+        p[k + 1], v[k + 1] = p[k] + v[k] * dt + r @ vp[3:], v[k] + r @ vp[:3]
+        jp[k + 1], jv[k + 1] = jp[k] + jv[k] * dt + r @ motion.jac[6:, 3:], jv[k] + r @ motion.jac[3:6, 3:]
+    return _Integrated(times, v, p, jv, jp)
+
+
 def align(
     T_m_b: F64,
     p_b_c: F64,
@@ -70,69 +105,71 @@ def align(
     images. accel_bias_sigma: m/s^2, of the guess.
     """
     n = len(T_m_b)
-    if n < 5:
+    if n < _MIN_POSES:
         return None
     rotated = T_m_b[:, :3, :3] @ p_b_c
     camera = (T_m_b[:, :3, 3] + rotated).reshape(-1)
-    times, v, p = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))  # integrated accelerometer
-    jv, jp = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    for k, motion in enumerate(motions):
-        _, vp = motion.corrected(bias)
-        r, dt = T_m_b[k, :3, :3], motion.dt_s
-        times[k + 1] = times[k] + dt
-        p[k + 1], v[k + 1] = p[k] + v[k] * dt + r @ vp[3:], v[k] + r @ vp[:3]
-        jp[k + 1], jv[k + 1] = jp[k] + jv[k] * dt + r @ motion.jac[6:, 3:], jv[k] + r @ motion.jac[3:6, 3:]
-    integrated = (rotated + p).reshape(-1)
+    felt = _integrated(T_m_b, motions, bias)
+    integrated = (rotated + felt.p).reshape(-1)
     # With q = 1 / s the noisy positions are alone on one side, so that noise does not bias the scale:
     # p_c = p0 q + v0 q t + gravity q t^2 / 2 + jp bias q + integrated q
     free = np.concatenate(
         [
             np.tile(np.eye(3), (n, 1)),
-            np.kron(times[:, None], np.eye(3)),
-            jp.reshape(-1, 3),
-            np.kron(0.5 * times[:, None] ** 2, np.eye(3)),
+            np.kron(felt.times[:, None], np.eye(3)),
+            felt.jp.reshape(-1, 3),
+            np.kron(0.5 * felt.times[:, None] ** 2, np.eye(3)),
         ],
         axis=1,
     )
-    guess = np.zeros((3, free.shape[1]))
-    guess[:, 6:9] = np.eye(3)
-    ratio = position_sigma_m / accel_bias_sigma
-    unit, length = -v[-1] / float(np.linalg.norm(v[-1])), gravity_m_s2
-    if not with_scale:
-        x = np.linalg.lstsq(
-            np.concatenate([free, ratio * guess]), np.append(camera - integrated, np.zeros(3)), rcond=1e-10
-        )[0]
-        length = float(np.linalg.norm(x[9:]))
-        if not 0.3 * gravity_m_s2 < length < 3.0 * gravity_m_s2:
+    bias_weight = position_sigma_m / accel_bias_sigma
+    if with_scale:
+        up, length = felt.v[-1], gravity_m_s2  # in the mean, an accelerometer measures the opposite of gravity
+        unit = -up / float(np.linalg.norm(up))
+    else:
+        gravity = _free_gravity(free, camera - integrated, bias_weight)
+        length = float(np.linalg.norm(gravity))
+        if not _GRAVITY_RANGE[0] * gravity_m_s2 < length < _GRAVITY_RANGE[1] * gravity_m_s2:
             return None
-        unit = x[9:] / length
+        unit = gravity / length
     # impose the length: gravity q = length * (q unit + basis @ w), w in the tangent plane
     q = 1.0
-    for _ in range(8):
+    for _ in range(_ITERATIONS):
         basis = np.linalg.svd(unit[None, :])[2][1:].T
-        pull = integrated + gravity_m_s2 * free[:, 9:] @ unit
-        a = np.concatenate([free[:, :9], gravity_m_s2 * free[:, 9:] @ basis], axis=1)
+        pull = integrated + gravity_m_s2 * free[:, _GRAVITY] @ unit
+        a = np.concatenate([free[:, : _GRAVITY.start], gravity_m_s2 * free[:, _GRAVITY] @ basis], axis=1)
         b = camera - (0.0 if with_scale else pull)
         if with_scale:
             a = np.concatenate([a, pull[:, None]], axis=1)
-        prior = np.zeros((3, a.shape[1]))
-        prior[:, 6:9] = ratio * np.eye(3)
-        a, b = np.concatenate([a, prior]), np.append(b, np.zeros(3))
-        x, _, rank, _ = np.linalg.lstsq(a, b, rcond=1e-10)
+        a, b = _with_bias_prior(a, b, bias_weight)
+        x, _, rank, _ = np.linalg.lstsq(a, b, rcond=_RANK_TOL)
         if rank < a.shape[1]:
             return None
-        q = float(x[11]) if with_scale else 1.0
+        q = float(x[_Q]) if with_scale else 1.0
         if q <= 0.0:
             return None
-        rotated_unit = q * unit + basis @ x[9:11]
+        rotated_unit = q * unit + basis @ x[_TURNS]
         unit = rotated_unit / float(np.linalg.norm(rotated_unit))
     rest = a @ x - b
-    gravity, change = gravity_m_s2 * unit, x[6:9] / q
-    velocities = x[3:6] / q + times[:, None] * gravity + v + jv @ change
+    gravity, change = gravity_m_s2 * unit, x[_BIAS] / q
+    velocities = x[_VELOCITY] / q + felt.times[:, None] * gravity + felt.v + felt.jv @ change
     sigma = 0.0
     if with_scale:
-        variance = max(float(rest @ rest) / (3 * n - 9), (1e-5 * q) ** 2)
-        sigma = float(np.sqrt(variance * np.linalg.inv(a.T @ a)[11, 11])) / q**2
+        variance = max(float(rest @ rest) / (3 * n - 9), (_MIN_RESIDUAL * q) ** 2)
+        sigma = float(np.sqrt(variance * np.linalg.inv(a.T @ a)[_Q, _Q])) / q**2
     residual = float(np.sqrt(np.mean(rest[: 3 * n] ** 2))) / q
     error = abs(length / gravity_m_s2 - 1.0)
     return ImuAlignment(velocities, gravity, bias[3:] + change, 1.0 / q, sigma, residual, error)
+
+
+def _free_gravity(free: F64, positions: F64, bias_weight: float) -> F64:
+    """Gravity (3,) of any length that fits the positions (3n,) in metres. free: (3n,12) their derivatives."""
+    a, b = _with_bias_prior(free, positions, bias_weight)
+    return np.asarray(np.linalg.lstsq(a, b, rcond=_RANK_TOL)[0][_GRAVITY])
+
+
+def _with_bias_prior(a: F64, b: F64, weight: float) -> tuple[F64, F64]:
+    """The equations a x = b, and three that hold the change of the bias near 0."""
+    prior = np.zeros((3, a.shape[1]))
+    prior[:, _BIAS] = weight * np.eye(3)
+    return np.concatenate([a, prior]), np.append(b, np.zeros(3))
