@@ -15,24 +15,30 @@ FINE_STEP_PX = 2.0  # px of the finer level: error left by the coarser one, or b
 
 
 @njit
-def _row_costs(patch, image, y, first, mean, total, cost):  # type: ignore[no-untyped-def]
+def _row_costs(patch, image, y, first, mean, columns, total, cost):  # type: ignore[no-untyped-def]
     """Zero-mean SAD of a patch (SIDE, SIDE) int16 with n candidates of a row, the first at left column `first`.
 
-    mean: of the patch. total, cost: (n,) int32, out: sums of the candidates, and their costs. The loops run over the
-    candidates, with unsigned indices (no check for negative ones), so that they are vectorised.
+    mean: of the patch. columns: (n + SIDE - 1,) int32, sums of the image's columns, out. total, cost: (n,) int32, out:
+    sums of the candidates, and their costs. The loops run over the candidates, with unsigned indices (no check for
+    negative ones), so that they are vectorised.
     """
     n = cost.shape[0]
     for k in range(n):
         j = np.uint64(k)
         total[j] = 0
         cost[j] = 0
+    for k in range(n + SIDE - 1):
+        columns[np.uint64(k)] = 0
     for r in range(SIDE):
         line = image[y + r - RADIUS, first : first + n + SIDE - 1]
-        for c in range(SIDE):
-            shifted = line[c : c + n]
-            for k in range(n):
-                j = np.uint64(k)
-                total[j] += np.int32(shifted[j])
+        for k in range(n + SIDE - 1):
+            j = np.uint64(k)
+            columns[j] += np.int32(line[j])
+    for c in range(SIDE):
+        sums = columns[c : c + n]
+        for k in range(n):
+            j = np.uint64(k)
+            total[j] += sums[j]
     for k in range(n):
         j = np.uint64(k)
         total[j] = mean - total[j] // (SIDE * SIDE)
@@ -55,6 +61,7 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
     """
     levels = len(left)
     patch = np.empty((SIDE, SIDE), np.int16)
+    columns = np.empty(left[0].shape[1] + SIDE, np.int32)
     total = np.empty(left[0].shape[1], np.int32)
     cost = np.empty(left[0].shape[1], np.int32)
     for i in range(uv.shape[0]):
@@ -77,7 +84,7 @@ def search_rows(left, right, uv, octave, max_disparity_px, uniqueness, disparity
         reach = min(int(max_disparity_px / s) + 1, x - RADIUS)
         nearest = -1 if x + 1 + RADIUS < w else 0
         n = reach - nearest + 1  # candidate k lies at disparity reach - k
-        _row_costs(patch, b, y, x - reach - RADIUS, np.int32(mean), total[0:n], cost[0:n])
+        _row_costs(patch, b, y, x - reach - RADIUS, np.int32(mean), columns, total[0:n], cost[0:n])
         best = 1 << 30
         second = 1 << 30
         best_d = -1
