@@ -19,6 +19,7 @@ from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_terms import SHARED, STATE, InertialTerms
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState, tangent
+from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
@@ -60,7 +61,7 @@ class InertialBundle:
         """intervals: K - 1, between the keyframes. noise: factors on the inertial error model."""
         self._obs = observations
         self._terms = InertialTerms(intervals, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
-        self._r_bc, self._t_bc = T_b_c[:3, :3], T_b_c[:3, 3]
+        self._r_bc, self._t_bc = T_b_c[:3, :3].copy(), T_b_c[:3, 3].copy()
         self._sigma = config.sigma_px / focal_px
         self._length = gravity_m_s2
         self._prior = prior
@@ -69,6 +70,7 @@ class InertialBundle:
         self._keyframes, self._landmarks = observations.seen.shape
         self._origin, self._axes = np.zeros((self._landmarks, 3)), np.zeros((self._landmarks, 3, 3))
         self._error = np.zeros((0, 0))  # (K,P) of observations in deviations
+        self._projected: tuple[WindowState, tuple[F64, F64, F64, F64]] | None = None  # the last state's projections
 
     def solve(self, warm: WarmStart | None = None) -> WindowSolution | None:
         """The window's states; None if it is degenerate. warm: states to start from."""
@@ -226,13 +228,17 @@ class InertialBundle:
 
     def _project(self, state: WindowState) -> tuple[F64, F64, F64, F64]:
         """Landmarks in the body (K,P,3) times rho, depth times rho (K,P), pixels over focal (K,P,2), error there."""
+        if self._projected is not None and self._projected[0] is state:
+            return self._projected[1]
         to = self._origin[None] - state.p[:, None]
         y = (self._rays(state)[None] + state.rho[None, :, None] * to) @ state.R
         q = (y - state.rho[None, :, None] * self._t_bc) @ self._r_bc
         z = np.maximum(q[..., 2], 1e-3)
         xy = q[..., :2] / z[..., None]
         error = (xy - self._obs.xy) / self._sigma
-        return y, z, xy, np.where(q[..., 2:] > 1e-2, error, 1e3)
+        found = y, z, xy, np.where(q[..., 2:] > 1e-2, error, 1e3)
+        self._projected = state, found
+        return found
 
     def _visual_cost(self, error: F64) -> tuple[float, F64]:
         """Robust cost, and weights (K,P) of the observations."""
@@ -251,35 +257,19 @@ class InertialBundle:
         n, size = self._keyframes, STATE * self._keyframes + SHARED
         y, z, xy, error = self._project(state)
         cost, weight = self._visual_cost(error)
-        root = np.sqrt(weight) / self._sigma
-        slope = np.zeros((n, self._landmarks, 2, 3))  # d pixel / d y
-        slope[..., 0, :] = (self._r_bc[:, 0] - xy[..., :1] * self._r_bc[:, 2]) / z[..., None]
-        slope[..., 1, :] = (self._r_bc[:, 1] - xy[..., 1:] * self._r_bc[:, 2]) / z[..., None]
-        slope *= root[..., None, None]
-        error = error * np.sqrt(weight)[..., None]
-        pose = np.empty((n, self._landmarks, 2, 6))
-        pose[..., :3] = np.cross(slope, y[:, :, None, :])
-        pose[..., 3:] = -state.rho[None, :, None, None] * (slope @ state.R.transpose(0, 2, 1)[:, None])
-        place = np.empty((n, self._landmarks, 3, 3))  # d y / d (m, rho)
-        place[..., :2] = state.R.transpose(0, 2, 1)[:, None] @ self._axes[None, :, :, :2]
-        place[..., 2] = (self._origin[None] - state.p[:, None]) @ state.R - self._t_bc
-        point = slope @ place
         h, b = np.zeros((size, size)), np.zeros(size)
+        hpp, bp = np.zeros((self._landmarks, 3, 3)), np.zeros((self._landmarks, 3))
+        hpk, reduced, rest = np.zeros((self._landmarks, 3, 6 * n)), np.zeros((6 * n, 6 * n)), np.zeros(6 * n)
+        add_observations(
+            xy, error, weight, self._sigma, y, z, self._r_bc, state.R, state.p, self._t_bc, state.rho, self._origin,
+            self._axes, hpp, bp, hpk, reduced, rest,
+        )  # fmt: skip
         # landmarks are eliminated (Schur complement)
-        hpp = np.einsum("kpri,kprj->pij", point, point)
         hpp[:, [0, 1, 2], [0, 1, 2]] += np.array([1e-6, 1e-6, 1e-4]) + 1e-12 * np.einsum("pii->p", hpp)[:, None]
-        bp = np.einsum("kpri,kpr->pi", point, error)
-        w = np.swapaxes((np.swapaxes(point, 2, 3) @ pose).transpose(1, 0, 2, 3), 1, 2).reshape(
-            self._landmarks, 3, 6 * n
-        )
-        inv = np.linalg.inv(hpp)
-        iw = inv @ w
-        reduced = -(w.reshape(-1, 6 * n).T @ iw.reshape(-1, 6 * n))
-        rest = -np.einsum("pci,pc->i", iw, bp)
-        diagonal = np.einsum("kpri,kprj->kij", pose, pose)
-        for k in range(n):
-            reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += diagonal[k]
-        rest += np.einsum("kpri,kpr->ki", pose, error).ravel()
+        inv = np.asarray(np.linalg.inv(hpp), np.float64)
+        iw = inv @ hpk
+        reduced -= hpk.reshape(-1, 6 * n).T @ iw.reshape(-1, 6 * n)
+        rest -= bp.ravel() @ iw.reshape(-1, 6 * n)
         rows = (STATE * np.arange(n)[:, None] + np.arange(6)).ravel()
         h[np.ix_(rows, rows)] += reduced
         b[rows] += rest

@@ -41,6 +41,7 @@ class InertialTerms:
         self._prior = prior
         self.motions: list[Preintegrated] = []
         self._info: list[F64] = []
+        self._known: tuple[WindowState, F64, list[F64]] | None = None  # errors and motions of the last state
 
     def preintegrate(self, samples: Samples, bias: F64) -> Preintegrated:
         """One interval with a bias (6,)."""
@@ -48,6 +49,7 @@ class InertialTerms:
 
     def integrate(self, state: WindowState) -> None:
         """Integrate the samples with the state's biases."""
+        self._known = None
         self.motions = [
             self.preintegrate(samples, np.concatenate([state.gyro_bias, bias]))
             for samples, bias in zip(self.intervals, state.accel_bias, strict=False)
@@ -107,7 +109,13 @@ class InertialTerms:
 
     def _errors(self, state: WindowState) -> F64:
         """(K-1,9) errors of rotation, velocity and position."""
-        rows = []
+        return self._errors_and_motions(state)[0]
+
+    def _errors_and_motions(self, state: WindowState) -> tuple[F64, list[F64]]:
+        """`_errors`, and the change of velocity and position (6,) of each interval with the state's biases."""
+        if self._known is not None and self._known[0] is state:
+            return self._known[1:]
+        rows, moved = [], []
         for k, motion in enumerate(self.motions):
             turn, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
             back, dt = state.R[k].T, motion.dt_s
@@ -116,13 +124,16 @@ class InertialTerms:
             rows.append(
                 np.concatenate([se3.so3_log(turn.T @ back @ state.R[k + 1]), back @ dv - vp[:3], back @ dp - vp[3:]])
             )
-        return np.array(rows)
+            moved.append(vp)
+        errors = np.array(rows)
+        self._known = state, errors, moved
+        return errors, moved
 
     def _jacobian(self, state: WindowState, e: F64, k: int) -> tuple[F64, NDArray[np.int64]]:
         """(9,29) of interval k by its two keyframes and the shared unknowns, and their columns."""
         motion, back, o, shared = self.motions[k], state.R[k].T, STATE * k, STATE * len(state.R)
         dt, tilt = motion.dt_s, self._length * tangent(state.gravity)
-        _, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
+        vp = self._errors_and_motions(state)[1][k]
         columns = np.concatenate([np.arange(o, o + 2 * STATE), np.arange(shared, shared + SHARED)])
         j = np.zeros((9, 2 * STATE + SHARED))
         j[:3, :3], j[:3, 12:15] = -state.R[k + 1].T @ state.R[k], np.eye(3)

@@ -12,6 +12,7 @@ from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
+from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
 from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans.local_grid import LocalGrid
@@ -108,10 +109,15 @@ def _resting(k: int) -> ImuBatch:
 
 
 def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
-    """The start from two views, on a cloud of points (3,n) drawn from 0 to 1, and the search along a segment."""
+    """Both starts, on a cloud of points (3,n) drawn from 0 to 1 and on one point, and the search along a segment."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
     two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
+    one, two, three, turn = np.ones((1, 1)), np.zeros((1, 1, 2)), np.zeros((1, 3)), np.eye(3)
+    add_observations(
+        two, two, one, 1.0, three[None], one, turn, turn[None], three, three[0], one[0], three, turn[None],
+        np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros((1, 3, 6)), np.zeros((6, 6)), np.zeros(6),
+    )  # fmt: skip
     place = np.array([[160.0, 120.0]])
     templates = np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
     search_segments(
