@@ -312,7 +312,7 @@ class GridConfig:
     log_free_far: int = 2  # 1/32; the same of a far view
     log_free_low: int = 1  # 1/32; the same where no ground was seen, but rays pass low
     occupied_from: int = 10  # 1/32; log-odds from which a band is occupied: one near view, two far ones
-    free_from: int = 2  # 1/32; a cell is free if all bands lie at or below minus this: one view of its ground
+    free_from: int = 3  # 1/32; a cell is free if all bands lie at or below minus this: one near view, two far ones
     free_beside: int = 8  # 1/32; the same beside an occupied cell: a near view and another, as one may lie a cell off
     hole_neighbours: int = (
         5  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)
