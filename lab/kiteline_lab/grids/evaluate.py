@@ -31,11 +31,7 @@ def between_paths(estimate: str, truth: str) -> NDArray[np.float64]:
     return T
 
 
-def main(argv: list[str]) -> int:
-    """Run `kiteline grid eval`, which prints one JSON object; the exit status.
-
-    Raises GridFileError and TrajectoryError.
-    """
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="kiteline grid eval",
         description="Precision and recall of an occupancy grid for path planning: roads drawn on EST that are free in "
@@ -72,6 +68,15 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=default.seed)
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw estimate, truth and difference")
     parser.add_argument("--json", action="store_true", help="print JSON; it always does")
+    return parser
+
+
+def main(argv: list[str]) -> int:
+    """Run `kiteline grid eval`, which prints one JSON object; the exit status.
+
+    Raises GridFileError and TrajectoryError.
+    """
+    parser, default = _parser(), GridEvalConfig()
     args = parser.parse_args(argv)
     if args.draws < 1 or args.nodes < 2 or args.opening < 0 or not args.robot_radius >= 0.0:
         parser.error("expected at least 1 draw, 2 nodes, and no negative opening or radius")
