@@ -42,7 +42,6 @@ class BundleWindowConfig:
 
     max_free: int = 10  # keyframes whose poses are free: more cost time and change little
     max_fixed: int = 15  # keyframes held fixed: those that observe most of the same landmarks
-    few_observations: int = 30  # of the window, by a keyframe: below, its parent is held too, as odometry ties them
     min_shared: int = 12  # landmarks that two covisible keyframes share
     min_landmarks: int = 20  # landmarks of a bundle: fewer do not constrain the poses
 

@@ -14,7 +14,14 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.fused_landmarks import FusedInMap
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_codec.schema import FusedLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
+from kiteline_codec.schema import (
+    CulledLandmarks,
+    FusedLandmarks,
+    KeyframeHeader,
+    KeyframePose,
+    RefinedLandmarks,
+    RemovedObservations,
+)
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, SubmapId
@@ -157,15 +164,39 @@ def test_landmarks_that_waited_do_not_come_after_newer_ones() -> None:
     assert np.array_equal(held.bearing, newest)
 
 
-def test_landmarks_that_only_the_base_could_triangulate_wait_for_nothing() -> None:
+def test_landmarks_that_only_the_base_could_triangulate_wait_with_the_others() -> None:
     held = local_map()
     held.share(KeyframeId(0), 30)
     held.usable[0, :5], held.seed[0, :5] = False, True
-    assert refined(held, 0, 0.2)
+    assert not refined(held, 0, 0.2)
+    saved = held.save()
+    held.try_corrections([KeyframeId(0)])  # nothing was tracked there: they tell nothing of the camera
+    assert held.seed[0, :5].all()
+    assert (held.rho[0, :5] == saved[2][0, :5]).all()
+    held.restore(saved)
+    told(held, 1, 2.0 * LEAST_M)
+    assert held.apply_corrections()
     assert held.usable[0, :5].all()
     assert not held.seed[0, :5].any()
     assert np.allclose(held.rho[0, :5], 1.0 / DEPTH_M)
-    assert held.measured[0, 5:20].all()  # known ones are as they were
+
+
+@pytest.mark.parametrize("holds", [False, True])
+@pytest.mark.parametrize("kind", [CulledLandmarks, RemovedObservations])
+def test_removed_landmarks_are_searched_until_corrections_matter(
+    kind: type[CulledLandmarks | RemovedObservations], holds: bool
+) -> None:
+    held = local_map()
+    held.holds_landmarks = holds
+    held.share(KeyframeId(0), 30)
+    index = np.array([3, 4], np.uint16)
+    culled = kind is CulledLandmarks
+    record = CulledLandmarks(KeyframeId(0), index, 0) if culled else RemovedObservations(KeyframeId(0), index)
+    assert held.remove(record) != holds
+    assert held.usable[0, 3:5].all() == holds
+    told(held, 1, 2.0 * LEAST_M)
+    assert held.apply_corrections()
+    assert np.flatnonzero(~held.usable[0, :30]).tolist() == [3, 4]
 
 
 def test_refined_landmarks_of_evicted_keyframes_are_forgotten() -> None:
@@ -194,6 +225,9 @@ def test_a_fused_landmark_is_dropped_once_the_base_has_set_both_poses() -> None:
     fused.corrected()
     assert np.flatnonzero(~held.usable[slot, :30]).tolist() == [4]  # the other root is not stored here
     later = FusedLandmarks(KeyframeId(2), np.array([4, 6], np.uint16), roots[[0, 0]])
+    assert not fused.take(later)  # waits with the next corrections that matter
+    assert held.usable[slot, 6]
+    held.holds_landmarks = False
     assert fused.take(later)
     assert not held.usable[slot, 6]
 
@@ -216,7 +250,7 @@ def test_rotations_stay_orthonormal_along_a_long_chain_of_keyframes() -> None:
     reference = ReferenceKeyframe(held)
     step = se3.exp(np.array([0.1, 0.02, 0.05, 0.1, 0.2, -0.05]))
     add(held, 0)
-    reference.set_new(KeyframeId(0), SubmapId(0), np.eye(4), 0, 0)
+    reference.set_new(KeyframeId(0), SubmapId(0), np.eye(4), np.eye(4), 0, 0)
     for k in range(1, 80):
         newest = held.T_m_k[held.slot_of(k - 1)]
         reference.T_k_c = se3.inverse(newest) @ se3.orthonormalise(newest @ step)
@@ -225,6 +259,6 @@ def test_rotations_stay_orthonormal_along_a_long_chain_of_keyframes() -> None:
         slot = held.slot_of(k)
         held.T_p_k[slot], held.T_m_k[slot] = T_p_k, newest @ T_p_k
         held.compose_unplaced()
-        reference.set_new(keyframe, SubmapId(0), np.eye(4), k, k)
+        reference.set_new(keyframe, SubmapId(0), newest @ T_p_k, newest @ T_p_k, k, k)
     R = held.T_m_k[held.slot_of(79)][:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)

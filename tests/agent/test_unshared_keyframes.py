@@ -10,6 +10,7 @@ import pytest
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.run import FlyingAgent
+from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations, Record
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME
 
@@ -56,6 +57,24 @@ def test_a_thin_link_does_not_thin_out_the_local_map(room: Recording) -> None:
     assert len(wide[1].headers()) == in_map[0]
     assert len(thin[1].headers()) < 0.7 * in_map[1]
     assert thin[0].run.lost == 0
+
+
+@pytest.mark.parametrize(("profile", "bytes_s"), [("wifi", 0), ("radio", 1000)])
+def test_a_link_does_not_change_how_the_agent_tracks(room: Recording, profile: str, bytes_s: int) -> None:
+    """Whatever is rounded and left out on the way to a base: while that has nothing to say, poses are the same."""
+    alone, _ = fly(room, 0)
+    near, far = coded_channel(1, bytes_s, profile), coded_channel(1, bytes_s, profile)
+    linked = FlyingAgent(room.rig, room.imu, channel=near)
+    down: list[bytes] = []
+    for item in room.items:
+        now_ns = item.frame.t_ns - room.items[0].frame.t_ns
+        up = linked.step(item, down, now_ns)
+        far.receive(up, now_ns)
+        down = far.poll(now_ns)
+    assert near.stats.packets_sent > 10
+    for a, b in zip(alone.run.found, linked.run.found, strict=True):
+        assert np.array_equal(a.T_o_b, b.T_o_b)
+        assert np.array_equal(a.cov_o, b.cov_o)
 
 
 def test_the_base_hears_of_shared_keyframes_alone(room: Recording) -> None:

@@ -21,8 +21,11 @@ SUBMAP = submap_id(0, 0, 0)
 KEYFRAMES, BIRTHS = 6, 14
 
 
-def flight(noise_px: float) -> tuple[SparseMap, list[np.ndarray]]:
-    """Keyframes along x with few new landmarks each, seen again by the next; links are exact, pixels are not."""
+def flight(noise_px: float, births: int = BIRTHS, unseen: int = -1) -> tuple[SparseMap, list[np.ndarray]]:
+    """Keyframes along x with new landmarks each, seen again by the next; links are exact, pixels are not.
+
+    unseen: a keyframe that sees none of those before it.
+    """
     rng = np.random.default_rng(1)
     sparse_map = SparseMap()
     sparse_map.set_camera(AgentId(0), CAMERA)
@@ -30,27 +33,28 @@ def flight(noise_px: float) -> tuple[SparseMap, list[np.ndarray]]:
     before: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 3)), np.zeros(0, np.int64))
     for k, T in enumerate(truth):
         keyframe = keyframe_id(SUBMAP, k)
+        before = (before[0][:0], before[1][:0]) if k == unseen else before
         seen = len(before[1])
         parent = KeyframeId(keyframe - 1) if k else NO_KEYFRAME
         T_p_k = se3.inverse(truth[k - 1]) @ T if k else T
-        sparse_map.add_keyframe(keyframe, k, parent, T_p_k, BIRTHS + seen)
-        uv = rng.uniform(60, (690, 420), (BIRTHS, 2)).astype(np.float32)
-        rho = rng.uniform(0.2, 0.5, BIRTHS)
-        noisy = (rho + rng.normal(0, noise_px, BIRTHS) / CAMERA.bf).astype(np.float32)
-        index = np.arange(BIRTHS, dtype=np.uint16)
+        sparse_map.add_keyframe(keyframe, k, parent, T_p_k, births + seen)
+        uv = rng.uniform(60, (690, 420), (births, 2)).astype(np.float32)
+        rho = rng.uniform(0.2, 0.5, births)
+        noisy = (rho + rng.normal(0, noise_px, births) / CAMERA.bf).astype(np.float32)
+        index = np.arange(births, dtype=np.uint16)
         sparse_map.put_new_landmarks(
-            keyframe, 0, index, uv, noisy, np.zeros(BIRTHS, np.uint8), np.zeros(BIRTHS, np.uint8),
-            rng.integers(0, 256, (BIRTHS, 32)).astype(np.uint8),
+            keyframe, 0, index, uv, noisy, np.zeros(births, np.uint8), np.zeros(births, np.uint8),
+            rng.integers(0, 256, (births, 32)).astype(np.uint8),
         )  # fmt: skip
         if seen:
             local = se3.transform(se3.inverse(T), before[0])
             at = local[:, :2] / local[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
             at = (at + rng.normal(0, noise_px, at.shape)).astype(np.float32)
             depth = (1.0 / local[:, 2] + rng.normal(0, noise_px, seen) / CAMERA.bf).astype(np.float32)
-            rows = np.arange(BIRTHS, BIRTHS + seen, dtype=np.uint16)
+            rows = np.arange(births, births + seen, dtype=np.uint16)
             sparse_map.put_observations(keyframe, 0, rows, at, depth, np.zeros(seen, np.uint8), before[1])
-        ray = np.column_stack([(uv - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(BIRTHS)])
-        before = se3.transform(T, ray / rho[:, None]), keyframe << 11 | np.arange(BIRTHS)
+        ray = np.column_stack([(uv - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(births)])
+        before = se3.transform(T, ray / rho[:, None]), keyframe << 11 | np.arange(births)
     return sparse_map, truth
 
 
@@ -71,6 +75,20 @@ def test_links_hold_what_few_points_cannot() -> None:
     assert len(result.points) == len(part.points)
     assert len(result.inlier) == len(part.slots)
     assert error_m(result.T_c_m, truth) < 0.5 * error_m(alone.T_c_m, truth)
+
+
+def test_keyframes_that_see_nothing_of_those_before_them_are_held_by_their_parent() -> None:
+    sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
+    config, free = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(3, KEYFRAMES)]
+    part = bundle_window(sparse_map, free, config.bundle_window, config.measurement)
+    assert part is not None
+    held = dict(zip((sparse_map.keyframes.id[part.rows] - keyframe_id(SUBMAP, 0)).tolist(), part.problem.free))
+    assert held == {2: False, 3: True, 4: True, 5: True}
+    linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
+    moved = linked.T_c_m.copy()
+    moved[1:, 0, 3] += 0.02  # all of them together
+    result = bundle(replace(linked, T_c_m=moved), config.bundle)
+    assert np.linalg.norm(result.T_c_m[1:, :3, 3] - linked.T_c_m[1:, :3, 3], axis=1).max() < 0.004
 
 
 def turn_error(poses: np.ndarray, truth: list[np.ndarray]) -> float:

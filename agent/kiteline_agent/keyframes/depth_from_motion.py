@@ -84,7 +84,7 @@ class DepthFromMotion:
         if len(fine) <= limit:
             return fine
         rows = seeds.rows.take(fine)
-        order = np.lexsort((-rows, self._map.tried.take(rows), -self._map.hits.take(rows)))
+        order = np.lexsort((-fine, self._map.tried.take(rows), -self._map.hits.take(rows)))
         return np.sort(fine[order[:limit]])
 
     def _state(self, rows: I64) -> tuple[F64, F64, F64]:

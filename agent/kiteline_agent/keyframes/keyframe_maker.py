@@ -1,6 +1,12 @@
-"""Makes a keyframe of a frame: shares its records with the base, adds it to the local map as the base decodes it."""
+"""Makes a keyframe of a frame: shares its records with the base, adds it to the local map.
+
+The local map keeps what was measured, whatever is shared of it and however it is rounded: a link does not change how
+the agent tracks.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +19,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
+from kiteline_codec.coding import quantise
 from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
@@ -67,13 +74,13 @@ class KeyframeMaker:
         return points
 
     def make(
-        self, ctx: FrameContext, track: Track | None, points: NewPoints, keyframe: KeyframeId, parent: KeyframeId,
-        T_p_k: F64, up: tuple[F64, float] | None = None,
+        self, ctx: FrameContext, track: Track | None, points: NewPoints, T_m_k: F64, keyframe: KeyframeId,
+        parent: KeyframeId, T_p_k: F64, up: tuple[F64, float] | None = None,
     ) -> F64:  # fmt: skip
-        """Share and store a keyframe. Returns its pose T_m_k (4,4) as both sides hold it, after quantisation.
+        """Share and store a keyframe at T_m_k (4,4). Returns T_p_k (4,4) as the base holds it, after quantisation.
 
-        track: None for a keyframe without observations of older landmarks. up: (3,) against gravity in the camera, and
-        its deviation in rad; None if unknown.
+        T_p_k: (4,4) in its parent as the base holds that, which rounds the former. track: None for a keyframe without
+        observations of older landmarks. up: (3,) against gravity in the camera, its deviation in rad; None if unknown.
         """
         rows, seen = (np.zeros(0, np.int64), np.zeros((0, 3))) if track is None else self._inliers(track)
         profile = self._channel.profile
@@ -86,33 +93,21 @@ class KeyframeMaker:
         self._count(ctx, len(landmarks.index), len(observations.index))
         header = self._channel.put(KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, n_keypoints, *(up or ())))
         assert isinstance(header, KeyframeHeader)
-        uv, rho = landmarks.uv.astype(np.float64), landmarks.inv_depth.astype(np.float64)
-        for part in sections[0]:
-            decoded = self._channel.put(part)
-            assert isinstance(decoded, NewLandmarks)
-            uv[decoded.index], rho[decoded.index] = decoded.uv, decoded.inv_depth
-        for section in sections[1]:
+        for section in (*sections[0], *sections[1]):
             self._channel.put(section)
-        T_m_k = self._pose_of(header)
-        seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
-        self._store(ctx, header, T_m_k, uv, seen_uv, rho, landmarks)
+        seen_uv = self._store(ctx, header, T_m_k, points, order, landmarks)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         self.new_uv = seen_uv[: min(len(order), profile.landmarks)]
-        return T_m_k
+        return header.T_p_k
 
     def make_unshared(
-        self, ctx: FrameContext, points: NewPoints, keyframe: KeyframeId, parent: KeyframeId, T_p_k: F64
+        self, ctx: FrameContext, points: NewPoints, T_m_k: F64, keyframe: KeyframeId, parent: KeyframeId
     ) -> None:  # fmt: skip
-        """Store a keyframe for the tracker alone. parent: a keyframe that is shared; T_p_k: (4,4)."""
+        """Store a keyframe at T_m_k (4,4) for the tracker alone. parent: a keyframe that is shared."""
         order = _in_order_of_rows(points, ctx.config.detector.cell_px, len(points.uv))
         landmarks, _ = self._new_landmarks(keyframe, points, order)
         self._count(ctx, len(order), 0)
-        uv = landmarks.uv.astype(np.float64)
-        header = KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, 0)
-        seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
-        self._store(
-            ctx, header, self._pose_of(header), uv, seen_uv, landmarks.inv_depth.astype(np.float64), landmarks
-        )  # fmt: skip
+        self._store(ctx, KeyframeHeader(keyframe, ctx.t_ns, parent, T_m_k, 0), T_m_k, points, order, landmarks)
         self._map.share(keyframe, 0)
 
     def _inliers(self, track: Track) -> tuple[NDArray[np.int64], F64]:
@@ -137,7 +132,7 @@ class KeyframeMaker:
             keyframe,
             0,
             np.arange(n, dtype=np.uint16),
-            points.uv[order].astype(np.float32),
+            quantise.pixels(quantise.pixel_codes(points.uv[order].astype(np.float32))),  # the landmark is what is there
             self._measured_rho(disparity, points.uv[order]),
             points.octave[order],
             points.angle[order],
@@ -161,19 +156,16 @@ class KeyframeMaker:
         raw = disparity + self._map.offset_px(uv)
         return np.where((disparity > 0.0) & (raw > 0.0), raw / self._camera.bf, 0.0).astype(np.float32)
 
-    def _pose_of(self, header: KeyframeHeader) -> F64:
-        if header.parent == NO_KEYFRAME:
-            return header.T_p_k
-        return se3.orthonormalise(self._map.T_m_k[self._map.slot_of(header.parent)] @ header.T_p_k)
-
     def _store(
-        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, uv: F64, seen_uv: F64, rho: F64,
+        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, points: NewPoints, order: NDArray[np.int64],
         landmarks: NewLandmarks,
-    ) -> None:  # fmt: skip
-        """Cut the templates at seen_uv (n,2), where the image shows them, and add the keyframe to the local map.
+    ) -> F64:  # fmt: skip
+        """Cut the templates where the image shows the landmarks, and add the keyframe to the local map.
 
-        rho: (n,) 1/m as measured, with the stereo offset.
+        landmarks: points in `order`. Returns where the image shows them, (n,2) px.
         """
+        uv, rho = landmarks.uv.astype(np.float64), landmarks.inv_depth.astype(np.float64)
+        seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
         rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         octave, config = landmarks.octave, ctx.config
         side = alignment_kernels.TEMPLATE
@@ -182,10 +174,15 @@ class KeyframeMaker:
         sigma = config.stereo.sigma_px * (1 << octave).astype(np.float64) / self._camera.bf
         if ctx.images.depth_m is not None and not self._camera.stereo:
             sigma = np.maximum(sigma, _DEPTH_CAMERA_SIGMA_RHO)
+        parent = self._map.slot_of(header.parent)
+        if header.parent != NO_KEYFRAME and parent >= 0:
+            header = replace(header, T_p_k=se3.orthonormalise(se3.inverse(self._map.T_m_k[parent]) @ T_m_k))
         slot = self._map.add(
-            header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number
+            header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number,
+            np.argsort(order),
         )  # fmt: skip
         self._map.rolled[slot] = ctx.shutter is None
+        return seen_uv
 
 
 def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> NDArray[np.int64]:

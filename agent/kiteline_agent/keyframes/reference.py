@@ -33,7 +33,10 @@ class _Made:
 
 
 class ReferenceKeyframe:
-    """The keyframe relative to which the pose is reported. T_k_c: (4,4) camera in it."""
+    """The keyframe relative to which the pose is reported. T_k_c: (4,4) camera in it, as the base holds it.
+
+    What is shared is relative to keyframes as the base composes them, so that their rounding does not add up.
+    """
 
     def __init__(self, local_map: LocalMap) -> None:
         self._map = local_map
@@ -43,11 +46,16 @@ class ReferenceKeyframe:
         self._unshared = 0  # number of keyframes that were not shared
         self.keyframe: KeyframeId = NO_KEYFRAME
         self.T_k_c: F64 = np.eye(4)
+        self._rounding: F64 = np.eye(4)  # the keyframe as the base holds it, in the keyframe of the local map
 
     @property
     def T_m_k(self) -> F64 | None:
-        """(4,4) in the local map; None if the keyframe was evicted."""
-        return self._pose_of(self.keyframe)
+        """(4,4) in the local map, as the base holds it; None if the keyframe was evicted."""
+        slot = self._map.slot_of(self.keyframe)
+        if slot < 0:
+            return None
+        T_m_k: F64 = self._map.T_m_k[slot]
+        return T_m_k if self._map.from_base[slot] else T_m_k @ self._rounding
 
     def _pose_of(self, keyframe: KeyframeId) -> F64 | None:
         slot = self._map.slot_of(keyframe)
@@ -71,8 +79,8 @@ class ReferenceKeyframe:
             self._newest.inliers = track.inliers
         if ctx.number - self._shared.frame_number == 1:
             self._shared.inliers = of_base
-        T_m_k = self._pose_of(self._newest.keyframe) if unshared else self.T_m_k
-        T_m_k = self.T_m_k if T_m_k is None else T_m_k
+        T_m_k = self._pose_of(self._newest.keyframe) if unshared else None
+        T_m_k = self._pose_of(self.keyframe) if T_m_k is None else T_m_k
         assert T_m_k is not None
         age_s = (ctx.t_ns - self._newest.t_ns) * 1e-9
         now = situation(track, self._map.camera, T_m_k, frames, age_s, self._newest.inliers)
@@ -102,10 +110,13 @@ class ReferenceKeyframe:
         """Id of the next keyframe that is not shared: from the end of the sequence numbers, where no other ones are."""
         return keyframe_id(submap, MAX_KEYFRAMES - 1 - self._unshared % _UNSHARED)
 
-    def set_new(self, keyframe: KeyframeId, submap: SubmapId, T_k_c: F64, t_ns: int, frame_number: int) -> None:
-        """A keyframe was made. T_k_c: (4,4), not exactly the identity, since the keyframe's pose is quantised."""
+    def set_new(
+        self, keyframe: KeyframeId, submap: SubmapId, T_m_c: F64, T_m_k: F64, t_ns: int, frame_number: int
+    ) -> None:
+        """A keyframe was made of the camera at T_m_c (4,4). T_m_k: (4,4) as the base holds it."""
         self._last_sequence[submap] = self._last_sequence.get(submap, -1) + 1
-        self.keyframe, self.T_k_c = keyframe, T_k_c
+        self.keyframe, self.T_k_c = keyframe, se3.inverse(T_m_k) @ T_m_c
+        self._rounding = se3.inverse(self.T_k_c)
         self._shared = _Made(keyframe, t_ns, frame_number, self._shared.inliers)
         self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers)
 
@@ -120,7 +131,7 @@ class ReferenceKeyframe:
 
     def return_to(self, keyframe: KeyframeId, inliers: int, frame_number: int) -> None:
         """Use an older keyframe after a relocalisation; `set_camera` follows."""
-        self.keyframe = keyframe
+        self.keyframe, self._rounding = keyframe, np.eye(4)
         self._newest = replace(self._shared, inliers=inliers)
         self._shared.inliers = inliers
         self._map.last_seen[self._map.slot_of(keyframe)] = frame_number

@@ -13,6 +13,7 @@ class FusedInMap:
     """Stops the search for landmarks whose root is stored, too, once the base has set the poses of both keyframes.
 
     Until then the two lie apart by the drift between their keyframes: the newer one is where the camera sees it.
+    Like all corrections it waits until these matter, in a map that holds landmarks.
     """
 
     def __init__(self, local_map: LocalMap) -> None:
@@ -23,7 +24,7 @@ class FusedInMap:
         """Take in what the base found. Returns whether a landmark is not searched for any more."""
         self._told[record.keyframe] = record
         self._told = {k: held for k, held in self._told.items() if self._map.slot_of(k) >= 0}
-        return self._drop(record)
+        return not self._map.holds_landmarks and self._drop(record)
 
     def corrected(self) -> None:
         """The base has set poses of the map."""

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
+from kiteline_agent.local_map.held_corrections import HeldCorrections, Removed
 from kiteline_codec.schema import (
-    CulledLandmarks,
     KeyframeHeader,
     KeyframePose,
     RefinedLandmarks,
-    RemovedObservations,
 )
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -51,15 +50,6 @@ class Candidates:
     depth: F64
 
 
-@dataclass(frozen=True, slots=True)
-class SavedMap:
-    """A local map before corrections of the base, and these."""
-
-    arrays: tuple[NDArray[Any], ...]
-    poses: dict[KeyframeId, F64]
-    landmarks: dict[KeyframeId, tuple[I64, F64, F64]]
-
-
 class LocalMap:
     """Keyframes and landmarks near the vehicle."""
 
@@ -79,6 +69,7 @@ class LocalMap:
         self.rolled = np.zeros(k, np.bool_)  # the pixels are as a rolling shutter took them: its motion was unknown
         self.last_seen = np.zeros(k, np.int64)  # number of the frame that last tracked a landmark of the slot
         self.counts = np.zeros(k, np.int64)
+        self.order = np.tile(np.arange(b), (k, 1))  # of a slot's landmarks as candidates: no link changes it
         self.shared = np.zeros(k, np.int64)  # number of landmarks in each slot that the base knows: the first ones
         self.usable = np.zeros((k, b), np.bool_)
         self.seed = np.zeros((k, b), np.bool_)  # a landmark that still has no depth
@@ -97,11 +88,10 @@ class LocalMap:
         self.hits = np.zeros(k * b, np.int32)
         self.misses = np.zeros(k * b, np.int32)  # of a seed: searches without a match
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
-        self._new_poses: dict[KeyframeId, F64] = {}  # sent by the base, and not taken over yet
-        self._new_landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = {}  # the same of landmarks: index, rho, bearing
+        self._held = HeldCorrections()
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
-        # True: refined landmarks wait, as poses do, until they move the image: the agent's own depths are as good.
+        # True: landmarks to refine, add or remove wait, as poses do, until they move the image: own depths are good.
         self.holds_landmarks = camera.stereo
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
@@ -133,14 +123,16 @@ class LocalMap:
     def add(
         self, head: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
         angle: NDArray[np.uint8], descriptor: NDArray[np.uint8], templates: NDArray[np.uint8], frame_number: int,
+        order: I64 | None = None,
     ) -> int:  # fmt: skip
         """Store a keyframe with its new landmarks, and return its slot. The slot seen least recently is evicted.
 
         uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: without depth, a seed.
-        angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21).
+        angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21). order: (n,) in which landmarks
+        are candidates, if nothing else decides; None for their own.
         """
         slot = self._free_slot(head.parent)
-        self._forget_corrections(int(self.keyframe[slot]))
+        self._held.forget(KeyframeId(int(self.keyframe[slot])))
         n = min(len(uv), self.slot_size)
         rows = slice(slot * self.slot_size, slot * self.slot_size + n)
         self.keyframe[slot], self.parent[slot] = head.keyframe, head.parent
@@ -148,6 +140,7 @@ class LocalMap:
         self.from_base[slot] = False
         self.last_seen[slot] = frame_number
         self.counts[slot] = n
+        self.order[slot, :n] = np.arange(n) if order is None else order[order < n]
         self.usable[slot] = False
         self.usable[slot, :n] = rho[:n] > 0.0
         self.uv[slot, :n] = uv[:n]
@@ -196,7 +189,7 @@ class LocalMap:
         wanted = self.active if submap is None else submap
         slots = self._searched((self.keyframe >> SEQUENCE_BITS == wanted).nonzero()[0])
         n = kernels.project(
-            T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.counts,
+            T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.order, self.counts,
             self.seed if seeds else self.usable,
             self.bearing, self.rho, self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip
@@ -255,21 +248,17 @@ class LocalMap:
         """Drop the keyframes of a submap."""
         slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == submap)
         for keyframe in self.keyframe[slots].tolist():
-            self._forget_corrections(keyframe)
+            self._held.forget(KeyframeId(keyframe))
         self.keyframe[slots] = NO_KEYFRAME
         self.counts[slots] = 0
 
     # records of the base
 
-    def _forget_corrections(self, keyframe: int) -> None:
-        self._new_poses.pop(KeyframeId(keyframe), None)
-        self._new_landmarks.pop(KeyframeId(keyframe), None)
-
     def set_pose(self, record: KeyframePose) -> bool:
         """Hold a keyframe's pose ready for `apply_corrections`. False: nothing moves yet."""
         slot = self.slot_of(record.keyframe)
         if slot >= 0:
-            self._new_poses[record.keyframe] = record.T_m_k
+            self._held.poses[record.keyframe] = record.T_m_k
             self.due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
         return False
 
@@ -281,41 +270,43 @@ class LocalMap:
         """
         if not self.due:
             return False
-        self.try_corrections(self._new_landmarks.keys())
-        self._new_poses.clear()
-        self._new_landmarks.clear()
+        self.try_corrections(self._held.landmarks.keys())
+        for keyframe, landmarks in self._held.landmarks.items():
+            self._add_fresh(self.slot_of(keyframe), *landmarks)
+        for record in self._held.removed.values():
+            self._drop(record)
+        self._held.clear()
         self.due = False
         return True
 
     def try_corrections(self, keyframes: Collection[KeyframeId]) -> None:
-        """Take over the poses that the base sent, and landmarks of some keyframes alone; all of them still wait."""
+        """Take over the poses that the base sent, and tracked landmarks of some keyframes; all of them still wait."""
         slots = self._slots()
-        for keyframe, T_m_k in self._new_poses.items():
+        for keyframe, T_m_k in self._held.poses.items():
             if keyframe in slots:
                 self.T_m_k[slots[keyframe]] = T_m_k
                 self.from_base[slots[keyframe]] = True
-        for keyframe, landmarks in self._new_landmarks.items():
+        for keyframe, (index, rho, bearing) in self._held.landmarks.items():
             if keyframe in keyframes and keyframe in slots:
-                self._set_landmarks(slots[keyframe], *landmarks)
+                known = ~self._is_fresh(slots[keyframe], index)
+                self._set_landmarks(slots[keyframe], index[known], rho[known], bearing[known])
 
     def _slots(self) -> dict[int, int]:
         """Slots by keyframe."""
         return {keyframe: slot for slot, keyframe in enumerate(self.keyframe.tolist())}
 
     def _corrected(self) -> tuple[NDArray[Any], ...]:
-        """What `apply_corrections` changes."""
+        """What `try_corrections` changes."""
         return self.T_m_k, self.from_base, self.rho, self.bearing, self.measured, self.sigma_rho
 
-    def save(self) -> SavedMap:
-        """The map before `apply_corrections`."""
-        return SavedMap(tuple(a.copy() for a in self._corrected()), dict(self._new_poses), dict(self._new_landmarks))
+    def save(self) -> tuple[NDArray[Any], ...]:
+        """The map before `try_corrections`."""
+        return tuple(a.copy() for a in self._corrected())
 
-    def restore(self, saved: SavedMap) -> None:
-        """Undo `apply_corrections`: what the base sent waits again."""
-        self.due = True
-        for array, before in zip(self._corrected(), saved.arrays, strict=True):
+    def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
+        """Undo `try_corrections`."""
+        for array, before in zip(self._corrected(), saved, strict=True):
             array[...] = before
-        self._new_poses, self._new_landmarks = saved.poses, saved.landmarks
 
     def _shift_px(self, slot: int, T_m_k: F64) -> float:
         """By how much landmarks at the keyframe's typical depth move in its image if its pose is set to T_m_k (4,4)."""
@@ -323,8 +314,15 @@ class LocalMap:
         rho = self.rho[slot, self.usable[slot]]
         return float(self.camera.fx * (shift_m * (median(rho) if len(rho) else 0.0) + turn))
 
-    def remove(self, record: RemovedObservations | CulledLandmarks) -> bool:
-        """Stop searching for landmarks that the base removed."""
+    def remove(self, record: Removed) -> bool:
+        """Stop searching for landmarks that the base removed; held ready for `apply_corrections`."""
+        if not self.holds_landmarks:
+            return self._drop(record)
+        if self.slot_of(record.keyframe) >= 0:
+            self._held.removed[record.keyframe, record.KIND] = record
+        return False
+
+    def _drop(self, record: Removed) -> bool:
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
@@ -334,34 +332,38 @@ class LocalMap:
         return True
 
     def refine(self, record: RefinedLandmarks) -> bool:
-        """Take over landmarks that only the base could triangulate; hold the others ready for `apply_corrections`.
-
-        All are taken over while depths rest on the agent's own images alone: the base's are better.
-        """
+        """Hold landmarks ready for `apply_corrections`, or take them over at once if the map holds none."""
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
         keep = (record.index < self.shared[slot]) & (record.inv_depth > 0.0)
         index = record.index[keep].astype(np.int64)
-        never = ~self.usable[slot, index] & (self.tried[slot * self.slot_size + index] == 0)
-        fresh = never | self.seed[slot, index]
-        rho, bearing = (
-            record.inv_depth[keep].astype(np.float64),
-            self._bearings(self.uv[slot, index] + record.offset[keep]),
-        )
-        self._new_landmarks.pop(record.keyframe, None)  # older ones, that waited
-        at_once = fresh | (not self.holds_landmarks)
-        any_at_once = bool(at_once.any())
-        if any_at_once:
-            self._set_landmarks(slot, index[at_once], rho[at_once], bearing[at_once])
-            self.promote(slot * self.slot_size + index[fresh])
-            index, rho, bearing = index[~at_once], rho[~at_once], bearing[~at_once]
+        rho = record.inv_depth[keep].astype(np.float64)
+        bearing = self._bearings(self.uv[slot, index] + record.offset[keep])
+        self._held.landmarks.pop(record.keyframe, None)  # older ones, that waited
+        if not self.holds_landmarks:
+            fresh = self._is_fresh(slot, index)
+            self._set_landmarks(slot, index[~fresh], rho[~fresh], bearing[~fresh])
+            self._add_fresh(slot, index, rho, bearing)
+            return bool(len(index))
         if len(index):
-            self._new_landmarks[record.keyframe] = index, rho, bearing
+            self._held.landmarks[record.keyframe] = index, rho, bearing
             turned = np.hypot(*(bearing - self.bearing[slot, index]).T) * self.camera.fx
             nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
-            self.due |= median(np.maximum(turned, nearer)) >= self._config.moved_px
-        return any_at_once
+            px = np.maximum(turned, nearer)[~self._is_fresh(slot, index)]
+            self.due |= len(px) > 0 and median(px) >= self._config.moved_px
+        return False
+
+    def _is_fresh(self, slot: int, index: I64) -> NDArray[np.bool_]:
+        """Which landmarks of a slot have no depth of their own: only the base could triangulate them."""
+        never = ~self.usable[slot, index] & (self.tried[slot * self.slot_size + index] == 0)
+        return np.asarray(never | self.seed[slot, index])
+
+    def _add_fresh(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
+        """Track those of a slot's landmarks from now on that only the base could triangulate."""
+        fresh = self._is_fresh(slot, index)
+        self._set_landmarks(slot, index[fresh], rho[fresh], bearing[fresh])
+        self.promote(slot * self.slot_size + index[fresh])
 
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
         self.rho[slot, index], self.bearing[slot, index] = rho, bearing

@@ -16,6 +16,7 @@ def project(  # type: ignore[no-untyped-def]
     max_scale,
     slots,
     T_m_k,
+    order,
     counts,
     usable,
     bearing,
@@ -30,9 +31,10 @@ def project(  # type: ignore[no-untyped-def]
 ):
     """Project the usable landmarks of keyframe slots into a camera.
 
-    T_c_m: (4,4). camera: fx, fy, cx, cy, bf. size: width, height px. slots: (s,) int64. T_m_k: (K,4,4). counts: (K,).
-    usable: (K,B) bool. bearing: (K,B,2) x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth, its deviation,
-    1/m. Out, capacity K*B: out_row slot*B+index, out_uv px, out_warp (2,2) d(px here)/d(px in the keyframe), out_xyz
+    T_c_m: (4,4). camera: fx, fy, cx, cy, bf. size: width, height px. slots: (s,) int64. T_m_k: (K,4,4). order: (K,B)
+    int64, landmarks of a slot in the order in which they are taken. counts: (K,). usable: (K,B) bool. bearing: (K,B,2)
+    x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth, its deviation, 1/m.
+    Out, capacity K*B: out_row slot*B+index, out_uv px, out_warp (2,2) d(px here)/d(px in the keyframe), out_xyz
     m in the submap frame, out_ray m (one deviation of depth as a vector), out_depth m. Returns how many were written.
     """
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
@@ -53,7 +55,8 @@ def project(  # type: ignore[no-untyped-def]
                 for m in range(3):
                     v += T_c_m[a, m] * T_m_k[k, m, b]
                 r[a, b] = v
-        for i in range(counts[k]):
+        for j in range(counts[k]):
+            i = order[k, j]
             if not usable[k, i]:
                 continue
             bx, by, p = bearing[k, i, 0], bearing[k, i, 1], rho[k, i]

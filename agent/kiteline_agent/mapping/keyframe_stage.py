@@ -15,7 +15,7 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
 from kiteline_core.geometry import se3
-from kiteline_core.ids import KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[float64]
 
@@ -63,7 +63,7 @@ class KeyframeStage:
         camera, reference = self._camera, self._camera.reference
         keyframe = reference.next_unshared(camera.submaps.active)
         points = self._maker.points_beside(ctx, track)
-        self._maker.make_unshared(ctx, points, keyframe, reference.keyframe, reference.T_k_c)
+        self._maker.make_unshared(ctx, points, camera.pose.T_m_c, keyframe, reference.keyframe)
         reference.set_unshared(keyframe, ctx.t_ns, ctx.number)
         self._finish(ctx, keyframe, Extra.KEYFRAME)
 
@@ -91,11 +91,13 @@ class KeyframeStage:
         """
         reference, submap = self._camera.reference, self._camera.submaps.active
         keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
-        T_m_k = self._maker.make(ctx, track, points, keyframe, parent, T_p_k, self._camera.motion.up())
+        T_m_p = reference.T_m_k
+        T_p_k = self._maker.make(ctx, track, points, T_m_c, keyframe, parent, T_p_k, self._camera.motion.up())
         steps = self._camera.motion.take_steps(keyframe, ctx.t_ns)
         if steps is not None and self._channel.profile.inertial_steps:
             self._channel.put(steps)
-        reference.set_new(keyframe, submap, se3.inverse(T_m_k) @ T_m_c, ctx.t_ns, ctx.number)
+        T_m_k = T_p_k if parent == NO_KEYFRAME else T_m_c if T_m_p is None else se3.orthonormalise(T_m_p @ T_p_k)
+        reference.set_new(keyframe, submap, T_m_c, T_m_k, ctx.t_ns, ctx.number)
         self._relocaliser.add_keyframe(keyframe)
         self._finish(ctx, keyframe, kind)
         return keyframe

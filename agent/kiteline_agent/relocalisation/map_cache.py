@@ -81,6 +81,7 @@ class MapCache:
         self.keyframe = np.full(k, NO_KEYFRAME, np.int64)
         self._submap = np.full(k, _NO_SUBMAP, np.int64)  # to which the pose refers
         self._T_m_k = np.tile(np.eye(4), (k, 1, 1))
+        self._order = np.tile(np.arange(p), (k, 1))
         self._counts = np.zeros(k, np.int64)
         self._touched = np.zeros(k, np.int64)  # value of _clock at the last record
         self._clock = 0
@@ -190,8 +191,8 @@ class MapCache:
         slots = np.flatnonzero(self._submap == submap)
         row, uv, warp, xyz, ray, depth = self._out
         n = projection_kernels.project(
-            T_c_m, self._intrinsics, self._size, margin_px, self._config.max_scale, slots, self._T_m_k, self._counts,
-            self._usable, self._bearing, self._rho, self._sigma_rho, row, uv, warp, xyz, ray, depth,
+            T_c_m, self._intrinsics, self._size, margin_px, self._config.max_scale, slots, self._T_m_k, self._order,
+            self._counts, self._usable, self._bearing, self._rho, self._sigma_rho, row, uv, warp, xyz, ray, depth,
         )  # fmt: skip
         rows = row[:n].copy()
         nearer = np.log2(1.0 / (self._rho.reshape(-1)[rows] * depth[:n]))

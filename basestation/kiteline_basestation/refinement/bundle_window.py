@@ -68,14 +68,13 @@ def bundle_window(
     mask = np.zeros(len(sparse_map), bool)
     mask[rows_inside] = True
     mask &= keyframes.pose_source[: len(sparse_map)] != NO_POSE
-    scarce = free_rows[counts[free_rows] < config.few_observations]
     counts[~mask] = 0
     counts[free_rows] = 0
     others = np.flatnonzero(counts > 0)
     order = np.lexsort((-keyframes.id[others], -counts[others]))
     others = others[order[: config.max_fixed]].astype(np.int32)
-    # Odometry ties keyframes with few observations to their parents.
-    parents = np.array([sparse_map.rows.get(KeyframeId(int(p)), -1) for p in keyframes.parent[scarce]], np.int32)
+    # Odometry ties keyframes to their parents: without these, few observations elsewhere would carry all of them away.
+    parents = np.array([sparse_map.rows.get(KeyframeId(int(p)), -1) for p in keyframes.parent[free_rows]], np.int32)
     parents = parents[(parents >= 0) & mask[parents]]
     rows = np.unique(np.concatenate([free_rows, others, parents]))
     rows = rows[np.argsort(keyframes.id[rows])]
