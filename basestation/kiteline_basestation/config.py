@@ -292,7 +292,7 @@ class GroundConfig:
 
 @dataclass(frozen=True, slots=True)
 class GridConfig:
-    """The occupancy grid. Heights are relative to the local ground; log-odds are in 1/32."""
+    """The occupancy grid. Heights are relative to the local ground; log-odds are in 1/16."""
 
     cell_m: float = 0.05  # m; a quarter of the gap that a small vehicle passes; 0.01 possible, 0.2 suits wide streets
     max_range_m: float = 20.0  # m; beyond, the columns of a scan are wider than half a metre
@@ -306,13 +306,12 @@ class GridConfig:
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
     accurate_sigma_m: float = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
     gap_sigmas: float = 2.7  # standard deviations before an obstacle within which ground is not freed
-    log_hit: int = 12  # 1/32; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
-    log_free: int = 6  # 1/32; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
-    log_free_far: int = 2  # 1/32; the same of a far view
-    log_free_low: int = 1  # 1/32; the same where no ground was seen, but rays pass low
-    occupied_from: int = 10  # 1/32; log-odds from which a band is occupied: one near view, two far ones
-    free_from: int = 3  # 1/32; a cell is free if all bands lie at or below minus this: one near view, two far ones
-    free_beside: int = 8  # 1/32; the same beside an occupied cell: a near view and another, as one may lie a cell off
+    log_hit: int = 6  # 1/16; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
+    log_free: int = 3  # 1/16; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
+    log_free_far: int = 1  # 1/16; the same of a far view, and where no ground was seen, but rays pass low
+    occupied_from: int = 5  # 1/16; log-odds from which a band is occupied: one near view, two far ones
+    free_from: int = 2  # 1/16; a cell is free if all bands lie at or below minus this: one near view, two far ones
+    free_beside: int = 4  # 1/16; the same beside an occupied cell: a near view and another, as one may lie a cell off
     hole_neighbours: int = (
         5  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)
     )

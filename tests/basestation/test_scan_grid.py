@@ -283,7 +283,7 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_if_tw
     near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
-    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_low).all()
+    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
     assert not odds[:, columns < first - 0.05].any()
     assert grid.cells(near)[0][1, 37] == -1
     grid.put(1, kept(bare), camera(0.0, 0.0, 0.05))
@@ -306,7 +306,7 @@ def test_ground_that_was_seen_over_a_low_obstacle_is_free_and_what_it_hides_is_u
 
 def test_a_view_counts_by_how_accurate_it_is_not_by_how_far() -> None:
     wall = scan_of(np.array(box(-12.03, -12.03, 12.03, 12.03)), 0.0, 0.0, 0.0)
-    for bf, expected in ((30.0, 0), (400.0, round(12 * np.sqrt(0.05 * 400.0 / 0.3) / 12.03)), (2000.0, 12)):
+    for bf, expected in ((30.0, 0), (400.0, round(6 * np.sqrt(0.05 * 400.0 / 0.3) / 12.03)), (2000.0, 6)):
         found = keep(CONFIG, wall, bf)
         assert found is not None
         grid = ScanGrid(CONFIG)

@@ -233,7 +233,6 @@ class ScanGrid:
         end = np.where(behind & (under == 0), free, np.minimum(free, before))
         space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
         accurate_m = scan.accurate_m(config)
-        weights = np.array([config.log_free, config.log_free_far, config.log_free_low], np.int64)
         weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
 
         reach = max(float(np.max(space[:, 2:])), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
@@ -255,8 +254,8 @@ class ScanGrid:
             touched, used = np.zeros((rows, columns), np.uint8), np.zeros(1, np.int64)
             kernels.draw_hits(hits, cells, found, sign, slots, spare, used, self._store.pool, touched)
             kernels.draw_free(
-                x, y, first, scan.step, space, under, camera_band, accurate_m / cell, weights,
-                hits, sign, slots, spare, used, self._store.pool, touched,
+                x, y, first, scan.step, space, under, camera_band, accurate_m / cell, config.log_free,
+                config.log_free_far, hits, sign, slots, spare, used, self._store.pool, touched,
             )  # fmt: skip
             for r, c in np.argwhere(touched).tolist():
                 place = Place(storey, box[0] + r, box[1] + c)

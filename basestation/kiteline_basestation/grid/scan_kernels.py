@@ -94,14 +94,14 @@ def draw_hits(
 @njit
 def draw_free(
     x: float, y: float, first_rad: float, step_rad: float, free: F64, under: U8, camera_band: int, near_cells: float,
-    weights: I64, hits: U16, sign: int, slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
+    weight: int, far_weight: int, hits: U16, sign: int, slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
 ) -> None:  # fmt: skip
     """Take evidence of free space from the cells of each column's sector; each cell belongs to one column.
 
     free: (n,5) ranges in cells: from where the rays to the nearest seen ground are low, from and up to where the ground
     was seen and all bands are free, up to where the bands `under` (n,) are free too, and up to where the line of sight
-    is clear, which frees camera_band (-1: none). weights: (3,) of seen ground up to near_cells, beyond, and where rays
-    are low. Marked cells keep the bands of their obstacles.
+    is clear, which frees camera_band (-1: none). weight: of seen ground up to near_cells; far_weight: beyond, and where
+    rays are low. Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
     near2 = near_cells * near_cells
@@ -162,12 +162,7 @@ def draw_free(
                     if slot < 0:
                         slot = _tile(row, column, slots, spare, used)
                         touched[row >> _SHIFT, column >> _SHIFT] = 1
-                    if start2 <= distance2 <= near2:
-                        value = -sign * weights[0]
-                    elif begin2 <= distance2 < start2:
-                        value = -sign * weights[2]
-                    else:
-                        value = -sign * weights[1]
+                    value = -sign * (weight if start2 <= distance2 <= near2 else far_weight)
                     if bands == ALL:
                         total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
                         pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
