@@ -18,6 +18,7 @@ F64 = NDArray[np.float64]
 
 STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, accelerometer bias
 SHARED = 5  # unknowns of the window: gyro bias, direction of gravity
+_PAIR = 2 * STATE  # unknowns of two keyframes
 _FLOOR = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)  # of an interval's covariance: rad, m/s, m
 
 
@@ -72,13 +73,19 @@ class InertialTerms:
 
     def add(self, state: WindowState, h: F64, b: F64, *, inertial: bool) -> float:
         """Add the normal equations of the errors; returns their cost."""
-        cost = 0.0
-        errors, infos = self._errors(state), self._used_info(inertial=inertial)
+        cost, shared = 0.0, STATE * len(state.R)
+        errors, infos, tilt = self._errors(state), self._used_info(inertial=inertial), self._tilt(state)
         for k, e in enumerate(errors):
-            j, columns = self._jacobian(state, e, k)
+            j = self._jacobian(state, e, k, tilt)
             weighted = j.T @ infos[k]
-            h[np.ix_(columns, columns)] += weighted @ j
-            b[columns] += weighted @ e
+            both, system = slice(STATE * k, STATE * (k + 2)), weighted @ j
+            h[both, both] += system[:_PAIR, :_PAIR]
+            h[both, shared:] += system[:_PAIR, _PAIR:]
+            h[shared:, both] += system[_PAIR:, :_PAIR]
+            h[shared:, shared:] += system[_PAIR:, _PAIR:]
+            change = weighted @ e
+            b[both] += change[:_PAIR]
+            b[shared:] += change[_PAIR:]
             cost += 0.5 * float(e @ infos[k] @ e)
         return cost + self._add_priors(state, h, b)
 
@@ -92,9 +99,11 @@ class InertialTerms:
 
         What the unknowns take up of an error is not expected (W. Förstner, variance components).
         """
-        chi2, expected = np.zeros(3), np.zeros(3)
+        chi2, expected, tilt = np.zeros(3), np.zeros(3), self._tilt(state)
+        shared = np.arange(STATE * len(state.R), STATE * len(state.R) + SHARED)
         for k, (e, motion) in enumerate(zip(self._errors(state), self.motions, strict=True)):
-            j, columns = self._jacobian(state, e, k)
+            j = self._jacobian(state, e, k, tilt)
+            columns = np.concatenate([np.arange(STATE * k, STATE * (k + 2)), shared])
             taken = j @ cov[np.ix_(columns, columns)] @ j.T
             for part, rows in enumerate((slice(0, 3), slice(3, 9))):
                 info = np.linalg.inv(motion.cov[rows, rows] + _FLOOR[rows, rows])
@@ -129,12 +138,14 @@ class InertialTerms:
         self._known = state, errors, moved
         return errors, moved
 
-    def _jacobian(self, state: WindowState, e: F64, k: int) -> tuple[F64, NDArray[np.int64]]:
-        """(9,29) of interval k by its two keyframes and the shared unknowns, and their columns."""
-        motion, back, o, shared = self.motions[k], state.R[k].T, STATE * k, STATE * len(state.R)
-        dt, tilt = motion.dt_s, self._length * tangent(state.gravity)
+    def _tilt(self, state: WindowState) -> F64:
+        """(3,2) by which the direction of gravity moves it."""
+        return np.asarray(self._length * tangent(state.gravity))
+
+    def _jacobian(self, state: WindowState, e: F64, k: int, tilt: F64) -> F64:
+        """(9,29) of interval k by its two keyframes and the shared unknowns. tilt: see `_tilt`."""
+        motion, back, dt = self.motions[k], state.R[k].T, self.motions[k].dt_s
         vp = self._errors_and_motions(state)[1][k]
-        columns = np.concatenate([np.arange(o, o + 2 * STATE), np.arange(shared, shared + SHARED)])
         j = np.zeros((9, 2 * STATE + SHARED))
         j[:3, :3], j[:3, 12:15] = -state.R[k + 1].T @ state.R[k], np.eye(3)
         j[3:6, :3], j[3:6, 6:9], j[3:6, 18:21] = se3.skew(e[3:6] + vp[:3]), -back, back
@@ -143,7 +154,7 @@ class InertialTerms:
         j[3:, 9:12] = -motion.jac[3:, 3:]
         j[:, 24:27] = -motion.jac[:, :3]
         j[3:6, 27:], j[6:, 27:] = -dt * back @ tilt, -0.5 * dt * dt * back @ tilt
-        return j, columns
+        return j
 
     def _used_info(self, *, inertial: bool) -> list[F64]:
         if inertial:
