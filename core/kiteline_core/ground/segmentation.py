@@ -265,7 +265,7 @@ class GroundSegmenter:
         last = round((expected_m + expected.within_m) / _HEIGHT_STEP_M) + 1
         near = slice(max(first, 0), max(last, 0))
         centres = (np.arange(bins) + 0.5) * level_kernels.BIN_PX
-        sure = (centres >= self._lowest_px) & (expected_m * self.sigma_px / centres < 0.5 * config.expected_m)
+        sure = (centres >= self._lowest_px) & (expected_m * self.sigma_px / centres < config.expected_m)
         n = self._heights[sure, near].sum(1)
         disparities, slopes = (sums[sure, near].sum(1) for sums in self._height_sums)
         some, height_m = n > 0, expected_m
