@@ -13,9 +13,13 @@ from kiteline_lab.grids import truth
 from kiteline_lab.grids.files import GridFile, read_grid
 
 RECORDED = "room_flight"
-_SCENES = {"room": 40.0, "corridor": 70.0, "hall": 60.0}  # s of a lap of each course
+_SCENES = {"room": 40.0, "corridor": 35.0, "hall": 30.0}  # s: a lap of the room's course, half of one of the others
 _SEED = 41
-RIGS = ("true", "worn")
+DEPTH = "depth"  # a depth camera in place of the right one
+CASES = (
+    *((scene, rig) for rig in ("true", "worn") for scene in _SCENES),
+    ("corridor", DEPTH),
+)  # scenes, and the rigs that fly them
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +47,18 @@ def simulated(bench: Bench, scene: str, rig: str, options: str = "objects=1", sh
     """A scene with objects, flown along a part of its own course; rendered unless the bench's folder has it."""
     seconds = _SCENES[scene] * share
     name = f"{scene}_{options.replace('=', '').replace('&', '_')}_{rig}_{seconds:g}s"
-    command = [f"{scene}?{options}", "--seed", f"{_SEED}", "--seconds", f"{seconds:g}", "--rig", rig]
+    sensor = ["--depth"] if rig == DEPTH else ["--rig", rig]
+    command = [f"{scene}?{options}", "--seed", f"{_SEED}", "--seconds", f"{seconds:g}", *sensor]
     file = render(bench, name, command)[0]
     world = open_sim(f"{scene}?{options}", seed=_SEED, seconds=seconds, texture_bits=7, imu=False).world
-    return Place(f"{scene}, {rig} rig", str(file), *_grids(file.with_suffix("")), world)
+    return Place(
+        f"{scene}, RGB-D" if rig == DEPTH else f"{scene}, {rig} rig", str(file), *_grids(file.with_suffix("")), world
+    )
 
 
 def all_places(bench: Bench) -> list[Place]:
-    """The recorded room, and the simulated scenes by a true and a worn rig; fewer for a quick look."""
-    chosen = bench.chosen([(scene, rig) for rig in RIGS for scene in _SCENES])
-    return [recorded(bench), *(simulated(bench, scene, rig) for scene, rig in chosen)]
+    """The recorded room, and the simulated scenes, by a true and a worn rig and by RGB-D; fewer for a quick look."""
+    return [recorded(bench), *(simulated(bench, scene, rig) for scene, rig in bench.chosen(CASES))]
 
 
 def _grids(stem: Path) -> tuple[GridFile, GridFile]:

@@ -51,3 +51,17 @@ def aligned(est: GridFile, true: GridFile, T_true_est: F64) -> F64:
     T[:2, :2] = turn
     T[:2, 2] = T_true_est[:2, :2] @ middle + T_true_est[:2, 2] + [x, y] - turn @ middle
     return T
+
+
+def share_near(est: GridFile, true: GridFile, T_true_est: F64, near_m: float) -> float:
+    """Share of the obstacle cells of est that lie within near_m of one of true; 1 without any."""
+    row, column = np.nonzero(est.state == OCCUPIED)
+    if not len(row):
+        return 1.0
+    points = est.points(np.column_stack([column + 0.5, row + 0.5])) @ T_true_est[:2, :2].T + T_true_est[:2, 2]
+    border = int(np.ceil(near_m / true.cell_m)) + 1
+    free = np.pad(true.state != OCCUPIED, border, constant_values=True).astype(np.uint8)
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * true.cell_m
+    c, r = np.floor(true.cells(points)).astype(np.int64).T + border
+    inside = (c >= 0) & (r >= 0) & (c < distance.shape[1]) & (r < distance.shape[0])
+    return float((distance[r[inside], c[inside]] <= near_m).sum() / len(row))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from kiteline_lab.evaluation.metrics import MAX_DIFFERENCE_NS, truth_at
 from kiteline_lab.evaluation.trajectories import TrajectoryError, read_pair
-from kiteline_lab.grids.align import aligned
-from kiteline_lab.grids.files import planar, read_grid
+from kiteline_lab.grids.align import aligned, share_near
+from kiteline_lab.grids.files import GridFile, planar, read_grid
 from kiteline_lab.grids.picture import draw_comparison
 from kiteline_lab.grids.prm import GridEvalConfig, score
+
+_NEAR_M, _LEAST_NEAR = 0.3, 0.7  # of obstacles of grids in one frame: all in room_flight, half of them if turned
 
 
 def between_paths(estimate: str, truth: str) -> NDArray[np.float64]:
@@ -88,6 +91,8 @@ def main(argv: list[str]) -> int:
         T_true_est = between_paths(*args.paths)
     if args.align:
         T_true_est = aligned(est, true, T_true_est)
+    elif args.paths is None and args.transform == parser.get_default("transform"):
+        _warn_of_frames(est, true)
     found = score(est, true, T_true_est, config)
     if args.plot is not None:
         draw_comparison(args.plot, est, true, T_true_est, config)
@@ -109,6 +114,17 @@ def main(argv: list[str]) -> int:
     }
     print(json.dumps(result, indent=2))
     return 0
+
+
+def _warn_of_frames(est: GridFile, true: GridFile) -> None:
+    """Say so if the obstacles of two grids, taken as they are, do not lie near each other."""
+    share = share_near(est, true, np.eye(3), _NEAR_M)
+    if share < _LEAST_NEAR:
+        print(
+            f"kiteline: {share:.0%} of the estimate's obstacles lie within {_NEAR_M:g} m of true ones: the grids seem "
+            "to lie in two frames; --paths EST GT takes the motion between them from two trajectories, --align "
+            "refines it", file=sys.stderr,
+        )  # fmt: skip
 
 
 def _rounded(value: float) -> float | None:

@@ -51,7 +51,9 @@ def find_path(grid: GridFile, start: F64, goal: F64, radius_m: float, *, through
     ends = []
     for name, place in (("start", start), ("goal", goal)):
         column, row = np.floor(grid.cells(place[None])[0]).astype(np.int64)
-        _check(grid, name, place, (int(row), int(column)), clearance, radius_m, through_unknown)
+        fault = _fault(grid, place, (int(row), int(column)), clearance, radius_m, through_unknown=through_unknown)
+        if fault:
+            raise GridPathError(f"the {name} {_text(place)} {fault}; {_nearest_place(grid, clear, place)}")
         ends.append(int(row * grid.state.shape[1] + column))
     n = clear.size
     cost, before = np.full(n, np.inf), np.full(n, -1, np.int64)
@@ -83,25 +85,31 @@ def clearance_m(blocked: Bool, cell_m: float) -> F64:
     return np.asarray(np.maximum(distance - np.sqrt(0.5), 0.0) * cell_m, np.float64)
 
 
-def _check(
-    grid: GridFile, name: str, place: F64, cell: tuple[int, int], clearance: F64, radius_m: float, through_unknown: bool
-) -> None:
-    """Raises GridPathError if the vehicle cannot be at an end of the path."""
+def _fault(
+    grid: GridFile, place: F64, cell: tuple[int, int], clearance: F64, radius_m: float, *, through_unknown: bool
+) -> str:
+    """Why the vehicle cannot be at an end of the path; empty if it can."""
     rows, columns = grid.state.shape
     if not (0 <= cell[0] < rows and 0 <= cell[1] < columns):
         corners = grid.points(np.array([[0.0, 0.0], [columns, rows]]))
-        raise GridPathError(
-            f"the {name} {_text(place)} lies outside of the grid, {_text(corners[0])} to {_text(corners[1])}"
-        )
+        return f"lies outside of the grid, {_text(corners[0])} to {_text(corners[1])}"
     if grid.state[cell] == OCCUPIED:
-        raise GridPathError(f"the {name} {_text(place)} lies in an obstacle")
+        return "lies in an obstacle"
     if grid.state[cell] == UNKNOWN and not through_unknown:
-        raise GridPathError(f"the {name} {_text(place)} lies in an unknown cell; --through-unknown allows that")
+        return "lies in an unknown cell; --through-unknown allows that"
     if clearance[cell] < radius_m:
-        raise GridPathError(
-            f"the {name} {_text(place)} is {clearance[cell]:.2f} m from what blocks the way: too near for a radius of "
-            f"{radius_m:g} m"
-        )
+        return f"is {clearance[cell]:.2f} m from what blocks the way: too near for a radius of {radius_m:g} m"
+    return ""
+
+
+def _nearest_place(grid: GridFile, clear: Bool, place: F64) -> str:
+    """The nearest place where the vehicle can be, in words."""
+    row, column = np.nonzero(clear)
+    if not len(row):
+        return "nowhere in this grid is room for the vehicle: a smaller --radius, or a longer flight"
+    places = grid.points(np.column_stack([column + 0.5, row + 0.5]))
+    nearest = places[int(np.argmin(np.sum((places - place) ** 2, axis=1)))]
+    return f"the nearest place with room is {_text(np.round(nearest, 2))}"
 
 
 def _text(place: F64) -> str:
@@ -142,14 +150,19 @@ def main(argv: list[str]) -> int:
         "--radius", type=float, default=0.3, metavar="R", help="of the vehicle in m (default %(default)s)"
     )
     parser.add_argument("--through-unknown", action="store_true", help="unknown cells do not block the way")
-    parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the grid and the path")
+    parser.add_argument("--plot", type=Path, metavar="F.png", help="draw grid and path, or its ends if there is none")
     parser.add_argument("--json", action="store_true", help="print length, clearance and corners as JSON")
     # A place with a negative x would be taken for an option.
     args = parser.parse_args([f" {a}" if re.match(r"-[\d.]", a) and "," in a else a for a in argv])
     if not args.radius >= 0.0:
         parser.error("expected a radius that is not negative")
     grid = read_grid(args.grid)
-    found = find_path(grid, args.start, args.goal, args.radius, through_unknown=args.through_unknown)
+    try:
+        found = find_path(grid, args.start, args.goal, args.radius, through_unknown=args.through_unknown)
+    except GridPathError:
+        if args.plot is not None:  # it shows why
+            draw_path(args.plot, grid, np.array([args.start, args.goal]), args.radius, found=False)
+        raise
     if args.plot is not None:
         draw_path(args.plot, grid, found.places, args.radius)
     if args.json:

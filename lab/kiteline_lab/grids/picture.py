@@ -66,13 +66,16 @@ def draw_comparison(
     _write(path, _legend(np.hstack([_titled(p, n) for p, n in zip(panels, names, strict=True)])))
 
 
-def draw_path(path: Path, grid: GridFile, places: F64, radius_m: float) -> None:
-    """Write a PNG of a grid with a path of places (n,2) in m, and the vehicle's radius at both ends."""
+def draw_path(path: Path, grid: GridFile, places: F64, radius_m: float, *, found: bool = True) -> None:
+    """Write a PNG of a grid with a path of places (n,2) in m, and the vehicle's radius at both ends.
+
+    found: False: places are the ends of a path that does not exist.
+    """
     scale = max(1, round(_LEAST_PX / max(grid.state.shape))) if max(grid.state.shape) < _MOST_PX else 1.0
     image = _shown(shaded(grid.state), scale)
     cells = grid.cells(places)
     pixels = [_pixel(image, cell, np.zeros(2), scale) for cell in cells]
-    for a, b in pairwise(pixels):
+    for a, b in pairwise(pixels if found else []):
         cv2.line(image, a, b, _RED, 2, cv2.LINE_AA)
     for at, colour in ((pixels[0], _GREEN), (pixels[-1], _RED)):
         cv2.circle(image, at, max(3, round(radius_m / grid.cell_m * scale)), colour, 2, cv2.LINE_AA)

@@ -29,6 +29,12 @@ def hall_with_wall() -> np.ndarray:
     return state
 
 
+def write(folder: Path, state: np.ndarray) -> None:
+    image = np.where(state == FREE, 254, 0).astype(np.uint8)[::-1]
+    (folder / "g.pgm").write_bytes(b"P5\n80 60\n255\n" + image.tobytes())
+    (folder / "g.yaml").write_text("image: g.pgm\nresolution: 0.1\norigin: [-4.0, -3.0, 0.0]\n")
+
+
 def at(*xy: float) -> np.ndarray:
     return np.array(xy)
 
@@ -126,6 +132,22 @@ def test_ends_that_cannot_be_are_told(start: tuple[float, float], goal: tuple[fl
         find_path(grid(state), at(*start), at(*goal), 0.15)
 
 
+def test_the_nearest_place_with_room_is_named(tmp_path: Path) -> None:
+    for place in ((4.05, 1.0), (3.9, 1.0), (-2.0, 3.0)):
+        with pytest.raises(GridPathError, match="the nearest place with room is") as told:
+            find_path(grid(hall_with_wall()), at(*place), at(1.0, 1.0), 0.15)
+        named = at(*map(float, str(told.value).rsplit(" ", 1)[1].split(",")))
+        assert find_path(grid(hall_with_wall()), named, at(1.0, 1.0), 0.15).length_m > 0.0
+        assert np.linalg.norm(named - place) < 2.5
+    with pytest.raises(GridPathError, match="nowhere in this grid is room"):
+        find_path(grid(hall_with_wall()), at(2.0, 1.0), at(1.0, 1.0), 9.0)
+    write(tmp_path, hall_with_wall())
+    with pytest.raises(GridPathError):
+        main([str(tmp_path / "g.yaml"), "0.05,-1", "2,-1", "--plot", str(tmp_path / "why.png")])
+    drawn = cv2.imread(str(tmp_path / "why.png"))
+    assert drawn is not None and ((drawn[..., 1] > 120) & (drawn[..., 2] < 90)).any(), "the start in green"
+
+
 def test_no_way_for_a_wide_vehicle_and_none_through_the_unknown_unless_allowed() -> None:
     with pytest.raises(GridPathError, match=r"no path of radius 0\.4 m from 2,2 to 6,2"):
         find_path(grid(hall_with_wall()), at(2.0, 2.0), at(6.0, 2.0), 0.4)
@@ -137,9 +159,7 @@ def test_no_way_for_a_wide_vehicle_and_none_through_the_unknown_unless_allowed()
 
 
 def test_the_command_prints_metres_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    image = np.where(hall_with_wall() == FREE, 254, 0).astype(np.uint8)[::-1]
-    (tmp_path / "g.pgm").write_bytes(b"P5\n80 60\n255\n" + image.tobytes())
-    (tmp_path / "g.yaml").write_text("image: g.pgm\nresolution: 0.1\norigin: [-4.0, -3.0, 0.0]\n")
+    write(tmp_path, hall_with_wall())
     arguments = [str(tmp_path / "g.yaml"), "-2,-1", "2,-1", "--radius", "0.15"]
     assert main([*arguments, "--plot", str(tmp_path / "p.png")]) == 0
     said = capsys.readouterr().out

@@ -176,3 +176,20 @@ def test_the_motion_between_two_paths_is_found(tmp_path: Path) -> None:
     (tmp_path / "later.tum").write_text("900 0 0 0 0 0 0 1\n901 1 0 0 0 0 0 1\n902 1 0 0 0 0 0 1\n")
     with pytest.raises(TrajectoryError, match="true pose"):
         between_paths(str(tmp_path / "later.tum"), str(tmp_path / "true.tum"))
+
+
+def test_grids_in_two_frames_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = np.full((120, 160), 254, np.uint8)
+    image[[0, -1], :] = image[:, [0, -1]] = image[30:50, 90:110] = 0
+    (tmp_path / "g.pgm").write_bytes(b"P5\n160 120\n255\n" + image.tobytes())
+    for name, origin in (("here", "[0.0, 0.0, 0.0]"), ("there", "[1.0, 2.0, 0.7]")):
+        (tmp_path / f"{name}.yaml").write_text(f"image: g.pgm\nresolution: 0.05\norigin: {origin}\n")
+    here, there = (str(tmp_path / f"{name}.yaml") for name in ("here", "there"))
+    few = ["--draws", "2", "--nodes", "10"]
+    main([here, here, *few])
+    assert not capsys.readouterr().err
+    main([here, there, *few])
+    told = capsys.readouterr()
+    assert "to lie in two frames; --paths EST GT" in told.err and told.out.startswith("{")
+    main([here, there, *few, "--transform", "1", "2", "0.1"])
+    assert not capsys.readouterr().err, "the user knows"

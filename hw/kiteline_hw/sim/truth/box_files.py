@@ -10,6 +10,8 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.world.textures import TexturePool
 from kiteline_hw.sim.world.world import NO_GROUND, World
 
+_ROWS = "rows of 7 numbers: centre x y z, positive half-extents x y z, yaw"
+
 
 def read_boxes(path: Path) -> World:
     """The world of a CSV file: centre x y z, half-extents x y z in m and yaw in rad of each box; first the room itself.
@@ -20,9 +22,10 @@ def read_boxes(path: Path) -> World:
         lines = (line.split("#")[0].strip() for line in path.read_text().splitlines())
         rows = np.array([[float(v) for v in line.split(",")] for line in lines if line]).reshape(-1, 7)
     except (OSError, ValueError) as e:
-        raise SourceError(f"{path}: cannot be read as a list of boxes ({e})") from None
+        reason = e.strerror if isinstance(e, OSError) else e
+        raise SourceError(f"{path}: cannot be read as a list of boxes ({reason}): expected {_ROWS}") from None
     if not len(rows) or not np.isfinite(rows).all() or (rows[:, 3:6] <= 0.0).any():
-        raise SourceError(f"{path}: expected rows of 7 numbers: centre x y z, positive half-extents x y z, yaw")
+        raise SourceError(f"{path}: expected {_ROWS}")
     boxes = np.column_stack([rows[:, :6], np.cos(rows[:, 6]), np.sin(rows[:, 6])])
     floor_m = float(boxes[0, 2] - boxes[0, 5])
     far_m = float(2.5 * np.linalg.norm(boxes[0, 3:6]))
