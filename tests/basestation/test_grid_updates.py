@@ -200,8 +200,10 @@ def test_two_runs_are_equal_whatever_the_order_of_scans(make_flight: MakeFlight)
 def test_a_restored_map_has_the_same_grid(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=20, turns=0.8)
     first = Mapper()
-    published = feed(first, flight, with_scans(flight))
-    records = [r for group in with_scans(flight) for r in group]
+    groups = [*with_scans(flight), between(flight)]
+    published = feed(first, flight, groups)
+    records = [r for group in groups for r in group]
+    assert len(first.grid) == 3 * 20
     own = {messages.key(r): r for r in published}
     second = Mapper()
     camera = CameraIntrinsics(flight.agent, flight.camera)
