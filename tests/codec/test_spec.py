@@ -300,8 +300,10 @@ def read_code(kind: int, id_: int, data: bytes, part: int = 0) -> dict[str, Any]
         out["camera_height_m"] = float("nan") if z < 0 else (-(z + 1) // 2 if z % 2 else z // 2) / 256
         n, m = s.varint(), s.varint()
         rows, out["labels"] = scan(s.raw(len(data) - s.at), n, m)
-        out["obstacle_m"] = [r or float("inf") for r in ranges(rows["obstacle"])]
-        out["free_m"], out["clear_m"], out["bands"] = ranges(rows["free"]), ranges(rows["clear"]), rows["bands"]
+        step = 2 if part else 1
+        out["obstacle_m"] = [r or float("inf") for r in ranges([step * c for c in rows["obstacle"]])]
+        out["free_m"] = ranges([step * c for c in rows["free"]])
+        out["clear_m"], out["bands"] = ranges(rows["clear"]), rows["bands"]
         out["free_from_m"] = ranges([2 * c for c in rows["from"]])
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]

@@ -307,6 +307,12 @@ def test_a_scan_between_keyframes_keeps_its_place_in_a_level_frame() -> None:
         rotations = [T[:3, :3] @ level_rotation(s.up_c) for T, s in ((T_k_s, scan), (read.T_k_s, read.scan))]
         assert np.linalg.norm(se3.so3_log(rotations[0].T @ rotations[1])) < 3.4e-3
         assert np.abs(read.T_k_s[:3, 3] - T_k_s[:3, 3]).max() <= 0.5 / 256 + 1e-9
+        seen = scan.bands > 0
+        told, held = scan.obstacle_m[seen], read.scan.obstacle_m[seen]
+        assert np.all(np.abs(held - told) <= 3.1 * (told + 2.0) / 256)
+        known = scan.free_m > 0.05
+        assert np.all(read.scan.free_m[known] <= scan.free_m[known] + (scan.free_m[known] + 2.0) / 256)
+        assert np.all(read.scan.free_m >= read.scan.free_from_m) and not read.scan.clear_m.any()
 
 
 def test_only_scans_of_later_frames_have_a_pose() -> None:

@@ -26,7 +26,7 @@ _MAX_AZIMUTH = 4 * _AZIMUTH_STEPS
 _HEIGHT_STEPS = 256  # codes in 1 m
 _MAX_HEIGHT = 1 << 18  # 1024 m
 _COARSE = 2  # range codes in a step of where free ground begins, which is rounded up; 8 cost 2 % of a grid's recall
-_MOST_FROM = (quantise.RANGE_CODES - 1) // _COARSE
+_MOST_COARSE = (quantise.RANGE_CODES - 1) // _COARSE
 _LABELS = 3  # unknown, ground, obstacle
 _LEVEL_UP_C = np.array([0.0, -1.0, 0.0])  # against gravity in a level camera
 
@@ -39,7 +39,7 @@ class KeyframeScan(Record):
     labels: (m,) uint8 of the keyframe's first m keypoints: 0 unknown, 1 ground, 2 obstacle. part: 0 the keyframe's own
     image, 1 and more: of later frames. T_k_s: (4,4) of the camera of a later frame in that of the keyframe, as the
     agent tracked it; None in part 0. It is rounded in a level frame: as decoded, its scan has an up_c of (0, -1, 0).
-    Scans of later frames go without clear_m.
+    Scans of later frames go without clear_m, and with half as many range codes.
     """
 
     KIND = 11
@@ -91,9 +91,12 @@ class KeyframeScan(Record):
             scan.bands > 0, np.maximum(quantise.range_codes(np.where(scan.bands > 0, scan.obstacle_m, 0.0)), 1), 0
         )
         free_from, free, clear = (quantise.range_codes(r) for r in (scan.free_from_m, scan.free_m, scan.clear_m))
+        free_from = np.minimum(-(-free_from // _COARSE), _MOST_COARSE)
         if self.part:
-            clear = np.zeros_like(clear)
-        free_from = np.minimum(-(-free_from // _COARSE), _MOST_FROM)
+            clear, foot = np.zeros_like(clear), free == obstacle
+            obstacle = np.minimum((obstacle + 1) // _COARSE, _MOST_COARSE)
+            free = np.where(foot, obstacle, np.where(free > 0, np.maximum(free // _COARSE, 1), 0))
+            free_from = np.minimum(free_from, free)
         return np.stack([obstacle, free, free_from, clear, scan.bands.astype(np.int64)])
 
     @classmethod
@@ -109,18 +112,20 @@ class KeyframeScan(Record):
         data = source.raw(source.left)
         if len(data) > kernels.MAX_CODE:
             raise WireError("the columns of a scan are expected")
-        if (
-            kernels.code_scan(columns, labels, quantise.RANGE_CODES - 1, True, np.frombuffer(bytearray(data), np.uint8))
-            < 0
-        ):
+        most = _MOST_COARSE if key.part else quantise.RANGE_CODES - 1
+        if kernels.code_scan(columns, labels, most, True, np.frombuffer(bytearray(data), np.uint8)) < 0:
             raise WireError("a range is out of range")
         obstacle, free, free_from, clear, bands = columns
+        if key.part:
+            if clear.any() or (free_from > free).any():
+                raise WireError("later frames tell no line of sight, and free ground begins before it ends")
+            obstacle, free = obstacle * _COARSE, free * _COARSE
         free_from = free_from * _COARSE
         if free_from.max() >= quantise.RANGE_CODES:
             raise WireError("free ground begins too far away")
         if not np.array_equal(obstacle > 0, bands > 0):
             raise WireError("an obstacle reaches into at least one height band, and only an obstacle does")
-        if (key.part and clear.any()) or _packed(columns, labels) != data:
+        if _packed(columns, labels) != data:
             raise WireError("a scan in its shortest code is expected")
         scan = ColumnScan(
             up_c, first / _AZIMUTH_STEPS, step / _STEP_STEPS, quantise.ranges(free_from), quantise.ranges(free),
