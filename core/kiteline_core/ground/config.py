@@ -43,6 +43,7 @@ class GroundConfig:
     known_for_m: float = 8.0  # m of flight without a view of the ground after which its height is unknown
     ground_m: float = 0.06  # m above or below the curve that is still ground: half a door sill
     ground_sigmas: float = 2.5  # the same in standard deviations of the measured height
+    ground_most_m: float = 0.15  # m; farther above or below nothing is ground, however uncertain: it may be a low box
     columns: int = 64  # of a scan over the field of view: 1.3 degrees each, 0.1 m at 5 m; 80 to 110 bytes in all
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m above ground between which obstacles count: foot, table, head
     column_pixels: int = 5  # of an obstacle in a column, at least: fewer are chance

@@ -35,15 +35,15 @@ def mark_texture(image, least, reach, out):  # type: ignore[no-untyped-def]
 
 @njit
 def label_points(  # type: ignore[no-untyped-def]
-    x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, bands, slab_m, labels, grounds, obstacles,
-    sums, in_band, slab, slab_sums,
+    x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, most_m, bands, slab_m, labels, grounds,
+    obstacles, sums, in_band, slab, slab_sums,
 ):  # fmt: skip
     """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, and the slab.
 
     ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
-    bands: (b,) heights. sums: of disparities of obstacles. in_band: (n, bins, b-1). slab, slab_sums: within slab_m
-    of the camera's height. Labels and counts are zero before. Returns how many pixels lie on the ground that was seen,
-    and how many below it.
+    most_m: heights beyond are not ground, however uncertain. bands: (b,) heights. sums: of disparities of obstacles.
+    in_band: (n, bins, b-1). slab, slab_sums: within slab_m of the camera's height. Labels and counts are zero before.
+    Returns how many pixels lie on the ground that was seen, and how many below it.
     """
     bins = grounds.shape[1]
     last = len(bands) - 1
@@ -66,7 +66,7 @@ def label_points(  # type: ignore[no-untyped-def]
             limit = max(ground_m, sigmas * sigma)
             if abs(height) <= limit:
                 on += seen[j]
-                if seen[j] and textured[v, u]:
+                if seen[j] and textured[v, u] and abs(height) <= most_m:
                     labels[v, u] = GROUND
                     grounds[c, j] += 1
             elif height > 0.0:

@@ -295,8 +295,8 @@ class GroundSegmenter:
             counts.fill(0)
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
-            config.ground_sigmas, self._bands, config.slab_m, self.labels, grounds, obstacles, self._sums,
-            self._in_band, slab, self._slab_sums,
+            config.ground_sigmas, config.ground_most_m, self._bands, config.slab_m, self.labels, grounds, obstacles,
+            self._sums, self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
             self.saw_ground = False

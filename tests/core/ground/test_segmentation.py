@@ -184,6 +184,19 @@ def test_a_table_is_not_taken_for_the_ground_that_was_expected() -> None:
     assert np.isfinite(scan.obstacle_m).mean() > 0.9
 
 
+def test_a_low_platform_far_away_is_not_ground_however_uncertain_its_height() -> None:
+    def platform(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
+        top = (HEIGHT_M - 0.18) / np.maximum(-r[..., 2], 1e-6)
+        return np.where((top * r[..., 0] > 4.5) & (np.abs(top * r[..., 1]) < 0.7) & (r[..., 2] < 0.0), top, np.inf)
+
+    edge = wall(4.5, -HEIGHT_M, -HEIGHT_M + 0.18, 0.7, 0.7)
+    segmenter, disparity = view(up(), level_ground, platform, edge, noise_px=0.02)
+    scan = segmenter.segment(disparity, None, up(), expected=ExpectedGround(HEIGHT_M, 0.1))
+    there = np.abs(np.tan(scan.azimuths_rad)) < 0.1
+    assert (scan.free_m[there] > 4.0).mean() > 0.9
+    assert (scan.free_m[there] < 5.2).all()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_half_of_the_disparities_may_be_missing_or_wrong(seed: int) -> None:
     rng = np.random.default_rng(seed)
