@@ -118,6 +118,7 @@ class Agent:
         self._frame_number = 0
         self._last_t_ns: int | None = None  # of the last processed frame
         self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
+        self._placed_ns: int | None = None  # of the last frame with a pose
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         self._obstacle_event_ns = 0  # stamp of the last event about the nearest obstacle
@@ -174,6 +175,7 @@ class Agent:
         if track is None:
             # 4. Not tracked: dead reckoning, relocalisation, or a new submap.
             outcome = self._loss.handle(ctx, stuck=stuck)
+            self._forget_scans(ctx, outcome)
         else:
             # 5. Fuse the pose with IMU and odometer.
             self.work.fused = int(camera.motion.tracker is not None)
@@ -211,6 +213,7 @@ class Agent:
         if not self._was_lost:
             self._image_shift.remember(images.sampled, camera.pose.T_c_m)
         self._last_t_ns = frame.t_ns
+        self._placed_ns = frame.t_ns if outcome.tracked else self._placed_ns
         self._last_track = None if self._was_lost else track
         return self._report.report(ctx, outcome), outcome.events
 
@@ -287,6 +290,15 @@ class Agent:
         self._obstacle_event_ns = ctx.t_ns
         around = self._local_grid.around(T_o_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)
         return [] if around is None else [around.line]
+
+    def _forget_scans(self, ctx: FrameContext, outcome: FrameOutcome) -> None:
+        """Forget what scans saw around the vehicle once nothing has told its motion for too long."""
+        if outcome.bridged or self._placed_ns is None:
+            return
+        if ctx.t_ns - self._placed_ns > self._full_config.local_grid.lost_s * 1e9:
+            self._local_grid.forget()
+            if self._scans is not None:
+                self._scans.forget()
 
     def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
         """Set the effort that the governor chooses, and buffer the step's IMU samples.

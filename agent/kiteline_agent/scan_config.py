@@ -32,5 +32,7 @@ class LocalGridConfig:
     body_m: float = 0.25  # m above and below the vehicle where an obstacle stands in its way: a small drone
     doubt_px: float = 0.3  # px; deviation of disparities from which tiles of the base do not count: 6 cm at 3 m
     gap_m: float = 1.0  # m along a ray that may be unknown before an obstacle is told: a turn between two scans
+    level_rad: float = 0.03  # rad; error of the vertical from which scans are levelled again: 0.1 m of height at 3 m
+    lost_s: float = 0.3  # s without a pose after which scans are forgotten: 0.15 m at a change of speed by 3 m/s^2
     vehicle_m: float = 0.15  # m about its middle where the vehicle is itself
     tiles: int = 512  # of the base's grid that are kept, 2 MiB: the farthest go

@@ -330,6 +330,24 @@ def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None
     assert keep(CONFIG, replace(scan, camera_height_m=np.nan), BF) is None
 
 
+def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() -> None:
+    """Its range is as uncertain as that of one that is drawn."""
+    sigma_per_m2 = CONFIG.sigma_px / 20.0
+    limit_m = np.sqrt(CONFIG.max_sigma_m / sigma_per_m2)
+    for at_m in (1.02 * limit_m, 2.0 * limit_m):
+        wall = np.full(84, at_m)
+        scan = replace(
+            scan_of(ROOM, 3.0, -2.0, 0.0), free_from_m=np.full(84, 0.8), free_m=wall, obstacle_m=wall, clear_m=wall,
+            bands=np.full(84, 7, np.uint8),
+        )  # fmt: skip
+        found = keep(CONFIG, scan, 20.0)
+        assert found is not None
+        obstacle, _, _, free, clear = found.ranges()
+        assert np.isinf(obstacle).all()
+        until_m = min(limit_m, at_m - CONFIG.gap_sigmas * sigma_per_m2 * at_m**2)
+        assert free == pytest.approx(until_m, abs=0.01) and clear == pytest.approx(until_m, abs=0.01)
+
+
 def test_memory_goes_by_tiles_touched_and_a_far_outlier_costs_nothing() -> None:
     config = replace(CONFIG, resident_tiles=64)
     scan = kept(scan_of(np.array(box(-60.0, -60.0, 60.0, 60.0)), 0.0, 0.0, 0.0), config)

@@ -129,6 +129,11 @@ class ReferenceKeyframe:
         """True if the newest keyframe that is shared was made of this frame."""
         return self._shared.frame_number == frame_number
 
+    @property
+    def is_newest(self) -> bool:
+        """True if no older keyframe is the reference, after a relocalisation."""
+        return self.keyframe == self._shared.keyframe
+
     def return_to(self, keyframe: KeyframeId, inliers: int, frame_number: int) -> None:
         """Use an older keyframe after a relocalisation; `set_camera` follows."""
         self.keyframe, self._rounding = keyframe, np.eye(4)

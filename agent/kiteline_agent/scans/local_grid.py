@@ -42,6 +42,16 @@ class _Drawn:
     scan: ColumnScan
     offset_px: F64
 
+    @staticmethod
+    def of(p: F64, ahead: F64, scan: ColumnScan, offset_px: F64) -> _Drawn:
+        """That of a camera at p (3,) whose azimuth 0 lies towards ahead (3,)."""
+        return _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan, offset_px)
+
+    def turned(self, R: F64) -> _Drawn:
+        """The same in axes turned by R (3,3)."""
+        ahead = np.array([np.cos(self.heading), np.sin(self.heading), 0.0])
+        return _Drawn.of(R @ [self.x_m, self.y_m, self.z_m], R @ ahead, self.scan, self.offset_px)
+
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
@@ -114,18 +124,34 @@ class LocalGrid:
         self._take(error)
         T, scan = scanned.T_o_c, scanned.record.scan
         R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
-        if self._R_g_o is None:
-            self._R_g_o = R_l_o
-        p = self._R_g_o @ T[:3, 3]
-        ahead = self._R_g_o @ R_l_o.T[:, 0]
-        heading = float(np.arctan2(ahead[1], ahead[0]))
-        drawn = _Drawn(float(p[0]), float(p[1]), float(p[2]), heading, scan, scanned.offset_px)
+        if self._R_g_o is None or float(self._R_g_o[2] @ R_l_o[2]) < np.cos(self._config.level_rad):
+            self._level(R_l_o)
+        assert self._R_g_o is not None
+        drawn = _Drawn.of(self._R_g_o @ T[:3, 3], self._R_g_o @ R_l_o[0], scan, scanned.offset_px)
         self._scans.append(drawn)
         self._ground_m = None if scanned.height_m is None else drawn.z_m - scanned.height_m
         self._draw(self._canvas, drawn)
         if self._again is not None:
             self._again.append(drawn)
         self._move_on(drawn.x_m, drawn.y_m, drawn.z_m)
+
+    def forget(self) -> None:
+        """The camera has moved by an unknown way: what was seen before lies elsewhere in o."""
+        self._scans.clear()
+        self._clear()
+        self._R_g_o = self._ground_m = None
+
+    def _clear(self) -> None:
+        self._canvas.begin(np.zeros(2), 0.0)
+        self._canvas.fits, self._again = False, None
+
+    def _level(self, R_g_o: F64) -> None:
+        """Take a better vertical: a flight that begins in motion knows it late."""
+        if self._R_g_o is not None:
+            turn = R_g_o @ self._R_g_o.T
+            self._scans = deque((drawn.turned(turn) for drawn in self._scans), maxlen=self._scans.maxlen)
+            self._clear()
+        self._R_g_o = R_g_o
 
     def _take(self, error: RangeError) -> None:
         """Take over what is known of ranges."""
@@ -166,7 +192,8 @@ class LocalGrid:
         cell_m, tile_at = config.cell_m, np.zeros(3)
         if tiles and T_w_f is not None:
             height_m = None if self._ground_m is None else float(p[2]) - self._ground_m
-            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.body_m))
+            told = height_m is None or height_m <= bands_m[-1]  # of what is higher, tiles tell nothing
+            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.body_m) if told else 0)
             tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
             window = self._window
         out = np.empty(SECTORS)
@@ -233,6 +260,8 @@ class LocalGrid:
         for (c, r), tile in tiles.items():
             i, j = r - row + reach, c - column + reach
             if tile.cell_m != cell_m or not (0 <= i < 2 * reach and 0 <= j < 2 * reach):
+                continue
+            if not mask:
                 continue
             solid = (tile.cells > FREE) & ((tile.cells & mask) > 0)
             values = np.where(solid, kernels.OCCUPIED, np.where(tile.cells == FREE, kernels.FREE, 0))

@@ -6,7 +6,6 @@ scan to scan; those that saw another are held back or withdrawn.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +18,10 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.scan_config import ScanConfig
 from kiteline_agent.scans.range_error import RangeError
+from kiteline_agent.scans.scan_queue import ScanQueue
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Key, KeyframeScan
+from kiteline_codec.schema import KeyframeScan
 from kiteline_core.geometry import se3
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
@@ -33,8 +33,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _MOST_PARTS = 2  # of a scan in one frame, after a gap too
-_UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
-_WAITING = 256  # scans kept while the link has no room, 1 MB
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +85,9 @@ class ScanStage:
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan
         self._ground: GroundHeight[KeyframeScan] = GroundHeight(ground)
-        self._part = 0  # of the keyframe's newest scan
-        self._under_way: list[Key] = []
-        self._waiting: deque[KeyframeScan] = deque(maxlen=_WAITING)
+        self._keyframe = NO_KEYFRAME  # the newest one, whose scans are numbered
+        self._part = 0  # of its newest scan
+        self._queue = ScanQueue(channel)
 
     def range_error(self, cov_px: F64 | None) -> RangeError:
         """What is known of errors of ranges. cov_px: (5,5) of the disparity offset; None of a camera without one."""
@@ -101,14 +99,15 @@ class ScanStage:
 
     def step(self, ctx: FrameContext) -> Scanned | None:
         """Go on with the scan in work, or begin one if this frame became a keyframe that shows something new."""
-        self._share_waiting()
+        self._queue.share()
         if not ctx.config.scan.on:
             return None
-        of_keyframe = self._camera.reference.is_of(ctx.number)
-        if of_keyframe:
-            self._part = 0
+        reference = self._camera.reference
+        of_keyframe = reference.is_of(ctx.number)
+        if reference.is_newest and reference.keyframe != self._keyframe:
+            self._keyframe, self._part = reference.keyframe, 0
         if self._begun is None:
-            if self._part < KeyframeScan.PARTS and self._shows_more():
+            if self._shows_more():
                 self._begin(ctx, of_keyframe)
             return None
         if of_keyframe or not self._governor.may_scan():
@@ -122,6 +121,11 @@ class ScanStage:
             self._begun = None
             return self._finish(begun, begun.disparity)
         return None
+
+    def forget(self) -> None:
+        """The camera has moved by an unknown way: the ground lies elsewhere than where it was seen, in o."""
+        self._begun = self._last_T_o_c = None
+        self._ground = GroundHeight(self._segmenter.config)
 
     def _match_stripe(self, begun: _Begun) -> bool:
         """Match the next stripe; True if there was none left, and the disparity is whole."""
@@ -148,7 +152,9 @@ class ScanStage:
     def _begin(self, ctx: FrameContext, of_keyframe: bool) -> None:
         """Take what a scan of this frame needs."""
         images, disparity, reference = ctx.images, None, self._camera.reference
-        if not of_keyframe and (reference.keyframe == NO_KEYFRAME or self._part == KeyframeScan.PARTS - 1):
+        # An older keyframe, to which a relocalisation led, has scans under the next numbers already.
+        hangs = reference.keyframe != NO_KEYFRAME and reference.keyframe == self._keyframe
+        if not of_keyframe and (not hangs or self._part == KeyframeScan.PARTS - 1):
             return
         if images.depth_m is not None:
             disparity = self._segmenter.camera.disparity_of_depth(images.depth_m)
@@ -186,18 +192,6 @@ class ScanStage:
         """Share scans that are believed, and take back those that are not any more."""
         for wrong in verdict.withdrawn:
             blank = without_ground(wrong.scan)
-            self._waiting.append(KeyframeScan(wrong.keyframe, blank, wrong.labels[:0], wrong.part, wrong.T_k_s))
-        self._waiting.extend(verdict.believed)
-        self._share_waiting()
-
-    def _share_waiting(self) -> None:
-        """Share scans, newest first, while those before arrive: they never fill a link that is short of bytes."""
-        if not self._waiting:
-            return
-        self._under_way = [key for key in self._under_way if not self._channel.arrived(key)]
-        while self._waiting and len(self._under_way) < _UNDER_WAY:
-            record = self._waiting.pop()
-            others = [r for r in self._waiting if r.key() != record.key()]  # an older one was taken back
-            self._waiting = deque(others, maxlen=_WAITING)
-            self._channel.put(record)
-            self._under_way.append(record.key())
+            self._queue.put(KeyframeScan(wrong.keyframe, blank, wrong.labels[:0], wrong.part, wrong.T_k_s))
+        for record in verdict.believed:
+            self._queue.put(record)

@@ -125,9 +125,13 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1
         free_limit_m = 0.0
     solid = (scan.bands > 0) & (scan.obstacle_m <= limit_m)
     stop = np.where(scan.bands > 0, scan.obstacle_m, np.inf)  # nothing is known behind an obstacle, however far it is
-    free = np.minimum(scan.free_m, free_limit_m)
+    # Before an obstacle that is too far to be drawn, nothing is free within some deviations of its range, either.
+    far_m = np.where((scan.bands > 0) & ~solid & np.isfinite(scan.obstacle_m), scan.obstacle_m, np.nan)
+    before = np.fmin(far_m - np.maximum(config.gap_sigmas * sigma_per_m2 * far_m**2, config.cell_m), np.inf)
+    free = np.minimum(np.minimum(scan.free_m, free_limit_m), before)
+    free = np.where(free > scan.free_from_m, free, 0.0)
     free_from = np.where(free > 0.0, scan.free_from_m, 0.0)
-    clear = np.minimum(np.minimum(scan.clear_m, limit_m), stop)
+    clear = np.maximum(np.minimum(np.minimum(scan.clear_m, limit_m), np.minimum(stop, before)), 0.0)
     rows = np.stack([
         np.where(solid, scan.obstacle_m, 0.0) * _RANGE_STEPS,
         np.where(solid, scan.bands, 0),

@@ -170,6 +170,39 @@ def test_own_scans_that_disagree_are_not_decided_by_the_base() -> None:
     assert found is not None and found.distance_m[0] > 2.5
 
 
+def test_tiles_tell_nothing_of_what_lies_above_their_bands() -> None:
+    grid, T = LocalGrid(LocalGridConfig()), vehicle(0.0, 0.0, 0.0, z=3.0)
+    grid.add(scan_at(0.0, 0.0, 0.0, z=3.0), EXACT)
+    free = {(c, r): GridTile(c, r, 0, CELL_M, np.zeros((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
+    found = grid.around(TURN @ T, T, free, BANDS_M)
+    assert found is not None
+    assert np.isnan(found.distance_m[SECTORS // 2]) and np.isfinite(found.distance_m[0])
+
+
+def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
+    """A flight that begins in motion: tilted axes would let a level flight climb out of what it saw."""
+    grid, tilt = LocalGrid(LocalGridConfig()), se3.so3_exp(np.array([0.15, 0.0, 0.1]))
+    for k in range(40):
+        scanned = scan_at(-1.5 + 0.1 * k, 0.0, 0.0)
+        if k < 3:
+            wrong = replace(scanned.record.scan, up_c=tilt @ scanned.record.scan.up_c)
+            scanned = replace(scanned, record=replace(scanned.record, scan=wrong))
+        grid.add(scanned, EXACT)
+    heights = [drawn.z_m for drawn in grid._scans]
+    assert np.ptp(heights) < 0.01
+    level = LocalGrid(LocalGridConfig())
+    for k in range(40):
+        level.add(scan_at(-1.5 + 0.1 * k, 0.0, 0.0), EXACT)
+    T = TURN @ vehicle(2.4, 0.0, 0.0)
+    for _ in range(10):
+        grid.follow(scan_at(2.4, 0.0, 0.0).T_o_c)
+    found, expected = (g.around(T, None, {}, BANDS_M) for g in (grid, level))
+    assert found is not None and expected is not None
+    assert np.isnan(found.distance_m).mean() < np.isnan(expected.distance_m).mean() + 0.05
+    both = np.isfinite(found.distance_m) & np.isfinite(expected.distance_m)
+    assert np.abs(found.distance_m - expected.distance_m)[both].max() < 0.15
+
+
 def test_what_was_clear_at_another_height_is_not_free_here() -> None:
     """A drone that descends saw over what stands before it."""
     grid, config = LocalGrid(LocalGridConfig()), LocalGridConfig()

@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.scans import scan_queue
 from kiteline_agent.step import Identity, StepInput
 from kiteline_codec.schema import Key, KeyframeHeader, KeyframeScan, Record, messages
 from kiteline_core.frame import Frame
@@ -115,7 +117,6 @@ def test_scans_above_a_table_are_taken_back_once_the_floor_is_seen(recording: Pa
     assert stage is not None
     table = replace(channel.scans[0], keyframe=KeyframeId(10))
     channel.scans.clear()
-    stage._waiting.append(table)
     stage._take(Verdict([], [table]))
     (sent,) = channel.scans
     assert sent.keyframe == table.keyframe
@@ -133,3 +134,54 @@ def test_frames_between_keyframes_are_scanned_and_hang_on_the_one_before(recordi
         messages.encode(record)
     _, still, _, _ = flown(recording, AgentConfig())
     assert len(still.scans) < len(channel.scans)
+
+
+def test_an_outage_keeps_the_newest_scans_as_codes(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, free, _, _ = flown(recording, eager())
+    monkeypatch.setattr(scan_queue, "_UNDER_WAY", 1)
+    monkeypatch.setattr(scan_queue, "_WAITING", 2)
+    agent, channel, _, _ = flown(recording, eager(), busy=True)
+    stage = agent._scans
+    assert stage is not None and len(free.scans) > 3
+    assert [scan.key() for scan in channel.scans] == [free.scans[0].key()]
+    assert list(stage._queue._waiting)[-1] == free.scans[-1].key() and len(stage._queue) == 2
+    assert all(isinstance(code, bytes) for code in stage._queue._waiting.values())
+
+
+def test_an_older_keyframe_gets_no_second_scan_under_a_number(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a relocalisation frames hang on it, and its own scans would be replaced."""
+    source, channel, config = open_source(str(recording)), Heard(), eager()
+    agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), channel)
+    assert agent._scans is not None
+    agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
+    reference, returned = agent._camera.reference, False
+    for number, frame in enumerate((item for item in source if isinstance(item, Frame)), 1):
+        agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns)
+        if not returned and len(channel.keyframes) > 5:
+            first = channel.scans[0].keyframe
+            assert first < max(channel.keyframes) and agent.map.slot_of(first) >= 0
+            reference.return_to(first, 100, number)
+            monkeypatch.setattr(agent._keyframes, "add_if_needed", lambda ctx, track: [])
+            returned = True
+    assert returned and len(channel.scans) > 1
+    keys = [scan.key() for scan in channel.scans]
+    assert len(set(keys)) == len(keys)
+
+
+def test_what_was_seen_before_a_long_loss_is_forgotten(recording: Path) -> None:
+    """Nothing told how the vehicle moved: free space and ground lie elsewhere than in the odometry frame."""
+    source = open_source(str(recording))
+    frames = [item for item in source if isinstance(item, Frame)]
+    for dark_s, forgotten in ((0.1, False), (0.6, True)):
+        agent = Agent(source.rig, None, eager(), Identity(AgentId(0), 0), Heard())
+        assert agent._scans is not None
+        agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
+        for frame in frames:
+            agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns)
+        assert agent._local_grid._scans and agent._scans._ground._foot is not None
+        step_ns, t_ns, black = frames[1].t_ns - frames[0].t_ns, frames[-1].t_ns, np.zeros_like(frames[0].left)
+        for k in range(1, round(dark_s * 1e9 / step_ns) + 1):
+            agent.step(StepInput(Frame(t_ns + k * step_ns, black, black), cpu_ns=3_000_000), t_ns + k * step_ns)
+        assert (not agent._local_grid._scans) == forgotten
+        assert (agent._scans._ground._foot is None) == forgotten
+        assert bool(agent._local_grid._canvas.marks.any()) != forgotten
