@@ -199,6 +199,26 @@ def test_removed_landmarks_are_searched_until_corrections_matter(
     assert np.flatnonzero(~held.usable[0, :30]).tolist() == [3, 4]
 
 
+@pytest.mark.parametrize("holds", [False, True])
+def test_a_removed_landmark_stays_so_though_the_base_refines_it(holds: bool) -> None:
+    """Others still observe it at the base, and the agent has never tracked it."""
+    held = local_map()
+    held.holds_landmarks = holds
+    held.share(KeyframeId(0), 30)
+    held.usable[0, :5], held.seed[0, :5] = False, True
+    refined(held, 0, 0.2)
+    held.remove(RemovedObservations(KeyframeId(0), np.array([3], np.uint16)))
+    for share in (2.0, 4.0):
+        told(held, 1, share * LEAST_M)
+        assert held.apply_corrections()
+        assert np.flatnonzero(~held.usable[0, :30]).tolist() == [3]
+        refined(held, 0, 0.2)
+    held.drop_submap(SubmapId(0))
+    add(held, 5)
+    assert held.usable[held.slot_of(5), :30].all()
+    assert not held.removed[held.slot_of(5)].any()
+
+
 def test_refined_landmarks_of_evicted_keyframes_are_forgotten() -> None:
     held = local_map(keyframes=8)
     held.share(KeyframeId(0), 30)

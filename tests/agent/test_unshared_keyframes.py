@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +59,31 @@ def test_a_thin_link_does_not_thin_out_the_local_map(room: Recording) -> None:
     assert len(wide[1].headers()) == in_map[0]
     assert len(thin[1].headers()) < 0.7 * in_map[1]
     assert thin[0].run.lost == 0
+
+
+def test_a_frame_that_the_map_cache_finds_hangs_on_a_keyframe_that_the_base_knows(
+    room: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, link = fly(room, GAP_NS)
+    flown: Any = agent.box
+    shared, stored = [header.keyframe for header in link.headers()], flown.map.keyframe
+    assert stored.max() > max(shared)  # one that is not shared has the highest id
+    matches = SimpleNamespace(T_c_m=np.eye(4), corner=np.arange(30), depth_m=np.ones(30))
+    looked: list[set[int]] = []
+
+    def find(seen: object, submaps: set[int], number: int) -> tuple[int, SimpleNamespace]:
+        looked.append(submaps)
+        return int(flown.map.active), matches
+
+    relocaliser: Any = flown._relocaliser
+    monkeypatch.setattr(relocaliser, "_is_consistent", lambda *_: True)
+    monkeypatch.setattr(relocaliser._cache, "find", find)
+    found = relocaliser._search_cache(SimpleNamespace(number=FRAMES), None, None)
+    assert found.keyframe == max(shared)
+    stored[np.isin(stored, shared)] = NO_KEYFRAME
+    monkeypatch.setattr(relocaliser._cache, "find", lambda seen, submaps, number: looked.append(submaps))
+    assert relocaliser._search_cache(SimpleNamespace(number=FRAMES), None, None) is None
+    assert looked == [{int(flown.map.active)}, set()]  # nothing is left that the base knows
 
 
 @pytest.mark.parametrize(("profile", "bytes_s"), [("wifi", 0), ("radio", 1000)])

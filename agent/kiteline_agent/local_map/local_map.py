@@ -18,11 +18,7 @@ from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_agent.local_map.held_corrections import HeldCorrections, Removed
-from kiteline_codec.schema import (
-    KeyframeHeader,
-    KeyframePose,
-    RefinedLandmarks,
-)
+from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId
@@ -73,6 +69,7 @@ class LocalMap:
         self.shared = np.zeros(k, np.int64)  # number of landmarks in each slot that the base knows: the first ones
         self.usable = np.zeros((k, b), np.bool_)
         self.seed = np.zeros((k, b), np.bool_)  # a landmark that still has no depth
+        self.removed = np.zeros((k, b), np.bool_)  # the base removed the landmark
         self.measured = np.zeros((k, b), np.bool_)  # the depth is that of stereo, not of the base or of motion
         self.disparity_offset = disparity_offset.none()  # of the stereo disparities, as base or agent estimate it
         self.disparity = np.zeros((k, b))  # px, in the keyframe itself, with the offset; 0: not measured
@@ -141,7 +138,7 @@ class LocalMap:
         self.last_seen[slot] = frame_number
         self.counts[slot] = n
         self.order[slot, :n] = np.arange(n) if order is None else order[order < n]
-        self.usable[slot] = False
+        self.usable[slot] = self.removed[slot] = False
         self.usable[slot, :n] = rho[:n] > 0.0
         self.uv[slot, :n] = uv[:n]
         self.bearing[slot, :n] = self._bearings(uv[:n])
@@ -326,9 +323,9 @@ class LocalMap:
         slot = self.slot_of(record.keyframe)
         if slot < 0:
             return False
-        index = record.index.astype(np.int64)
-        self.usable[slot, index[index < self.shared[slot]]] = False
-        self.seed[slot, index[index < self.shared[slot]]] = False
+        index = record.index[record.index < self.shared[slot]].astype(np.int64)
+        self.usable[slot, index] = self.seed[slot, index] = False
+        self.removed[slot, index] = True
         return True
 
     def refine(self, record: RefinedLandmarks) -> bool:
@@ -355,9 +352,12 @@ class LocalMap:
         return False
 
     def _is_fresh(self, slot: int, index: I64) -> NDArray[np.bool_]:
-        """Which landmarks of a slot have no depth of their own: only the base could triangulate them."""
+        """Which landmarks of a slot have no depth of their own: only the base could triangulate them.
+
+        The base refines landmarks that others observe even where it has removed the one of this keyframe.
+        """
         never = ~self.usable[slot, index] & (self.tried[slot * self.slot_size + index] == 0)
-        return np.asarray(never | self.seed[slot, index])
+        return np.asarray((never | self.seed[slot, index]) & ~self.removed[slot, index])
 
     def _add_fresh(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
         """Track those of a slot's landmarks from now on that only the base could triangulate."""

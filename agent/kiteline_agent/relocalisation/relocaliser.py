@@ -212,8 +212,11 @@ class Relocaliser:
         return False
 
     def _search_cache(self, ctx: FrameContext, seen: FrameFeatures, exclude: SubmapId | None) -> Relocalisation | None:
-        """Try cached keyframes in every submap of which a keyframe is remembered; the newest becomes the reference."""
-        known = self._map.keyframe[self._map.keyframe != NO_KEYFRAME].tolist()
+        """Try cached keyframes in every submap of which a keyframe is remembered that the base knows, too.
+
+        The newest one becomes the reference.
+        """
+        known = self._map.keyframe[(self._map.keyframe != NO_KEYFRAME) & (self._map.shared > 0)].tolist()
         submaps = {int(submap_of_keyframe(KeyframeId(k))) for k in known} - {exclude}
         found = self._cache.find(seen, submaps, ctx.number)
         if found is None or not self._is_consistent(ctx, found[1].T_c_m, SubmapId(found[0])):

@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> None:
         share_out(by_module(lines), processes(len(os.sched_getaffinity(0)), ComputerReader().read()))
         for module in modules:
             module.warm()
-    kernel_cache.mark()
+        kernel_cache.mark()
 
 
 def processes(cores: int, computer: Computer) -> int:
@@ -126,8 +126,10 @@ def _in_turn(modules: list[ModuleType]) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         for line in listed(modules[0])[:1]:
             folder = kernel_cache.folder_of(import_module(line.split(":")[0]))
+            if folder is None:
+                continue  # nothing is kept
             with contextlib.suppress(OSError):
-                lock = stack.enter_context((folder or Path()).joinpath("kiteline-compiling").open("wb"))
+                lock = stack.enter_context(folder.joinpath("kiteline-compiling").open("wb"))
                 fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 

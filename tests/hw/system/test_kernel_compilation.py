@@ -77,6 +77,40 @@ def _is_running(pid: int) -> bool:
         return False
 
 
+WARM = """
+import os, time
+from pathlib import Path
+import tiny_kernels
+
+def warm():
+    with Path(os.environ["WARMED"]).open("a") as log:
+        for word in ("begin", "end"):
+            log.write(f"{word}\\n")
+            log.flush()
+            time.sleep(0.3)
+"""
+
+
+@pytest.mark.parametrize("cached", [True, False])
+def test_processes_compile_one_after_the_other_where_kernels_are_kept(tmp_path: Path, cached: bool) -> None:
+    (tmp_path / "tiny_kernels.py").write_text(
+        f"import numba\n\n@numba.njit(cache={cached})\ndef same(x):\n    return x\n"
+    )
+    (tmp_path / "tiny_warm.py").write_text(WARM)
+    (tmp_path / "kernels.txt").write_text("tiny_kernels:same (int64,)\n")
+    log, place = tmp_path / "log", tmp_path / "place"
+    place.mkdir()
+    environment = {
+        **os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]), "WARMED": str(log),
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+    }  # fmt: skip
+    command = [sys.executable, "-m", "kiteline_hw.system.kernel_compilation", "tiny_warm"]
+    both = [subprocess.Popen(command, env=environment, cwd=place) for _ in range(2 if cached else 1)]
+    assert [one.wait(60) for one in both] == [0] * len(both)
+    assert log.read_text().split() == ["begin", "end"] * len(both)
+    assert not list(place.iterdir())
+
+
 @pytest.mark.parametrize(
     ("cores", "free_mib", "expected"),
     [(1, 8000, 1), (2, 8000, 2), (8, 8000, 3), (4, 350, 1), (4, 700, 2), (4, 1500, 3)],
