@@ -282,3 +282,19 @@ def test_rotations_stay_orthonormal_along_a_long_chain_of_keyframes() -> None:
         reference.set_new(keyframe, SubmapId(0), newest @ T_p_k, newest @ T_p_k, k, k)
     R = held.T_m_k[held.slot_of(79)][:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_the_reference_is_where_the_base_holds_it_after_a_relocalisation_too() -> None:
+    held = local_map(keyframes=0)
+    reference, rounded = ReferenceKeyframe(held), se3.exp(np.array([1e-3, 0.0, 0.0, 0.0, 1e-3, 0.0]))
+    for k in range(2):
+        add(held, k)
+        reference.set_new(KeyframeId(k), SubmapId(0), np.eye(4), rounded, k, k)
+    for k in (1, 1):
+        reference.return_to(KeyframeId(k), 50, 2)
+        assert reference.T_m_k is not None
+        np.testing.assert_allclose(reference.T_m_k, rounded, atol=1e-15)
+    T_w_k = se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.1]))
+    held.set_pose(KeyframePose(KeyframeId(1), T_w_k))
+    assert held.apply_corrections()
+    np.testing.assert_array_equal(reference.T_m_k, T_w_k)  # what the base says is not rounded again

@@ -135,8 +135,9 @@ class ReferenceKeyframe:
         return self.keyframe == self._shared.keyframe
 
     def return_to(self, keyframe: KeyframeId, inliers: int, frame_number: int) -> None:
-        """Use an older keyframe after a relocalisation; `set_camera` follows."""
-        self.keyframe, self._rounding = keyframe, np.eye(4)
+        """Use a keyframe after a relocalisation, mostly the same; `set_camera` follows."""
+        if keyframe != self.keyframe:
+            self.keyframe, self._rounding = keyframe, np.eye(4)
         self._newest = replace(self._shared, inliers=inliers)
         self._shared.inliers = inliers
         self._map.last_seen[self._map.slot_of(keyframe)] = frame_number
