@@ -24,12 +24,16 @@ _FRAMES = 64  # most frames that are kept
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Raw samples between two frames, and the poses (4,4) by images at both. rates: (2,3) rad/s, raw, at both."""
+    """Raw samples between two frames, and the poses (4,4) by images at both. rates: (2,3) rad/s, raw, at both.
+
+    frames: all of the window, with these two: IMU time and pose (4,4).
+    """
 
     samples: Samples
     T_m_b0: F64
     T_m_b1: F64
     rates: F64
+    frames: tuple[tuple[int, F64], ...]
 
 
 class PoseChain:
@@ -66,9 +70,15 @@ class PoseChain:
         if last is None or self._poses[last][0] + shift + _RATE_NS > newest:
             return False
         end_ns, end = self._poses[last]
+        frames = tuple((t + shift, T) for t, T in self._poses[: last + 1])
         self._poses = self._poses[last:]
         samples = buffer.between(begin_ns + shift, end_ns + shift)
         rates = [buffer.mean(t + shift - _RATE_NS, t + shift + _RATE_NS) for t in (begin_ns, end_ns)]
         if samples is None or samples.duration_s > _LONGEST * self._window_s or min(n for _, _, n in rates) == 0:
             return True
-        return Link(samples, begin, end, np.array([mean[:3] for mean, _, _ in rates]))
+        return Link(samples, begin, end, np.array([mean[:3] for mean, _, _ in rates]), frames)
+
+
+def rate_at(buffer: SampleBuffer, t_ns: int) -> F64:
+    """Raw rate (3,) rad/s at an instant."""
+    return np.asarray(buffer.mean(t_ns - _RATE_NS, t_ns + _RATE_NS)[0][:3])

@@ -16,6 +16,7 @@ from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibrati
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
 from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
+from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
@@ -23,6 +24,8 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
+
+_KEPT = 0.25  # share of a window's added variance that the next has at least: the map that was dragged is still seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,9 @@ class SelfCalibration:
         self._earlier = KnownImuConfig()  # what earlier flights found
         self._turns = PoseChain(config.turn_window_s)
         self._moves = PoseChain(config.move_window_s)
-        self._before: tuple[Window, Link, float] | None = None  # the last window of moves, its density
+        self._before: tuple[Window, Link, float, float] | None = None  # last window of moves: density, `_unsteady`
+        self._added = 0.0  # rad^2, of the rotation by images in the last window of turns, beside turn_sigma_rad
+        self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
@@ -172,11 +177,16 @@ class SelfCalibration:
         """
         turn = self._turns.take(buffer, self.gyro.offset_s)
         if isinstance(turn, Link):
-            offset_s = self.gyro.offset_s
+            offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
+            added = added_variance(
+                turn, buffer, self.gyro.matrix, self.gyro.bias, self._config.turn_sigma_rad, density
+            )  # fmt: skip
+            self._added = added = max(added, _KEPT * self._added)
+            self._unsteady = max(self._unsteady, 1.0 + added / self._config.turn_sigma_rad**2)
             for gyro in (self.gyro, self._unprimed_gyro):
                 if gyro is not None:
                     window = self._integrate(turn, gyro)
-                    variance = self._config.turn_sigma_rad**2 + self._density(turn)[0] ** 2 * window.duration_s
+                    variance = self._config.turn_sigma_rad**2 + added + density**2 * window.duration_s
                     gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance, offset_s)
             self._drop_refuted_prior()
             self._test_gyro()
@@ -243,13 +253,15 @@ class SelfCalibration:
     def _add_move(self, link: Link) -> None:
         window, density = self._integrate(link, self.gyro), float(self._density(link)[1])
         if self._before is not None:
-            first, before, density_before = self._before
+            first, before, density_before, unsteady = self._before
+            unsteady = max(unsteady, self._unsteady)
             t0, t1 = first.duration_s, window.duration_s
             images = self._config.position_sigma_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
             imu = (t0 * density_before**2 + t1 * density**2) / 3.0
             tilt = (self._gravity_m_s2 * self._config.turn_sigma_rad) ** 2 * 0.5 * (t0**2 + t1**2)
-            self.accel.add((first, window), (before.T_m_b0, link.T_m_b0, link.T_m_b1), self._p_b_c, images + imu + tilt)
-        self._before = (window, link, density)
+            variance = images + imu + tilt + (unsteady - 1.0) * (images + tilt)
+            self.accel.add((first, window), (before.T_m_b0, link.T_m_b0, link.T_m_b1), self._p_b_c, variance)
+        self._before, self._unsteady = (window, link, density, self._unsteady), 1.0
 
     def _integrate(self, link: Link, gyro: GyroCalibration) -> Window:
         matrix, bias = gyro.matrix, gyro.bias
