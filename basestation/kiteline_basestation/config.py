@@ -42,7 +42,6 @@ class BundleWindowConfig:
 
     max_free: int = 10  # keyframes whose poses are free: more cost time and change little
     max_fixed: int = 15  # keyframes held fixed: those that observe most of the same landmarks
-    few_ties: int = 30  # landmarks of a keyframe that fixed ones see, too: below, its parent is held, as odometry says
     min_shared: int = 12  # landmarks that two covisible keyframes share
     min_landmarks: int = 20  # landmarks of a bundle: fewer do not constrain the poses
 

@@ -91,6 +91,15 @@ def test_keyframes_that_see_nothing_of_those_before_them_are_held_by_their_paren
     assert np.linalg.norm(result.T_c_m[1:, :3, 3] - linked.T_c_m[1:, :3, 3], axis=1).max() < 0.004
 
 
+def test_a_culled_parent_holds_nothing() -> None:
+    sparse_map, _ = flight(noise_px=0.1, births=40)
+    culled, *free = [keyframe_id(SUBMAP, k) for k in range(2, KEYFRAMES)]
+    sparse_map.cull_keyframe(culled)
+    part = bundle_window(sparse_map, free, BaseConfig().bundle_window, BaseConfig().measurement)
+    assert part is not None
+    assert sparse_map.rows[culled] not in part.rows.tolist()
+
+
 def turn_error(poses: np.ndarray, truth: list[np.ndarray]) -> float:
     return float(max(np.linalg.norm(se3.so3_log(a[:3, :3] @ b[:3, :3])) for a, b in zip(poses, truth, strict=True)))
 

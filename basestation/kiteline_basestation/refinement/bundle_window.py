@@ -73,12 +73,10 @@ def bundle_window(
     others = np.flatnonzero(counts > 0)
     order = np.lexsort((-keyframes.id[others], -counts[others]))
     others = others[order[: config.max_fixed]].astype(np.int32)
-    # Where few landmarks tie a keyframe to what is held, odometry ties it to its parent: else these carry it away.
-    is_tied = np.bincount(which[np.isin(table.row[slots], others)], minlength=len(points)) > 0
-    ties = np.bincount(table.row[slots][is_tied[which]], minlength=len(sparse_map))[free_rows]
-    scarce = free_rows[ties < config.few_ties]
-    parents = np.array([sparse_map.rows.get(KeyframeId(int(p)), -1) for p in keyframes.parent[scarce]], np.int32)
-    parents = parents[(parents >= 0) & mask[parents]]
+    # Odometry ties keyframes to their parents: without these, few observations elsewhere would carry all of them away.
+    parents = np.array([sparse_map.rows.get(KeyframeId(int(p)), -1) for p in keyframes.parent[free_rows]], np.int32)
+    # Culled ones do not: what has no observations moves with the map, and must not hold it.
+    parents = parents[(parents >= 0) & mask[parents] & (keyframes.culled[parents] == 0)]
     rows = np.unique(np.concatenate([free_rows, others, parents]))
     rows = rows[np.argsort(keyframes.id[rows])]
     number = np.full(len(sparse_map), -1, np.int32)

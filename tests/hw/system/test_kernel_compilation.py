@@ -20,6 +20,7 @@ import os, signal, sys, time
 from pathlib import Path
 from kiteline_hw.system import kernel_compilation
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a shell ignores it
 first = os.getpid()
 
 def noted(line):
