@@ -245,7 +245,9 @@ class Agent:
             ctx, track.T_c_m, submap, relocalised=False
         ):
             return None
-        return track
+        if self._was_lost or not self._camera.motion.running:
+            return track
+        return self._tracker.nearer(ctx, track)
 
     def _retry_with_image_shift(self, ctx: FrameContext, track: Track) -> Track:
         """The better of a track and another one that starts from the rotation that the image-shift estimate gives."""

@@ -119,6 +119,8 @@ class PoseConfig:
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom
     min_inliers: int = 15  # with fewer a pose is not trusted
     min_share: float = 0.3  # inliers of the landmarks searched for; good tracks have half, wrong ones a tenth
+    dragged_px: float = 2.0  # px from a prediction by the IMU above which landmarks near it are tried; usually 1
+    near_px: float = 4.0  # px; these: the errors of alignment, and of a prediction where the pose was dragged before
 
 
 @dataclass(frozen=True, slots=True)

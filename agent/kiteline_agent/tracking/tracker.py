@@ -14,6 +14,7 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages, depth_at
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
+from kiteline_core.order_statistics import median
 from kiteline_core.pose import pose_kernels
 
 F64 = NDArray[np.float64]
@@ -45,6 +46,30 @@ class Tracker:
         chosen = self._choose(fine, ctx.number, align.points, 2, align.cell_px)
         return self._measure(ctx, fine, chosen, T_c_m, coarse_only=False)
 
+    def nearer(self, ctx: FrameContext, track: Track) -> Track:
+        """The track, or one of landmarks that agree with a prediction by an IMU, if it is far from that prediction.
+
+        Where people walk through the view, landmarks on them may outvote those of the room for a frame. The IMU tells
+        which of the two stand still: it is right to a fraction of a pixel since the last frame.
+        """
+        pose = ctx.config.pose
+        off_px = self._off_px(track, ctx.T_m_c)
+        if off_px < pose.dragged_px:
+            return track
+        T_c_m = se3.inverse(ctx.T_m_c)
+        fine = self._map.candidates(T_c_m, _MARGIN_PX, ctx.config.align.max_scale)
+        chosen = self._choose(fine, ctx.number, ctx.config.align.points, 2, ctx.config.align.cell_px)
+        other = self._measure(ctx, fine, chosen, T_c_m, coarse_only=False, near_px=pose.near_px)
+        enough = other.inliers >= max(2 * pose.min_inliers, track.inliers // 2)
+        return other if enough and self._off_px(other, ctx.T_m_c) < 0.5 * off_px else track
+
+    def _off_px(self, track: Track, predicted_T_m_c: F64) -> float:
+        """By how much the image of a track differs from the prediction, px at the inliers' median depth."""
+        if not track.inlier.any():
+            return 0.0
+        shift_m, turn = se3.shift_and_turn(track.T_c_m @ predicted_T_m_c)
+        return self._map.camera.fx * (shift_m / median(track.depth_m[track.inlier]) + turn)
+
     def _choose(self, candidates: Candidates, frame_number: int, limit: int, per_cell: int, cell_px: int) -> I64:
         """Candidates spread over image cells: landmarks of the last frame first, then those of least uncertainty."""
         rows = candidates.rows
@@ -60,9 +85,13 @@ class Tracker:
         return chosen[:n]
 
     def _measure(
-        self, ctx: FrameContext, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool
-    ) -> Track:
-        """Align the templates of the chosen candidates (n,), and optimise the pose from T_c_m (4,4)."""
+        self, ctx: FrameContext, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool,
+        near_px: float = np.inf,
+    ) -> Track:  # fmt: skip
+        """Align the templates of the chosen candidates (n,), and optimise the pose from T_c_m (4,4).
+
+        near_px: at most so far from where that pose has them.
+        """
         images, config, shutter = ctx.images, ctx.config, ctx.shutter
         align = config.align
         rows, uv, warp = candidates.rows.take(chosen), candidates.uv.take(chosen, 0), candidates.warp.take(chosen, 0)
@@ -101,8 +130,18 @@ class Tracker:
             at_frame[:, 2] = np.where(observed[:, 2] >= 0.0, observed[:, 2] * at_frame[:, 2], observed[:, 2])
             rolled = self._map.rolled[candidates.rows.take(chosen) // self._map.slot_size]
             observed = np.where(rolled[:, None], observed, at_frame)
+        if near_px < np.inf:
+            expected = self._pixels(T_c_m, candidates.xyz.take(chosen, 0))
+            near = (np.linalg.norm(expected - observed[:, :2], axis=1) < near_px).nonzero()[0]
+            octave, chosen, observed = octave.take(near), chosen.take(near), observed.take(near, 0)
         sigma_px = align.sigma_px * (1 << octave).astype(np.float64) * (2.0 if coarse_only else 1.0)
         return self._solve(candidates, chosen, observed, sigma_px, T_c_m, config, tried=len(found))
+
+    def _pixels(self, T_c_m: F64, xyz: F64) -> F64:
+        """Where a camera at T_c_m (4,4) sees points (n,3)."""
+        fx, fy, cx, cy = self._map.intrinsics[:4]
+        q = xyz @ T_c_m[:3, :3].T + T_c_m[:3, 3]
+        return np.asarray(q[:, :2] / q[:, 2:] * (fx, fy) + (cx, cy), np.float64)
 
     def _solve(
         self, candidates: Candidates, chosen: I64, observed: F64, sigma_px: F64, T_c_m: F64, config: AgentConfig,
