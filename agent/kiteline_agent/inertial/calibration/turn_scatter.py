@@ -16,7 +16,7 @@ from kiteline_core.geometry import se3
 F64 = NDArray[np.float64]
 
 _FITTED = 4  # bias and time offset
-_CHANCE = 3.0  # times the expected mean square, which 11 degrees of freedom exceed in one of 1000 windows
+_CHANCE = 4.0  # times the expected mean square: chance makes up to 3 of it, and worn lenses seldom more
 
 
 def added_variance(link: Link, buffer: SampleBuffer, matrix: F64, bias: F64, image_rad: float, density: float) -> float:
