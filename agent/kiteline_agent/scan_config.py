@@ -12,6 +12,7 @@ class ScanConfig:
     on: bool = True  # False: the agent makes no scans
     moved_m: float = 0.2  # m; motion since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
     turned_rad: float = 0.17  # rad; rotation since the last scan: a tenth of the field of view is new
+    again_s: float = 0.5  # s; a camera that stays where it is scans again for the local grid: people walk in
     part_s: float = (
         0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned
     )
@@ -31,6 +32,7 @@ class LocalGridConfig:
     seen_m: float = 0.2  # m above and below the camera that a scan's line of sight covers: `ground.slab_m`
     body_m: float = 0.25  # m above and below the vehicle where an obstacle stands in its way: a small drone
     doubt_px: float = 0.3  # px; deviation of disparities from which tiles of the base do not count: 6 cm at 3 m
+    repeats: int = 4  # newest scans of one view that are kept: as many as turn a cell that was free
     gap_m: float = 1.0  # m along a ray that may be unknown before an obstacle is told: a turn between two scans
     level_rad: float = 0.03  # rad; error of the vertical from which scans are levelled again: 0.1 m of height at 3 m
     lost_s: float = 0.3  # s without a pose after which scans are forgotten: 0.15 m at a change of speed by 3 m/s^2

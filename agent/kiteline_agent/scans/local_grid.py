@@ -115,12 +115,13 @@ class LocalGrid:
         self._window_of: tuple[object, ...] = ()
         self._window_tiles: tuple[GridTile, ...] = ()  # kept, so that no new tile takes the place of one in memory
         self._scans: deque[_Drawn] = deque(maxlen=config.scans)
+        self._repeats = 0  # of the newest ones: of the same view
         self._R_g_o: F64 | None = None
         self._ground_m: float | None = None  # z of the ground; None while it is not known
 
     def add(self, scanned: Scanned, error: RangeError) -> None:
         """Draw a new scan. error: of the ranges of all scans, as it is known now."""
-        self._sure_scans += 1
+        self._sure_scans += not scanned.repeats  # those in doubt leave with other views
         self._take(error)
         T, scan = scanned.T_o_c, scanned.record.scan
         R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
@@ -128,16 +129,27 @@ class LocalGrid:
             self._level(R_l_o)
         assert self._R_g_o is not None
         drawn = _Drawn.of(self._R_g_o @ T[:3, 3], self._R_g_o @ R_l_o[0], scan, scanned.offset_px)
-        self._scans.append(drawn)
+        self._keep(drawn, scanned.repeats)
         self._ground_m = None if scanned.height_m is None else drawn.z_m - scanned.height_m
         self._draw(self._canvas, drawn)
         if self._again is not None:
             self._again.append(drawn)
         self._move_on(drawn.x_m, drawn.y_m, drawn.z_m)
 
+    def _keep(self, drawn: _Drawn, repeats: bool) -> None:
+        """Keep a scan; of the repeated ones of a view only the newest, so that other views are not forgotten."""
+        if not repeats:
+            self._repeats = 0
+        elif self._repeats == self._config.repeats:
+            del self._scans[-self._repeats]
+        else:
+            self._repeats += 1
+        self._scans.append(drawn)
+
     def forget(self) -> None:
         """The camera has moved by an unknown way: what was seen before lies elsewhere in o."""
         self._scans.clear()
+        self._repeats = 0
         self._clear()
         self._R_g_o = self._ground_m = None
 

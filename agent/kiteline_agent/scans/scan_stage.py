@@ -1,7 +1,7 @@
 """Makes column scans, spread over frames: a stripe of the disparity image each, then ground and labels.
 
-Keyframes are scanned, and frames between them in which something new is seen. The height of the ground is followed from
-scan to scan; those that saw another are held back or withdrawn.
+Keyframes are scanned, and frames between them in which something new is seen; a view that stays is scanned again now
+and then. The height of the ground is followed from scan to scan; those that saw another are held back or withdrawn.
 """
 
 from __future__ import annotations
@@ -40,20 +40,22 @@ class Scanned:
     """A finished scan. T_o_c: (4,4) of its camera in the odometry frame, in which that does not move any more.
 
     height_m: of the camera above the ground; None while that is not known.
-    offset_px: (5,) the disparity offset that it was made with (`disparity_offset`).
+    offset_px: (5,) the disparity offset that it was made with (`disparity_offset`). repeats: the view of the scan
+    before, which the base has.
     """
 
     record: KeyframeScan
     T_o_c: F64
     height_m: float | None
     offset_px: F64
+    repeats: bool = False
 
 
 @dataclass(slots=True)
 class _Begun:
     """A scan that is being made. uv: (n,2) keypoints to label. stripe: the next one; disparity: of a depth camera.
 
-    part: 0 of the keyframe itself; else T_k_s (4,4) is the pose of a later camera in it.
+    part: 0 of the keyframe itself; else T_k_s (4,4) is the pose of a later camera in it. repeats: see `Scanned`.
     """
 
     keyframe: KeyframeId
@@ -64,6 +66,7 @@ class _Begun:
     uv: F64
     disparity: F32 | None
     stripe: int = 0
+    repeats: bool = False
 
 
 class ScanStage:
@@ -83,7 +86,8 @@ class ScanStage:
         self._segmenter = GroundSegmenter(local_map.camera, ground)
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
         self._begun: _Begun | None = None
-        self._last_T_o_c: F64 | None = None  # of the newest scan
+        self._last_T_o_c: F64 | None = None  # of the newest scan of another view
+        self._last_ns = 0  # when the newest scan was begun
         self._ground: GroundHeight[KeyframeScan] = GroundHeight(ground)
         self._keyframe = NO_KEYFRAME  # the newest one, whose scans are numbered
         self._part = 0  # of its newest scan
@@ -107,8 +111,9 @@ class ScanStage:
         if reference.is_newest and reference.keyframe != self._keyframe:
             self._keyframe, self._part = reference.keyframe, 0
         if self._begun is None:
-            if self._shows_more():
-                self._begin(ctx, of_keyframe)
+            shows_more = self._shows_more()
+            if shows_more or ctx.t_ns - self._last_ns > self._config.again_s * 1e9:
+                self._begin(ctx, of_keyframe, repeats=not shows_more)
             return None
         if of_keyframe or not self._governor.may_scan():
             return None  # a keyframe is work enough for a frame
@@ -149,12 +154,12 @@ class ScanStage:
     def _T_o_c(self) -> F64:
         return np.asarray(self._camera.pose.T_o_m @ self._camera.pose.T_m_c)
 
-    def _begin(self, ctx: FrameContext, of_keyframe: bool) -> None:
+    def _begin(self, ctx: FrameContext, of_keyframe: bool, *, repeats: bool) -> None:
         """Take what a scan of this frame needs."""
         images, disparity, reference = ctx.images, None, self._camera.reference
         # An older keyframe, to which a relocalisation led, has scans under the next numbers already.
         hangs = reference.keyframe != NO_KEYFRAME and reference.keyframe == self._keyframe
-        if not of_keyframe and (not hangs or self._part == KeyframeScan.PARTS - 1):
+        if not (of_keyframe or repeats) and (not hangs or self._part == KeyframeScan.PARTS - 1):
             return
         if images.depth_m is not None:
             disparity = self._segmenter.camera.disparity_of_depth(images.depth_m)
@@ -164,7 +169,11 @@ class ScanStage:
             self._stripes.begin(images.half(), images.right.half())
         up = self._camera.motion.up()
         up_c = self._camera.pose.T_m_c[2, :3].copy() if up is None else up[0]  # z of a submap points up
-        T_o_c = self._last_T_o_c = self._T_o_c()
+        T_o_c, self._last_ns = self._T_o_c(), ctx.t_ns
+        if repeats:
+            self._begun = _Begun(reference.keyframe, 0, None, up_c, T_o_c, np.empty((0, 2)), disparity, repeats=True)
+            return
+        self._last_T_o_c = T_o_c
         if of_keyframe:
             self._begun = _Begun(reference.keyframe, 0, None, up_c, T_o_c, self._maker.new_uv, disparity)
         else:
@@ -183,10 +192,11 @@ class ScanStage:
         labels = segmenter.label_of(begun.uv)
         labels = labels[:0] if self._channel.profile.thin else labels
         record = KeyframeScan(begun.keyframe, scan, labels, begun.part, begun.T_k_s)
-        seen = Seen(begun.T_o_c, scan, segmenter.saw_ground, segmenter.lowest_m)
-        self._take(self._ground.note(record, seen))
+        if not begun.repeats:
+            self._take(self._ground.note(record, Seen(begun.T_o_c, scan, segmenter.saw_ground, segmenter.lowest_m)))
         ground = self._ground.expected(begun.T_o_c, begun.up_c)
-        return Scanned(record, begun.T_o_c, None if ground is None else ground.height_m, self._map.disparity_offset)
+        height_m = None if ground is None else ground.height_m
+        return Scanned(record, begun.T_o_c, height_m, self._map.disparity_offset, begun.repeats)
 
     def _take(self, verdict: Verdict[KeyframeScan]) -> None:
         """Share scans that are believed, and take back those that are not any more."""

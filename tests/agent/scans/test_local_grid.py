@@ -307,6 +307,24 @@ def test_asking_does_not_change_what_is_told_later() -> None:
         assert np.array_equal(found[0].distance_m, found[1].distance_m, equal_nan=True)
 
 
+def test_who_walks_into_a_view_that_stays_is_told_and_other_views_are_kept() -> None:
+    grid, distances = LocalGrid(LocalGridConfig()), []
+    for k in range(40):
+        grid.add(scan_at(0.0, 0.0, 2.0 * np.pi * k / 40), EXACT)
+    seen = scan_at(0.0, 0.0, 0.0)
+    person = replace(seen.record.scan, clear_m=np.full_like(seen.record.scan.clear_m, 1.2))
+    for shown in (0, 12, 60):
+        for _ in range(shown):
+            grid.add(replace(seen, record=replace(seen.record, scan=person), repeats=True), EXACT)
+        found = grid.around(TURN @ vehicle(0.0, 0.0, 0.0), None, {}, BANDS_M)
+        assert found is not None
+        distances.append(found.distance_m)
+    assert distances[0][0] == pytest.approx(EAST, abs=0.1)
+    assert distances[1][0] == pytest.approx(1.2, abs=0.1) and distances[2][0] == pytest.approx(1.2, abs=0.1)
+    for told in distances:
+        assert told[SECTORS // 2] == pytest.approx(-WEST, abs=0.1)  # behind: not in view any more
+
+
 @pytest.mark.parametrize(
     ("turn_deg", "where"), [(0.0, "ahead"), (5.0, "5 degrees right"), (-90.0, "90 degrees left"), (180.0, "behind")]
 )

@@ -136,6 +136,21 @@ def test_frames_between_keyframes_are_scanned_and_hang_on_the_one_before(recordi
     assert len(still.scans) < len(channel.scans)
 
 
+def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path) -> None:
+    source = open_source(str(recording))
+    channel = Heard(busy=False)
+    agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), channel)
+    assert agent._scans is not None
+    agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
+    first = next(item for item in source if isinstance(item, Frame))
+    for k in range(100):  # 5 s
+        frame = replace(first, t_ns=first.t_ns + 50_000_000 * k)
+        agent.step(StepInput(frame), frame.t_ns)
+    grid = agent._local_grid
+    assert len(grid._scans) == 1 + AgentConfig().local_grid.repeats
+    assert len(channel.scans) == 1
+
+
 def test_an_outage_keeps_the_newest_scans_as_codes(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _, free, _, _ = flown(recording, eager())
     monkeypatch.setattr(scan_queue, "_UNDER_WAY", 1)
