@@ -72,6 +72,23 @@ def _mask(data: U8, state: I64, model: I64, mask: int) -> int:
     return 8 * out + node - 8
 
 
+@helper
+def _range_beside(
+    data: U8, state: I64, model: I64, last: I64, row: int, context: int, mask: int, obstacle: int, other: int,
+    value: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Code a range of a row, by one decision where it is that of an obstacle, which is there if mask is not 0.
+
+    other: 1 if the last one beside an obstacle was not the obstacle's. Returns the range, and the same of this one.
+    """
+    if mask:
+        other = code(data, state, model, context + other, 1 if value != obstacle else 0)
+        if not other:
+            last[row, 0] = obstacle
+            return obstacle, other
+    return _range(data, state, model, last, row, value), other
+
+
 @njit
 def code_scan(columns: I64, labels: U8, most: int, reading: bool, data: U8) -> int:
     """Code columns (5,n) and labels (m,) 0..2 into data (MAX_CODE,), or fill them from data if reading.
@@ -98,27 +115,15 @@ def code_scan(columns: I64, labels: U8, most: int, reading: bool, data: U8) -> i
         unclear = code(data, state, model, _UNCLEAR + unclear, 1 if column[CLEAR] == 0 else 0)
         clear = 0
         if not unclear:
-            other = 1
-            if mask:
-                other = code(data, state, model, _CLEAR_ELSE + clear_else, 1 if column[CLEAR] != obstacle else 0)
-                clear_else = other
-            if other:
-                clear = _range(data, state, model, last, CLEAR, column[CLEAR])
-            else:
-                clear = obstacle
-                last[CLEAR, 0] = clear
+            clear, clear_else = _range_beside(
+                data, state, model, last, CLEAR, _CLEAR_ELSE, mask, obstacle, clear_else, column[CLEAR]
+            )
         not_free = code(data, state, model, _NOT_FREE + not_free, 1 if column[FREE] == 0 else 0)
         free = free_from = 0
         if not not_free:
-            other = 1
-            if mask:
-                other = code(data, state, model, _FREE_ELSE + free_else, 1 if column[FREE] != obstacle else 0)
-                free_else = other
-            if other:
-                free = _range(data, state, model, last, FREE, column[FREE])
-            else:
-                free = obstacle
-                last[FREE, 0] = free
+            free, free_else = _range_beside(
+                data, state, model, last, FREE, _FREE_ELSE, mask, obstacle, free_else, column[FREE]
+            )
             last[FREE_FROM, 0] += _difference(data, state, model, _FROM, column[FREE_FROM] - last[FREE_FROM, 0])
             free_from = int(last[FREE_FROM, 0])
         column[OBSTACLE], column[FREE], column[FREE_FROM], column[CLEAR] = obstacle, free, free_from, clear
