@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation.trajectories import TrajectoryError, read
+from kiteline_lab.plots import plot
 from kiteline_lab.tools import evaluate
 
 TUM = "1403715273.262142976 0.1 0.2 0.3 0 0 0 1\n1403715273.312143104 0.2 0.2 0.3 0 0 0.6 0.8\n"
@@ -137,3 +139,18 @@ def test_plot_without_truth_and_of_an_empty_line(tmp_path: Path) -> None:
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     plot_trajectories(tmp_path / "c.png", [Line("live", whole), Line("lost", nothing)], whole, "both", align=True)
     assert (tmp_path / "c.png").stat().st_size > 10_000
+
+
+def test_errors_at_the_ends_of_a_line_are_against_the_truth_beyond_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[NDArray[np.float64]] = []
+    monkeypatch.setattr(plot, "_draw_errors", lambda axes, errors: drawn.extend(off for _, off, _ in errors))
+    t_ns = np.arange(11, dtype=np.int64) * 20_000_000
+    poses = np.tile(np.eye(4), (11, 1, 1))
+    poses[:, 0, 3] = 0.1 * np.arange(11)
+    between = Trajectory(t_ns[:-1] + 10_000_000, poses[:-1].copy())
+    between.T_w_b[:, 0, 3] += 0.05
+    plot.plot_trajectories(tmp_path / "a.png", [plot.Line("live", between)], Trajectory(t_ns, poses))
+    assert len(drawn[0]) == 10
+    assert drawn[0].max() < 1e-9

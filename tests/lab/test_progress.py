@@ -28,6 +28,22 @@ def test_a_file_gets_whole_lines_and_few_of_them(monkeypatch: pytest.MonkeyPatch
     assert "\r" not in out.getvalue()
 
 
+def test_the_time_before_the_first_unit_is_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    out = io.StringIO()
+    with Progress("flying", 100, "frames", out) as p:
+        now[0] = 20.0  # kernels are loaded
+        p.update(1)
+        now[0] = 21.0
+        p.update(11)
+        now[0] = 25.0
+        p.update(51)
+    first, later, _ = out.getvalue().splitlines()
+    assert first == "flying: 1/100 frames"
+    assert later.startswith("flying: 51/100 frames  5 s left")
+
+
 def test_a_terminal_gets_one_line_redrawn() -> None:
     out = Terminal()
     with Progress("reading", 4, "images", out) as p:

@@ -9,6 +9,7 @@ from typing import TextIO
 BAR_WIDTH = 28  # cells; leaves room for counts and a note in 80 columns
 BAR_PERIOD_S = 0.1  # a terminal over ssh is slow
 LINE_PERIOD_S = 5.0  # few lines in a log file
+RATE_PERIOD_S = 2.0  # of work, before its rate tells the time left
 
 
 class Progress:
@@ -21,6 +22,7 @@ class Progress:
         self._start_s = time.monotonic()
         self._shown_s = self._start_s if not self._tty else -1e9
         self._done = 0
+        self._begun: tuple[float, int] | None = None  # s and units at the first update: what loads before it is no rate
         self._note = ""
         self._width = 0
 
@@ -38,6 +40,8 @@ class Progress:
         """Report that `done` units are done; drawn at most once a period."""
         self._done, self._note = done, note
         now_s = time.monotonic()
+        if self._begun is None:
+            self._begun = now_s, done
         if now_s - self._shown_s >= (BAR_PERIOD_S if self._tty else LINE_PERIOD_S):
             self._shown_s = now_s
             self._show(last=False)
@@ -45,7 +49,7 @@ class Progress:
     def _show(self, last: bool) -> None:
         elapsed_s = time.monotonic() - self._start_s
         count = f"{self._done}/{self._total}" if self._total else str(self._done)
-        rest = f"  {elapsed_s:.1f} s" if last else self._left(elapsed_s)
+        rest = f"  {elapsed_s:.1f} s" if last else self._left()
         note = f"  {self._note}" if self._note else ""
         if not self._tty:
             self._stream.write(f"{self._label}: {count} {self._unit}{rest}{note}\n")
@@ -60,8 +64,13 @@ class Progress:
         self._stream.flush()
         self._width = len(text)
 
-    def _left(self, elapsed_s: float) -> str:
-        if not self._total or not self._done:
+    def _left(self) -> str:
+        """The time left by the rate since the first update; nothing while that is not known."""
+        if not self._total or self._begun is None:
             return ""
-        left_s = elapsed_s / self._done * max(0, self._total - self._done)
+        begun_s, before = self._begun
+        worked_s = time.monotonic() - begun_s
+        if worked_s < RATE_PERIOD_S or self._done <= before:
+            return ""
+        left_s = worked_s / (self._done - before) * max(0, self._total - self._done)
         return f"  {left_s:.0f} s left"

@@ -51,16 +51,15 @@ def plot_trajectories(
     drawn = [_aligned(line, truth) for line in lines] if align and truth is not None else list(lines)
     across, along, up, sign = _axes(truth if truth is not None else drawn[0].trajectory if drawn else None)
     start_ns = min([int(line.trajectory.t_ns[0]) for line in drawn if len(line.trajectory.t_ns)], default=0)
-    if truth is not None and drawn:
-        truth = _during(truth, drawn)
 
     figure = Figure(figsize=(11.0, 5.6), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     top, height, error = _panels(figure, with_error=truth is not None)
     if truth is not None and len(truth.t_ns):
-        p = truth.T_w_b[:, :3, 3]
+        shown = _during(truth, drawn)
+        p = shown.T_w_b[:, :3, 3]
         top.plot(p[:, across], p[:, along], color=TRUTH_COLOUR, lw=2.6, label="truth", zorder=1)
-        height.plot((truth.t_ns - start_ns) / 1e9, sign * p[:, up], color=TRUTH_COLOUR, lw=2.2, zorder=1)
+        height.plot((shown.t_ns - start_ns) / 1e9, sign * p[:, up], color=TRUTH_COLOUR, lw=2.2, zorder=1)
     errors: list[tuple[F64, F64, str]] = []
     for i, line in enumerate(drawn):
         colour = COLOURS[i % len(COLOURS)]
