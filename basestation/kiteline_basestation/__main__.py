@@ -10,7 +10,7 @@ from pathlib import Path
 from kiteline_basestation.runtime.live import fly_live
 from kiteline_basestation.runtime.lockstep import fly_lockstep
 from kiteline_basestation.runtime.options import BaseOptions, options_of, parser
-from kiteline_basestation.store.store import StoreError
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_codec.schema import WireError
 from kiteline_core import config as configuration
 from kiteline_hw.links.kinds import link_forms
@@ -35,8 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Seconds since a fixed date: a base on another machine, without this one's files, still begins a later session.
     folder = Path(a.store) if a.store else process.state_folder() / "base"
     session = process.next_number(folder / "session", int(time.time()) - _SESSION_EPOCH_S)
-    fly_live(options_of(a, session), None, process.StopSignal())
-    process.exit_now(0)
+    stored = fly_live(options_of(a, session), None, process.StopSignal())
+    process.exit_now(0 if stored else 1)
 
 
 if __name__ == "__main__":

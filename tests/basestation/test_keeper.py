@@ -13,9 +13,10 @@ import pytest
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store import keeper as keeper_module
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.keeper import WRITE_NS, Keeper
 from kiteline_basestation.store.saved_map import SavedMap
-from kiteline_basestation.store.store import Batch, Store, StoreError, read
+from kiteline_basestation.store.store import Batch, Store, read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import KeyframeHeader, messages
 from kiteline_codec.sync.config import SyncConfig

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import signal
 import sqlite3
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,8 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
-from kiteline_basestation.store.store import FILE, Batch, Store, StoreError, batch_of, read
+from kiteline_basestation.store.store import FILE, Batch, Store, backup, batch_of, read
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
 
@@ -107,19 +111,146 @@ def test_other_version_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / FILE) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(StoreError, match="version 99, expected version 3"):
+    with pytest.raises(StoreError, match="version 99, expected version 4"):
         Store(tmp_path)
 
 
-def test_damaged_file_is_refused(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    store.write(Batch(rows=[(1, 0, 3, i, 0, bytes(500)) for i in range(200)]))
+def filled(folder: Path, rows: int = 200) -> SavedMap:
+    """A closed store of some values and texts."""
+    store = Store(folder)
+    codes = {Key(3, i): bytes([i % 251]) * (i % 90 + 1) for i in range(rows)}
+    texts = {f"state{i}": f"text {i} " * (i % 7 + 1) for i in range(rows // 10)}
+    store.write(batch_of(SavedMap({AgentId(1): SavedValues(codes, codes)}, texts), SavedMap()))
+    saved = store.load()
     store.close()
+    return saved
+
+
+def same_or_told(folder: Path, saved: SavedMap) -> bool:
+    """True if a store is read as it was written; False if it tells what is amiss. Fails on anything else."""
+    try:
+        got = read(folder)
+    except StoreError:
+        return False
+    for agent, codes in got.agents.items():
+        for ours, theirs in ((saved.agents[agent].received, codes.received), (saved.agents[agent].own, codes.own)):
+            assert all(ours.get(key) == code for key, code in theirs.items()), "an altered value was loaded"
+    assert all(saved.texts.get(name) == text for name, text in got.texts.items()), "an altered text was loaded"
+    same = (got.agents, got.texts) == (saved.agents, saved.texts)
+    assert same or got.faults, "something is missing, and nothing was said"
+    return same
+
+
+@settings(max_examples=150)
+@given(st.data())
+def test_no_flipped_bit_is_loaded_silently(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    folder = tmp_path_factory.mktemp("store")
+    saved = filled(folder)
+    content = bytearray((folder / FILE).read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    (folder / FILE).write_bytes(content)
+    same_or_told(folder, saved)
+
+
+def test_an_altered_value_is_left_out_named_and_kept_aside(tmp_path: Path) -> None:
+    saved = filled(tmp_path)
+    content = (tmp_path / FILE).read_bytes()
+    code = saved.agents[AgentId(1)].received[Key(3, 89)]
+    assert content.count(code) >= 1
+    (tmp_path / FILE).write_bytes(content.replace(code, code[:-1] + b"?"))
+    assert not same_or_told(tmp_path, saved)
+    store = Store(tmp_path)
+    loaded = store.load()
+    assert any("89 of agent 1 was altered on disk: left out" in fault for fault in loaded.faults)
+    assert Key(3, 89) not in loaded.agents[AgentId(1)].received and Key(3, 88) in loaded.agents[AgentId(1)].received
+    store.write(Batch(rows=[(1, 0, 3, 89, 0, code)]))  # its agent sent it again
+    store.close()
+    assert read(tmp_path).faults == () and read(tmp_path).agents[AgentId(1)].received[Key(3, 89)] == code
+    assert "altered" in (tmp_path / f"{FILE}.damaged-1.txt").read_text()
+    assert (tmp_path / f"{FILE}.damaged-1").stat().st_size == len(content)
+
+
+def test_rows_that_are_gone_are_missed(tmp_path: Path) -> None:
+    filled(tmp_path)
+    with sqlite3.connect(tmp_path / FILE) as db:
+        db.execute("DELETE FROM code WHERE id = 7")
+        db.execute("DELETE FROM state WHERE name = 'state3'")
+    db.close()
+    faults = read(tmp_path).faults
+    assert faults == ("2 rows of table code are missing", "1 rows of table state are missing")
+
+
+def test_what_is_left_of_a_damaged_file_is_taken(tmp_path: Path) -> None:
+    saved = filled(tmp_path, 2000)
     content = bytearray((tmp_path / FILE).read_bytes())
-    content[8192:24576] = bytes(16384)
+    content[len(content) // 2 : len(content) // 2 + 8192] = bytes(8192)
     (tmp_path / FILE).write_bytes(content)
-    with pytest.raises(StoreError, match=r"map\.sqlite"):
-        Store(tmp_path)
+    store = Store(tmp_path)
+    loaded = store.load()
+    store.close()
+    left = sum(len(codes.received) + len(codes.own) for codes in loaded.agents.values())
+    assert 2000 < left < 4000 and loaded.faults
+    assert read(tmp_path).agents == loaded.agents and read(tmp_path).faults == ()
+    assert loaded.agents != saved.agents
+
+
+def test_a_store_with_views_or_other_tables_is_refused(tmp_path: Path) -> None:
+    filled(tmp_path)
+    with sqlite3.connect(tmp_path / FILE) as db:
+        db.execute("CREATE VIEW mine AS SELECT * FROM code")
+    db.close()
+    with pytest.raises(StoreError, match="other tables"):
+        read(tmp_path)
+
+
+def test_a_backup_equals_its_store_also_while_a_base_writes(tmp_path: Path) -> None:
+    saved = filled(tmp_path / "store")
+    store = Store(tmp_path / "store")
+    store.write(Batch(rows=[(2, 0, 3, 1, 0, b"newest")]))
+    backup(tmp_path / "store", tmp_path / "copy")
+    store.close()
+    copy = read(tmp_path / "copy")
+    assert copy.agents == {**saved.agents, AgentId(2): SavedValues({Key(3, 1): b"newest"}, {})}
+    assert copy.texts == saved.texts and copy.faults == ()
+    with pytest.raises(StoreError, match="a store already"):
+        backup(tmp_path / "store", tmp_path / "copy")
+
+
+READ_ONLY = """
+import sys
+from pathlib import Path
+from kiteline_basestation.store.keeper import Keeper
+from kiteline_basestation.store.store import read
+folder = Path(sys.argv[1])
+saved = read(folder)
+assert len(saved.agents) == 2 and not saved.faults, saved
+keeper = Keeper(folder)
+assert keeper.load() == saved
+"""
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_a_store_on_read_only_media_is_read(tmp_path: Path, log: bool) -> None:
+    folder = tmp_path / "store"
+    filled(folder)
+    store = Store(folder)
+    store.write(Batch(rows=[(2, 0, 3, 1, 0, b"newest")]))
+    if log:  # as after a power cut: the newest batch stands in the write-ahead log
+        shutil.copytree(folder, tmp_path / "cut")
+    store.close()
+    place = tmp_path / "cut" if log else folder
+    assert (place / f"{FILE}-wal").exists() == log
+    (place / f"{FILE}-shm").unlink(missing_ok=True)
+    command = f"mount --bind {place} {place} && mount -o remount,ro,bind {place} && exec {sys.executable} - {place}"
+    done = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", command], input=READ_ONLY, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    if "unshare" in done.stderr or "mount" in done.stderr:
+        pytest.skip("no file systems can be mounted here")
+    assert done.returncode == 0, done.stderr
+    assert "not stored until that is mended" in done.stderr
 
 
 def write_for_ever(folder: str) -> None:

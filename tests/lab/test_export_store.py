@@ -11,9 +11,10 @@ import pytest
 from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.mapper_state import MapperState
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import texts_of
-from kiteline_basestation.store.store import FILE, Store, StoreError, batch_of
+from kiteline_basestation.store.store import FILE, Store, batch_of
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement, messages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera

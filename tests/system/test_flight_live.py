@@ -18,8 +18,9 @@ from urllib.request import urlopen
 
 import pytest
 
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.integrity import check
-from kiteline_basestation.store.store import FILE, StoreError, read
+from kiteline_basestation.store.store import FILE, read
 from kiteline_cli.main import main as kiteline
 from kiteline_codec.schema import KeyframeHeader, record_log
 from kiteline_core.frame import EncodedImage

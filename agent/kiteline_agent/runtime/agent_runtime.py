@@ -16,6 +16,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.camera_reader import CameraReader
+from kiteline_agent.runtime.flight_log import STEP
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
 from kiteline_agent.runtime.frame_counts import CpuAccount, FrameCounts
 from kiteline_agent.runtime.frame_reader import FrameReader
@@ -30,19 +31,22 @@ from kiteline_agent.runtime.warm import WARMING, warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
+from kiteline_core.config import ConfigError
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
-from kiteline_hw.logs.log_budget import make_room
+from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
-from kiteline_hw.ports import FrameSource, is_live
+from kiteline_hw.logs.whole_file import LineFile
+from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import kernel_cache
 from kiteline_hw.system.memory import release_memory, rss_mib
+from kiteline_hw.system.notices import Notices
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
@@ -87,6 +91,9 @@ class AgentRuntime:
         self._log_config = config.log
         self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, config.log.waiting))
         self._log: LogWriter | None = None
+        self._budget: LogBudget | None = None
+        self._lines: tuple[LineFile, ...] = ()
+        self._notices = Notices()
         self._record = self._open_record(config) if options.log_name else None
         self.agent = Agent(
             source.rig,
@@ -108,21 +115,29 @@ class AgentRuntime:
         self._core = VirtualCpu(options.cpu_percent)
         self.output: StepOutput | None = None  # of the last step
 
-    def _open_record(self, config: AgentConfig) -> FlightRecord:
+    def _open_record(self, config: AgentConfig) -> FlightRecord | None:
+        """Begin log and trajectories; None where a vehicle flies without, as its disk takes none."""
         options, source = self.options, self.source
         folder = Path(options.folder)
-        folder.mkdir(parents=True, exist_ok=True)
         about = metadata(options, source.name, config, self.channel)
-        cap_bytes = make_room(folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
-        log = self._files.enter_context(
-            LogWriter(folder / options.log_name, about, cap_bytes=cap_bytes, encoder=self._encoder)
-        )
-        self._log = log
+        budget = LogBudget(folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            log = LogWriter(
+                folder / options.log_name, about, budget=budget, part_topic=STEP, encoder=self._encoder
+            )  # fmt: skip
+        except (OSError, SourceError) as error:
+            if not options.log_optional:
+                raise
+            self._notices.say("log", f"no log of this flight: {error}")
+            return None
+        self._files.enter_context(log)
+        self._log, self._budget = log, budget
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
-        live, odometry = (
-            self._files.enter_context((folder / name).open("w", buffering=1)) for name in ("live.tum", "odometry.tum")
-        )
+        self._lines = live, odometry = LineFile(folder / "live.tum"), LineFile(folder / "odometry.tum")
+        for file in self._lines:
+            self._files.callback(file.close)
         return FlightRecord(log, live, odometry, options.agent, self.channel, config.log.every)
 
     @property
@@ -256,13 +271,28 @@ class AgentRuntime:
         }
 
     def log_notes(self) -> list[str]:
-        """A line if the log is not whole: its limit was reached, or the disk is full."""
-        lost = 0 if self._log is None else self._log.dropped
-        return [f"log: {lost} messages were not written: --log-mib was reached, or the disk is full"] if lost else []
+        """A line for each file that is not whole."""
+        files = [] if self._log is None else [("log", self._log.dropped, "messages", self._log.why)]
+        files += [("trajectory", file.lost, "poses", file.why) for file in self._lines]
+        return [f"{name}: {lost} {what} were not written: {why}" for name, lost, what, why in files if lost]
+
+    def take_notices(self) -> list[str]:
+        """What is to be told of files: each kind of trouble once in a flight."""
+        if self._log is not None and self._log.why:
+            self._notices.say("log", f"log: messages are lost: {self._log.why}; the flight goes on")
+        for why in [file.why for file in self._lines if file.why][:1]:
+            self._notices.say("lines", f"trajectory: poses are not written: {why}; the flight goes on")
+        if self._budget is not None and self._budget.deleted:
+            limit = f"--log-mib {self.options.log_mib}, or a disk that is nearly full"
+            self._notices.say("budget", f"log: the oldest logs are deleted: {limit}")
+        return self._notices.take()
 
     def _save_rig(self) -> None:
         if self._rig_file is not None:
-            self._rig_file.save(self.agent.known_rig())
+            try:
+                self._rig_file.save(self.agent.known_rig())
+            except ConfigError as error:
+                self._notices.say("rig", f"rig: {error}")
 
     def close(self) -> None:
         """Finish the files."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TextIO
+from typing import Protocol
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
@@ -20,11 +20,17 @@ from kiteline_core.ids import AgentId
 _LINK_NS = 1_000_000_000  # ns between two link reports in the log
 
 
+class Lines(Protocol):
+    """A file of text lines that never raises; kiteline_hw.logs.whole_file.LineFile is one."""
+
+    def write(self, line: str, /) -> object: ...
+
+
 class FlightRecord:
     """Writes each step, the records that it shared, and the poses."""
 
     def __init__(
-        self, log: StepLog, live: TextIO, odometry: TextIO, agent: int, channel: RecordChannel, every: int = 1
+        self, log: StepLog, live: Lines, odometry: Lines, agent: int, channel: RecordChannel, every: int = 1
     ) -> None:
         """live, odometry: files of TUM lines. every: the images of one frame in so many are written, 0: none."""
         self._every = every
@@ -66,7 +72,8 @@ class FlightRecord:
 
 def metadata(options: AgentOptions, source: str, config: AgentConfig, channel: RecordChannel) -> dict[str, str]:
     """Metadata at the head of a log. source: its name."""
-    plain = {key: value for key, value in asdict(options).items() if key not in ("folder", "config", "rig", "log_mib")}
+    unlogged = ("folder", "config", "rig", "log_mib", "log_optional")
+    plain = {key: value for key, value in asdict(options).items() if key not in unlogged}
     plain["link"] = options.link.partition(":")[
         0
     ]  # the kind of link decides how packets are made, its address does not

@@ -86,6 +86,7 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                 break
             now_ns = captured_ns = clock.now_ns()
             if parent is None:
+                told += runtime.take_notices()
                 process.print_lines(f"{(now_ns - begin_ns) / 1e9:8.1f} s  {line}" for line in told)
             frame = imu = odometry = predict_ns = None
             if runtime.next_ns is not None and now_ns >= begin_ns + runtime.next_ns:
@@ -117,7 +118,7 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
             elif runtime.counts.frames % PROGRESS_FRAMES == 0:
                 parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
         if parent is None:
-            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.log_notes()])
+            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.take_notices(), *runtime.log_notes()])
         _drain_live(runtime, link, clock, parent, stop)
         if parent is not None:
             parent.send_event("result", report=runtime.report())

@@ -16,6 +16,7 @@ from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 
 LOG_STEM = "boot"  # of the names of logs of `kiteline agent --log`
+LOG_MIB = 8000  # MiB of logs by default: half an hour of flight with images at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class AgentOptions:
     folder: str  # for the log and the trajectories
     log_name: str = "log.mcap"  # "": no log and no trajectories
     log_mib: int = 0  # MiB that this log and earlier ones in the folder may take; 0: no limit
+    log_optional: bool = False  # fly also where no log can be written
     agent: int = 0
     boot: int = 0
     link: str = "none"  # LINK, or lockstep:ENDPOINT
@@ -64,7 +66,7 @@ def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
     """Options from the command line. folder: for the log. boot: number of this start."""
     return AgentOptions(
         source=a.source, folder=str(folder), log_name=f"{LOG_STEM}{boot:05d}.mcap" if a.log else "", log_mib=a.log_mib,
-        agent=a.agent, boot=boot,
+        log_optional=True, agent=a.agent, boot=boot,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
         up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
@@ -166,8 +168,9 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
     p.add_argument(
-        "--log-mib", metavar="N", type=int, default=0,
-        help="MiB that the logs of all starts may take: the oldest are deleted at a start, and at N the log ends",
+        "--log-mib", metavar="N", type=int, default=LOG_MIB,
+        help="MiB that the logs of all starts may take: the oldest are deleted, also in flight (default: %(default)s; "
+        "0: no limit)",
     )  # fmt: skip
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
     p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")

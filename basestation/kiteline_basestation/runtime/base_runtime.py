@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -14,7 +13,7 @@ import cv2
 
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
-from kiteline_basestation.runtime.flight_log import RESTORED, metadata_of, station_of, write_step
+from kiteline_basestation.runtime.flight_log import RESTORED, STEP, metadata_of, station_of, write_step
 from kiteline_basestation.runtime.flight_summary import FlightSummary, counts, flight_summary, timings
 from kiteline_basestation.runtime.imports import read_imports
 from kiteline_basestation.runtime.map_files import map_files
@@ -32,11 +31,13 @@ from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
-from kiteline_hw.logs.log_budget import make_room
+from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log import LogWriter
+from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
 from kiteline_hw.system import process
 from kiteline_hw.system.memory import rss_mib
+from kiteline_hw.system.notices import Notices
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 _DRAIN_TICK_NS = 50_000_000  # ns of flight time between two ticks after the last frame: acknowledgements go at once
@@ -47,7 +48,7 @@ _RSS_STEPS = 10  # steps between two readings of the resident memory
 def load_vocabulary() -> Vocabulary | None:
     """The shipped visual vocabulary; None if gtsam, which loop closing needs, is not installed."""
     if importlib.util.find_spec("gtsam") is None:
-        print("gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'", file=sys.stderr)
+        process.print_lines(["gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'"])
         return None
     return shipped_vocabulary()
 
@@ -86,20 +87,43 @@ class BaseRuntime:
         self._drained_ns = 0
         self._last_frame_ns = 0
         self._folder = Path(options.folder)
-        self._log: LogWriter | None = None
-        if options.log_name:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            cap_bytes = make_room(self._folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
-            about = metadata_of(options, self.config, plain_channels=plain)
-            self._log = LogWriter(self._folder / options.log_name, about, cap_bytes=cap_bytes)
-            self._log.text("/log", options.start_ns, "info", f"base, session {options.session}")
-            self._log.flush()  # a base that dies at once leaves a log that can be read
+        self._notices = Notices()
+        self._budget: LogBudget | None = None
+        self._log = self._open_log(metadata_of(options, self.config, plain_channels=plain))
         disorder = LinkModelConfig(
             loss=options.loss, duplicate=options.disorder, reorder=options.disorder,
             delay_ns=round(options.delay_s * 1e9),
         )  # fmt: skip
         self._links = LinkModels(disorder, options.seed * 64 + 32)
         self._imports: list[Import] = []
+
+    def _open_log(self, about: Mapping[str, str]) -> LogWriter | None:
+        """Begin the log; None where there is to be none, or a live base's disk takes none."""
+        options = self.options
+        if not options.log_name:
+            return None
+        if options.log_mib > 0:
+            self._budget = LogBudget(self._folder, LOG_STEM, options.log_mib << 20)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            log = LogWriter(self._folder / options.log_name, about, budget=self._budget, part_topic=STEP)
+        except (OSError, SourceError) as error:
+            if not options.log_optional:
+                raise
+            self._notices.say("log", f"no log of this start: {error}")
+            return None
+        log.text("/log", options.start_ns, "info", f"base, session {options.session}")
+        log.flush()  # a base that dies at once leaves a log that can be read
+        return log
+
+    def take_notices(self) -> list[str]:
+        """What is to be told of files: each kind of trouble once."""
+        if self._log is not None and self._log.why:
+            self._notices.say("log", f"log: messages are lost: {self._log.why}; the base goes on")
+        if self._budget is not None and self._budget.deleted:
+            limit = f"--log-mib {self.options.log_mib}, or a disk that is nearly full"
+            self._notices.say("budget", f"log: the oldest logs are deleted: {limit}")
+        return self._notices.take()
 
     def restore_maps(self, now_ns: int) -> Restored | None:
         """Load the map of the store and the imported ones; None if there are none.
@@ -192,8 +216,17 @@ class BaseRuntime:
         if self.at_last_frame is None:
             self.at_last_frame = self.summary()
             if self._log is not None:
-                for name, content in map_files(self.station.mapper).items():
-                    (self._folder / name).write_bytes(content)
+                self._write_map()
+
+    def _write_map(self) -> None:
+        """Write the map's files. Raises OSError, but for a base that goes on without them."""
+        for name, content in map_files(self.station.mapper).items():
+            try:
+                process.write_atomically(self._folder / name, content)
+            except OSError as error:
+                if not self.options.log_optional:
+                    raise
+                self._notices.say("map", f"{self._folder / name}: not written: {error.strerror}")
 
     def summary(self) -> FlightSummary:
         """Counts and keyframe poses now."""
@@ -213,21 +246,24 @@ class BaseRuntime:
             "timing": {**timings(self.jobs.cpu_ms, grid_ms, self._step_ms), "rss_mib": round(rss, 1)},
         }
 
-    def close(self) -> None:
-        """Close the store and the log."""
-        if self.keeper is not None:
-            self.keeper.close(self.station)
+    def close(self) -> bool:
+        """Close the store and the log. False if the store does not hold all of the map; that was said."""
+        stored = self.keeper is None or self.keeper.close(self.station)
         if self._log is not None:
             self._log.close()
+        return stored
 
 
 def report_restored(restored: Restored | None, parent: process.Parent | None) -> None:
     """Print what was restored and repaired, and send it to the parent process."""
     if restored is None:
         return
-    print(f"store: {restored.keyframes} keyframes, {restored.awaited} values awaited", file=sys.stderr)
-    for fault in restored.faults:
-        print(f"store: repaired: {fault}", file=sys.stderr)
+    process.print_lines(
+        [
+            f"store: {restored.keyframes} keyframes, {restored.awaited} values awaited",
+            *(f"store: repaired: {fault}" for fault in restored.faults),
+        ]
+    )
     if parent is not None:
         faults = list(restored.faults)
         parent.send_event("restored", keyframes=restored.keyframes, faults=faults, awaited=restored.awaited)

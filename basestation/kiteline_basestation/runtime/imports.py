@@ -9,10 +9,11 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log
 from kiteline_basestation.station import Import, Station
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.keeper import snapshot
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import SavedMap, unpack
-from kiteline_basestation.store.store import FILE, StoreError, read
+from kiteline_basestation.store.store import FILE, read
 from kiteline_codec.schema import Key, record_log
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LogMessage, LogReader

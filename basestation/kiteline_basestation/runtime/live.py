@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,15 +35,18 @@ _POLL_S = 0.005  # s between two polls of the links: small beside the camera's p
 _STEP_NS = 50_000_000  # ns between two steps without input: keeps acknowledgements and heartbeats moving
 
 
-def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
-    """Serve agents until `stop`. parent: the process that started this one, if it is a child of `kiteline fly`."""
+def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.StopSignal) -> bool:
+    """Serve agents until `stop`. parent: the process that started this one, if it is a child of `kiteline fly`.
+
+    False if the store does not hold all of the map.
+    """
     return_large_arrays()
     if not kernel_cache.filled():
         with starting():
             kernel_cache.fill(WARMING, stop)
     if stop:
-        return
-    clock = MonotonicClock()
+        return True
+    clock, closed = MonotonicClock(), list[bool]()
     with contextlib.ExitStack() as stack:
         link = open_link(options.link, "base", framer=StreamFramer, required=False)
         stack.callback(link.close)
@@ -55,12 +57,12 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         try:
             with starting(), long_work(stop, "compiling kernels"):
                 base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), worker)
-            stack.callback(base.close)
+            stack.callback(lambda: closed.append(base.close()))
             process.notify("READY=1")  # a store or an import that takes minutes is no failed start
             with long_work(stop, "reading the map"):
                 restored = base.restore_maps(clock.now_ns())
         except StoppedError:
-            return
+            return True
         report_restored(restored, parent)
         queries = _open_queries(options, link, stack)
         if parent is not None:
@@ -83,6 +85,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
                 stepped_ns = now_ns
                 _send(hub, base.outgoing(now_ns))
                 base.compare_digests(hub.alive())
+                if parent is None:
+                    process.print_lines(base.take_notices())
                 if terminal is not None:
                     stored = None if base.keeper is None else base.keeper.idle
                     process.print_lines(terminal.lines(hub.alive(), now_ns - begin_ns, base.rss_mib, stored))
@@ -98,6 +102,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         if parent is not None and base.at_last_frame is not None:
             parent.send_event("flown", keyframes=base.at_last_frame.keyframes)
             parent.send_event("result", report=base.report(), keyframes=base.summary().keyframes)
+        process.print_lines(base.take_notices())
+    return all(closed)
 
 
 def _sealed(options: BaseOptions, hub: LinkHub) -> LinkHub:
@@ -135,7 +141,7 @@ def _open_page(options: BaseOptions, now_ns: int, stack: contextlib.ExitStack) -
 
     page = open_page(options.web, now_ns)
     stack.callback(page.close)
-    print(f"status page: {page.url}", file=sys.stderr)
+    process.print_lines([f"status page: {page.url}"])
     return page
 
 

@@ -15,6 +15,7 @@ from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 
 LOG_STEM = "session"  # of the names of logs of `kiteline base --log`
+LOG_MIB = 4000  # MiB of logs by default: days of flights, as they hold no images
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,7 @@ class BaseOptions:
     folder: str  # for the log, the map and the grid
     log_name: str = "log.mcap"
     log_mib: int = 0  # MiB that this log and earlier ones in the folder may take; 0: no limit
+    log_optional: bool = False  # begin also where no log can be written
     agents: tuple[int, ...] = ()
     session: int = 1  # higher than that of any base before it
     link: str = "none"  # LINK, or lockstep:ENDPOINT
@@ -69,9 +71,9 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
-    p.add_argument("--log-mib", metavar="N", type=int, default=0,
-                   help="MiB that the logs of all starts may take: the oldest are deleted at a start, and at N the "
-                   "log ends")  # fmt: skip
+    p.add_argument("--log-mib", metavar="N", type=int, default=LOG_MIB,
+                   help="MiB that the logs of all starts may take: the oldest are deleted, also while the base runs "
+                   "(default: %(default)s; 0: no limit)")  # fmt: skip
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; drop those of agents without a key in it")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
@@ -83,7 +85,8 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
 def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
     """Options from the command line."""
     return BaseOptions(
-        folder=a.log, log_name=f"{LOG_STEM}{session}.mcap" if a.log else "", log_mib=a.log_mib, session=session,
+        folder=a.log, log_name=f"{LOG_STEM}{session}.mcap" if a.log else "", log_mib=a.log_mib, log_optional=True,
+        session=session,
         link=a.link, config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
         imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
     )  # fmt: skip

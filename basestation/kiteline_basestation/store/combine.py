@@ -11,7 +11,7 @@ from kiteline_basestation.merging.map_merger import MergerState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_codec.schema import GridTile, Key, KeyframeHeader, SubmapPlacement, WireError
-from kiteline_core.ids import AgentId, KeyframeId
+from kiteline_core.ids import KeyframeId
 
 
 def combine(first: SavedMap, second: SavedMap) -> SavedMap:
@@ -20,8 +20,8 @@ def combine(first: SavedMap, second: SavedMap) -> SavedMap:
     Raises WireError if the maps hold different keyframes under the same ids.
     """
     if first.empty:
-        return second
-    agents: dict[AgentId, SavedValues] = dict(first.agents)
+        return replace(second, faults=first.faults + second.faults)
+    agents, faults = dict(first.agents), first.faults + second.faults
     new: list[KeyframeId] = []
     for agent, values in sorted(second.agents.items()):
         here = agents.get(agent, SavedValues({}, {}))
@@ -37,11 +37,11 @@ def combine(first: SavedMap, second: SavedMap) -> SavedMap:
         own = {key: code for key, code in values.own.items() if _is_taken(key, known)}
         agents[agent] = SavedValues({**values.received, **here.received}, {**own, **here.own})
     if not second.texts:
-        return SavedMap(agents, first.texts)
+        return SavedMap(agents, first.texts, faults)
     ours, theirs = state_of(first.texts), state_of(second.texts)
     if not first.texts:  # the second map's state, but nothing of it is placed
         ours = replace(theirs, placements=PlacementState({}, theirs.placements.unmerged), merger=MergerState())
-    return SavedMap(agents, texts_of(_combined(ours, theirs, new)))
+    return SavedMap(agents, texts_of(_combined(ours, theirs, new)), faults)
 
 
 def _is_taken(key: Key, known: set[int]) -> bool:

@@ -13,10 +13,9 @@ import numpy as np
 from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.mapper_state import MapperState
-from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues, value_name
 from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_codec.schema import (
-    RECORD_TYPES,
     CulledLandmarks,
     FusedLandmarks,
     GravityAlignment,
@@ -37,6 +36,7 @@ from kiteline_codec.schema import (
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     NO_KEYFRAME,
+    SEQUENCE_BITS,
     AgentId,
     KeyframeId,
     SubmapId,
@@ -62,7 +62,7 @@ class Checked:
 
 def check(saved: SavedMap) -> Checked:
     """Check every value of a saved map."""
-    faults: list[str] = []
+    faults = list(saved.faults)
     decoded = {
         agent: (_decoded(agent, codes.received, faults), _decoded(agent, codes.own, faults))
         for agent, codes in sorted(saved.agents.items())
@@ -83,13 +83,13 @@ def check(saved: SavedMap) -> Checked:
             if isinstance(record, NewLandmarks | Observations):
                 awaited += record.keyframe not in headers
                 if (why := _wrong_section(record, headers)) is not None:
-                    faults.append(f"{_name(key)} of agent {agent} {why}: left out")
+                    faults.append(f"{value_name(key)} of agent {agent} {why}: left out")
                     del received[key]
             elif isinstance(record, GravityAlignment | SubmapScale | SubmapTie):
                 awaited += record.submap not in submaps
         for key, record in list(own.items()):
             if (why := _wrong_own(record, agent, headers, submaps)) is not None:
-                faults.append(f"{_name(key)} of the base for agent {agent} {why}: left out")
+                faults.append(f"{value_name(key)} of the base for agent {agent} {why}: left out")
                 del own[key]
     agents = {}
     for agent, codes in saved.agents.items():
@@ -97,14 +97,15 @@ def check(saved: SavedMap) -> Checked:
         agents[agent] = SavedValues(
             {key: codes.received[key] for key in received}, {key: codes.own[key] for key in own}
         )
-    texts = texts_of(_sound_state(state_of(saved.texts), submaps, faults)) if saved.texts else {}
+    texts: Mapping[str, str] = {}
+    try:
+        if saved.texts:
+            texts = texts_of(_sound_state(state_of(saved.texts), submaps, faults))
+    except (KeyError, TypeError, ValueError):
+        if not saved.faults:
+            raise
+        faults.append("the state beside the values is incomplete: maps are apart until places are recognised again")
     return Checked(SavedMap(agents, texts), tuple(faults), awaited)
-
-
-def _name(key: Key) -> str:
-    record_type = RECORD_TYPES.get(key.kind)
-    kind = f"kind {key.kind}" if record_type is None else record_type.__name__
-    return f"{kind} {key.id}" + (f" part {key.part}" if key.part else "")
 
 
 def _decoded(agent: AgentId, values: Mapping[Key, bytes], faults: list[str]) -> dict[Key, Record]:
@@ -113,7 +114,7 @@ def _decoded(agent: AgentId, values: Mapping[Key, bytes], faults: list[str]) -> 
         try:
             out[key] = messages.decode(key, values[key])
         except WireError as error:
-            faults.append(f"{_name(key)} of agent {agent} cannot be read ({error}): left out")
+            faults.append(f"{value_name(key)} of agent {agent} cannot be read ({error}): left out")
     return out
 
 
@@ -213,7 +214,7 @@ def contradictions(mapper: Mapper) -> list[str]:
             at, steps = int(table.next[at]), steps + 1
     if np.any(listed[linked] != 1) or listed.sum() != len(linked):
         out.append("the lists of observations do not hold every observation once")
-    submap = keyframes.id[table.row[:n]] >> 20
+    submap = keyframes.id[table.row[:n]] >> SEQUENCE_BITS
     map_id = {s: int(sparse_map.map_id(SubmapId(s))) for s in np.unique(submap).tolist()}
     across = linked[submap[linked] != submap[on]]
     apart = sum(map_id[a] != map_id[b] for a, b in zip(submap[across].tolist(), submap[root[across]].tolist()))

@@ -6,6 +6,7 @@ batches and does not delay the loop.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import sys
 import threading
@@ -13,9 +14,10 @@ from pathlib import Path
 
 from kiteline_basestation.exchange.map_cache_planner import is_cached_key
 from kiteline_basestation.station import Station
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import StateWriter, texts_of
-from kiteline_basestation.store.store import Batch, Store, StoreError, batch_of, submap_of
+from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, batch_of, read, submap_of
 from kiteline_codec.channel import CodedChannel
 from kiteline_core.ids import SubmapId
 
@@ -25,10 +27,18 @@ _CLOSE_S = 10.0  # s that the last batch may take
 
 
 class Keeper:
-    """Keeps a store up to date with a station. Raises StoreError if the store cannot be opened."""
+    """Keeps a store up to date with a station. Raises StoreError if the store cannot be opened.
+
+    A disk that is full, read-only or failing only keeps it from being written: that is tried again and again.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self._store = Store(folder)
+        self._folder = folder
+        self._store: Store | None = None
+        try:
+            self._store = Store(folder)
+        except DiskError as error:
+            _say(f"store: {error}; the map is not stored until that is mended")
         self._writer = StateWriter()
         self._deleted: set[SubmapId] = set()
         self._written_ns = -(1 << 62)
@@ -36,8 +46,9 @@ class Keeper:
         self._writing = 0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="kiteline-store", daemon=True)
-        self._thread.start()
         self.batches = 0
+        self.fault: str | None = None  # why the last batch is not written yet
+        self._thread.start()
 
     @property
     def idle(self) -> bool:
@@ -46,7 +57,9 @@ class Keeper:
 
     def load(self) -> SavedMap:
         """Read what earlier processes saved."""
-        return self._store.load()
+        if self._store is not None:
+            return self._store.load()
+        return read(self._folder) if (self._folder / FILE).exists() else SavedMap()
 
     def begin(self, station: Station, saved: SavedMap, held: SavedMap) -> None:
         """Begin with a station that was restored from `saved`, in a store that holds `held`."""
@@ -85,29 +98,43 @@ class Keeper:
 
     def _run(self) -> None:
         while (batch := self._batches.get()) is not None:
-            reported = False
+            self.fault = None
             while True:
                 try:
+                    if self._store is None:
+                        self._store = Store(self._folder)
                     self._store.write(batch)
                     break
                 except StoreError as error:
-                    if not reported:
-                        print(f"store: {error}; trying again", file=sys.stderr)
-                    reported = True
+                    if self.fault is None:
+                        _say(f"store: {error}; trying again")
+                    self.fault = str(error)
                 if self._closing.wait(_RETRY_S):
                     return
+            if self.fault is not None:
+                _say("store: written again")
+            self.fault = None
             self._writing -= 1
 
-    def close(self, station: Station) -> None:
-        """Write all that is left, and close the store."""
+    def close(self, station: Station) -> bool:
+        """Write all that is left, and close the store. False if it could not be written; that is said."""
         if station.changed is not None:
             self._put(self._gather(station))
         self._batches.put(None)
         self._thread.join(_CLOSE_S)
         self._closing.set()
         self._thread.join(_RETRY_S)
-        if not self._thread.is_alive():
+        if not self._thread.is_alive() and self._store is not None:
             self._store.close()
+        if self._writing:
+            _say(f"store: the newest part of the map is not stored: {self.fault or 'the disk is too slow'}")
+        return self._writing == 0
+
+
+def _say(line: str) -> None:
+    """Print a line; a terminal or a file that takes none does not stop the base."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def snapshot(station: Station, before: SavedMap) -> SavedMap:

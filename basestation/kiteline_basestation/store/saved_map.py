@@ -11,7 +11,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from kiteline_codec.schema import Key, WireError
+from kiteline_codec.schema import RECORD_TYPES, Key, WireError
 from kiteline_core.ids import AgentId
 
 _MAGIC = b"KLSTORE3"
@@ -32,15 +32,23 @@ class SavedValues:
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """A map at rest. texts: state of the mapper by name, see `state_texts`."""
+    """A map at rest. texts: state of the mapper by name, see `state_texts`. faults: what was left out, in words."""
 
     agents: Mapping[AgentId, SavedValues] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
 
     @property
     def empty(self) -> bool:
         """True if there is no map."""
         return not any(codes.received or codes.own for codes in self.agents.values())
+
+
+def value_name(key: Key) -> str:
+    """The name of a value in messages."""
+    record_type = RECORD_TYPES.get(key.kind)
+    kind = f"kind {key.kind}" if record_type is None else record_type.__name__
+    return f"{kind} {key.id}" + (f" part {key.part}" if key.part else "")
 
 
 def pack(saved: SavedMap) -> bytes:

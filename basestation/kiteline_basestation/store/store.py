@@ -1,8 +1,11 @@
 """The map on disk: one SQLite file in a folder, written a batch at a time, safe against a kill at any instant.
 
-Tables: code (agent, own, kind, id, part, code), every value that an agent (own 0) or the base (own 1) wrote, as it is
-shared; state (name, text), the mapper's state (see `state_texts`). A batch is one transaction, so that what is read
-back is the base between two of its steps.
+Tables: code (agent, own, kind, id, part, code, sum), every value that an agent (own 0) or the base (own 1) wrote, as it
+is shared; state (name, text, sum), the mapper's state (see `state_texts`); total (name, rows, sum), of each of them. A
+batch is one transaction, so that what is read back is the base between two of its steps.
+
+Every row has a checksum, and the totals tell of rows that are gone (`checksums`): what a disk altered is left out and
+named, never loaded. A file with such faults is kept beside the store, which is written anew (`salvage`).
 
 Write-ahead logging with synchronous=NORMAL: a commit is one write to the log without waiting for the disk. A process
 that dies loses nothing that was committed, for the kernel holds it; a power cut may lose the last seconds but never
@@ -12,29 +15,23 @@ tears a batch, and what is lost then the agents send again. FULL would wait for 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+from kiteline_basestation.store import checksums, salvage
+from kiteline_basestation.store.checksums import Row, StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_codec.schema import KEYFRAME_KINDS, SUBMAP_KINDS, Key
-from kiteline_core.errors import KitelineError
-from kiteline_core.ids import SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
+from kiteline_core.ids import SEQUENCE_BITS, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
-_APPLICATION = 0x6B6C6D70  # "klmp"
-_VERSION = 3  # of the tables; a store of another version is refused
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
-_TABLES = """
-CREATE TABLE code (
-  agent INTEGER NOT NULL, own INTEGER NOT NULL, kind INTEGER NOT NULL, id INTEGER NOT NULL, part INTEGER NOT NULL,
-  code BLOB NOT NULL, PRIMARY KEY (agent, own, kind, id, part)
-);
-CREATE TABLE state (name TEXT PRIMARY KEY, text TEXT NOT NULL) WITHOUT ROWID;
-"""
+_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 
 
 def submap_of(key: Key) -> SubmapId | None:
@@ -44,11 +41,8 @@ def submap_of(key: Key) -> SubmapId | None:
     return SubmapId(key.id) if key.kind in SUBMAP_KINDS else None
 
 
-Row = tuple[int, int, int, int, int, bytes]
-
-
-class StoreError(KitelineError):
-    """A store that cannot be used. The text says what was found, what was expected and how to mend it."""
+class DiskError(StoreError):
+    """A store that cannot be written now, as its disk is full, read-only or failing."""
 
 
 @dataclass(slots=True)
@@ -87,44 +81,57 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE
         self._lock = _take(folder)
+        self._damaged: SavedMap | None = None  # what is left of a damaged file that could not be written anew yet
         try:
-            self._db = _open(self.path, make=True)
+            self._db = _open(self.path)
         except BaseException:
             self._lock.close()
             raise
 
     def load(self) -> SavedMap:
-        """Read the whole store."""
+        """Read the whole store. If it has faults, it is written anew from what is sound, as soon as the disk allows."""
         with _explained(self.path):
-            return _read(self._db)
+            saved = checksums.read_all(self._db, self.path)
+        if saved.faults:
+            self._damaged = saved
+            with contextlib.suppress(StoreError):
+                self._renew()
+        return saved
+
+    def _renew(self) -> None:
+        """Write a damaged store anew; the damaged file is kept beside it."""
+        if self._damaged is not None:
+            with _explained(self.path):
+                self._db.close()
+                salvage.renew(self.path, self._damaged)
+                self._damaged = None
+            self._db = _open(self.path)
 
     def write(self, batch: Batch) -> None:
         """Write a batch, all of it or nothing."""
+        self._renew()
         with _explained(self.path), self._db:
             self._db.execute("BEGIN IMMEDIATE")
-            for submap in batch.deleted:
-                self._delete(submap)
-            self._db.executemany(
-                "DELETE FROM code WHERE agent = ? AND own = ? AND kind = ? AND id = ? AND part = ?", batch.gone
-            )
-            self._db.executemany("INSERT OR REPLACE INTO code VALUES (?, ?, ?, ?, ?, ?)", batch.rows)
-            written = [(name, text) for name, text in batch.texts.items() if text is not None]
-            self._db.executemany("INSERT OR REPLACE INTO state VALUES (?, ?)", written)
-            gone = [(name,) for name, text in batch.texts.items() if text is None]
-            self._db.executemany("DELETE FROM state WHERE name = ?", gone)
+            with checksums.Changes(self._db) as changes:
+                for submap in batch.deleted:
+                    self._delete(changes, submap)
+                for row in batch.gone:
+                    changes.remove_code("agent = ? AND own = ? AND kind = ? AND id = ? AND part = ?", row)
+                for values in batch.rows:
+                    changes.put_code(values)
+                for name, text in batch.texts.items():
+                    changes.put_text(name, text)
 
-    def _delete(self, submap: SubmapId) -> None:
-        agent, first, end = agent_of_submap(submap), submap << SEQUENCE_BITS, (submap + 1) << SEQUENCE_BITS
+    def _delete(self, changes: checksums.Changes, submap: SubmapId) -> None:
+        agent, first, end = int(agent_of_submap(submap)), submap << SEQUENCE_BITS, (submap + 1) << SEQUENCE_BITS
         for own in (0, 1):
             for kind in KEYFRAME_KINDS:
-                self._db.execute(
-                    "DELETE FROM code WHERE agent = ? AND own = ? AND kind = ? AND id >= ? AND id < ?",
-                    (int(agent), own, int(kind), first, end),
+                changes.remove_code(
+                    "agent = ? AND own = ? AND kind = ? AND id >= ? AND id < ?", (agent, own, int(kind), first, end)
                 )
             for kind in SUBMAP_KINDS:
-                self._db.execute(
-                    "DELETE FROM code WHERE agent = ? AND own = ? AND kind = ? AND id = ?",
-                    (int(agent), own, int(kind), int(submap)),
+                changes.remove_code(
+                    "agent = ? AND own = ? AND kind = ? AND id = ?", (agent, own, int(kind), int(submap))
                 )
 
     def close(self) -> None:
@@ -135,16 +142,42 @@ class Store:
 
 
 def read(path: Path) -> SavedMap:
-    """Read a store, also while its base runs. path: its folder, or the file in it. Raises StoreError."""
+    """Read a store, also while its base runs, and from read-only media. Raises StoreError.
+
+    path: its folder, or the file in it. What the disk altered is left out and named in `faults`.
+    """
     file = path / FILE if path.is_dir() else path
     if not file.is_file():
         raise StoreError(f"{file}: no such file; expected what `kiteline base --store DIR` keeps in DIR")
-    db = _open(file, make=False)
+    with _explained(file), salvage.reader(file, _BUSY_S) as db:
+        checksums.check_tables(db, file)
+        return checksums.read_all(db, file)
+
+
+def backup(path: Path, out: Path) -> SavedMap:
+    """Copy a store, also while its base runs. out: a folder without a store. Returns what the copy holds."""
+    file, copy = path / FILE if path.is_dir() else path, out / FILE
+    if copy.exists():
+        raise StoreError(f"{copy}: there is a store already; expected a new folder")
+    saved = read(path)
     try:
-        with _explained(file):
-            return _read(db)
+        salvage.write_new(copy, saved)
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(f"{copy}: {error}; the backup was not made") from None
+    if read(out) != SavedMap(saved.agents, saved.texts):
+        raise StoreError(f"{copy}: the copy differs from {file}: is its disk sound?")
+    return saved
+
+
+def repair(folder: Path) -> SavedMap:
+    """Write a store with faults anew, from what is sound. Returns what it holds, with its faults."""
+    store = Store(folder)
+    try:
+        saved = store.load()
+        store.write(Batch())  # raises if it could not be written
     finally:
-        db.close()
+        store.close()
+    return saved
 
 
 def _take(folder: Path) -> IO[bytes]:
@@ -153,7 +186,8 @@ def _take(folder: Path) -> IO[bytes]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / "lock").open("wb")
     except OSError as error:
-        raise StoreError(f"{folder}: {error.strerror or error}; a store is a folder that can be written") from None
+        kind = DiskError if error.errno in _DISK else StoreError
+        raise kind(f"{folder}: {error.strerror or error}; a store is a folder that can be written") from None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -162,52 +196,29 @@ def _take(folder: Path) -> IO[bytes]:
     return lock
 
 
-def _open(path: Path, make: bool) -> sqlite3.Connection:
+def _open(path: Path) -> sqlite3.Connection:
     with _explained(path):
         db = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
         try:
-            tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-            application, version = (
-                db.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
-            )
-            if tables and (application, version) != (_APPLICATION, _VERSION):
-                what = f"version {version}" if application == _APPLICATION else "no store of a base"
-                raise StoreError(
-                    f"{path}: {what}, expected version {_VERSION}; begin an empty store and import the agents' logs"
-                )
-            if not make and not tables:
-                raise StoreError(f"{path}: empty; expected a store that a base has begun")
-            if make:
-                db.execute("PRAGMA journal_mode = WAL")
-                db.execute("PRAGMA synchronous = NORMAL")
-            if make and not tables:
-                marks = f"PRAGMA application_id = {_APPLICATION}; PRAGMA user_version = {_VERSION};"
-                db.executescript(f"BEGIN; {marks} {_TABLES} COMMIT;")
-            found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
-            if found != "ok":
-                raise StoreError(f"{path}: damaged ({found}); put a copy in its place, or begin an empty store")
+            if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+                checksums.check_tables(db, path)
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = NORMAL")
+            checksums.make_tables(db)
         except BaseException:
             db.close()
             raise
     return db
 
 
-def _read(db: sqlite3.Connection) -> SavedMap:
-    agents: dict[AgentId, tuple[dict[Key, bytes], dict[Key, bytes]]] = {}
-    db.execute("BEGIN")  # both tables as they stand at one moment
-    try:
-        for agent, own, kind, number, part, code in db.execute("SELECT agent, own, kind, id, part, code FROM code"):
-            agents.setdefault(AgentId(agent), ({}, {}))[own][Key(kind, number, part)] = code
-        texts: Mapping[str, str] = dict(db.execute("SELECT name, text FROM state"))
-    finally:
-        db.execute("COMMIT")
-    return SavedMap({agent: SavedValues(*agents[agent]) for agent in sorted(agents)}, texts)
-
-
 @contextlib.contextmanager
 def _explained(path: Path) -> Iterator[None]:
-    """Turn errors of SQLite into StoreErrors that say how to mend them."""
+    """Turn errors of SQLite and of files into StoreErrors that say how to mend them."""
     try:
         yield
+    except sqlite3.OperationalError as error:
+        raise DiskError(f"{path}: {error}; expected a disk with room left that can be written") from error
     except sqlite3.DatabaseError as error:
-        raise StoreError(f"{path}: {error}; expected a store of `kiteline base`, on a disk with room left") from error
+        raise StoreError(f"{path}: {error}; expected a store of `kiteline base`: put a backup in its place") from error
+    except OSError as error:
+        raise DiskError(f"{path}: {error.strerror or error}") from error

@@ -1,28 +1,72 @@
-"""Limits what the logs of all starts take on disk: the oldest are deleted before a new one begins."""
+"""Limits what the logs of all starts take on disk: the oldest go first, also those of the flight under way."""
 
 from __future__ import annotations
 
+import os
+import threading
 from pathlib import Path
 
+_PARTS = 8  # files that the limit is cut into: an eighth of it at most goes at once
+_LEAST_PART_BYTES = 64 << 20  # bytes of a file on a disk with little room left
+_RESERVE_BYTES = 256 << 20  # bytes that logs leave free on their disk, for maps and numbers of starts
 
-def make_room(folder: Path, stem: str, cap_bytes: int) -> int:
-    """Delete the oldest logs `STEM*.mcap` until half of the cap is free; the bytes that the next log may take.
 
-    Nothing else in the folder is touched. A file that cannot be deleted counts as used.
+class LogBudget:
+    """Keeps the logs `STEM*.mcap` of a folder within a limit, and within what the disk has. Touches nothing else there.
+
+    part_bytes: size at which a log goes on in another file. deleted: files so far. Never raises: a file that cannot be
+    deleted counts as used.
     """
-    logs = []
-    for path in folder.glob(f"{stem}*.mcap"):
-        digits = path.stem.removeprefix(stem).replace("_", "")
-        if digits.isdecimal():
-            status = path.stat()
-            logs.append((status.st_mtime_ns, path, status.st_size))
-    used = sum(size for _, _, size in logs)
-    for _, path, size in sorted(logs):
-        if used <= cap_bytes // 2:
-            break
-        try:
-            path.unlink()
+
+    def __init__(self, folder: Path, stem: str, cap_bytes: int, reserve_bytes: int = _RESERVE_BYTES) -> None:
+        """cap_bytes: of all logs. reserve_bytes: bytes of the disk to be left free, where others leave them."""
+        self.deleted = 0
+        self.part_bytes = max(1, cap_bytes // _PARTS)
+        self._least_part_bytes = min(self.part_bytes, _LEAST_PART_BYTES)
+        self._folder, self._stem = folder, stem
+        self._cap_bytes, self._reserve_bytes = cap_bytes, reserve_bytes
+        self._deleting: threading.Thread | None = None
+
+    def make_room(self, writing: Path | None = None) -> None:
+        """Delete the oldest logs until there is room for another part. writing: the newest one, which stays."""
+        logs = self._logs()
+        used = sum(size for _, _, size in logs)
+        room = min(self._cap_bytes, used + self._free_bytes() - self._reserve_bytes)
+        self.part_bytes = max(self._least_part_bytes, room // _PARTS)
+        allowed = room - self.part_bytes
+        for _, path, size in logs:
+            if used <= allowed:
+                break
+            if path == writing:
+                continue
+            try:
+                path.unlink()
+            except OSError:
+                continue
             used -= size
+            self.deleted += 1
+
+    def make_room_beside(self, writing: Path) -> None:
+        """The same in a thread, for a loop that cannot wait for a disk; nothing if the last one still deletes."""
+        if self._deleting is None or not self._deleting.is_alive():
+            self._deleting = threading.Thread(target=self.make_room, args=(writing,), name="log-budget", daemon=True)
+            self._deleting.start()
+
+    def _logs(self) -> list[tuple[int, Path, int]]:
+        """Time of the last change, path and size of each log, oldest first."""
+        found = []
+        for path in self._folder.glob(f"{self._stem}*.mcap"):
+            if path.stem.removeprefix(self._stem).replace("_", "").isdecimal():
+                try:
+                    status = path.stat()
+                except OSError:
+                    continue
+                found.append((status.st_mtime_ns, path, status.st_size))
+        return sorted(found)
+
+    def _free_bytes(self) -> int:
+        try:
+            disk = os.statvfs(self._folder)
         except OSError:
-            continue
-    return max(0, cap_bytes - used)
+            return self._cap_bytes + self._reserve_bytes
+        return disk.f_bavail * disk.f_frsize

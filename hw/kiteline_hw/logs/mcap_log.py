@@ -33,7 +33,7 @@ import json
 from collections.abc import Mapping
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +43,11 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs import mcap_schemas as schemas
 from kiteline_hw.logs.image_encoder import ENCODE_ALL, ImageEncoder
+from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
 from kiteline_hw.logs.mcap_write import McapWriter
 from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
+from kiteline_hw.logs.whole_file import WholeFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system.closing import Closing
 
@@ -67,25 +69,28 @@ _NO_NOTES: Mapping[str, str] = {}
 
 
 class LogWriter(Closing):
-    """Writes one log. Raises SourceError if the file cannot be created.
+    """Writes one log. Raises SourceError if the file cannot be created; a disk that is full later only loses messages.
 
-    rotate_bytes: size at which a new file NAME_1.mcap, NAME_2.mcap… is started. cap_bytes: limit on disk; with rotation
-    the oldest files are deleted, without it writing stops. dropped: messages not written, also because of a full disk.
-    encoder: of raw images; it is closed with the log.
+    budget: limits the logs of the folder; at a part of it a new file NAME_1.mcap, NAME_2.mcap… begins, with the next
+    message on `part_topic`, and the oldest logs are deleted. dropped: messages not written. why: of the first of them;
+    "" if none was lost. encoder: of raw images; it is closed with the log.
     """
 
     def __init__(
-        self, path: Path | str, metadata: Mapping[str, str], *, rotate_bytes: int | None = None,
-        cap_bytes: int | None = None, encoder: ImageEncoder | None = None,
+        self, path: Path | str, metadata: Mapping[str, str], *, budget: LogBudget | None = None,
+        part_topic: str | None = None, encoder: ImageEncoder | None = None,
     ) -> None:  # fmt: skip
         self.path = Path(path)
         self.dropped = 0
+        self.why = ""
         self._encoder = ImageEncoder(ENCODE_ALL) if encoder is None else encoder
         self._metadata = dict(metadata)
-        self._rotate_bytes, self._cap_bytes = rotate_bytes, cap_bytes
-        self._files: list[Path] = []
+        self._budget, self._part_topic = budget, part_topic
+        self._part = 0
         self._rig: tuple[CameraRig, ImuCalibration | None] | None = None
-        self._open()
+        if budget is not None:
+            budget.make_room()
+        self._open(self.path)
 
     # Data of a source
 
@@ -229,8 +234,8 @@ class LogWriter(Closing):
         self._encoder.drain()
         try:
             self._writer.flush()
-        except OSError:
-            self._count_lost()
+        except OSError as error:
+            self._count_lost(error)
 
     def close(self) -> None:
         """Finish the file with its index."""
@@ -242,25 +247,27 @@ class LogWriter(Closing):
             return
         try:
             self._writer.finish()
+        except OSError as error:
+            self._count_lost(error)
+        finally:
             self._stream.close()
-        except OSError:
-            self._count_lost()
 
-    def _count_lost(self) -> None:
-        """Count what a full disk did not take."""
+    def _count_lost(self, error: OSError) -> None:
+        """Count what the disk did not take."""
+        self.why = self.why or error.strerror or str(error)
         self.dropped += max(1, self._writer.lost)
         self._writer.lost = 0
+        if self._budget is not None:
+            self._budget.make_room_beside(self._path)
 
-    def _open(self) -> None:
-        number = len(self._files)
-        path = self.path if number == 0 else self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
+    def _open(self, path: Path) -> None:
+        self._path = path  # of the file that is being written
         try:
-            self._stream: BinaryIO = path.open("wb")
+            self._stream = WholeFile(path)
         except OSError as error:
             raise SourceError(f"{path}: cannot write the log: {error.strerror}") from error
-        self._files.append(path)
         self._writer = McapWriter(self._stream, CHUNK_BYTES, "kiteline")
-        self._writer.add_metadata("kiteline", self._metadata)
+        self._writer.add_metadata("kiteline", {**self._metadata, **({"part": str(self._part)} if self._part else {})})
         self._channels: dict[str, tuple[int, object]] = {}  # number and kind, by topic
         self._schemas: dict[str, int] = {}
         self._flushed_ns: int | None = None
@@ -286,11 +293,8 @@ class LogWriter(Closing):
         self, topic: str, t_ns: int, kind: object, pieces: tuple[bytes, ...], notes: Mapping[str, str]
     ) -> None:
         size = sum(map(len, pieces)) + 64
-        if self._cap_bytes is not None and not self._rotate_bytes and self._bytes + size > self._cap_bytes:
-            self.dropped += 1
-            return
-        if self._rotate_bytes is not None and self._bytes and self._bytes + size > self._rotate_bytes:
-            self._rotate(t_ns)
+        if self._budget is not None and self._bytes + size > self._budget.part_bytes:
+            self._begin_part(self._budget, topic, t_ns)
         try:
             known = self._channels.get(topic)
             if known is None:
@@ -304,8 +308,8 @@ class LogWriter(Closing):
             elif abs(t_ns - self._flushed_ns) >= FLUSH_NS:
                 self._flushed_ns = t_ns
                 self._writer.flush()
-        except OSError:
-            self._count_lost()
+        except OSError as error:
+            self._count_lost(error)
 
     def _register(self, topic: str, kind: object, notes: Mapping[str, str]) -> int:
         """The number of a new channel. kind: a protobuf message's class, or the name of a JSON schema."""
@@ -315,13 +319,25 @@ class LogWriter(Closing):
             self._schemas[name] = self._writer.register_schema(name, "jsonschema" if text else "protobuf", data)
         return self._writer.register_channel(topic, "json" if text else "protobuf", self._schemas[name], notes)
 
-    def _rotate(self, t_ns: int) -> None:
-        self._finish()
-        if self._cap_bytes is not None and self._rotate_bytes is not None:
-            most = max(1, self._cap_bytes // self._rotate_bytes - 1)
-            for path in self._files[:-most]:
-                path.unlink(missing_ok=True)
-        self._open()
+    def _begin_part(self, budget: LogBudget, topic: str, t_ns: int) -> None:
+        """Go on in another file, if one can begin with this message and can be made; else in this one."""
+        if not self._bytes or (self._part_topic is not None and topic != self._part_topic):
+            return
+        writer, stream, path = self._writer, self._stream, self._path
+        self._part += 1
+        try:
+            self._open(self.path.with_name(f"{self.path.stem}_{self._part}{self.path.suffix}"))
+        except SourceError:
+            self._part -= 1
+            self._path = path
+            return
+        try:
+            writer.finish()
+        except OSError as error:
+            self._count_lost(error)
+        finally:
+            stream.close()
+        budget.make_room_beside(self._path)
         if self._rig is not None:
             self.rig(t_ns, *self._rig)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from typing import BinaryIO
+from typing import Protocol
 from zlib import crc32
 
 from mcap import records
@@ -22,32 +22,42 @@ _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the rows
 _RECORD_BYTES = 9  # opcode and length
 
 
+class ByteStream(Protocol):
+    """What takes the bytes of a file."""
+
+    def write(self, data: bytes, /) -> int: ...
+    def flush(self) -> None: ...
+
+
 class McapWriter:
     """One MCAP file in a stream. Messages of a chunk whose writing fails with OSError are lost and counted.
 
-    chunk_bytes: size above which a chunk is written. lost: messages.
+    stream: one that then ends where it ended before (`WholeFile`), so that later chunks follow it. The head of the file
+    waits for the first chunk. chunk_bytes: size above which a chunk is written. lost: messages.
     """
 
-    def __init__(self, stream: BinaryIO, chunk_bytes: int, library: str) -> None:
+    def __init__(self, stream: ByteStream, chunk_bytes: int, library: str) -> None:
         self.lost = 0
         self._stream = stream
         self._chunk_bytes = chunk_bytes
-        self._at = 0  # bytes written to the stream
+        self._at = 0  # bytes of the file, the waiting ones included
+        self._waiting = b""  # the head, until a chunk is written behind it
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
         self._metadata: list[records.MetadataIndex] = []
         self._chunks: list[records.ChunkIndex] = []
         self._counts: dict[int, int] = {}  # messages by channel
+        self._lost: dict[int, int] = {}  # of them
         self._first_ns: int | None = None  # of the first message
         self._span_ns = (0, 0)  # of all messages
         self._begin_chunk()
-        self._put(_MAGIC + _packed(records.Header("", library)))
+        self._put_head(_MAGIC + _packed(records.Header("", library)))
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Add a metadata record."""
+        """Add a metadata record, before the first message."""
         packed = _packed(records.Metadata(name, dict(data)))
         self._metadata.append(records.MetadataIndex(self._at, len(packed), name))
-        self._put(packed)
+        self._put_head(packed)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Add a schema. Returns its number."""
@@ -93,9 +103,14 @@ class McapWriter:
 
     def finish(self) -> None:
         """End the file with its index. The stream stays open."""
-        self._end_chunk()
-        self._put(_packed(records.DataEnd(0)))
-        start = self._at
+        try:
+            self._end_chunk()
+        finally:
+            self._put_index()
+
+    def _put_index(self) -> None:
+        end = _packed(records.DataEnd(0))
+        start = self._at + len(end)
         groups = [
             (Opcode.SCHEMA, b"".join(map(_packed, self._schemas))),
             (Opcode.CHANNEL, b"".join(map(_packed, self._channels))),
@@ -110,12 +125,13 @@ class McapWriter:
             at += len(data)
         summary = b"".join(data for _, data in groups) + offsets
         head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, at)
-        self._put(summary + _packed(records.Footer(start, at, crc32(head, crc32(summary)))) + _MAGIC)
+        self._put(end + summary + _packed(records.Footer(start, at, crc32(head, crc32(summary)))) + _MAGIC)
 
     def _statistics(self) -> records.Statistics:
+        counts = {channel: n - self._lost.get(channel, 0) for channel, n in self._counts.items()}
         return records.Statistics(
-            attachment_count=0, channel_count=len(self._channels), channel_message_counts=self._counts,
-            chunk_count=len(self._chunks), message_count=sum(self._counts.values()), metadata_count=len(self._metadata),
+            attachment_count=0, channel_count=len(self._channels), channel_message_counts=counts,
+            chunk_count=len(self._chunks), message_count=sum(counts.values()), metadata_count=len(self._metadata),
             message_start_time=self._span_ns[0], message_end_time=self._span_ns[1], schema_count=len(self._schemas),
         )  # fmt: skip
 
@@ -154,6 +170,10 @@ class McapWriter:
             self._put(b"".join((head, *pieces, *indices)))
         except OSError:
             self.lost += len(times)
+            for channel, numbers in rows.items():
+                self._lost[channel] = self._lost.get(channel, 0) + len(numbers) // 2
+            for record in (*self._schemas, *self._channels):  # those that were in it, too
+                self._append(_packed(record))
             raise
         self._chunks.append(
             records.ChunkIndex(
@@ -163,8 +183,13 @@ class McapWriter:
             )
         )  # fmt: skip
 
+    def _put_head(self, data: bytes) -> None:
+        self._waiting += data
+        self._at += len(data)
+
     def _put(self, data: bytes) -> None:
-        self._stream.write(data)
+        self._stream.write(self._waiting + data if self._waiting else data)
+        self._waiting = b""
         self._at += len(data)
 
 

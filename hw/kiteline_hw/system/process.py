@@ -60,8 +60,9 @@ def exit_now(status: int) -> NoReturn:
     The interpreter's own shutdown is skipped: it would cancel threads of native libraries such as Zenoh in mid-call,
     which sometimes aborts the process.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # a file on a full disk, a closed pipe
+            stream.flush()
     os._exit(status)
 
 
@@ -111,7 +112,7 @@ class Parent:
 def run_child(
     link: str,
     fly_lockstep: Callable[[Parent], None],
-    fly_live: Callable[[Parent, StopSignal], None],
+    fly_live: Callable[[Parent, StopSignal], object],
     expected: tuple[type[Exception], ...],
 ) -> int:
     """Fly as a child process, in lock-step if the link says so. Returns the exit status.

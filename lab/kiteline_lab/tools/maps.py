@@ -1,4 +1,7 @@
-"""`kiteline maps list|get|name|merge|split|delete`: query and change the maps of a running base."""
+"""`kiteline maps list|get|name|merge|split|delete`: query and change the maps of a running base.
+
+`check|repair|backup` work on the folder of a store.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from kiteline_hw.links.zenoh_queries import ask
@@ -38,6 +42,14 @@ def parser() -> argparse.ArgumentParser:
     merge.add_argument("map", metavar="MAP")
     merge.add_argument("into", metavar="INTO")
     merge.add_argument("--at", metavar="N", type=float, nargs=16, help="T_into_map, 16 numbers in rows")
+    stores = {
+        "check": "check every value of a store, also while its base runs",
+        "repair": "write a store with faults anew, from what is sound; the old file is kept",
+        "backup": "copy a store, also while its base runs",
+    }
+    for verb, what in stores.items():
+        verbs.add_parser(verb, help=what).add_argument("store", metavar="STORE", type=Path)
+    verbs.choices["backup"].add_argument("out", metavar="DIR", type=Path, help="a folder without a store")
     return p
 
 
@@ -69,9 +81,30 @@ def _submap(submap: Mapping[str, Any]) -> str:
     return str(submap["id"]) if submap["scale"] == 1.0 else f"{submap['id']} (x{submap['scale']:.4g})"
 
 
+def _of_store(a: argparse.Namespace) -> int:
+    """Check, repair or copy a store; 1 if it has, or had, faults. Raises StoreError."""
+    from kiteline_basestation.store import store
+    from kiteline_basestation.store.integrity import check
+
+    if a.verb == "check":
+        saved = store.read(a.store)
+    elif a.verb == "repair":
+        saved = store.repair(a.store)
+    else:
+        saved = store.backup(a.store, a.out)
+    checked = check(saved)
+    values = sum(len(codes.received) + len(codes.own) for codes in checked.saved.agents.values())
+    for fault in checked.faults:
+        print(f"{a.store}: {fault}", file=sys.stderr)
+    print(f"{a.store}: {values} values of {len(checked.saved.agents)} agents are sound, {len(checked.faults)} faults")
+    return 1 if checked.faults else 0
+
+
 def main(argv: list[str]) -> int:
-    """Run `kiteline maps`; exit status 1 if the base refused."""
+    """Run `kiteline maps`; exit status 1 if the base refused, or a store has faults."""
     a = parser().parse_args(argv)
+    if hasattr(a, "store"):
+        return _of_store(a)
     ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, json.dumps(query(a)))
     if a.json:
         print(text)

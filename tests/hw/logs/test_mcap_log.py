@@ -16,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
+from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, LEFT, LogReader, LogWriter, read_frame
 from kiteline_hw.logs.mcap_schemas import CompressedImage, bytes_field
 from kiteline_hw.logs.rig_json import rig_from_json, rig_to_json
@@ -52,7 +53,7 @@ def flight(n: int = 6, encoded: bool = True) -> list[tuple[ImuBatch, Frame]]:
     return out
 
 
-def write(path: Path, items: list[tuple[ImuBatch, Frame]], **options: int) -> LogWriter:
+def write(path: Path, items: list[tuple[ImuBatch, Frame]], **options: LogBudget) -> LogWriter:
     with LogWriter(path, {"role": "agent"}, **options) as log:
         log.rig(T0, RIG, ImuCalibration(1e-4, 2e-5, 3e-3, 4e-3, 200.0))
         for samples, frame in items:
@@ -201,16 +202,12 @@ def test_a_cut_log_still_opens(tmp_path_factory: pytest.TempPathFactory, share: 
     assert 1 <= len([i for i in source if isinstance(i, Frame)]) <= 20
 
 
-def test_disk_cap_and_rotation(tmp_path: Path) -> None:
+def test_each_part_of_a_log_is_a_source(tmp_path: Path) -> None:
     items = flight(40)
-    capped = write(tmp_path / "capped.mcap", items, cap_bytes=100_000)
-    assert capped.dropped > 0 and (tmp_path / "capped.mcap").stat().st_size < 130_000
-    assert LogReader(tmp_path / "capped.mcap").cut is None
-    rotated = write(tmp_path / "turn.mcap", items, rotate_bytes=60_000, cap_bytes=180_000)
-    left = sorted(tmp_path.glob("turn*.mcap"))
-    assert rotated.dropped == 0 and 2 <= len(left) <= 3 and (tmp_path / "turn.mcap") not in left
-    assert sum(f.stat().st_size for f in left) < 220_000
-    for path in left:  # each part stands alone
+    rotated = write(tmp_path / "turn.mcap", items, budget=LogBudget(tmp_path, "turn", 480_000, 0))
+    left = sorted(tmp_path.glob("turn*.mcap"), key=lambda path: path.stat().st_mtime_ns)
+    assert rotated.dropped == 0 and len(left) >= 2
+    for path in left:
         frames = [i for i in open_source(str(path)) if isinstance(i, Frame)]
         assert frames and open_source(str(path)).rig.left == RIG.left
     assert frames[-1].t_ns == items[-1][1].t_ns

@@ -75,3 +75,4 @@ def test_messages_of_a_chunk_that_is_not_written_are_counted() -> None:
     with pytest.raises(OSError, match="no space"):
         writer.add_message(channel, 20, (b"x" * 1000,))
     assert writer.lost > 5
+    assert writer._statistics().message_count == 21 - writer.lost

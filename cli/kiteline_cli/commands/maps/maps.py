@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-SUMMARY = "manage the maps of a running base: list, get, name, merge, split, delete"
+SUMMARY = "maps of a running base: list, get, name, merge, split, delete; stores: check, repair, backup"
 EXAMPLES = (
     "kiteline maps list",
     "kiteline maps name 0.3.0 hangar",
     "kiteline maps merge 1.1.0 hangar",
+    "kiteline maps check maps",
+    "kiteline maps backup maps copy",
 )
 
 

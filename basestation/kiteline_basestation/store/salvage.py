@@ -1,0 +1,95 @@
+"""Files of a store on a disk that fails: read where nothing can be written, written anew from what is sound."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from kiteline_basestation.store import checksums
+from kiteline_basestation.store.saved_map import SavedMap
+
+_BESIDE = ("-wal", "-shm")  # files that SQLite keeps beside a database
+
+
+@contextlib.contextmanager
+def reader(file: Path, busy_s: float) -> Iterator[sqlite3.Connection]:
+    """A connection that only reads.
+
+    SQLite wants to write beside a database with a write-ahead log. Where it cannot, the file is read as it is, or with
+    its log from a copy in the temporary folder. Raises sqlite3.Error, OSError.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            db = _connected(file, "mode=ro", busy_s)
+        except sqlite3.OperationalError:
+            log = file.with_name(file.name + "-wal")
+            if not log.exists() or log.stat().st_size == 0:
+                db = _connected(file, "mode=ro&immutable=1", busy_s)
+            else:
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kiteline-store-")))
+                for path in (file, log):
+                    shutil.copyfile(path, folder / path.name)
+                db = _connected(folder / file.name, "mode=rw", busy_s)
+        stack.callback(db.close)
+        yield db
+
+
+def _connected(file: Path, how: str, busy_s: float) -> sqlite3.Connection:
+    db = sqlite3.connect(f"file:{quote(str(file.absolute()))}?{how}", uri=True, timeout=busy_s, isolation_level=None)
+    try:
+        db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except BaseException:
+        db.close()
+        raise
+    return db
+
+
+def write_new(path: Path, saved: SavedMap) -> None:
+    """Write a store of a map, all of it or nothing, and wait for the disk. Raises OSError, sqlite3.Error."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(path.name + ".new")
+    new.unlink(missing_ok=True)
+    try:
+        db = sqlite3.connect(new, isolation_level=None)
+        try:
+            checksums.make_tables(db)
+            checksums.write_all(db, saved)
+        finally:
+            db.close()
+        os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def renew(path: Path, saved: SavedMap) -> Path:
+    """Put a new file with a map in the place of a damaged one, which is kept. Returns where."""
+    number = 1
+    while (kept := path.with_name(f"{path.name}.damaged-{number}")).exists():
+        number += 1
+    fresh = path.with_name(path.name + ".fresh")
+    write_new(fresh, saved)
+    os.replace(path, kept)
+    for end in _BESIDE:
+        with contextlib.suppress(FileNotFoundError):
+            os.replace(path.with_name(path.name + end), kept.with_name(kept.name + end))
+    os.replace(fresh, path)
+    with contextlib.suppress(OSError):
+        kept.with_name(kept.name + ".txt").write_text("".join(f"{fault}\n" for fault in saved.faults))
+    sync_folder(path.parent)
+    return kept
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
