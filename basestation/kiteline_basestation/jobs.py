@@ -18,12 +18,21 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class JobDone:
-    """Result of a job. cost_ops: arithmetic operations, at one a nanosecond on the modelled core."""
+    """Result of a job. cost_ops: arithmetic operations, at one a nanosecond on the modelled core.
+
+    failed: why there is no result; "" if there is one. What the job was to mend then stays as it is.
+    """
 
     id: int
     kind: str
     result: Any
     cost_ops: int
+    failed: str = ""
+
+
+def set_aside(job: Job, why: str) -> JobDone:
+    """The end of a job that has no result."""
+    return JobDone(job.id, job.kind, None, 0, why)
 
 
 @dataclass(frozen=True, slots=True)

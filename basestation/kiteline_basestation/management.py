@@ -19,6 +19,8 @@ from kiteline_basestation.map.matrices import numbers_of, similarity_from
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.map_merger import MapMerger
 from kiteline_basestation.merging.merges import NOTHING, MergeResult
+from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import (
     BOOT_BITS,
@@ -32,6 +34,8 @@ from kiteline_core.ids import (
 )
 
 _NAME_CHARS = 64
+_TEXT_CHARS = 1 << 14  # of a command
+_FAR_M = 1e7  # of a merge that a user asks for
 _FLYING_NS = 10_000_000_000  # ns after its last contact during which an agent counts as flying
 
 Json = Any
@@ -85,9 +89,11 @@ class MapManager:
             if command.verb not in VERBS:
                 raise _Refused(f"no command {command.verb!r}; there are: {', '.join(VERBS)}")
             verb, allowed = VERBS[command.verb]
+            if len(command.text) > _TEXT_CHARS:
+                raise _Refused(f"{len(command.text)} characters, expected at most {_TEXT_CHARS}")
             try:
                 given = json.loads(command.text or "{}")
-            except ValueError as error:
+            except (ValueError, *INPUT_FAULTS) as error:
                 raise _Refused(f"{command.text[:80]!r} is no JSON") from error
             if not isinstance(given, dict):
                 raise _Refused("expected a JSON object")
@@ -142,7 +148,9 @@ class MapManager:
             return {"merged": False, "looking": count}, NOTHING
         try:
             S = similarity_from(given["T_into_map"])
-        except (TypeError, ValueError) as error:
+            if not (np.abs(S[:3, 3]) <= _FAR_M).all() or not MIN_SCALE <= sim3.scale_of(S) <= MAX_SCALE:
+                raise ValueError("beyond all maps")
+        except (TypeError, ValueError, *INPUT_FAULTS) as error:
             raise _Refused(
                 '"T_into_map" is a rigid motion, or a similarity for a monocular map: 16 numbers, rows of a 4x4 matrix'
             ) from error
@@ -189,7 +197,7 @@ class MapManager:
         if found is None:
             found = next((s for s, name in self._names.items() if name == text), None)
         if found is None or found not in self._map.submaps or found in self._intake.deleted:
-            raise _Refused(f"no map {text!r}; `list` names all maps")
+            raise _Refused(f"no map {text[:80]!r}; `list` names all maps")
         return found
 
     def _named_map(self, given: Mapping[str, Json], key: str) -> SubmapId:

@@ -73,6 +73,7 @@ class Mapper:
         self.map = SparseMap()
         self.names: dict[SubmapId, str] = {}  # of maps, by map id
         self.counts = MapperCounts()
+        self.jobs_failed = 0  # since the process began
         self.cpu_ns: Callable[[], int] = lambda: 0  # clock of `grid_ns`, which no output depends on
         self.grid_ns: deque[int] = deque(maxlen=_TIMED_UPDATES)  # time of the updates of the grid
         job_ids = itertools.count(1)
@@ -104,7 +105,10 @@ class Mapper:
         # 2. Apply the results of finished jobs, then carry out commands.
         changes = NOTHING
         for done in given.done:
-            changes += self._finish[done.kind](done, now_ns)
+            if done.failed:
+                self._set_aside(done, now_ns)
+            else:
+                changes += self._finish[done.kind](done, now_ns)
         answers = []
         for command in given.commands:
             answer, changed = self._manager.answer(command, now_ns)
@@ -234,6 +238,7 @@ class Mapper:
             "merges_undone": merger.undone if merger else 0,
             "maps": len({self.map.map_id(s) for s in submaps}),
             "jobs_open": pending,
+            "jobs_failed": self.jobs_failed,
         }
 
     # -- steps -------------------------------------------------------------------------------------------------------
@@ -277,6 +282,13 @@ class Mapper:
     def _finish_local_bundle(self, done: JobDone, now_ns: int) -> MergeResult:
         self.counts.bundles += self._local_bundles.finish(done)
         return NOTHING
+
+    def _set_aside(self, done: JobDone, now_ns: int) -> None:
+        """Forget a job that failed: the map stays as it is until another job of its kind is due."""
+        self.jobs_failed += 1
+        self._local_bundles.forget(done.id)
+        if self.merger is not None:
+            self.merger.forget_job(done.id, now_ns)
 
     def _draw_grid(self) -> None:
         begin_ns = self.cpu_ns()

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, PROFILES, Profile
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Observations, Record, WireError, messages
+from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Observations, Record, WireError, messages, owners
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import SyncConfig, SyncStats
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.link_traits import LinkTraits
+from kiteline_core.ids import AgentId
 
 
 class RecordChannel(Protocol):
@@ -121,10 +123,17 @@ class CodedChannel:
     """Records through the codec and an endpoint, over any link that carries packets."""
 
     def __init__(
-        self, config: SyncConfig, session: int, profile: Profile | None = None, spill: Spill | None = None
-    ) -> None:
-        """profile: what to share of a keyframe; None: chosen by the link's throughput. spill: keeps old values."""
-        self.endpoint = Endpoint(config, session, ResidualCoder(), spill)
+        self, config: SyncConfig, session: int, profile: Profile | None = None, spill: Spill | None = None,
+        peer: AgentId | None = None,
+    ) -> None:  # fmt: skip
+        """profile: what to share of a keyframe; None: chosen by the link's throughput. spill: keeps old values. peer:
+        the agent at the other end, which writes nothing of others, and whose claims of memory count; None: a base.
+        """
+        if peer is None:
+            self.endpoint = Endpoint(config, session, ResidualCoder(), spill)
+        else:
+            may_write = partial(owners.of_agent, peer)
+            self.endpoint = Endpoint(config, session, ResidualCoder(), spill, may_write, owners.claimed_bytes)
         self.undecodable = 0  # values whose code is no valid record: the other side has another schema
         self.noting = False  # whether `take_noted` is used
         self._noted: dict[Key, bytes] = {}
@@ -251,10 +260,12 @@ def coded_channel(
     spill: Spill | None = None,
     *,
     bounded: bool = False,
+    peer: AgentId | None = None,
 ) -> CodedChannel:
     """One end of a channel over a link. budget_bytes: on the wire in any second; 0: unlimited. profile: wifi, radio, or
     "" to choose by the link. seal_bytes: what sealing adds to a packet. bounded: whether values of keyframes may take
-    only so much memory, and then go to `spill`. Raises ValueError.
+    only so much memory, and then go to `spill`. peer: the agent at the other end of a base's channel. Raises
+    ValueError.
     """
     if link is not None:
         profile = profile or link.profile
@@ -272,4 +283,4 @@ def coded_channel(
         resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else None,
         resident_bytes=None if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
     )
-    return CodedChannel(config, session, named, spill)
+    return CodedChannel(config, session, named, spill, peer)

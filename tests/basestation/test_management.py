@@ -194,3 +194,36 @@ def test_refused_commands_give_a_reason(make_flight: MakeFlight, verb: str, text
 def test_submap_names_and_verbs() -> None:
     assert submap_name(SubmapId(submap_id(3, 17, 4))) == "3.17.4"
     assert set(VERBS) == {"list", "get", "name", "merge", "split", "delete"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 1000, "[" * 100_000, '{"map":' * 1000, "1" * 400, "1" * 10_000, '{"map": "%s"}' % ("7" * 5000 + ".0.0"),
+     '{"map": "\\ud800", "name": "\\ud800"}', "NaN", '{"map": 1e999}', "\ud800", '{"map": "0.0.0"}' + " " * 100_000],
+)  # fmt: skip
+@pytest.mark.parametrize("verb", [*VERBS, "[" * 1000])
+def test_questions_that_mean_harm_are_refused(text: str, verb: str, words: Any) -> None:
+    (answer,) = Base(words).step(commands=[Command(1, verb, text)])
+    assert not answer.ok
+    assert set(json.loads(answer.text)) == {"error"}
+
+
+HUGE = [
+    [10**400, *np.eye(4).ravel()[1:].tolist()],
+    [1.0, 0, 0, 1e300, *np.eye(4).ravel()[4:].tolist()],
+    [*np.diag([1e-12, 1e-12, 1e-12, 1.0]).ravel().tolist()],
+    [*np.diag([1e12, 1e12, 1e12, 1.0]).ravel().tolist()],
+    [1e308] * 16,
+    ["[" * 1000] * 16,
+]
+
+
+@pytest.mark.parametrize("numbers", HUGE, ids=range(len(HUGE)))
+def test_merges_beyond_all_numbers_are_refused(numbers: list[Any], words: Any, make_flight: MakeFlight) -> None:
+    base = Base(words)
+    flights = [make_flight(agent=a, keyframes=4, turns=0.05) for a in (0, 1)]
+    base.fly(flights)
+    text = json.dumps({"map": "1.0.0", "into": "0.0.0", "T_into_map": numbers})
+    (answer,) = base.step(commands=[Command(1, "merge", text)])
+    assert not answer.ok
+    base.step()

@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kiteline_basestation.store.checksums import StoreError
+from kiteline_basestation.store.checksums import sum_of
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, Store, backup, batch_of, read
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
@@ -289,3 +290,46 @@ def test_a_kill_leaves_a_whole_batch(tmp_path: Path, delay_s: float) -> None:
     written = {code.decode() for code in kept.agents[AgentId(1)].received.values()} | set(kept.texts.values())
     assert len(written) == 1
     assert len(kept.agents[AgentId(1)].received) == 300
+
+
+HOSTILE_SCHEMAS = [
+    "CREATE VIEW more AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n",
+    "DROP TABLE state; CREATE VIEW state AS SELECT hex(zeroblob(1000000000)) AS name, 1 AS text",
+    "CREATE TRIGGER t AFTER INSERT ON code BEGIN DELETE FROM state; END",
+    "CREATE TABLE other (a, b AS (hex(zeroblob(1000000000))))",
+    "CREATE INDEX i ON code (hex(code))",
+]
+
+
+@pytest.mark.parametrize("sql", HOSTILE_SCHEMAS)
+def test_a_store_with_views_triggers_or_computed_columns_is_refused(tmp_path: Path, sql: str) -> None:
+    store = Store(tmp_path)
+    store.write(Batch(rows=[(1, 0, 3, 5, 0, b"head")]))
+    store.close()
+    with sqlite3.connect(tmp_path / FILE) as db:
+        db.executescript(sql)
+    db.close()
+    begin = time.process_time()
+    with pytest.raises(StoreError, match="other tables"):
+        read(tmp_path)
+    with pytest.raises(StoreError, match="other tables"):
+        Store(tmp_path)
+    assert time.process_time() - begin < 1.0
+
+
+@pytest.mark.parametrize(
+    "row",
+    [("a", 0, 3, 5, 0, b"x"), (1, 7, 3, 5, 0, b"x"), (1, 0, 300, 5, 0, b"x"), (1, 0, 3, -5, 0, b"x"),
+     (1, 0, 3, 5, 1 << 40, b"x"), (1, 0, 3, 5, 0, "text"), (1.5, 0, 3, 5, 0, b"x"), (99, 0, 3, 5, 0, b"x")],
+)  # fmt: skip
+def test_rows_that_no_base_writes_are_left_out(tmp_path: Path, row: tuple[object, ...]) -> None:
+    """Their checksum may be right: whoever wrote them can compute it."""
+    store = Store(tmp_path)
+    store.write(Batch(rows=[(1, 0, 3, 5, 1, b"head")]))
+    store.close()
+    content = row[5] if isinstance(row[5], bytes) else str(row[5]).encode()
+    with sqlite3.connect(tmp_path / FILE) as db:
+        db.execute("INSERT INTO code VALUES (?, ?, ?, ?, ?, ?, ?)", (*row, sum_of(row[:5], content)))
+    db.close()
+    saved = read(tmp_path)
+    assert saved.agents[AgentId(1)].received == {Key(3, 5, 1): b"head"} and saved.faults

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pytest
 
-from kiteline_basestation.config import GraphConfig
+from kiteline_basestation import job_kinds
+from kiteline_basestation.config import BaseConfig, GraphConfig
 from kiteline_basestation.job_kinds import run_job
-from kiteline_basestation.jobs import Job, JobDone
+from kiteline_basestation.jobs import Job, JobDone, JobKind, set_aside
+from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.merging.essential_graph import GraphInputs
+from kiteline_basestation.runtime import worker as worker_module
 from kiteline_basestation.runtime.flight_log import fingerprint
-from kiteline_basestation.runtime.worker import Worker
+from kiteline_basestation.runtime.worker import LockstepJobs, Worker
+from tests.basestation.feeding import feed
 
 
 def graph_job(number: int) -> Job:
@@ -56,3 +67,100 @@ def test_a_worker_gives_the_results_in_order_and_survives_being_killed() -> None
 
 def test_fingerprints_tell_results_apart() -> None:
     assert fingerprint(run_job(graph_job(1))) != fingerprint(run_job(graph_job(2)))
+
+
+@dataclass(frozen=True, slots=True)
+class BadInputs:
+    """What a job does instead of work: raise, end the process, or give its number."""
+
+    what: str
+
+
+def _bad(inputs: BadInputs) -> str:
+    if inputs.what == "raise":
+        raise ZeroDivisionError("no landmarks")
+    if inputs.what == "die":
+        os._exit(9)
+    return inputs.what
+
+
+BAD = JobKind("bad", _bad, lambda inputs, result: 1)
+
+
+def _work_with_bad_jobs(pipe: Any) -> None:
+    job_kinds.KINDS[BAD.name] = BAD
+    worker_module._work(pipe)
+
+
+@pytest.fixture
+def bad_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that know jobs which fail, and start quickly."""
+    monkeypatch.setitem(job_kinds.KINDS, BAD.name, BAD)
+    context = multiprocessing.get_context("fork")
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: context)
+    monkeypatch.setattr(worker_module, "warm", lambda: None)
+    monkeypatch.setattr(worker_module, "warm_graphs", lambda: None)
+
+
+def test_a_job_that_fails_twice_is_set_aside_and_the_others_go_on(bad_jobs: None) -> None:
+    worker = Worker()
+    try:
+        worker.add([Job(n, "bad", BadInputs(what)) for n, what in enumerate(("a", "die", "b", "raise", "c"))], 0)
+        done = {d.id: d for d in collected(worker, 5)}
+        assert [done[n].result for n in (0, 2, 4)] == ["a", "b", "c"]
+        assert "ended with status 9" in done[1].failed and "no landmarks" in done[3].failed
+        assert worker.deaths == 2 and worker.idle
+        assert len(worker.notes) == 2 and all("set aside" in note for note in worker.notes)
+    finally:
+        worker.close()
+
+
+def test_a_stopped_worker_is_replaced(bad_jobs: None) -> None:
+    worker = Worker()
+    try:
+        worker.add([Job(1, "bad", BadInputs("a"))], 0)
+        collected(worker, 1)
+        os.kill(worker._process.pid or 0, signal.SIGSTOP)
+        worker.add([Job(2, "bad", BadInputs("b"))], 0)
+        begin_s = time.monotonic()
+        assert [d.result for d in collected(worker, 1)] == ["b"]
+        assert time.monotonic() - begin_s < 3.0
+        assert "was stopped" in worker.notes[0]
+    finally:
+        worker.close()
+
+
+def test_a_worker_that_cannot_start_is_tried_ever_less_often(
+    bad_jobs: None, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    monkeypatch.setattr(worker_module, "warm", lambda: os._exit(7))
+    worker = Worker()
+    try:
+        end_s = time.monotonic() + 2.5
+        while time.monotonic() < end_s:
+            assert worker.done(0) == ()
+            time.sleep(0.01)
+        assert worker.deaths <= 3
+        assert "cannot start (status 7)" in worker.notes[0]
+    finally:
+        worker.close()
+
+
+def test_a_job_that_raises_in_lock_step_is_set_aside(bad_jobs: None) -> None:
+    jobs = LockstepJobs()
+    jobs.add([Job(1, "bad", BadInputs("raise")), Job(2, "bad", BadInputs("a"))], 0)
+    first, second = jobs.done(10)
+    assert "no landmarks" in first.failed and second.result == "a"
+
+
+def test_a_mapper_forgets_jobs_that_failed_and_goes_on(words: Any, make_flight: Callable[..., Any]) -> None:
+    mapper, tried = Mapper(BaseConfig(), words), 0
+
+    def run(job: Job) -> JobDone:
+        nonlocal tried
+        tried += 1
+        return set_aside(job, "by chance") if tried % 3 == 0 else run_job(job)
+
+    feed(mapper, [make_flight()], run=run)
+    assert mapper.jobs_failed == tried // 3 > 0
+    assert mapper.counts.bundles > 0 and mapper.summary()["jobs_open"] == 0

@@ -11,6 +11,7 @@ from kiteline_core.geometry import sim3
 
 F64 = NDArray[np.float64]
 
+_MOST = 1e9  # of a number in a matrix
 _TOLERANCE = 1e-6  # of a rotation matrix
 
 
@@ -19,9 +20,17 @@ def numbers_of(pose: F64 | None) -> list[float] | None:
     return None if pose is None else [float(x) for x in pose.ravel()]
 
 
+def _matrix(numbers: Sequence[float] | F64) -> F64:
+    """(4,4) of 16 numbers, whose products are finite. Raises ValueError."""
+    values = np.array(numbers, np.float64).reshape(4, 4)
+    if not (np.abs(values) <= _MOST).all():
+        raise ValueError("numbers too large")
+    return values
+
+
 def similarity_from(numbers: Sequence[float] | F64) -> F64:
     """S (4,4) from 16 numbers. Raises ValueError if it is no similarity."""
-    S = np.array(numbers, np.float64).reshape(4, 4)
+    S = _matrix(numbers)
     scale = sim3.scale_of(S) if np.isfinite(S).all() else 0.0
     if scale <= 0.0:
         raise ValueError("no similarity")
@@ -33,7 +42,7 @@ def similarity_from(numbers: Sequence[float] | F64) -> F64:
 
 def rigid_from(numbers: Sequence[float] | F64) -> F64:
     """T (4,4) from 16 numbers. Raises ValueError if it is no rigid motion."""
-    T = np.array(numbers, np.float64).reshape(4, 4)
+    T = _matrix(numbers)
     R = T[:3, :3]
     if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         raise ValueError("no rigid motion")

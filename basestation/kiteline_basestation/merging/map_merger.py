@@ -172,6 +172,11 @@ class MapMerger:
             disparity.set_offsets(self._map, agents, window.problem, result, self._config.disparity)
         return changed
 
+    def forget_job(self, job: int, now_ns: int) -> None:
+        """Forget a job without a result, if it is one of these."""
+        self._corrections.take_graph(job)
+        self._corrections.take_bundle(job, 0, now_ns)
+
     def search_overlap(self, newer: SubmapId, older: SubmapId) -> None:
         """Search the older map for every keyframe of the newer one; one match then suffices (a user's command)."""
         self.detector.requested.add((min(newer, older), max(newer, older)))

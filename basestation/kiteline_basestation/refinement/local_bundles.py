@@ -93,6 +93,10 @@ class LocalBundles:
                 busy.add(self._map.map_id(submap))
         return jobs
 
+    def forget(self, job: int) -> None:
+        """Forget a job without a result, if it is one of these."""
+        self._pending.pop(job, None)
+
     def finish(self, done: JobDone) -> bool:
         """Apply a finished bundle. Returns False if it was cancelled."""
         pending = self._pending.pop(done.id, None)

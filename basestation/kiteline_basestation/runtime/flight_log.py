@@ -16,7 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone, set_aside
 from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.station import Import, Station, StationOutput
@@ -104,7 +105,8 @@ def write_step(
         else:
             log.json(COMMAND, log_ns, {"id": order.id, "verb": order.verb, "text": order.text})
     for job in done:
-        log.json(JOB, log_ns, {"id": job.id, "cost_ops": job.cost_ops, "result": fingerprint(job)})
+        failed = {"failed": job.failed} if job.failed else {}
+        log.json(JOB, log_ns, {"id": job.id, "cost_ops": job.cost_ops, "result": fingerprint(job), **failed})
     for answer in output.answers:
         log.json(ANSWER, log_ns, {"id": answer.id, "ok": answer.ok, "text": answer.text})
     for agent, out in output.packets:
@@ -122,6 +124,12 @@ def read_orders(messages: Iterable[StepMessage]) -> tuple[Import | Command, ...]
         elif message.topic == COMMAND:
             out.append(Command(**message.json()))
     return tuple(out)
+
+
+def done_again(job: Job, logged: StepMessage) -> JobDone:
+    """The job as it ended in the log: done again, or set aside."""
+    failed = logged.json().get("failed")
+    return set_aside(job, str(failed)) if failed else run_job(job)
 
 
 def fingerprint(done: JobDone) -> str:

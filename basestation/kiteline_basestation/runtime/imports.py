@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log
 from kiteline_basestation.station import Import, Station
@@ -15,6 +14,7 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import SavedMap, unpack
 from kiteline_basestation.store.store import FILE, read
 from kiteline_codec.schema import Key, record_log
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LogMessage, LogReader
 
@@ -28,6 +28,15 @@ def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station])
     """
     if path.is_dir() or path.suffix == Path(FILE).suffix:
         return read(path)
+    try:
+        return _of_log(path, make_station)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, *INPUT_FAULTS) as error:
+        raise StoreError(
+            f"{path}: damaged, or no log of kiteline ({error!r}); `kiteline log recover` mends logs"
+        ) from error
+
+
+def _of_log(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | list[Import]:
     with LogReader(path) as log:
         role = log.metadata.get("role")
         if role == "agent":
@@ -65,7 +74,8 @@ def _of_base(log: LogReader, path: Path, station: Station) -> SavedMap:
         head = messages[0].json()
         topics = {AgentId(int(a)): flight_log.packets_in(int(a)) for a in head["agents"]}
         packets = {agent: [m.blob() for m in messages if m.topic == topic] for agent, topic in topics.items()}
-        done = [run_job(jobs.pop(number)) for number in head["done"]]
+        logged = [m for m in messages if m.topic == flight_log.JOB]
+        done = [flight_log.done_again(jobs.pop(n), m) for n, m in zip(head["done"], logged, strict=True)]
         output = station.step(packets, done, head["now_ns"], flight_log.read_orders(messages))
         jobs.update({job.id: job for job in output.jobs})
     return snapshot(station, before)

@@ -76,6 +76,9 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
             now_ns = clock.now_ns()
             packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}
             done = worker.done(now_ns)
+            if worker.notes:
+                process.print_lines(worker.notes)
+                worker.notes.clear()
             commands = [Command(q.number, q.verb, q.text) for q in queries.questions()] if queries else []
             if packets or done or commands or now_ns - stepped_ns >= _STEP_NS:
                 output = base.step(packets, done, now_ns, commands)

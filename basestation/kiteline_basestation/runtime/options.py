@@ -95,4 +95,4 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
 def coded_channels(spec: BaseOptions, link: LinkTraits) -> Callable[[AgentId], RecordChannel]:
     """A function that opens the base's end of the channel to an agent."""
     sealed = seal_bytes(suite_for(link)) if spec.key else 0
-    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link)
+    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link, peer=agent)

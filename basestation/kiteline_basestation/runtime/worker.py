@@ -14,16 +14,22 @@ from multiprocessing.connection import Connection
 import cv2
 
 from kiteline_basestation.job_kinds import run_job
-from kiteline_basestation.jobs import Job, JobDone
+from kiteline_basestation.jobs import Job, JobDone, set_aside
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_hw.system.memory import return_large_arrays
+from kiteline_hw.system.process import is_stopped
 
 SAMPLES = 1 << 15  # newest CPU times that are recorded: half an hour of steps
 _END_S = 0.5  # s that a worker may take to end before it is killed
+_LOOK_S = 1.0  # s between two looks whether the process was stopped
+_LONGEST_PAUSE_S = 60.0  # s between two starts of a process that dies before its first job
+_MOST_CHARS = 300  # of an error that a job raised
 
 
 def _work(pipe: Connection) -> None:
-    """Loop of the worker process: receive a job, send its result and CPU time in ms, until the pipe closes."""
+    """Loop of the worker process: say that it is ready, then receive a job and send its result and CPU time in ms, or
+    the error that it raised, until the pipe closes.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the base, which closes the pipe
     return_large_arrays()
     cv2.setNumThreads(1)
@@ -31,21 +37,36 @@ def _work(pipe: Connection) -> None:
     if importlib.util.find_spec("gtsam") is not None:
         warm_graphs()
     with contextlib.suppress(EOFError, OSError):
+        pipe.send(None)
         while True:
             job = pipe.recv()
             begin_ns = time.process_time_ns()
-            done = run_job(job)
+            done: JobDone | str
+            try:
+                done = run_job(job)
+            except Exception as error:
+                done = f"{type(error).__name__}: {error}"[:_MOST_CHARS]
             pipe.send((done, (time.process_time_ns() - begin_ns) / 1e6))
 
 
 class Worker:
-    """A worker process that runs jobs in order. If it dies, it is started again with the same job."""
+    """A worker process that runs jobs in order; if it dies, or was stopped, another one takes its place.
+
+    A job that raises or ends the process is tried once more, then set aside: the other jobs go on. notes: lines about
+    what happened, for the user.
+    """
 
     def __init__(self) -> None:
         self.cpu_ms: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=SAMPLES))
         self.deaths = 0
+        self.notes: list[str] = []
         self._queue: deque[Job] = deque()
         self._running: Job | None = None
+        self._failed_once: set[int] = set()  # jobs that are tried for the second time
+        self._aside: list[JobDone] = []
+        self._idle_deaths = 0  # in a row, without a job done in between
+        self._start_s = 0.0  # when the next process may start, if there is none
+        self._looked_s = 0.0
         self._start()
 
     def _start(self) -> None:
@@ -53,6 +74,7 @@ class Worker:
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs,), name="kiteline-worker", daemon=True)
         self._process.start()
+        self._ready = self._away = False
         theirs.close()  # so that each side notices when the other ends
 
     def add(self, jobs: Sequence[Job], now_ns: int) -> None:
@@ -61,41 +83,87 @@ class Worker:
         self._start_next()
 
     def done(self, now_ns: int) -> tuple[JobDone, ...]:
-        """Jobs finished since the last call. Never blocks."""
+        """Jobs finished or set aside since the last call. Never blocks."""
         results = []
+        now_s = time.monotonic()
+        if self._away:
+            if now_s < self._start_s:
+                return self._taken_aside()
+            self._start()
         try:
             while self._pipe.poll():
-                result, cpu_ms = self._pipe.recv()
-                if self._running is not None:
-                    self.cpu_ms[self._running.kind].append(cpu_ms)
-                self._running = None
-                results.append(result)
+                message = self._pipe.recv()
+                if message is None:
+                    self._ready = True
+                else:
+                    results += self._finished(*message)
                 self._start_next()
         except (EOFError, OSError):
-            self._replace()
-        return tuple(results)
+            self._replace(now_s)
+        if now_s - self._looked_s >= _LOOK_S:
+            self._looked_s = now_s
+            if is_stopped(self._process.pid):
+                self.notes.append("the worker process was stopped; another one takes its place")
+                self._replace(now_s, is_fault=False)
+        return (*results, *self._taken_aside())
 
     @property
     def idle(self) -> bool:
         """True if no job is running or waiting."""
-        return self._running is None and not self._queue
+        return self._running is None and not self._queue and not self._aside
+
+    def _finished(self, done: JobDone | str, cpu_ms: float) -> list[JobDone]:
+        """Take in what became of the running job."""
+        job, self._running = self._running, None
+        self._idle_deaths = 0
+        if job is None:
+            return []
+        if isinstance(done, str):
+            self._try_again(job, done)
+            return []
+        self.cpu_ms[job.kind].append(cpu_ms)
+        self._failed_once.discard(job.id)
+        return [done]
+
+    def _try_again(self, job: Job, why: str) -> None:
+        """Queue a job that failed once more, or set it aside."""
+        if job.id not in self._failed_once:
+            self._failed_once.add(job.id)
+            self._queue.appendleft(job)
+            return
+        self._failed_once.discard(job.id)
+        self.notes.append(f"job {job.id} ({job.kind}) failed twice and was set aside: {why}")
+        self._aside.append(set_aside(job, why))
+
+    def _taken_aside(self) -> tuple[JobDone, ...]:
+        aside, self._aside = self._aside, []
+        return tuple(aside)
 
     def _start_next(self) -> None:
-        if self._running is None and self._queue:
+        if self._ready and self._running is None and self._queue:
             self._running = self._queue.popleft()
             try:
                 self._pipe.send(self._running)
             except OSError:
-                self._replace()
+                self._replace(time.monotonic())
 
-    def _replace(self) -> None:
+    def _replace(self, now_s: float, *, is_fault: bool = True) -> None:
+        """End the process and start another: at once, or later if it did nothing between two deaths."""
         self.deaths += 1
         self.close()
-        if self._running is not None:
-            self._queue.appendleft(self._running)
-            self._running = None
-        self._start()
-        self._start_next()
+        job, self._running = self._running, None
+        if job is not None and is_fault:
+            self._try_again(job, f"the worker process ended with status {self._process.exitcode}")
+        elif job is not None:
+            self._queue.appendleft(job)
+        elif is_fault and not self._ready:
+            self._idle_deaths += 1
+            self.notes.append(f"the worker process cannot start (status {self._process.exitcode}); it is tried again")
+        if self._idle_deaths:
+            self._ready, self._away = False, True
+            self._start_s = now_s + min(_LONGEST_PAUSE_S, 2.0 ** (self._idle_deaths - 1))
+        else:
+            self._start()
 
     def close(self) -> None:
         """End the worker process, also during a job."""
@@ -118,7 +186,10 @@ class LockstepJobs:
         """Run jobs now; `done` returns their results later."""
         for job in jobs:
             begin_ns = time.process_time_ns()
-            done = run_job(job)
+            try:
+                done = run_job(job)
+            except Exception as error:
+                done = set_aside(job, f"{type(error).__name__}: {error}"[:_MOST_CHARS])
             self.cpu_ms[job.kind].append((time.process_time_ns() - begin_ns) / 1e6)
             self._free_ns = max(now_ns, self._free_ns) + done.cost_ops
             self._waiting.append((self._free_ns, done))

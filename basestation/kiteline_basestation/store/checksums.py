@@ -33,6 +33,7 @@ INSERT INTO total VALUES ('code', 0, 0), ('state', 0, 0);
 """
 
 Row = tuple[int, int, int, int, int, bytes]
+_LIMITS = (63, 1, 255, (1 << 63) - 1, 0xFFFF)  # agent, own, kind, id, part
 
 
 class StoreError(KitelineError):
@@ -147,7 +148,7 @@ def read_all(db: sqlite3.Connection, path: Path) -> SavedMap:
         columns = "agent, own, kind, id, part, code, sum"
         for row in _rows(db, columns, "code", "rowid", faults):
             count += 1
-            if not isinstance(row[5], bytes) or sum_of(row[:5], row[5]) != row[6]:
+            if not _is_value(row) or sum_of(row[:5], row[5]) != row[6]:
                 faults.append(f"{_row_name(row)} was altered on disk: left out")
                 continue
             agent, own, kind, number, part, code, own_sum = row
@@ -169,6 +170,12 @@ def read_all(db: sqlite3.Connection, path: Path) -> SavedMap:
             with contextlib.suppress(sqlite3.DatabaseError):
                 db.execute("ROLLBACK")
     return SavedMap({a: SavedValues(*agents[a]) for a in sorted(agents)}, texts, tuple(faults))
+
+
+def _is_value(row: Sequence[Any]) -> bool:
+    """True if a row has the types and ranges that a base writes; SQLite keeps any type in any column."""
+    fits = all(type(n) is int and 0 <= n <= limit for n, limit in zip(row[:5], _LIMITS))
+    return fits and type(row[5]) is bytes
 
 
 def _structure(db: sqlite3.Connection) -> str:

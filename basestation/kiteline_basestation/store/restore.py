@@ -11,6 +11,7 @@ from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.state_texts import state_of
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import WireError, messages
+from kiteline_core.errors import INPUT_FAULTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ def restore(station: Station, saved: SavedMap, now_ns: int) -> Restored:
     """
     try:
         return _restore(station, check(saved), now_ns)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, *INPUT_FAULTS) as error:
         raise WireError(f"the saved map's state cannot be read ({error!r}); begin an empty store") from error
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from kiteline_codec.schema import RECORD_TYPES, Key, WireError
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
 
 _MAGIC = b"KLSTORE3"
@@ -73,6 +74,13 @@ def unpack(content: bytes) -> SavedMap:
     body, digest = content[:-_DIGEST_BYTES], content[-_DIGEST_BYTES:]
     if not body.startswith(_MAGIC) or hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest() != digest:
         raise WireError(f"a saved map of {len(content)} bytes is damaged, or of another version")
+    try:
+        return _unpacked(body)
+    except (ValueError, *INPUT_FAULTS) as error:
+        raise WireError(f"a saved map of {len(content)} bytes is damaged ({error!r})") from error
+
+
+def _unpacked(body: bytes) -> SavedMap:
     agents: dict[AgentId, SavedValues] = {}
     (count,) = _AGENTS.unpack_from(body, len(_MAGIC))
     at = len(_MAGIC) + _AGENTS.size

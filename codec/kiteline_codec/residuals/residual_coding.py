@@ -16,6 +16,7 @@ from kiteline_codec.residuals.landmark_residuals import CHECKSUM_BYTES, NewLandm
 from kiteline_codec.residuals.observation_residuals import ObservationResiduals
 from kiteline_codec.residuals.predictors import Held, Predictors
 from kiteline_codec.schema import Key, NewLandmarks, Observations, RefinedLandmarks
+from kiteline_core.errors import INPUT_FAULTS
 
 _Coder = NewLandmarkResiduals | ObservationResiduals | RefinedLandmarkResiduals
 
@@ -57,10 +58,14 @@ class ResidualCoder:
         if coder is None:
             raise WireError(f"kind {key.kind} has no residual code")
         source, out = Reader(data), Writer()
-        versions = coder.expand(out, key, source, held)
-        checksum, code = source.raw(CHECKSUM_BYTES), out.bytes()
+        try:
+            versions = coder.expand(out, key, source, held)
+            checksum, code = source.raw(CHECKSUM_BYTES), out.bytes()
+            expected = _checksum(code, versions)
+        except INPUT_FAULTS as error:
+            raise WireError(f"the residual code of {key} cannot be read ({error!r})") from error
         source.end()
-        if _checksum(code, versions) != checksum:
+        if expected != checksum:
             raise WireError("a residual code was made with other values than are held")
         return code
 

@@ -6,6 +6,7 @@ from collections import deque
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.record import RECORD_TYPES, Key, Record
+from kiteline_core.errors import INPUT_FAULTS
 
 _KEPT = 32  # records: all sections of a keyframe, and those that were tried
 _measured: deque[tuple[Record, bytes]] = deque(
@@ -43,6 +44,9 @@ def decode(key: Key, code: bytes) -> Record:
     if not 0 <= key.id <= record_type.ID.max_id or not 0 <= key.part < record_type.PARTS:
         raise WireError(f"{key} is out of range")
     source = Reader(code)
-    record = record_type.read(source, key)
+    try:
+        record = record_type.read(source, key)
+    except INPUT_FAULTS as error:
+        raise WireError(f"the code of {key} cannot be read ({error!r})") from error
     source.end()
     return record

@@ -47,7 +47,7 @@ class SyncConfig:
     oldest_every: int = 8
     max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
     max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
-    max_inbox_bytes: int = 1 << 30  # of values that the peer wrote
+    max_inbox_bytes: int = 2 << 30  # memory for what the peer wrote, and what that claims in the map: 40,000 keyframes
     resident_bytes: int | None = None  # memory for own values of keyframes, archived pages apart; None: unlimited
     resident_inbox_bytes: int | None = None  # the same for the peer's values of keyframes; needs a spill
     order: Callable[[Key], Order] = default_order

@@ -8,7 +8,7 @@ No message is queued. Packets are described in SPEC.md, states in `agreement`.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.pacing.budget import SlidingBudget
@@ -20,7 +20,7 @@ from kiteline_codec.sync import resumption
 from kiteline_codec.sync.agreement import OwnState, OwnValues, PeerValues
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats
-from kiteline_codec.sync.inbox import Inbox, Update
+from kiteline_codec.sync.inbox import Claims, EarlierValues, Inbox, Update
 from kiteline_codec.sync.outbox import Known, Outbox
 from kiteline_codec.sync.round_trip import RoundTrip
 from kiteline_codec.sync.send_queue import Order
@@ -40,11 +40,14 @@ class Endpoint:
     """One end of a relation between two sessions. Pure: time and packets are handed in, packets are handed out."""
 
     def __init__(
-        self, config: SyncConfig, session: int, coder: ResidualCoder | None = None, spill: Spill | None = None
-    ) -> None:
+        self, config: SyncConfig, session: int, coder: ResidualCoder | None = None, spill: Spill | None = None,
+        may_write: Callable[[Key], bool] = lambda key: True,
+        claimed_bytes: Callable[[Key, bytes], int] = lambda key, code: 0,
+    ) -> None:  # fmt: skip
         """session: above 0, and higher than any earlier one of this side. coder: makes values shorter on the wire; both
         ends have one, or none. spill: keeps values of keyframes beyond `resident_bytes`; without one, those that the
-        peer holds are forgotten and others dropped.
+        peer holds are forgotten and others dropped. may_write: tells whether a key is one of the peer's; values under
+        others are ignored. claimed_bytes: memory that a code of the peer claims for good where it is used.
         """
         if not 0 < session < 1 << 56:
             raise ValueError(f"session is {session}, expected 1..2^56-1")
@@ -60,7 +63,9 @@ class Endpoint:
         self.peer_session: int | None = None  # None before the first packet of the peer
         self._own_values = OwnValues()
         self._peer_values = PeerValues()
-        self._earlier: dict[Key, bytes] = {}  # written by earlier sessions of the peer
+        self._earlier = EarlierValues()
+        self._may_write = may_write
+        self._claims = Claims(claimed_bytes)
         self._resumable: dict[Key, int] = {}  # checksums of what the peer holds of earlier sessions of this side
         self._overtaken_below = 0  # packets with lower numbers have been overtaken by enough acknowledged ones
         self._unanswered = 0  # packets to acknowledge, and news to send
@@ -113,11 +118,13 @@ class Endpoint:
 
     def earlier_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
-        return dict(self._earlier)
+        return dict(self._earlier.codes)
 
     def resume(self, values: Mapping[Key, bytes]) -> None:
         """Take over values of earlier sessions of the peer from a store; the peer need not send them again."""
-        self._earlier.update(values)
+        self._earlier.keep(values)
+        for key, code in values.items():
+            self._claims.add(key, code)
 
     # ---- agreement
 
@@ -146,7 +153,7 @@ class Endpoint:
         return SyncStats(
             self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, packets.lost,
             self._duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
-            packets.in_flight, len(self._in), len(self._earlier), self.peer_session, self._restarts,
+            packets.in_flight, len(self._in), len(self._earlier.codes), self.peer_session, self._restarts,
             self._mismatches, self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped,
             self.throughput_bytes_s,
         )  # fmt: skip
@@ -187,17 +194,20 @@ class Endpoint:
                 self._duplicates += 1
                 self._owe_answer(now_ns)
                 return updates
-            if not self._in.room_for(items, self.config.max_inbox_bytes, self.config.max_assembly_bytes):
-                self._refuse("no memory left for it")
-                return updates
             try:
-                items = self._expanded(items)
+                items = self._own_items(self._expanded(items))
             except WireError as e:
                 return self._refuse(str(e))
+            taken = self._earlier.bytes + self._claims.bytes
+            if not self._in.room_for(items, self.config.max_inbox_bytes - taken, self.config.max_assembly_bytes):
+                self._refuse("no memory left for it")
+                return updates
             self._in.packets.mark(number)
             self._owe_answer(now_ns)
             self._in.raise_watermark(watermark)
+            limit = self.config.max_inbox_bytes - self._earlier.bytes - self._in.held_bytes
             for item in items:
+                known = self._in.held(item.key) is not None
                 update = self._in.apply(item)
                 if update is not None:
                     if update.key.kind in PREDICTOR_KINDS:
@@ -205,7 +215,11 @@ class Endpoint:
                     if update.key.kind == resumption.SUMMARY_KIND:
                         self._take_summary(update.code or b"")
                         continue
-                    self._earlier.pop(update.key, None)
+                    known = known or update.key in self._earlier.codes
+                    self._earlier.drop(update.key)
+                    if update.code is not None and not known and not self._claims.fit(update.key, update.code, limit):
+                        self._refuse("no memory left for what it claims")
+                        continue
                     updates.append(update)
         self._compare(header, now_ns)
         return updates
@@ -224,7 +238,14 @@ class Endpoint:
             return items
         if self._coder is None:
             raise WireError("a residual code, which this side does not read")
-        return resumption.expand_items(items, self._coder, self._held, self._earlier)
+        return resumption.expand_items(items, self._coder, self._held, self._earlier.codes)
+
+    def _own_items(self, items: list[Item]) -> list[Item]:
+        """The items without those of values that the peer may not write, which are counted."""
+        own = [item for item in items if item.key.kind == resumption.SUMMARY_KIND or self._may_write(item.key)]
+        if len(own) < len(items):
+            self._refuse("a value that the peer may not write")
+        return own
 
     def _held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value of either side."""
@@ -233,8 +254,10 @@ class Endpoint:
     def _take_summary(self, code: bytes) -> None:
         """Take in what the peer holds of earlier sessions of this side; a summary that cannot be read is ignored."""
         with contextlib.suppress(WireError):
-            self._resumable.update(resumption.read_summary(code))
-            self._out.predictors_changed()
+            summary = resumption.read_summary(code)
+            if len(self._resumable) + len(summary) <= resumption.MOST_LISTED:
+                self._resumable.update(summary)
+                self._out.predictors_changed()
 
     def _refuse(self, reason: str) -> list[Update]:
         self._reasons[reason] = self._reasons.get(reason, 0) + 1
@@ -245,12 +268,12 @@ class Endpoint:
         if self.peer_session is not None:
             self._restarts += 1
         self.peer_session = session
-        self._earlier.update(self.peer_values())
+        self._earlier.keep(self.peer_values())
         self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
         self._resumable.clear()
         self._out.restart()
         if self._coder is not None:
-            for key, code in resumption.summaries(self._earlier, session).items():
+            for key, code in resumption.summaries(self._earlier.codes, session).items():
                 self._out.put(key, code, self.config.order(key))
         self._own_values.new_session()
         self._peer_values.new_session()

@@ -6,6 +6,7 @@ With a limit and a spill, values of keyframes that were not used for long are ar
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from kiteline_codec.schema import KEYFRAME_KINDS, Key
@@ -16,7 +17,8 @@ from kiteline_codec.sync.resident import ResidentValues
 from kiteline_codec.transport.packet import MASK_BITS, Item
 from kiteline_codec.transport.sequence_window import SequenceWindow
 
-_VALUE_BYTES = 350  # memory of a value beside its code, roughly
+VALUE_BYTES = 350  # memory of a value beside its code, roughly; of a removal or of a value that came in part, too
+_MOST_PIECES = 256  # gaps in a value that comes in part: a link has 64 packets in flight
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,48 @@ class _Assembly:
     received: ranges.Ranges
 
 
+class EarlierValues:
+    """What earlier sessions of the peer wrote and its present one has not replaced, and the memory that it takes."""
+
+    def __init__(self) -> None:
+        self.codes: dict[Key, bytes] = {}
+        self.bytes = 0
+
+    def keep(self, values: Mapping[Key, bytes]) -> None:
+        """Add values."""
+        for key, code in values.items():
+            self.drop(key)
+            self.codes[key] = code
+            self.bytes += len(code) + VALUE_BYTES
+
+    def drop(self, key: Key) -> None:
+        """Remove a value, if it is here."""
+        code = self.codes.pop(key, None)
+        if code is not None:
+            self.bytes -= len(code) + VALUE_BYTES
+
+
+class Claims:
+    """Memory that values of the peer claim for good where they are used: removing a value gives nothing back."""
+
+    def __init__(self, claimed_bytes: Callable[[Key, bytes], int]) -> None:
+        """claimed_bytes: of a code under a key."""
+        self._claimed_bytes = claimed_bytes
+        self.bytes = 0
+
+    def add(self, key: Key, code: bytes) -> None:
+        """Count a value."""
+        self.bytes += self._claimed_bytes(key, code)
+
+    def fit(self, key: Key, code: bytes, limit: int) -> bool:
+        """Count a value unless all claims would then be above the limit; returns whether it was counted."""
+        claimed = self._claimed_bytes(key, code)
+        if claimed and self.bytes + claimed > limit:
+            return False
+        self.bytes += claimed
+        return True
+
+
 class Inbox:
     """Packet numbers, values, removals and unfinished values of one session of the peer."""
 
@@ -42,10 +86,10 @@ class Inbox:
         self._values: dict[Key, tuple[int, bytes]] = {}
         self._hashed: dict[Key, int] = {}  # parts of the digest, of values that were not archived since they came
         self._archive = Archive(spill)
-        self._resident = ResidentValues(None if spill is None else resident_bytes, _VALUE_BYTES)
+        self._resident = ResidentValues(None if spill is None else resident_bytes, VALUE_BYTES)
         self.digest = Digest()
-        self.value_bytes = 0
-        self.assembly_bytes = 0
+        self.value_bytes = 0  # of codes
+        self.assembly_bytes = 0  # of values that have arrived in part, with what they take beside their bytes
         self.newest = 0  # highest version seen; versions count from 1
         self.watermark = 0  # all versions up to it have arrived, or do not matter any more
         self._removed: dict[Key, int] = {}
@@ -87,15 +131,27 @@ class Inbox:
         last = self.packets.highest
         return None if last is None else (last, self.packets.missing())
 
+    @property
+    def held_bytes(self) -> int:
+        """Memory of values and removals, roughly; where values are archived, that of their codes in the archive too."""
+        return self.value_bytes + VALUE_BYTES * (len(self) + len(self._removed_order))
+
     def room_for(self, items: list[Item], max_values: int, max_assemblies: int) -> bool:
         """True if memory for the items is within the limits, in bytes."""
-        assemblies, values = self.assembly_bytes, self.value_bytes
+        assemblies, values = self.assembly_bytes, self.held_bytes
+        begun: dict[Key, tuple[int, int]] = {}  # version and length of values that this packet begins
         for item in items:
+            values += VALUE_BYTES
             if item.total is None:
                 continue
             values += len(item.data)
-            if not item.whole and item.key not in self._assemblies:
-                assemblies += item.total
+            if item.whole:
+                continue
+            part = self._assemblies.get(item.key)
+            known = begun.get(item.key) or (None if part is None else (part.version, len(part.data)))
+            if known != (item.version, item.total):
+                begun[item.key] = item.version, item.total
+                assemblies += item.total + VALUE_BYTES
         return values <= max_values and assemblies <= max_assemblies
 
     def raise_watermark(self, version: int) -> None:
@@ -160,7 +216,10 @@ class Inbox:
             self._drop_assembly(item.key)
             part = _Assembly(item.version, bytearray(item.total), ranges.NONE)
             self._assemblies[item.key] = part
-            self.assembly_bytes += item.total
+            self.assembly_bytes += item.total + VALUE_BYTES
+        if len(part.received) >= _MOST_PIECES:
+            self._drop_assembly(item.key)
+            return None
         stop = item.offset + len(item.data)
         part.data[item.offset : stop] = item.data
         part.received = ranges.add(part.received, item.offset, stop)
@@ -169,7 +228,7 @@ class Inbox:
     def _drop_assembly(self, key: Key, up_to: int | None = None) -> None:
         part = self._assemblies.get(key)
         if part is not None and (up_to is None or part.version <= up_to):
-            self.assembly_bytes -= len(part.data)
+            self.assembly_bytes -= len(part.data) + VALUE_BYTES
             del self._assemblies[key]
 
     def _drop_value(self, key: Key) -> None:

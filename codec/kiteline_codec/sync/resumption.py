@@ -22,6 +22,7 @@ REFERENCE_BYTES = 4
 _MIN_CODE_BYTES = 16  # shorter codes are sent as they are
 _VALUES_PER_PART = 60  # fit a packet of a thin link in a few pieces
 _MAX_PARTS = 1 << 16
+MOST_LISTED = 1 << 17  # values that are remembered of what a peer lists: 25 MB
 _SHORT_CHECKSUM = 0xFFFFFF
 _FROM_AGENT = KEYFRAME_KINDS & AGENT_KINDS
 
@@ -56,6 +57,8 @@ def read_summary(code: bytes) -> dict[Key, int]:
     source, last_id = Reader(code), 0
     out: dict[Key, int] = {}
     while source.left:
+        if len(out) == _VALUES_PER_PART:
+            raise WireError(f"a summary lists at most {_VALUES_PER_PART} values")
         last_id += source.signed(1 << 62)
         key = Key(source.u8(), last_id, source.varint(0xFFFF))
         if not 0 <= last_id < 1 << 62 or key.kind >= SUMMARY_KIND:

@@ -15,6 +15,8 @@ MASK_BITS = 64  # packets before the last one that an acknowledgement covers
 MAX_HEADER_BYTES = 64  # of a packet with values, checksum included
 MAX_KIND = 63
 MAX_ITEM_BYTES = 40  # of an item's own header
+MAX_PACKET_BYTES = 1 << 16
+MAX_VERSION = (1 << 63) - 1
 
 _FLAG_ACK = 1
 _FLAG_DIGEST = 2
@@ -118,8 +120,8 @@ def add_checksum(out: Writer) -> bytes:
 
 def parse(packet: bytes, max_value_bytes: int) -> tuple[Header, list[Item]]:
     """Header and items of a packet. Raises WireError; VersionError for another protocol version."""
-    if len(packet) < CRC_BYTES + 4:
-        raise WireError(f"a packet of {len(packet)} bytes is too short")
+    if not CRC_BYTES + 4 <= len(packet) <= MAX_PACKET_BYTES:
+        raise WireError(f"a packet of {len(packet)} bytes: expected {CRC_BYTES + 4}..{MAX_PACKET_BYTES}")
     body = packet[:-CRC_BYTES]
     if crc32(body).to_bytes(CRC_BYTES, "little") != packet[-CRC_BYTES:]:
         raise WireError("the checksum is wrong")
@@ -165,6 +167,8 @@ def _read_item(source: Reader, last_id: int, watermark: int, max_value_bytes: in
         raise WireError(f"an id is not negative and fits 63 bits, found {id_}")
     key = Key(kind, id_, source.varint(0xFFFF))
     version = watermark + 1 + source.varint()
+    if version > MAX_VERSION:
+        raise WireError(f"found version {version}, expected at most {MAX_VERSION}")
     if tag & _RESIDUAL == _REMOVED:
         return Item(key, version, None, 0, b"")
     length = source.varint(max_value_bytes)

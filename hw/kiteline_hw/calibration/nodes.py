@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_hw.ports import SourceError
 
 F64 = NDArray[np.float64]
 
-_MOST_BYTES = 1 << 20  # calibration files are a few kB
+_MOST_BYTES = 1 << 16  # calibration files are a few kB
+_MOST_ROWS = 1000  # of a matrix
 _MOST_PX = 100_000  # of an image's side
 
 
@@ -28,7 +31,9 @@ class Node:
 
     def error(self, expected: str) -> SourceError:
         """The error that this entry is not what was expected."""
-        found = "nothing" if self.value in (None, "") else repr(self.value)
+        found = (
+            "nothing" if self.value in (None, "") else reprlib.repr(self.value)
+        )  # aliases make long texts of short files
         return SourceError(f"{self.path}: expected {self.key or 'the file'} to be {expected}, found {found[:80]}")
 
     @property
@@ -89,6 +94,8 @@ class Node:
     def matrix(self, shape: tuple[int, int] | None, expected: str) -> F64:
         """A matrix written as a table of rows, cols and data. shape: None for any."""
         rows, columns = (round(self.get(key).number(f"the number of {key}")) for key in ("rows", "cols"))
+        if not (0 <= rows <= _MOST_ROWS and 0 <= columns <= _MOST_ROWS):
+            raise self.error(expected)
         if shape is not None and (rows, columns) != shape:
             raise self.error(expected)
         values = self.get("data").numbers((rows * columns,), expected)
@@ -98,17 +105,18 @@ class Node:
 def read_nodes(path: Path) -> Node:
     """The whole of a YAML file, OpenCV's FileStorage included. Raises SourceError."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; expected a calibration file") from error
     if len(data) > _MOST_BYTES:
-        raise SourceError(f"{path}: {len(data)} bytes: expected a calibration file, which is far smaller")
+        raise SourceError(f"{path}: more than {_MOST_BYTES} bytes: expected a calibration file, which is far smaller")
     # OpenCV's head "%YAML:1.0" is no YAML.
     lines = data.decode("utf-8", "replace").splitlines()
     text = "\n".join("" if line.startswith("%") else line for line in lines)
     try:
         value = yaml.load(text, Loader=yaml.BaseLoader)  # all scalars stay texts, tags are ignored
-    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, *INPUT_FAULTS) as error:
         raise SourceError(f"{path}: no YAML: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(value, dict):
         raise SourceError(f"{path}: expected a calibration file in YAML: keys with values")

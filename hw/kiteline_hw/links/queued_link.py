@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from kiteline_hw.system.closing import Closing
 
 OUTBOX_PACKETS = 256  # packets; one second of the fastest profile: the sender builds older ones anew
-INBOX_PACKETS = 4096  # packets; 4 MB at most with packets of usual size
+INBOX_PACKETS = 4096  # packets
+INBOX_BYTES = 1 << 20  # of them: a second of a fast Wi-Fi; the loop takes them every 5 to 50 ms
+MOST_PACKET_BYTES = (1 << 16) + 64  # of a packet with its seal
 
 
 @dataclass(slots=True)
@@ -22,7 +24,7 @@ class LinkCounters:
     failed_packets: int = 0  # accepted by send(), then lost in the device
     received_packets: int = 0
     received_bytes: int = 0
-    overrun_packets: int = 0  # the oldest of a full inbox
+    overrun_packets: int = 0  # the oldest of a full inbox, and those that are no packets by their length
     reconnects: int = 0
     callback_errors: int = 0
 
@@ -39,6 +41,7 @@ class QueuedLink(Closing):
         self._wake = wake or threading.Condition()
         self._outbox: deque[bytes] = deque()
         self._inbox: deque[bytes] = deque()
+        self._inbox_bytes = 0
         self._inbox_lock = threading.Lock()
 
     @property
@@ -66,6 +69,7 @@ class QueuedLink(Closing):
         with self._inbox_lock:
             packets = list(self._inbox)
             self._inbox.clear()
+            self._inbox_bytes = 0
         return packets
 
     def pending(self) -> bool:
@@ -88,11 +92,17 @@ class QueuedLink(Closing):
         self._counters.sent_bytes += len(packet)
 
     def deliver(self, packet: bytes) -> None:
-        """Put a packet that came in into the inbox; the oldest one makes room if it is full."""
+        """Put a packet that came in into the inbox; the oldest ones make room if it is full."""
         with self._inbox_lock:
-            if len(self._inbox) >= INBOX_PACKETS:
-                self._inbox.popleft()
+            if len(packet) > MOST_PACKET_BYTES:
+                self._counters.overrun_packets += 1
+                return
+            while self._inbox and (
+                len(self._inbox) >= INBOX_PACKETS or self._inbox_bytes + len(packet) > INBOX_BYTES
+            ):  # fmt: skip
+                self._inbox_bytes -= len(self._inbox.popleft())
                 self._counters.overrun_packets += 1
             self._inbox.append(packet)
+            self._inbox_bytes += len(packet)
             self._counters.received_packets += 1
             self._counters.received_bytes += len(packet)

@@ -16,8 +16,8 @@ from typing import Any
 import zenoh
 
 from kiteline_hw.links.ends import LinkOptions
-from kiteline_hw.links.queued_link import LinkCounters, QueuedLink
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.links.queued_link import MOST_PACKET_BYTES, LinkCounters, QueuedLink
+from kiteline_hw.links.zenoh_session import MOST_MESSAGE_BYTES, close_session, direct, open_session
 from kiteline_hw.ports import ByteLink, LinkError
 from kiteline_hw.system.closing import Closing
 
@@ -195,7 +195,7 @@ class ZenohHub(Closing):
         self._links: dict[int, _AgentLink] = {}
         self._closed = threading.Event()
         self.counters = LinkCounters()
-        self.session = open_session(endpoint, "base")
+        self.session = open_session(endpoint, "base", most_message_bytes=MOST_MESSAGE_BYTES)
         on_packet, on_agent = _guarded(self.counters, self._on_packet), _guarded(self.counters, self._on_agent)
         try:
             liveliness = self.session.liveliness()
@@ -220,6 +220,9 @@ class ZenohHub(Closing):
             return link
 
     def _on_packet(self, sample: Any) -> None:
+        if len(sample.payload) > MOST_PACKET_BYTES:
+            self.counters.overrun_packets += 1
+            return
         link = self._link(sample.key_expr)
         link.alive = True
         link.deliver(sample.payload.to_bytes())

@@ -16,11 +16,12 @@ from typing import Any
 
 import zenoh
 
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.links.zenoh_session import MOST_MESSAGE_BYTES, close_session, direct, open_session
 from kiteline_hw.ports import LinkError
 
 _RETRY_S = 0.1  # s between two requests that nobody answered
 _MAX_WAITING = 64  # requests in the queue; more are refused
+_MOST_BYTES = 1 << 16  # of a request
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,9 @@ class QueryServer:
     """Receives requests on a session, or on one of its own that listens on an endpoint. Raises LinkError."""
 
     def __init__(self, service: str, session: zenoh.Session | None = None, endpoint: str = "") -> None:
-        self._own_session = open_session(endpoint, "base") if session is None else None
+        self._own_session = (
+            open_session(endpoint, "base", most_message_bytes=MOST_MESSAGE_BYTES) if session is None else None
+        )
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}
         self._number = 0
@@ -56,7 +59,10 @@ class QueryServer:
 
     def _on_query(self, query: Any) -> None:
         try:
-            if self._arrived.qsize() >= _MAX_WAITING:
+            given = query.payload
+            if (0 if given is None else len(given)) + len(str(query.parameters)) > _MOST_BYTES:
+                _reply(query, False, json.dumps({"error": f"a question has at most {_MOST_BYTES} bytes"}))
+            elif self._arrived.qsize() >= _MAX_WAITING:
                 _reply(query, False, json.dumps({"error": "too many questions wait; ask again"}))
             else:
                 self._arrived.put(query)

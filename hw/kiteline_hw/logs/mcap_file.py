@@ -24,10 +24,14 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Metadata, Schema
 
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_hw.ports import SourceError
 
 MAGIC = b"\x89MCAP0\r\n"
 _RUN_BYTES = 1 << 20  # bytes; messages outside of chunks are read in runs of this size
+MOST_CHUNK_BYTES = 1 << 26  # of a chunk, packed and unpacked, and of a message outside of one; writers take 1 MB
+_MOST_DEFINITION_BYTES = 1 << 24  # of a schema, channel or metadata record
+_MOST_HELD_BYTES = 1 << 30  # of messages that wait for others whose chunks overlap theirs in time
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -104,13 +108,18 @@ class McapFile:
 
     def _merged(self, file: BinaryIO, spans: list[_Span], wanted: frozenset[int] | None) -> Iterator[RawMessage]:
         heap: list[tuple[int, int, RawMessage]] = []
-        order = 0
+        order = held_bytes = 0
         for span in sorted(spans, key=lambda s: (s.first_ns, s.offset)):
             while heap and heap[0][0] < span.first_ns:
-                yield heapq.heappop(heap)[2]
+                message = heapq.heappop(heap)[2]
+                held_bytes -= len(message.data)
+                yield message
             for message in self._span_messages(file, span, wanted):
                 heapq.heappush(heap, (message.log_ns, order, message))
                 order += 1
+                held_bytes += len(message.data)
+            if held_bytes > _MOST_HELD_BYTES:
+                raise SourceError(f"{self.path}: more than {_MOST_HELD_BYTES} bytes of messages overlap in time")
         while heap:
             yield heapq.heappop(heap)[2]
 
@@ -127,7 +136,7 @@ class McapFile:
             if summary is None or summary.statistics is None or not summary.chunk_indexes or not summary.channels:
                 return False
             self.metadata = list(reader.iter_metadata())
-        except (McapError, struct.error, ValueError, OSError, UnicodeDecodeError):
+        except (McapError, ValueError, KeyError, OSError, *INPUT_FAULTS):
             return False
         if sum(summary.statistics.channel_message_counts.values()) and not summary.schemas:
             return False
@@ -163,7 +172,7 @@ class McapFile:
                 break
             opcode, length = _RECORD.unpack(head)
             end = offset + _RECORD.size + length
-            if opcode == Opcode.MESSAGE and end <= self._size:
+            if opcode == Opcode.MESSAGE and end <= self._size and _MESSAGE.size <= length <= MOST_CHUNK_BYTES:
                 channel, _, log_ns, _ = _MESSAGE.unpack(file.read(_MESSAGE.size))
                 if not run_start:
                     run_start, run_times = offset, [log_ns, log_ns]
@@ -188,7 +197,7 @@ class McapFile:
             if end > self._size:
                 self.cut = f"cut after {self._size} bytes, inside a record that needs {end - self._size} more"
                 break
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA) and length <= _MOST_DEFINITION_BYTES:
                 self._read_definition(opcode, file.read(length))
             offset = end
         end_run()
@@ -216,10 +225,13 @@ class McapFile:
             else:
                 channel = Channel.read(stream)
                 self.channels[channel.id] = channel
-        except (McapError, struct.error, ValueError, UnicodeDecodeError) as error:
+        except (McapError, ValueError, *INPUT_FAULTS) as error:
             self._note(f"unreadable schema, channel or metadata ({error})")
 
     def _span_messages(self, file: BinaryIO, span: _Span, wanted: frozenset[int] | None) -> Iterator[RawMessage]:
+        if span.length > MOST_CHUNK_BYTES + _RUN_BYTES:
+            self._note(f"chunk of {span.length} bytes at byte {span.offset}, expected at most {MOST_CHUNK_BYTES}")
+            return
         file.seek(span.offset)
         body = file.read(span.length)
         if span.chunk:
@@ -251,17 +263,18 @@ class McapFile:
             (stored,) = struct.unpack_from("<Q", record, at + name_length)
             packed = record[at + name_length + 8 :][:stored]
             whole = len(packed) == stored
+            if size > MOST_CHUNK_BYTES:
+                raise ValueError(f"{size} bytes, expected at most {MOST_CHUNK_BYTES}")
             if compression == "":
                 body = packed
-            elif compression == "zstd" and whole:
-                body = zstandard.decompress(packed, size)
             elif compression == "zstd":
-                body = zstandard.ZstdDecompressor().decompressobj().decompress(packed)
+                with zstandard.ZstdDecompressor(max_window_size=MOST_CHUNK_BYTES).stream_reader(packed) as stream:
+                    body = stream.read(size)
             elif compression == "lz4":
-                body = lz4.frame.LZ4FrameDecompressor().decompress(packed)
+                body = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
             else:
                 raise ValueError(f"unknown compression {compression!r}")
-        except (struct.error, ValueError, RuntimeError, MemoryError, OverflowError, zstandard.ZstdError) as error:
+        except (ValueError, RuntimeError, zstandard.ZstdError, *INPUT_FAULTS) as error:
             self._note(f"damaged chunk at byte {offset} ({error})")
             return b""
         if whole and crc and zlib.crc32(body) != crc:

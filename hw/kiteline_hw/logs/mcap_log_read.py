@@ -12,6 +12,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_hw.logs import mcap_schemas as schemas
@@ -43,7 +44,7 @@ class LogMessage:
         """The logged value; of named fields an object, with arrays as lists."""
         try:
             return self._fields() if self.schema == "kiteline.Fields" else json.loads(self.data)
-        except ValueError as error:
+        except (ValueError, *INPUT_FAULTS) as error:
             raise SourceError(f"{self.topic} at {self.t_ns} ns holds no JSON") from error
 
     def _fields(self) -> dict[str, Any]:

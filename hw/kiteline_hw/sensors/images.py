@@ -16,12 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import EncodedImage
+from kiteline_hw.sensors.image_size import size_of
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 
 DEPTH_FORMAT = "png/1000"  # millimetres: what our logs write if a source has no encoded depth
+
+MOST_PIXELS = 1 << 25  # of an image: 33 million, which are decoded in a third of a second
+_PNG_GREY_16 = b"\x10\x00"  # bits and colour type in a PNG's head
 
 _FAST_PNG = (
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG
@@ -80,6 +84,8 @@ def decode_depth(ref: ImageRef) -> tuple[F32, EncodedImage | None]:
     if isinstance(ref, RawPixels):
         return ref.metres(), None
     image = _encoded(ref)
+    if image.data[:4] == b"\x89PNG" and image.data[24:26] != _PNG_GREY_16:
+        raise BadImage("depth image is no 16-bit grey PNG")
     raw = _imdecode(image, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise BadImage(f"depth image is {raw.dtype} with {raw.ndim} axes: expected 16-bit grey")
@@ -128,6 +134,10 @@ def encode_depth(depth_m: F32) -> EncodedImage:
 
 
 def _imdecode(image: EncodedImage, flags: int) -> NDArray[np.generic]:
+    size = size_of(image.data)
+    if size is None or not 0 < size[0] * size[1] <= MOST_PIXELS:
+        found = "no size" if size is None else f"{size[0]}x{size[1]} px"
+        raise BadImage(f"an image with {found}: expected at most {MOST_PIXELS} pixels")
     try:
         pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags)
     except cv2.error as error:

@@ -6,6 +6,7 @@ mav0 or in dso.
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +27,7 @@ from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_toleranc
 from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sensors.imu_buffer import ImuSamples, ImuTable
 from kiteline_hw.sources.recording import Recording, Stamped, image_size, list_images, sorted_trajectory
-from kiteline_hw.sources.text_files import pose_from_tum, read_rows, read_tum_poses
+from kiteline_hw.sources.text_files import listed_file, nanoseconds, pose_from_tum, read_rows, read_tum_poses
 
 F64 = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ def _read_imu(path: Path, report: SourceReport) -> ImuSamples:
             row = [float(cell) for cell in cells[1:7]]
             if len(row) != 6:
                 raise ValueError
-            times.append(int(cells[0]))
+            times.append(nanoseconds(cells[0]))
             values.append(row)
         except ValueError:
             report.skip("unreadable imu line", f"{path.name}: {','.join(cells)[:60]!r}")
@@ -140,12 +141,18 @@ def _list_stamped(folder: Path) -> Stamped:
     out: Stamped = []
     if listing.is_file():
         for cells in read_rows(listing, "t_ns,filename a line", ","):
-            if not cells[0].isdigit():
-                raise SourceError(f"{listing}: expected 't_ns,filename' a line, found {','.join(cells)[:60]!r}")
+            try:
+                t_ns = nanoseconds(cells[0])
+            except ValueError as error:
+                raise SourceError(
+                    f"{listing}: expected 't_ns,filename' a line, found {','.join(cells)[:60]!r}"
+                ) from error
             name = cells[1] if len(cells) > 1 and cells[1] else f"{cells[0]}.png"
-            out.append((int(cells[0]), folder / "data" / name))
+            out.append((t_ns, listed_file(folder / "data", name, listing)))
     else:
-        out = [(int(path.stem), path) for path in list_images(folder / "data") if path.stem.isdigit()]
+        for path in list_images(folder / "data"):
+            with contextlib.suppress(ValueError):  # some other image
+                out.append((nanoseconds(path.stem), path))
     if not out:
         raise SourceError(f"{folder}: no images: expected data.csv ('t_ns,filename' a line) and data/<t_ns>.png")
     return sorted(out)
@@ -160,7 +167,9 @@ def _read_ground_truth(folder: Path, mav: Path, T_s_i: F64) -> Trajectory | None
         for cells in read_rows(estimate, "ground truth", ","):
             try:
                 p = [float(cell) for cell in cells[1:8]]
-                poses.append((int(cells[0]), pose_from_tum(np.array([*p[:3], *p[4:7], p[3]]))))
+                if not np.isfinite(p).all() or not any(p[3:]):
+                    raise ValueError("no pose")
+                poses.append((nanoseconds(cells[0]), pose_from_tum(np.array([*p[:3], *p[4:7], p[3]]))))
             except (ValueError, IndexError) as error:
                 raise SourceError(f"{estimate}: expected t_ns, x y z, qw qx qy qz a line ({error})") from error
     elif tum is not None:

@@ -16,13 +16,37 @@ from kiteline_hw.ports import SourceError
 F64 = NDArray[np.float64]
 Yaml = dict[str, str | list[float]]
 
+_MOST_BYTES = 1 << 28  # of a table: hours of samples
+_MOST_YAML_BYTES = 1 << 16  # sensor files have a few kB
+_MOST_S, _MOST_DIGITS = 9_000_000_000, 10  # of a time: as many as fit 64 bits as ns
+_NO_LIST = frozenset("[:")
+_KEY = re.compile(r"[A-Za-z_][\w./-]*")
 
-def read_text(path: Path, what: str) -> str:
-    """The content of a small text file. what: for the error message. Raises SourceError."""
+
+def read_text(path: Path, what: str, most_bytes: int = _MOST_BYTES) -> str:
+    """The content of a text file of at most `most_bytes`. what: for the error message. Raises SourceError."""
     try:
-        return path.read_text(encoding="utf-8", errors="replace")
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; expected {what}") from error
+    if len(data) > most_bytes:
+        raise SourceError(f"{path}: more than {most_bytes} bytes; expected {what}")
+    return data.decode("utf-8", "replace")
+
+
+def listed_file(folder: Path, name: str, listing: Path) -> Path:
+    """The file in a folder that a listing names. Raises SourceError if the name leads out of the folder."""
+    if not name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise SourceError(f"{listing}: {name[:60]!r} is no file in {folder}")
+    return folder / name
+
+
+def nanoseconds(text: str) -> int:
+    """A time in whole ns, below 2^63. Raises ValueError."""
+    if not (text.isascii() and text.isdecimal() and len(text) <= 19 and int(text) < 1 << 63):
+        raise ValueError(f"{text[:40]!r} is no time in nanoseconds")
+    return int(text)
 
 
 def read_rows(path: Path, what: str, separator: str | None = None) -> Iterator[list[str]]:
@@ -49,9 +73,9 @@ def seconds_to_ns(text: str) -> int:
     try:
         value = Decimal(text)
     except InvalidOperation as error:
-        raise ValueError(f"{text!r} is no time in seconds") from error
-    if not value.is_finite():
-        raise ValueError(f"{text!r} is no time in seconds")
+        raise ValueError(f"{text[:40]!r} is no time in seconds") from error
+    if not value.is_finite() or value.adjusted() > _MOST_DIGITS or abs(value) > _MOST_S:
+        raise ValueError(f"{text[:40]!r} is no time in seconds")
     return int((value * 1_000_000_000).to_integral_value())
 
 
@@ -61,12 +85,24 @@ def read_yaml(path: Path, what: str) -> Yaml:
     Nested keys are joined by dots ("T_BS.data"). OpenCV's `%YAML:1.0` head and `!!tags`, which YAML readers reject, are
     skipped. Raises SourceError.
     """
-    text = "\n".join(line.split("#", 1)[0].rstrip() for line in read_text(path, what).splitlines())
+    lines = [line.split("#", 1)[0].rstrip() for line in read_text(path, what, _MOST_YAML_BYTES).splitlines()]
     out: Yaml = {}
     parent = ""
-    pattern = re.compile(r"^([ \t]*)([A-Za-z_][\w./-]*)[ \t]*:[ \t]*(?:!!\S+)?[ \t]*(\[[^\]]*\]|[^\n\[]*)$", re.M)
-    for match in pattern.finditer(text):
-        indent, key, value = match.group(1), match.group(2), match.group(3).strip()
+    for i, line in enumerate(lines):
+        head, colon, rest = line.partition(":")
+        key, value = head.strip(" \t"), rest.strip(" \t")
+        if not colon or not _KEY.fullmatch(key):
+            continue
+        if value.startswith("!!"):
+            _, _, value = value.partition(" ")
+            value = value.strip(" \t")
+        if value.startswith("["):
+            value = " ".join(_list_lines(value, lines, i + 1))
+            if value.find("]") != len(value) - 1:
+                continue
+        elif "[" in value:
+            continue
+        indent = line[0] in " \t"
         if not indent and not value:
             parent = key
             continue
@@ -75,11 +111,20 @@ def read_yaml(path: Path, what: str) -> Yaml:
         name = f"{parent}.{key}" if parent else key
         if value.startswith("["):
             try:
-                out[name] = [float(cell) for cell in value[1:-1].replace("\n", " ").split(",") if cell.strip()]
+                out[name] = [float(cell) for cell in value[1:-1].split(",") if cell.strip()]
             except ValueError as error:
-                raise SourceError(f"{path}: {key} holds something else than numbers ({error})") from error
+                raise SourceError(f"{path}: {key} holds something else than numbers ({str(error)[:80]})") from error
         else:
             out[name] = value.strip("\"'")
+    return out
+
+
+def _list_lines(first: str, lines: list[str], at: int) -> list[str]:
+    """The lines of a list, up to its end or to what cannot stand in one."""
+    out = [first]
+    while "]" not in out[-1] and at < len(lines) and not _NO_LIST.intersection(lines[at]):
+        out.append(lines[at])
+        at += 1
     return out
 
 

@@ -16,7 +16,7 @@ from kiteline_hw.sensors.frames import DEPTH_TOLERANCE_NS, EncodedFrame, pair_by
 from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sources.calibration import camera_from_yaml
 from kiteline_hw.sources.recording import Recording, Stamped, image_size, list_images, sorted_trajectory
-from kiteline_hw.sources.text_files import read_rows, read_tum_poses, read_yaml, seconds_to_ns, yaml_number
+from kiteline_hw.sources.text_files import listed_file, read_rows, read_tum_poses, read_yaml, seconds_to_ns, yaml_number
 
 DEPTH_SCALE = 5000.0  # stored units a metre, as the data set's page says
 
@@ -66,7 +66,7 @@ def _list_stamped(folder: Path, kind: str) -> Stamped:
             for cells in read_rows(listing, "'t filename' a line"):
                 if len(cells) < 2:
                     raise ValueError(f"{' '.join(cells)!r} is no 't filename'")
-                out.append((seconds_to_ns(cells[0]), folder / cells[1]))
+                out.append((seconds_to_ns(cells[0]), listed_file(folder, cells[1], listing)))
         else:
             out = [(seconds_to_ns(path.stem), path) for path in list_images(folder / kind)]
     except ValueError as error:

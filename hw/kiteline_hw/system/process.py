@@ -132,6 +132,14 @@ def run_child(
     return 0
 
 
+def is_stopped(pid: int | None) -> bool:
+    """True if a process was stopped by a signal (SIGSTOP) and does not run; False where the system does not tell."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0] in (b"T", b"t")
+    except (OSError, IndexError):
+        return False
+
+
 def state_folder() -> Path:
     """Folder for what survives a restart: a service's $STATE_DIRECTORY, else $XDG_STATE_HOME/kiteline."""
     of_service = os.environ.get("STATE_DIRECTORY", "").split(":")[0]

@@ -15,7 +15,6 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
 from kiteline_agent.runtime.warm import warm as agent_warm
-from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
 from kiteline_basestation.runtime.base_runtime import load_vocabulary
@@ -123,7 +122,7 @@ def _replay_base_step(out: ReplayResult, station: Station, step: Step, jobs: dic
     packets = {AgentId(int(a)): step.blobs(base_log.packets_in(int(a))) for a in step.head["agents"]}
     done = []
     for number, logged in zip(step.head["done"], step.of(base_log.JOB)):
-        done.append(run_job(jobs.pop(number)))
+        done.append(base_log.done_again(jobs.pop(number), logged))
         if base_log.fingerprint(done[-1]) != logged.json()["result"]:
             out.note_difference(step, f"job {number} has another result")
     orders = base_log.read_orders([*step.of(base_log.IMPORT), *step.of(base_log.COMMAND)])

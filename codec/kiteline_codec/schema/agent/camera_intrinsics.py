@@ -13,6 +13,8 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId
 
 _MAX_SIZE_PX = 1 << 14
+_MAX_PX = 1e6  # of focal lengths and centre
+_MAX_BASELINE_M = 1e3
 
 
 @register
@@ -49,6 +51,10 @@ class CameraIntrinsics(Record):
         T_b_c[:3] = np.array([source.f64() for _ in range(12)]).reshape(3, 4)
         if not (width and height and fx > 0 and fy > 0 and baseline_m > 0 and stereo < 2):
             raise WireError("a camera has size, focal lengths and a baseline above zero")
+        if not (
+            min(fx, fy) >= 1.0 and max(fx, fy, abs(cx), abs(cy)) <= _MAX_PX and 1e-6 < baseline_m < _MAX_BASELINE_M
+        ):
+            raise WireError("a camera's focal lengths, centre or baseline are out of range")
         if np.abs(T_b_c).max() > 1e6 or np.abs(T_b_c[:3, :3] @ T_b_c[:3, :3].T - np.eye(3)).max() > 1e-3:
             raise WireError("the camera's pose in the body is no rigid motion")
         camera = RectifiedCamera(width, height, fx, fy, cx, cy, baseline_m, stereo == 1, T_b_c)
