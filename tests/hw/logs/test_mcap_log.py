@@ -224,9 +224,9 @@ def test_writer_errors(tmp_path: Path) -> None:
             log.json("/b", T0, float("nan"))
 
 
-@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=16, max_size=16), st.booleans())
+@given(st.lists(st.floats(0.0, 0.19), min_size=6, max_size=6), st.booleans())
 def test_the_rig_in_json_is_exact_to_the_last_bit(values: list[float], depth: bool) -> None:
-    t = np.array(values).reshape(4, 4)
+    t = se3.exp(np.array(values))  # a rig that is no rigid motion is refused
     rig = CameraRig(replace(EYE, readout_s=values[1]), None, t, None, has_depth=depth)
     got, imu = rig_from_json(json.loads(json.dumps(rig_to_json(rig, ImuCalibration(values[0])))))
     assert got.left == rig.left and got.right is None and got.has_depth == depth
