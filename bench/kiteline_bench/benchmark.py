@@ -27,7 +27,7 @@ BENCHMARKS = {
     "consistency": "kiteline_bench.agent.consistency",
     "stages": "kiteline_bench.agent.stages",
     "link": "kiteline_bench.link.link",
-    "fuzz": "kiteline_bench.link.fuzz",
+    "fuzz": "kiteline_bench.trust.fuzz",
     "places": "kiteline_bench.base.places",
     "mapper": "kiteline_bench.base.mapper",
     "map-cache": "kiteline_bench.base.map_cache",
@@ -55,6 +55,10 @@ def parts(name: str) -> list[tuple[str, str, Run]]:
     return [(f"{whole}/{key}", title, run) for key, (title, run) in found.items() if part in ("", key)]
 
 
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
 def main(argv: list[str]) -> int:
     """Run `kiteline bench`; 1 when a bar is not met."""
     p = argparse.ArgumentParser(
@@ -67,6 +71,7 @@ def main(argv: list[str]) -> int:
     p.add_argument("--keep", metavar="DIR", type=Path, help="keep the flights in this folder")
     p.add_argument("--starts", metavar="N", type=int, default=0,
                    help="of the benches over several starts or seeds only N, for a quick look")  # fmt: skip
+    p.add_argument("--inputs", metavar="N", type=int, default=0, help="of `fuzz`: how many (default: 200,000)")
     a = p.parse_args(argv)
     chosen: list[tuple[str, str, Run]] = []
     for name in a.names or BENCHMARKS:
@@ -80,7 +85,7 @@ def main(argv: list[str]) -> int:
     all_met = True
     for name, title, run in chosen:
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:
-            bench = Bench(data, a.keep or Path(scratch), lambda text: print(text, flush=True), starts=a.starts)
+            bench = Bench(data, a.keep or Path(scratch), _say, starts=a.starts, inputs=a.inputs)
             bars = run(bench)
         text = section(name, title, bars, bench.more)
         print("\n" + text)

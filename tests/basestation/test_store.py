@@ -16,8 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_basestation.store.checksums import StoreError
-from kiteline_basestation.store.checksums import sum_of
+from kiteline_basestation.store.checksums import StoreError, sum_of
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, Store, backup, batch_of, read
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError

@@ -27,6 +27,7 @@ from kiteline_basestation.store import checksums, salvage
 from kiteline_basestation.store.checksums import Row, StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_codec.schema import KEYFRAME_KINDS, SUBMAP_KINDS, Key
+from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import SEQUENCE_BITS, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
@@ -218,7 +219,7 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except sqlite3.OperationalError as error:
         raise DiskError(f"{path}: {error}; expected a disk with room left that can be written") from error
-    except sqlite3.DatabaseError as error:
+    except (sqlite3.DatabaseError, UnicodeDecodeError, *INPUT_FAULTS) as error:
         raise StoreError(f"{path}: {error}; expected a store of `kiteline base`: put a backup in its place") from error
     except OSError as error:
         raise DiskError(f"{path}: {error.strerror or error}") from error

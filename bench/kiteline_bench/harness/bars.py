@@ -47,7 +47,7 @@ class FlightFailed(Exception):
 class Bench:
     """What a benchmark reads and writes. say: reports progress. more: Markdown that stands below the bars.
 
-    starts: most starts of a flight, or seeds, for a quick look; 0: all.
+    starts: most starts of a flight, or seeds, for a quick look; 0: all. inputs: of the fuzzer; 0: as it chooses.
     """
 
     data: Path
@@ -55,6 +55,7 @@ class Bench:
     say: Callable[[str], None]
     more: list[str] = field(default_factory=list)
     starts: int = 0
+    inputs: int = 0
 
     def chosen(self, starts: Sequence[T]) -> list[T]:
         """All starts, or as many as wanted, spread evenly."""

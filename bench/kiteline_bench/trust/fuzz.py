@@ -1,19 +1,28 @@
-"""Ten million random and mutated inputs for everything that reads bytes from a link: only WireError may come of it."""
+"""Random and mutated inputs for every door: packets, sealed packets, a sender with a key, questions, stores and files.
+
+Only the rooms' own errors may come of them, none may take long, and memory must not grow. `--inputs` sets how many.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import random
 import resource
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.trust.doors import ERRORS, Door, doors
+from kiteline_bench.trust.keyed_sender import KeyedSender
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import RECORD_TYPES, Key, WireError, messages
+from kiteline_codec.schema import RECORD_TYPES, Key, messages
+from kiteline_codec.schema.record import FIRST_BASE_KIND
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import Deframer, frame
@@ -22,20 +31,23 @@ from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 from kiteline_hw.ports import SourceError
 
 TITLE = "Fuzzing"
-INPUTS = 10_000_000
+INPUTS = 200_000  # some minutes
 _TESTS = Path(__file__).resolve().parents[3] / "tests" / "codec"
 
 _MAX_BYTES = 1400  # of an input
-_SLOW_S = 0.25  # s of CPU that one input may take; a hang would take more
+_MAX_FILE_BYTES = 1 << 16
+_FIRST = 30  # inputs of each door before memory is measured
 _KEY = bytes(32)
 _KINDS = tuple(sorted(RECORD_TYPES))
 
-Target = Callable[[bytes, random.Random], None]
+Target = Callable[[bytes, random.Random], object]
 
 
 @dataclass(slots=True)
 class FuzzResult:
-    """Outcome of a run. failures: a line for each input that raised anything but WireError, with its bytes in hex."""
+    """Outcome of a run. failures: a line for each input that raised anything but an error of its room, with its bytes.
+    slowest_s: of CPU. grown_mib: over the memory after the first inputs of each door.
+    """
 
     inputs: int
     accepted: int
@@ -43,6 +55,7 @@ class FuzzResult:
     failures: list[str]
     slowest_s: float
     grown_mib: float
+    slowest: str = ""  # the door of the slowest input
 
 
 def read_corpus(folder: Path) -> list[bytes]:
@@ -57,6 +70,8 @@ class Targets:
         self.accepted = 0
         self._held = {key: (i + 1, code) for i, (key, code) in enumerate(values)}
         self._coder = ResidualCoder()
+        self._keyed = KeyedSender([(key, code) for key, code in values if key.kind < FIRST_BASE_KIND])
+        self._taken = 0
         self._renew()
 
     def _renew(self) -> None:
@@ -68,7 +83,7 @@ class Targets:
 
     def all(self) -> tuple[Target, ...]:
         """All decoders; each takes bytes and raises WireError or nothing."""
-        return (self.record, self.packet, self.endpoint, self.residual, self.stream, self.sealed)
+        return (self.record, self.packet, self.endpoint, self.residual, self.stream, self.sealed, self.keyed)
 
     def record(self, data: bytes, draw: random.Random) -> None:
         """A code under a key."""
@@ -114,8 +129,13 @@ class Targets:
         if self._opener.open(data) is not None:
             self.accepted += 1
 
+    def keyed(self, data: bytes, draw: random.Random) -> None:
+        """A packet of an agent with a sound key, taken in by a station."""
+        before, self._taken = self._taken, self._keyed.send(data, draw)
+        self.accepted += self._taken > before
 
-def mutate(data: bytes, draw: random.Random) -> bytes:
+
+def mutate(data: bytes, draw: random.Random, most_bytes: int = _MAX_BYTES) -> bytes:
     """Valid bytes changed in a few places: flipped, cut, inserted, removed, repeated."""
     out = bytearray(data)
     for _ in range(draw.choice((1, 1, 2, 3, 8))):
@@ -135,72 +155,102 @@ def mutate(data: bytes, draw: random.Random) -> bytes:
             out[at:at] = out[: draw.randrange(1, 40)]
         else:
             out[at:at] = b"\xff" * draw.randrange(1, 11)
-    return bytes(out[:_MAX_BYTES])
+    return bytes(out[:most_bytes])
 
 
 def fuzz(
     corpus: Sequence[bytes], values: Sequence[tuple[Key, bytes]], inputs: int, seed: int,
-    say: Callable[[int], None] | None = None,
+    say: Callable[[int], None] | None = None, others: Sequence[Door] = (),
 ) -> FuzzResult:  # fmt: skip
-    """Feed inputs drawn from a corpus to each decoder in turn."""
+    """Feed inputs drawn from a corpus to each decoder in turn, and to the other doors mutations of their samples."""
     draw = random.Random(seed)
     targets = Targets(values)
-    todo = targets.all()
-    for target in todo:  # compile
-        for data in corpus[:20]:
-            _one(target, data, draw)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    targets.accepted = refused = 0
-    failures: list[str] = []
-    slowest = 0.0
+    todo: list[tuple[str, Target, Sequence[bytes], int]] = [
+        (target.__name__, target, corpus, _MAX_BYTES) for target in targets.all()
+    ]
+    todo += [(door.name, door.take, door.samples, _MAX_FILE_BYTES) for door in others]
     sealer = Sealer(_KEY, 3, 1, Direction.UP, Suite.TAGGED)
-    for i in range(inputs):
+
+    def one(i: int) -> tuple[str, str, bytes]:
+        name, target, samples, most_bytes = todo[i % len(todo)]
         kind = draw.random()
-        data = draw.randbytes(draw.randrange(80)) if kind < 0.1 or not corpus else mutate(draw.choice(corpus), draw)
-        target = todo[i % len(todo)]
-        if target == targets.sealed and kind > 0.5:
+        data = (
+            draw.randbytes(draw.randrange(80))
+            if kind < 0.1 or not samples
+            else mutate(draw.choice(samples), draw, most_bytes)
+        )
+        if name == "sealed" and kind > 0.5:
             data = mutate(sealer.seal(data[:64]), draw)
-        begin = time.thread_time()
-        outcome = _one(target, data, draw)
-        took = time.thread_time() - begin
-        if took > slowest:
-            slowest = took
-        if outcome == "refused":
-            refused += 1
-        elif outcome:
-            failures.append(f"{target.__name__}: {outcome}: {data.hex()}")
-            if len(failures) == 20:
-                break
-        if say is not None and i % 100_000 == 0:
-            say(i)
+        return name, _one(target, data, draw), data
+
+    with _quiet():
+        for i in range(_FIRST * len(todo)):  # compile, load libraries
+            one(i)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        targets.accepted = refused = 0
+        failures: list[str] = []
+        slowest, slowest_door = 0.0, ""
+        for i in range(inputs):
+            begin = time.thread_time()
+            name, outcome, data = one(i)
+            took = time.thread_time() - begin
+            if took > slowest:
+                slowest, slowest_door = took, name
+            if outcome == "refused":
+                refused += 1
+            elif outcome:
+                failures.append(f"{name}: {outcome}: {data[:400].hex()}")
+                if len(failures) == 20:
+                    break
+            elif i % len(todo) >= len(todo) - len(others):
+                targets.accepted += 1
+            if say is not None and i % 10_000 == 0:
+                say(i)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    return FuzzResult(inputs, targets.accepted, refused, failures, slowest, grown)
+    return FuzzResult(inputs, targets.accepted, refused, failures, slowest, grown, slowest_door)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Send what image libraries print to nowhere."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _one(target: Target, data: bytes, draw: random.Random) -> str:
     try:
         target(data, draw)
-    except WireError:
+    except ERRORS:
         return "refused"
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {error}"
     return ""
 
 
 def run(bench: Bench) -> list[Bar]:
-    """Feed all decoders in turn; the corpus is that of the tests."""
+    """Feed all doors in turn; the corpus of packets and codes is that of the tests."""
     if not _TESTS.is_dir():
         raise SourceError(f"no corpus in {_TESTS}: run this benchmark in a checkout of the sources")
     entries = json.loads((_TESTS / "golden" / "records.json").read_text())
     values = [(Key(*e["key"]), bytes.fromhex(e["code"])) for e in entries]
+    inputs, folder = bench.inputs or INPUTS, bench.folder / "fuzz"
+    folder.mkdir()
     found = fuzz(
-        read_corpus(_TESTS / "corpus"), values, INPUTS, seed=1, say=lambda n: bench.say(f"fuzz: {n:,} of {INPUTS:,}")
-    )
+        read_corpus(_TESTS / "corpus"), values, inputs, seed=1, others=doors(folder),
+        say=lambda n: bench.say(f"fuzz: {n:,} of {inputs:,}"),
+    )  # fmt: skip
     for failure in found.failures:
         bench.say(failure)
     return [
         at_most("inputs that were neither read nor refused", len(found.failures), 0, "", 0),
         at_most("memory grown", found.grown_mib, 64, "MiB", 1),
-        at_most("slowest input", found.slowest_s * 1e3, 1000, "ms", 1),
-        Bar("read and refused", f"{INPUTS:,} inputs", f"{found.accepted:,} read, {found.refused:,} refused", True),
+        at_most(f"slowest input ({found.slowest}), CPU", found.slowest_s * 1e3, 1000, "ms", 1),
+        Bar("read and refused", f"{inputs:,} inputs", f"{found.accepted:,} read, {found.refused:,} refused", True),
     ]

@@ -1,0 +1,1 @@
+"""What strangers, faulty agents and damaged files may do: hostile input for every door."""

@@ -1,0 +1,100 @@
+"""An agent with a sound key that means harm: its packets are well formed, what they say is drawn at random."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import JobDone, set_aside
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel
+from kiteline_codec.coding.packing import Writer
+from kiteline_codec.schema import RECORD_TYPES, IdOf, Key
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.transport.packet import Header, Item, add_checksum, write_header, write_item
+from kiteline_core.ids import AgentId, keyframe_id, submap_id
+
+PEER_BYTES = 24 << 20  # that this sender's values may take, map included: a small share of what a flight may
+_AGENT, _OTHER = AgentId(3), AgentId(4)
+_HUGE = (1 << 31, 1 << 32, (1 << 62) - 1, (1 << 63) - 1, 1 << 63, 1 << 64)
+_STEP_NS = 50_000_000
+
+
+class KeyedSender:
+    """A station, and an agent that sends it anything. What comes of it is in the station; nothing may be raised."""
+
+    def __init__(self, codes: Sequence[tuple[Key, bytes]]) -> None:
+        """codes: valid ones, that are sent under any keys, whole, mutated or in pieces."""
+        self._codes = codes
+        config = SyncConfig(max_inbox_bytes=PEER_BYTES, max_assembly_bytes=4 << 20)
+        self.station = Station(BaseConfig(), lambda agent: CodedChannel(config, 7, peer=agent))
+        self.station.track_changes()
+        self._session, self._number, self._version, self._now_ns = 1, 0, 0, 0
+        self._done: tuple[JobDone, ...] = ()
+
+    def send(self, mutated: bytes, draw: random.Random) -> int:
+        """Send one packet, and step the station. Returns how many values it took in so far."""
+        self._now_ns += _STEP_NS
+        self._session += draw.random() < 0.002
+        packet = self._packet(mutated, draw)
+        output = self.station.step({_AGENT: (packet,)}, self._done, self._now_ns)
+        self._done = tuple(set_aside(job, "not done here") for job in output.jobs)
+        if self.station.changed is not None:
+            self.station.changed.clear()
+        channel = self.station.channels[_AGENT]
+        assert isinstance(channel, CodedChannel)
+        return channel.stats.values
+
+    def _packet(self, mutated: bytes, draw: random.Random) -> bytes:
+        self._number += draw.choice((1, 1, 1, 0, 2, 100))
+        watermark = draw.choice((0, 0, 0, max(0, self._version - draw.randrange(400)), draw.choice(_HUGE[:3])))
+        if draw.random() < 0.98:
+            watermark = min(watermark, self._version)
+        header = Header(
+            self._session, draw.choice((7, 7, 7, 7, 0, 6, 8)),
+            (draw.randrange(100), draw.getrandbits(64)) if draw.random() < 0.5 else None,
+            (draw.choice((0, self._version, *_HUGE[:4])), draw.randbytes(16)) if draw.random() < 0.05 else None,
+            draw.choice((0, 5, *_HUGE[:4])) if draw.random() < 0.05 else None,
+            draw.choice((0, 5, *_HUGE[:4])) if draw.random() < 0.05 else None,
+            draw.choice((0, self._version, *_HUGE[:4])) if draw.random() < 0.005 else None,
+            (max(1, self._number), watermark),
+        )  # fmt: skip
+        out, last_id = Writer(), 0
+        write_header(out, header)
+        for _ in range(draw.choice((1, 2, 4, 12))):
+            item = self._item(mutated, watermark, draw)
+            write_item(out, item, last_id, watermark)
+            last_id = item.key.id
+        return add_checksum(out)
+
+    def _item(self, mutated: bytes, watermark: int, draw: random.Random) -> Item:
+        known, code = draw.choice(self._codes)
+        key = self._key(known, draw)
+        if draw.random() < 0.2:
+            code = mutated
+        self._version += 1
+        version = max(watermark + 1, self._version if draw.random() < 0.99 else draw.choice(_HUGE))
+        form = draw.random()
+        if form < 0.05:
+            return Item(key, version, None, 0, b"")
+        if form < 0.15:
+            return Item(key, version, len(code), 0, code, residual=True)
+        if form < 0.3 and len(code) > 1:
+            total = draw.choice((len(code) + 1, 1 << 20, 2 + len(code)))
+            return Item(key, version, total, draw.randrange(total - len(code)), code)
+        return Item(key, version, len(code), 0, code)
+
+    @staticmethod
+    def _key(known: Key, draw: random.Random) -> Key:
+        agent = _AGENT if draw.random() < 0.9 else _OTHER
+        submap = submap_id(agent, draw.choice((0, 1, 16383)), draw.choice((0, 1, 2, 4095)))
+        id_of = RECORD_TYPES[known.kind].ID
+        number = known.id
+        if id_of is IdOf.AGENT:
+            number = int(agent)
+        elif id_of is IdOf.SUBMAP:
+            number = int(submap)
+        elif id_of is IdOf.KEYFRAME:
+            number = int(keyframe_id(submap, draw.choice((0, 1, 2, draw.randrange(1 << 20)))))
+        return Key(known.kind if draw.random() < 0.98 else draw.randrange(64), number, draw.choice((0, 0, 1, 255)))
