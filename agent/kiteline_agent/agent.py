@@ -195,7 +195,6 @@ class Agent:
             if self.right_camera is not None:
                 events += self.right_camera.add(track)
             # 7. Make a keyframe if the policy needs one.
-            self._relocaliser.enter_keyframes()  # of earlier frames
             events += self._keyframes.add_if_needed(ctx, track)
             events += self._scan(ctx)
             # 8. Join an older submap, or continue a monocular one in metres.
@@ -235,7 +234,8 @@ class Agent:
     def _track(self, ctx: FrameContext) -> Track | None:
         """Track from the predicted pose, then retry if most landmarks were missed; None if the pose is not credible."""
         config = ctx.config.pose
-        track = self._tracker.track(ctx, ctx.T_c_m)
+        by_imu = self._camera.motion.running and not self._was_lost
+        track = self._tracker.track_by_imu(ctx) if by_imu else self._tracker.track(ctx, ctx.T_c_m)
         if not track.holds(config):
             track = self._retry_with_image_shift(ctx, track)
         if not track.holds(config) and track.inliers >= config.min_inliers and self._governor.may(Extra.SEARCH):
@@ -245,9 +245,7 @@ class Agent:
             ctx, track.T_c_m, submap, relocalised=False
         ):
             return None
-        if self._was_lost or not self._camera.motion.running:
-            return track
-        return self._tracker.nearer(ctx, track)
+        return self._tracker.nearer(ctx, track) if by_imu else track
 
     def _retry_with_image_shift(self, ctx: FrameContext, track: Track) -> Track:
         """The better of a track and another one that starts from the rotation that the image-shift estimate gives."""

@@ -12,6 +12,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.motion.motion_model import MotionModel
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking import tracker
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -70,11 +71,27 @@ def test_landmarks_that_move_alike_do_not_drag_the_pose(
 ) -> None:
     crowd = Crowd()
     monkeypatch.setattr(tracker.alignment_kernels, "align", crowd.align)
+    begun_by_imu = worst_m(room_flight, fly(room_flight, crowd))
+    monkeypatch.setattr(Tracker, "track_by_imu", lambda self, ctx: self.track(ctx, ctx.T_c_m))
     with_imu = worst_m(room_flight, fly(room_flight, crowd))
     monkeypatch.setattr(Tracker, "nearer", lambda _self, _ctx, track: track)
     by_images = worst_m(room_flight, fly(room_flight, crowd))
-    assert with_imu < 0.01
+    assert begun_by_imu < 0.01 and with_imu < 0.01
     assert by_images > 3.0 * with_imu
+
+
+def test_a_wrong_prediction_is_corrected_by_both_passes(
+    room_flight: RoomFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = fly(room_flight, Crowd())
+    real_predict, turn = MotionModel.predict, se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.02, 0.0]))  # 5 px or more
+
+    def off(self: MotionModel, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
+        return np.asarray(real_predict(self, t_ns, imu, dt_s) @ turn)
+
+    monkeypatch.setattr(MotionModel, "predict", off)
+    wrong = fly(room_flight, Crowd())
+    assert max(float(np.linalg.norm((a - b)[:3, 3])) for a, b in zip(plain, wrong, strict=True)) < 0.005
 
 
 def test_a_flight_without_people_is_the_same(room_flight: RoomFlight, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,6 +35,7 @@ class RightCamera:
         self.rows = RowAlignment(rectifier, config.rows)
         self.disparities = DisparityAlignment(local_map, config.disparities) if config.disparities.on else None
         self._good_cov = np.eye(disparity_offset.TERMS) * config.disparities.good_px**2
+        self._cov_of: tuple[F64, F64] | None = None  # see disparity_cov: of which expected_cov it is, and its value
         self._found_px = disparity_offset.none()  # error of disparities, without the base's part
         self._sigma_px: float | None = None  # of it, once this flight found it
 
@@ -71,10 +72,13 @@ class RightCamera:
 
     @property
     def disparity_cov(self) -> F64:
-        """(5,5) px^2: mean square of what the map's disparity offset is off by."""
+        """(5,5) px^2: mean square of what the map's disparity offset is off by. The same object until it changes."""
         if self.disparities is None:
             return self._good_cov
-        return self.disparities.expected_cov + self._good_cov
+        expected = self.disparities.expected_cov
+        if self._cov_of is None or self._cov_of[0] is not expected:
+            self._cov_of = expected, expected + self._good_cov
+        return self._cov_of[1]
 
     def share_rows(self) -> list[str]:
         """Tell the base of rows that have changed. Returns events."""

@@ -76,11 +76,14 @@ class Relocaliser:
         self.has_texture = True  # the last frame that was searched had enough corners
 
     def add_keyframe(self, keyframe: KeyframeId) -> None:
-        """Note a keyframe of the local map. `enter_keyframes` enters it: the frame of a keyframe has enough to do."""
+        """Note a keyframe of the local map. It enters the place index at the next search: most flights need none."""
         if self._index is not None:
             self._waiting.append(keyframe)
+            if len(self._waiting) > 2 * len(self._map.keyframe):
+                held = set(self._map.keyframe.tolist())
+                self._waiting = [waiting for waiting in self._waiting if waiting in held]
 
-    def enter_keyframes(self) -> None:
+    def _enter_keyframes(self) -> None:
         """Enter the keyframes that wait into the place index; evicted ones leave it."""
         waiting, self._waiting = self._waiting, []
         if self._index is None or not waiting:
@@ -140,7 +143,7 @@ class Relocaliser:
         self.has_texture = seen is not None
         if seen is None:
             return None
-        self.enter_keyframes()
+        self._enter_keyframes()
         # 2. Candidates, each verified by P3P, by the tracker and against the motion.
         for keyframe in self._candidates(seen, reference, exclude):
             fit = self._pose_from(keyframe, seen, ctx.number)

@@ -108,6 +108,7 @@ class LocalGrid:
     def __init__(self, config: LocalGridConfig) -> None:
         self._config = config
         self._error: RangeError | None = None  # by which scans are drawn
+        self._told: RangeError | None = None  # the last one that `follow` was given
         self._sure_scans = config.scans  # in a row, since the rig was in doubt
         self._canvas, self._next = _Canvas(), _Canvas()  # the latter while scans are drawn again
         self._again: deque[_Drawn] | None = None  # scans that are still to be drawn on it; None: it is not in use
@@ -177,7 +178,8 @@ class LocalGrid:
 
         error: see `add`; None: as before.
         """
-        if error is not None:
+        if error is not None and error is not self._told:
+            self._told = error
             self._take(error)
         if self._R_g_o is not None:
             p = self._R_g_o @ T_o_c[:3, 3]

@@ -6,7 +6,7 @@ and then. The height of the ground is followed from scan to scan; those that saw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,14 +92,18 @@ class ScanStage:
         self._keyframe = NO_KEYFRAME  # the newest one, whose scans are numbered
         self._part = 0  # of its newest scan
         self._queue = ScanQueue(channel)
+        bf, at_scan = local_map.camera.bf, self._segmenter.camera.bf
+        self._error = RangeError.of_noise(bf, self._segmenter.surface_sigma_px * bf / at_scan)
 
     def range_error(self, cov_px: F64 | None) -> RangeError:
-        """What is known of errors of ranges. cov_px: (5,5) of the disparity offset; None of a camera without one."""
-        bf, at_scan = self._map.camera.bf, self._segmenter.camera.bf
-        sigma_px = self._segmenter.surface_sigma_px * bf / at_scan
-        if cov_px is None:
-            return RangeError.of_noise(bf, sigma_px)
-        return RangeError(bf, sigma_px, self._map.disparity_offset, cov_px)
+        """What is known of errors of ranges: the same object until more is known.
+
+        cov_px: (5,5) of the disparity offset; None of a camera without one.
+        """
+        error, offset_px = self._error, self._map.disparity_offset
+        if cov_px is not None and (cov_px is not error.cov_px or offset_px is not error.offset_px):
+            self._error = replace(error, offset_px=offset_px, cov_px=cov_px)
+        return self._error
 
     def step(self, ctx: FrameContext) -> Scanned | None:
         """Go on with the scan in work, or begin one if this frame became a keyframe that shows something new."""

@@ -21,6 +21,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below which no coarser level is searched
+_COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 
 
@@ -38,13 +39,30 @@ class Tracker:
         # Coarse pass: few landmarks and large steps on small images correct the prediction.
         coarse = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
         chosen = self._choose(coarse, ctx.number, align.coarse_points, 1, 2 * align.cell_px)
-        rough = self._measure(ctx, coarse, chosen, T_c_m, coarse_only=True)
+        rough = self._measure(ctx, coarse, chosen, T_c_m, _COARSEST, coarse_only=True)
         if rough.inliers >= ctx.config.pose.min_inliers // 2:
             T_c_m = rough.T_c_m
-        # Fine pass: many landmarks, sub-pixel, with disparities.
+        return self._fine(ctx, T_c_m, align.fine_from)
+
+    def track_by_imu(self, ctx: FrameContext) -> Track:
+        """The same from the prediction of an IMU, which is mostly good to half a pixel: on the finest level alone then.
+
+        A track that is farther from the prediction is measured again by both passes.
+        """
+        pose = ctx.config.pose
+        track = self._fine(ctx, ctx.T_c_m, 0)
+        near = track.holds(pose) and self._off_px(track, ctx.T_m_c) < pose.dragged_px
+        return track if near else self.track(ctx, ctx.T_c_m)
+
+    def _fine(self, ctx: FrameContext, T_c_m: F64, first: int, near_px: float = np.inf) -> Track:
+        """Measure the pose from a prediction (4,4) that is good to some pixels: many landmarks, with disparities.
+
+        first: template level at which alignment begins. near_px: see `_measure`.
+        """
+        align = ctx.config.align
         fine = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
         chosen = self._choose(fine, ctx.number, align.points, 2, align.cell_px)
-        return self._measure(ctx, fine, chosen, T_c_m, coarse_only=False)
+        return self._measure(ctx, fine, chosen, T_c_m, first, coarse_only=False, near_px=near_px)
 
     def nearer(self, ctx: FrameContext, track: Track) -> Track:
         """The track, or one of landmarks that agree with a prediction by an IMU, if it is far from that prediction.
@@ -56,10 +74,7 @@ class Tracker:
         off_px = self._off_px(track, ctx.T_m_c)
         if off_px < pose.dragged_px:
             return track
-        T_c_m = se3.inverse(ctx.T_m_c)
-        fine = self._map.candidates(T_c_m, _MARGIN_PX, ctx.config.align.max_scale)
-        chosen = self._choose(fine, ctx.number, ctx.config.align.points, 2, ctx.config.align.cell_px)
-        other = self._measure(ctx, fine, chosen, T_c_m, coarse_only=False, near_px=pose.near_px)
+        other = self._fine(ctx, ctx.T_c_m, ctx.config.align.fine_from, pose.near_px)
         enough = other.inliers >= max(2 * pose.min_inliers, track.inliers // 2)
         return other if enough and self._off_px(other, ctx.T_m_c) < 0.5 * off_px else track
 
@@ -85,12 +100,12 @@ class Tracker:
         return chosen[:n]
 
     def _measure(
-        self, ctx: FrameContext, candidates: Candidates, chosen: I64, T_c_m: F64, *, coarse_only: bool,
-        near_px: float = np.inf,
+        self, ctx: FrameContext, candidates: Candidates, chosen: I64, T_c_m: F64, first: int, *,
+        coarse_only: bool, near_px: float = np.inf,
     ) -> Track:  # fmt: skip
         """Align the templates of the chosen candidates (n,), and optimise the pose from T_c_m (4,4).
 
-        near_px: at most so far from where that pose has them.
+        first: template level at which alignment begins. near_px: at most so far from where that pose has them.
         """
         images, config, shutter = ctx.images, ctx.config, ctx.shutter
         align = config.align
@@ -102,7 +117,6 @@ class Tracker:
         found = np.zeros(len(rows), np.bool_)
         last = 1 if coarse_only else 0
         step = align.coarse_step_px if coarse_only else align.fine_step_px
-        first = 2 if coarse_only else align.fine_from
         # Templates from a finer level than this frame has are aligned one level up.
         least = 0 if coarse_only else images.first
         raised = np.maximum(octave, least) - octave if least else np.zeros_like(octave)
