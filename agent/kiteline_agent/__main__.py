@@ -18,6 +18,7 @@ from kiteline_hw.links.kinds import MAVLINK_FORMS, link_forms
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.system import process
+from kiteline_hw.system.start_numbers import numbers_in
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,9 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     if not a.source:
         p.error("a SOURCE is required")
-    folder = (Path(a.log) if a.log else process.state_folder()) / f"agent{a.agent}"
-    options = options_of(a, folder, process.number_of_start(folder.name, folder))
-    fly_live(options, None, process.StopSignal())
+    kept = process.kept_folder(f"agent{a.agent}")
+    options = options_of(a, Path(a.log) / kept.name if a.log else kept)
+    fly_live(options, None, process.StopSignal(), numbers_in(kept))
     process.exit_now(0)
 
 

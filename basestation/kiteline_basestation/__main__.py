@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 from kiteline_basestation.runtime.live import fly_live
 from kiteline_basestation.runtime.lockstep import fly_lockstep
@@ -16,8 +16,11 @@ from kiteline_core import config as configuration
 from kiteline_hw.links.kinds import link_forms
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.system import process
+from kiteline_hw.system.start_numbers import numbers_in
 
-_SESSION_EPOCH_S = 1_735_689_600  # s of Unix time at which 2025 began: sessions are counted in seconds since then
+_EPOCH_S = 1_735_689_600  # s of Unix time at which 2025 began
+_UNIT_S = 10  # s in which sessions of bases are counted since then
+_DRAWN_BITS = 16  # of a session: two bases that start together have different ones
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,10 +35,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     if not a.link:
         p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
-    # Seconds since a fixed date: a base on another machine, without this one's files, still begins a later session.
-    folder = Path(a.store) if a.store else process.state_folder() / "base"
-    session = process.next_number(folder / "session", int(time.time()) - _SESSION_EPOCH_S)
-    stored = fly_live(options_of(a, session), None, process.StopSignal())
+    # Time since a fixed date: a base on another machine, without this one's files, still begins a later session.
+    least = max(0, int(time.time()) - _EPOCH_S) // _UNIT_S << _DRAWN_BITS | secrets.randbelow(1 << _DRAWN_BITS)
+    start = numbers_in(process.kept_folder("base")).next(max(1, least))
+    if start.kept:
+        process.print_lines([f"the number of this session cannot be kept: {start.kept}"])
+    stored = fly_live(options_of(a, start.order), None, process.StopSignal())
     process.exit_now(0 if stored else 1)
 
 

@@ -13,7 +13,7 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.schema import Key, Record, WireError, messages
+from kiteline_codec.schema import Key, LivePose, Record, WireError, messages
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 
@@ -131,6 +131,9 @@ class Station:
                 records.append(messages.decode(key, code))
             except WireError:
                 self.unreadable += 1
+                continue
+            if key.kind == LivePose.KIND and self.mapper.live(order.agent) is not None:
+                records.pop()  # of an earlier flight
                 continue
             if self.changed is not None:
                 self.changed[order.agent, False, key] = code

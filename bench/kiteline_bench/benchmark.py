@@ -28,6 +28,7 @@ BENCHMARKS = {
     "stages": "kiteline_bench.agent.stages",
     "link": "kiteline_bench.link.link",
     "fuzz": "kiteline_bench.trust.fuzz",
+    "trust": "kiteline_bench.trust.trust",
     "places": "kiteline_bench.base.places",
     "mapper": "kiteline_bench.base.mapper",
     "map-cache": "kiteline_bench.base.map_cache",

@@ -1,8 +1,9 @@
 """Ids that carry their origin: (agent, boot, submap, sequence[, keypoint]) packed into one non-negative int64.
 
-Bit layout of a landmark id, most significant first: agent 6 | boot 14 | submap 12 | sequence 20 | keypoint 11.
+Bit layout of a landmark id, most significant first: agent 6 | boot 19 | submap 10 | sequence 17 | keypoint 11.
 A keyframe id is a landmark id without the keypoint bits; a submap id is a keyframe id without the sequence bits. A
-landmark is named by the keyframe and keypoint at which it was new, so its id costs no bytes beyond its keypoint.
+landmark is named by the keyframe and keypoint at which it was new, so its id costs no bytes beyond its keypoint. The
+first boot of an agent is drawn at random: numbers of a lost or a cloned card are most likely others.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ SubmapId = NewType("SubmapId", int)
 KeyframeId = NewType("KeyframeId", int)
 LandmarkId = NewType("LandmarkId", int)
 
-BOOT_BITS = 14
-SUBMAP_BITS = 12
-SEQUENCE_BITS = 20
+BOOT_BITS = 19
+SUBMAP_BITS = 10
+SEQUENCE_BITS = 17
 KEYPOINT_BITS = 11
 
 MAX_AGENTS = 1 << 6

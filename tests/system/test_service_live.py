@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -14,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_core.ids import MAX_BOOTS
 from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter
 from kiteline_hw.logs.rig_json import rig_from_json
-from kiteline_hw.system import process
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.processes import free_endpoint
@@ -86,39 +87,44 @@ def test_an_agent_stops_within_a_second_and_closes_its_log(serve: Serve, raw_fli
     time.sleep(1.5)
     assert stop_in_s(program) < STOP_S
     assert program.returncode == 0
-    with LogReader(tmp_path / "logs" / "agent0" / "boot00001.mcap") as log:
+    (path,) = (tmp_path / "logs" / "agent0").glob("boot*.mcap")
+    with LogReader(path) as log:
         assert log.cut is None
         assert sum(1 for _ in log.messages((LEFT,))) >= 3
 
 
 def test_the_number_of_a_start_outlives_the_logs(serve: Serve, recording: Path, tmp_path: Path) -> None:
     logs = tmp_path / "logs" / "agent0"
-    for number in (1, 2):
+    found = []
+    for _ in range(2):
         program, _ = serve("agent", recording, "--log", tmp_path / "logs")
         program.wait(timeout=100)
-        assert [path.name for path in logs.glob("boot*.mcap")] == [f"boot{number:05d}.mcap"]
+        (path,) = logs.glob("boot*.mcap")
+        with LogReader(path) as log:
+            spec = json.loads(log.metadata["spec"])
+        assert path.name == f"boot{spec['order']:05d}.mcap"
+        found.append((spec["order"], spec["boot"]))
         for path in logs.iterdir():
             path.unlink()
-    assert (tmp_path / "state" / "agent0" / "boot").read_text() == "2\n"
+    assert found[1] == (found[0][0] + 1, (found[0][1] + 1) % MAX_BOOTS)
 
 
-def test_a_service_goes_on_from_numbers_of_starts_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    assert [process.number_of_start("agent0", tmp_path / "logs") for _ in range(2)] == [1, 2]
-    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
-    assert [process.number_of_start("agent0", tmp_path / "logs") for _ in range(2)] == [3, 4]
-    assert process.kept_folder("agent0", tmp_path / "logs") == tmp_path / "state" / "agent0"
+def test_a_start_that_fails_takes_no_number(serve: Serve, recording: Path, tmp_path: Path) -> None:
+    for words in (("no-such-recording.mcap",), (recording, "--link", "zenoh:tcp/127.0.0.1:7", "--key", "no-key")):
+        program, _ = serve("agent", *words)
+        assert program.wait(timeout=100) != 0
+    assert not (tmp_path / "state" / "agent0").exists()
 
 
 def test_logs_of_all_starts_stay_within_their_limit(serve: Serve, recording: Path, tmp_path: Path) -> None:
     logs = tmp_path / "logs" / "agent0"
-    for number in (1, 2):
+    for _ in range(2):
         program, _ = serve("agent", recording, "--log", tmp_path / "logs", "--log-mib", "1")
         assert program.stderr is not None
         said = program.stderr.read().decode()
         assert said.count("the oldest logs are deleted: --log-mib 1") == 1  # the recording's images are larger
         files = sorted(logs.glob("boot*.mcap"), key=lambda path: path.stat().st_mtime_ns)
-        assert files[-1].name.startswith(f"boot{number:05d}_")
+        assert "_" in files[-1].name
         assert sum(path.stat().st_size for path in files) < 1.3 * 2**20
         for path in files:
             with LogReader(path) as log:

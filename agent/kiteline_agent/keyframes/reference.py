@@ -15,7 +15,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_core.geometry import se3
-from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id
+from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 
@@ -73,6 +73,8 @@ class ReferenceKeyframe:
         After a keyframe that was not shared, another such one serves the tracker: what presses is that the base's
         landmarks leave the view.
         """
+        if self._last_sequence.get(submap_of_keyframe(self.keyframe), 0) >= MAX_KEYFRAMES - _UNSHARED - 1:
+            return None  # no ids are left in this submap: what is lost then begins another
         unshared = self._newest.keyframe != self._shared.keyframe
         frames, of_base = ctx.number - self._newest.frame_number, self._of_base(track)
         if frames == 1:

@@ -146,6 +146,11 @@ class AgentRuntime:
         stamp = self.reader.next_ns
         return None if stamp is None else stamp - self.options.start_ns
 
+    @property
+    def session(self) -> int:
+        """Session of the channel; 0 without a base."""
+        return self.channel.endpoint.session if isinstance(self.channel, CodedChannel) else 0
+
     def first_message(self) -> Up:
         """The first message at the barrier."""
         return Up(self.next_ns, False, False, ())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from pathlib import Path
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.runtime.options import (
@@ -36,7 +35,7 @@ def controller_link(
             ControllerOptions(
                 options.mavlink, options.axes, options.offset, options.odometry, options.heading,
                 options.pose_messages, options.origin, options.mavlink_key, options.link,
-                str(process.kept_folder(f"agent{options.agent}", Path(options.folder))),
+                str(process.kept_folder(f"agent{options.agent}")),
             ),
             source.rig, clock, pose_rate_hz=pose_rate_hz(options),
             imu_rate_hz=own.noise.rate_hz if options.imu_of else 0.0,

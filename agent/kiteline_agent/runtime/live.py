@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -19,12 +20,13 @@ from kiteline_agent.runtime.controller import (
     push_obstacles,
     with_controller_imu,
 )
-from kiteline_agent.runtime.options import AgentOptions
+from kiteline_agent.runtime.options import LOG_STEM, AgentOptions
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_agent.runtime.warm import WARMING
 from kiteline_agent.step import StepOutput
 from kiteline_codec.channel import settled
+from kiteline_codec.sync.resumption import agent_session, order_of
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core.frame import ImuBatch, OdometryBatch
@@ -37,6 +39,7 @@ from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
 from kiteline_hw.system.key_store import read_keys
 from kiteline_hw.system.long_work import starting
+from kiteline_hw.system.start_numbers import Start, StartNumbers
 
 _Batch = TypeVar("_Batch", ImuBatch, OdometryBatch)
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
@@ -44,8 +47,13 @@ _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become 
 _QUIET_S = 1.0  # s that the link has to stay quiet: the base may still be working on the last keyframe
 
 
-def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process.StopSignal) -> None:
-    """Fly on real clocks: frames of a camera as they come, others paced by their stamps; late ones are dropped."""
+def fly_live(
+    options: AgentOptions, parent: process.Parent | None, stop: process.StopSignal, numbers: StartNumbers | None = None
+) -> None:
+    """Fly on real clocks: frames of a camera as they come, others paced by their stamps; late ones are dropped.
+
+    numbers: of this agent's starts; one is taken when all else is at hand. None: the options hold them.
+    """
     source = opened(options)
     with ExitStack() as stack:
         stack.callback(source.close)
@@ -55,6 +63,12 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
                 kernel_cache.fill(WARMING, stop)
         if stop:
             return
+        key = _key_of(options)
+        if numbers is not None:
+            start = numbers.next()
+            options = _numbered(options, start)
+            if start.kept:
+                process.print_lines([f"the number of this start is drawn, as it cannot be kept: {start.kept}"])
         runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
         stack.callback(runtime.close)
         clock = MonotonicClock()
@@ -62,8 +76,11 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
         shared = None if controller is None else controller.tunnel_link()
         link = shared or open_link(options.link, "agent", options.agent, framer=StreamFramer, required=False)
         stack.callback(link.close)
-        if options.key:
-            link = _sealed(options, link)
+        sealer: Sealer | None = None
+        session = agent_session(options.order, options.boot)
+        if key is not None:
+            sealer = Sealer(key, options.agent, session, Direction.UP, suite_for(link_traits(options.link)))
+            link = SealedLink(link, options.agent, sealer, Opener({options.agent: key}, Direction.DOWN))
         if options.cpu_percent > 0.0:
             stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
         if parent is not None:
@@ -105,7 +122,10 @@ def fly_live(options: AgentOptions, parent: process.Parent | None, stop: process
             # Poses have a rate of their own, or are those of the frames: predictions may be for obstacles alone.
             if controller is not None and (own_hz > 0.0) == (frame is None):
                 push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
-            for packet in runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push):
+            sent = runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push)
+            if runtime.session > session:
+                session = _overtake(runtime.session, sealer, numbers)
+            for packet in sent:
                 link.send(packet)
             if controller is not None:
                 push_obstacles(controller, runtime.agent, runtime.output, around, now_ns)
@@ -160,18 +180,32 @@ def _link_text(options: AgentOptions) -> str:
     return "without a link" if options.link == "none" else f"the base at {options.link}"
 
 
-def _sealed(options: AgentOptions, link: ByteLink) -> ByteLink:
-    """The link with its packets sealed. Raises LinkError without a key for this agent."""
+def _numbered(options: AgentOptions, start: Start) -> AgentOptions:
+    """The options with the numbers of this start."""
+    name = options.log_name and f"{LOG_STEM}{start.order:05d}.mcap"
+    return replace(options, boot=start.boot, order=start.order, log_name=name)
+
+
+def _key_of(options: AgentOptions) -> bytes | None:
+    """The agent's key; None if packets are not sealed. Raises LinkError without a key for this agent."""
+    if not options.key:
+        return None
     keys = read_keys(Path(options.key))
     if options.agent not in keys:
         raise LinkError(
             f"{options.key} has no key for agent {options.agent}; `kiteline keys new {options.agent}` makes one"
         )
-    key = {options.agent: keys[options.agent]}
-    sealer = Sealer(
-        key[options.agent], options.agent, options.boot + 1, Direction.UP, suite_for(link_traits(options.link))
-    )
-    return SealedLink(link, options.agent, sealer, Opener(key, Direction.DOWN))
+    return keys[options.agent]
+
+
+def _overtake(session: int, sealer: Sealer | None, numbers: StartNumbers | None) -> int:
+    """Go on in a session above that of an earlier start which the base knows and this one did not: seal, keep, tell."""
+    if sealer is not None:
+        sealer.raise_to(session)
+    if numbers is not None:  # beside the flight, which cannot wait for a disk
+        threading.Thread(target=numbers.raise_to, args=(order_of(session),), name="start-number", daemon=True).start()
+    process.print_lines(["the base knows a later start of this agent: state lost, or two agents with one number?"])
+    return session
 
 
 def _drain_live(

@@ -11,6 +11,7 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime import rig_file
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.sync.archive import Spill
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
@@ -29,7 +30,8 @@ class AgentOptions:
     log_mib: int = 0  # MiB that this log and earlier ones in the folder may take; 0: no limit
     log_optional: bool = False  # fly also where no log can be written
     agent: int = 0
-    boot: int = 0
+    boot: int = 0  # of the ids that it makes
+    order: int = 1  # of its starts: higher than that of any before it
     link: str = "none"  # LINK, or lockstep:ENDPOINT
     mono: bool = False
     imu: bool = True
@@ -62,11 +64,11 @@ class AgentOptions:
     await_bases: bool = False  # wait for a new base whenever one ends
 
 
-def options_of(a: argparse.Namespace, folder: Path, boot: int) -> AgentOptions:
-    """Options from the command line. folder: for the log. boot: number of this start."""
+def options_of(a: argparse.Namespace, folder: Path) -> AgentOptions:
+    """Options from the command line, without the numbers of this start. folder: for the log."""
     return AgentOptions(
-        source=a.source, folder=str(folder), log_name=f"{LOG_STEM}{boot:05d}.mcap" if a.log else "", log_mib=a.log_mib,
-        log_optional=True, agent=a.agent, boot=boot,
+        source=a.source, folder=str(folder), log_name=LOG_STEM if a.log else "", log_mib=a.log_mib,
+        log_optional=True, agent=a.agent,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
         up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
@@ -94,7 +96,7 @@ def agent_config(path: str, cpu_percent: float = 0.0, rig: str = "", grid: str =
 
 
 def channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
-    """The agent's end of the codec, or a channel to nowhere without a base. A session is the boot, counted from 1.
+    """The agent's end of the codec, or a channel to nowhere without a base.
 
     spill: keeps what would take too much memory while the link is down.
     """
@@ -106,7 +108,8 @@ def channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None = N
 def coded_channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None) -> CodedChannel:
     """The agent's end of the codec."""
     sealed = seal_bytes(suite_for(link)) if options.key else 0
-    return coded_channel(options.boot + 1, options.up_bytes_s, options.profile, sealed, link, spill, bounded=True)
+    session = agent_session(options.order, options.boot)
+    return coded_channel(session, options.up_bytes_s, options.profile, sealed, link, spill, bounded=True)
 
 
 def parser(forms: str = "") -> argparse.ArgumentParser:
@@ -166,7 +169,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         help="who looks for ground and obstacles: the agent, where CPU time is left (default), or nobody",
     )  # fmt: skip
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
-    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap")
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap, …_1.mcap")
     p.add_argument(
         "--log-mib", metavar="N", type=int, default=LOG_MIB,
         help="MiB that the logs of all starts may take: the oldest are deleted, also in flight (default: %(default)s; "

@@ -163,7 +163,7 @@ class Intake:
 
     def _take_live_pose(self, record: LivePose, now_ns: int) -> None:
         held = self.live.get(record.agent)
-        if held is not None and _order(record) < _order(held):
+        if held is not None and _start(record) == _start(held) and record.t_ns < held.t_ns:
             return
         self.live[record.agent] = record
         submap = submap_of_keyframe(record.keyframe)
@@ -238,9 +238,9 @@ class Intake:
                     self._map.set_pose(keyframes[0], _LEVEL_T_M_C)
 
 
-def _order(live: LivePose) -> tuple[int, int]:
-    """Order of live poses: by boot of the agent first, because its clock may restart too."""
-    return live.keyframe >> SEQUENCE_BITS + SUBMAP_BITS, live.t_ns
+def _start(live: LivePose) -> int:
+    """The start of its agent that a live pose is of: clocks of different ones do not compare."""
+    return live.keyframe >> SEQUENCE_BITS + SUBMAP_BITS
 
 
 def _submap_of(record: Record) -> SubmapId | None:

@@ -13,6 +13,8 @@ from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import WARMING
 from kiteline_basestation.runtime.worker import Worker
+from kiteline_basestation.station import Station
+from kiteline_codec.channel import CodedChannel
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_core.ids import AgentId
@@ -50,7 +52,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
     with contextlib.ExitStack() as stack:
         link = open_link(options.link, "base", framer=StreamFramer, required=False)
         stack.callback(link.close)
-        hub = _sealed(options, link) if options.key else link
+        sealers: dict[int, Sealer] = {}
+        hub = _sealed(options, link, sealers) if options.key else link
         page = _open_page(options, clock.now_ns(), stack)
         worker = Worker()
         stack.callback(worker.close)
@@ -86,6 +89,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
                     if queries is not None:
                         queries.answer(answer.id, answer.ok, answer.text)
                 stepped_ns = now_ns
+                _raise_boots(sealers, base.station)
                 _send(hub, base.outgoing(now_ns))
                 base.compare_digests(hub.alive())
                 if parent is None:
@@ -109,19 +113,27 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
     return all(closed)
 
 
-def _sealed(options: BaseOptions, hub: LinkHub) -> LinkHub:
-    """The hub with sealed packets; packets of agents without a key are dropped. Raises LinkError."""
-    keys = read_keys(Path(options.key))
+def _sealed(options: BaseOptions, hub: LinkHub, sealers: dict[int, Sealer]) -> LinkHub:
+    """The hub with sealed packets; packets of agents without a key are dropped. Raises LinkError.
+
+    sealers: gets those that are made, by agent.
+    """
+    keys, suite = read_keys(Path(options.key)), suite_for(link_traits(options.link))
 
     def sealer(agent: int) -> Sealer | None:
-        key = keys.get(agent)
-        return (
-            None
-            if key is None
-            else Sealer(key, agent, options.session, Direction.DOWN, suite_for(link_traits(options.link)))
-        )
+        if agent in keys:
+            sealers[agent] = Sealer(keys[agent], agent, options.session, Direction.DOWN, suite)
+        return sealers.get(agent)
 
     return SealedHub(hub, sealer, Opener(keys, Direction.UP))
+
+
+def _raise_boots(sealers: Mapping[int, Sealer], station: Station) -> None:
+    """Let seals follow sessions that rose, as an agent knew a later one of another base."""
+    for agent, sealer in sealers.items():
+        channel = station.channels.get(AgentId(agent))
+        if isinstance(channel, CodedChannel):
+            sealer.raise_to(channel.endpoint.session)
 
 
 def _open_queries(options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack) -> QueryServer | None:

@@ -30,7 +30,7 @@ def combine(first: SavedMap, second: SavedMap) -> SavedMap:
             if here.received.get(key, values.received[key]) != values.received[key]:
                 raise WireError(
                     f"both maps hold keyframe {key.id} of agent {agent}, and not the same: another agent with this "
-                    "number? Give each its own --agent, and keep its --log folder, where its starts are counted"
+                    "number? Give each its own --agent, and keep its state folder, where its starts are counted"
                 )
         new += sorted(KeyframeId(key.id) for key in headers if key not in here.received)
         known = {key.id for key in headers if key in here.received}

@@ -18,6 +18,7 @@ from kiteline_basestation.station import Station
 from kiteline_bench.harness.recording import Item, Recording, items_of
 from kiteline_bench.harness.result import AgentRun
 from kiteline_codec.channel import RecordChannel, coded_channel
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.frame import ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import AgentId
@@ -234,7 +235,7 @@ class _Start:
         self.next = next(self._items, None)
         source = open_source(scenario.source, mono=scenario.mono, imu=scenario.has_imu)
         identity = Identity(self.agent, scenario.boot)
-        channel = coded_channel(scenario.boot + 1, bytes_s, profile)
+        channel = coded_channel(agent_session(scenario.boot + 1, scenario.boot), bytes_s, profile)
         self.flying = FlyingAgent(source.rig, source.imu, config, channel=channel, identity=identity)
         source.close()
 

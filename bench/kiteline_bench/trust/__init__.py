@@ -1,1 +1,1 @@
-"""What strangers, faulty agents and damaged files may do: hostile input for every door."""
+"""What may happen: hostile input at every door, disks that are full or alter bits, cards that are lost or cloned."""

@@ -49,11 +49,10 @@ class Endpoint:
         peer holds are forgotten and others dropped. may_write: tells whether a key is one of the peer's; values under
         others are ignored. claimed_bytes: memory that a code of the peer claims for good where it is used.
         """
-        if not 0 < session < 1 << 56:
+        if not 0 < session < resumption.MAX_SESSION:
             raise ValueError(f"session is {session}, expected 1..2^56-1")
-        self.config = config
-        self.session = session
-        self._coder = coder
+        self.config, self._coder = config, coder
+        self.session, self._overtaking = session, resumption.Overtaking()  # it rises where the peer knows a later one
         self._out = Outbox(
             config.order, config.oldest_every, self._compress if coder else None, config.resident_bytes, spill
         )
@@ -177,8 +176,10 @@ class Endpoint:
             return self._refuse("damaged or no packet of this protocol")
         if self.peer_session is not None and header.session < self.peer_session:
             return self._refuse("from an earlier session of the peer")
-        if header.peer > self.session:
-            return self._refuse("the peer knows a later session of this side: the stored session number went back")
+        if (session := self._overtaking.above(self.session, header.peer)) is None:
+            return self._refuse("the peer knows a later session of this side: does another one run with its number?")
+        if session != self.session:
+            self.session, self.peer_session = session, None  # all is sent again
         if self.peer_session is None or header.session > self.peer_session:
             self._begin_session(header.session)
             self._owe_answer(now_ns)

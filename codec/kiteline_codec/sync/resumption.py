@@ -15,7 +15,7 @@ from kiteline_codec.residuals.predictors import Held
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key
 from kiteline_codec.transport.packet import MAX_KIND, Item
-from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS
+from kiteline_core.ids import SEQUENCE_BITS, SUBMAP_BITS
 
 SUMMARY_KIND = MAX_KIND  # of the values that hold the checksums; no record has it
 REFERENCE_BYTES = 4
@@ -25,15 +25,49 @@ _MAX_PARTS = 1 << 16
 MOST_LISTED = 1 << 17  # values that are remembered of what a peer lists: 25 MB
 _SHORT_CHECKSUM = 0xFFFFFF
 _FROM_AGENT = KEYFRAME_KINDS & AGENT_KINDS
+MAX_SESSION = 1 << 56
+_MOST_OVERTAKEN = 3  # times: two sides with one number would overtake each other for ever
+_BOOT_PART_BITS = 6  # of an agent's session: the lowest bits of its boot
+
+
+def agent_session(order: int, boot: int) -> int:
+    """The session of an agent's start. order: of its starts, from 1. boot: of the ids that it makes."""
+    return order << _BOOT_PART_BITS | boot & (1 << _BOOT_PART_BITS) - 1
+
+
+def later_session(session: int, known: int) -> int:
+    """A session above one that the peer knows, for the same boot."""
+    return agent_session((known >> _BOOT_PART_BITS) + 1, session)
+
+
+class Overtaking:
+    """Sessions above those that the peer knows, where the number that this side kept was lost."""
+
+    def __init__(self) -> None:
+        self._left = _MOST_OVERTAKEN
+
+    def above(self, session: int, known: int) -> int | None:
+        """A session that the peer takes: this one, or one above what it knows; None after a few times."""
+        if known <= session:
+            return session
+        if not self._left or known >= MAX_SESSION >> 1:
+            return None
+        self._left -= 1
+        return later_session(session, known)
+
+
+def order_of(session: int) -> int:
+    """The order of an agent's start."""
+    return session >> _BOOT_PART_BITS
 
 
 def summaries(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
     """Summaries of the values held of earlier sessions, newest ids first, for a session of the peer.
 
-    Of an agent's keyframes only those of its present boot (its session is the boot, from 1): it holds no others.
+    Of an agent's keyframes only those of its present boot, as far as its session tells: it holds no others.
     """
     keys = [key for key, code in values.items() if len(code) >= _MIN_CODE_BYTES and key.kind != SUMMARY_KIND]
-    keys = [key for key in keys if key.kind not in _FROM_AGENT or _boot(key.id) + 1 == session]
+    keys = [key for key in keys if key.kind not in _FROM_AGENT or _is_of(key.id, session)]
     keys.sort(key=lambda key: (-key.id, key.kind, key.part))
     out: dict[Key, bytes] = {}
     for part, begin in enumerate(range(0, min(len(keys), _MAX_PARTS * _VALUES_PER_PART), _VALUES_PER_PART)):
@@ -48,8 +82,8 @@ def summaries(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
     return out
 
 
-def _boot(keyframe: int) -> int:
-    return keyframe >> SEQUENCE_BITS + SUBMAP_BITS & (1 << BOOT_BITS) - 1
+def _is_of(keyframe: int, session: int) -> bool:
+    return (keyframe >> SEQUENCE_BITS + SUBMAP_BITS ^ session) & (1 << _BOOT_PART_BITS) - 1 == 0
 
 
 def read_summary(code: bytes) -> dict[Key, int]:

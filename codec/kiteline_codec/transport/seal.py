@@ -2,13 +2,15 @@
 
 On IP links packets are encrypted (ChaCha20-Poly1305, RFC 8439); on thin links they are readable but carry a keyed
 BLAKE2s tag of 8 bytes (RFC 7693). The nonce is (direction, agent, boot, counter). Each writer counts its boots and
-never uses one again, so no nonce is used twice, not even after a crash.
+never uses one again. An encrypted packet also names 8 bytes that its writer drew at its start; its key is derived with
+them, so that no nonce meets a key twice, not even where a boot comes again, as on a cloned card.
 """
 
 from __future__ import annotations
 
 import hmac
-from collections.abc import Mapping
+import secrets
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from hashlib import blake2b, blake2s
@@ -24,8 +26,9 @@ if TYPE_CHECKING:
 KEY_BYTES = 32
 WINDOW_PACKETS = 1024  # a packet further behind the newest one is refused; no link reorders so much
 _MAX_AGENT = 63
-_MAX_BOOT = (1 << 35) - 1
-_MAX_COUNTER = (1 << 48) - 1
+_MAX_BOOT = (1 << 48) - 1
+_MAX_COUNTER = (1 << 40) - 1
+SALT_BYTES = {0: 8, 1: 0}  # by suite: a tag needs none
 
 
 class Suite(IntEnum):
@@ -46,8 +49,8 @@ _TAG_BYTES = {Suite.ENCRYPTED: 16, Suite.TAGGED: 8}
 
 
 def seal_bytes(suite: Suite) -> int:
-    """Bytes that sealing adds to a packet at most, below 2 million boots and 34 thousand million packets each."""
-    return 1 + 3 + 5 + _TAG_BYTES[suite]
+    """Bytes that sealing adds to a packet at most, below 2^42 as a boot and 2^28 packets."""
+    return 1 + 6 + 4 + SALT_BYTES[suite] + _TAG_BYTES[suite]
 
 
 def suite_for(link: LinkTraits) -> Suite:
@@ -69,7 +72,12 @@ def _derived(key: bytes, suite: Suite, direction: Direction) -> bytes:
 
 
 def _nonce(first: int, boot: int, counter: int) -> bytes:
-    return bytes((first,)) + boot.to_bytes(5, "big") + counter.to_bytes(6, "big")
+    return bytes((first,)) + boot.to_bytes(6, "big") + counter.to_bytes(5, "big")
+
+
+def _salted(key: bytes, salt: bytes) -> bytes:
+    """The key of one start of a writer."""
+    return blake2b(salt, key=key, digest_size=32, person=b"kiteline-start").digest()
 
 
 def _tag(key: bytes, data: bytes) -> bytes:
@@ -86,18 +94,29 @@ def _cipher(key: bytes) -> ChaCha20Poly1305:
 class Sealer:
     """Seals the packets of one start of one writer."""
 
-    def __init__(self, key: bytes, agent: int, boot: int, direction: Direction, suite: Suite) -> None:
-        """boot: number of this start of the writer, never used again. Raises ValueError."""
+    def __init__(
+        self, key: bytes, agent: int, boot: int, direction: Direction, suite: Suite,
+        draw: Callable[[int], bytes] = secrets.token_bytes,
+    ) -> None:  # fmt: skip
+        """boot: number of this start of the writer, never used again. draw: random bytes. Raises ValueError."""
         if not (0 <= agent <= _MAX_AGENT and 0 <= boot <= _MAX_BOOT):
             raise ValueError(f"agent {agent} is 0..{_MAX_AGENT} and boot {boot} is 0..{_MAX_BOOT}")
         self._first = suite << 7 | direction << 6 | agent
         self._boot = boot
         self._suite = suite
         self._key = _derived(key, suite, direction)
+        self._salt = draw(SALT_BYTES[suite])
+        if self._salt:
+            self._key = _salted(self._key, self._salt)
         self._counter = 0
 
+    def raise_to(self, boot: int) -> None:
+        """Go on under a higher boot, which the receiver asked for; a lower one is ignored."""
+        if self._boot < boot <= _MAX_BOOT:
+            self._boot, self._counter = boot, 0
+
     def seal(self, packet: bytes) -> bytes:
-        """The sealed packet. Raises OverflowError after 2^48 packets."""
+        """The sealed packet. Raises OverflowError after 2^40 packets."""
         self._counter += 1
         if self._counter > _MAX_COUNTER:
             raise OverflowError("no nonces left in this boot")
@@ -105,7 +124,7 @@ class Sealer:
         head.u8(self._first)
         head.varint(self._boot)
         head.varint(self._counter)
-        data = head.bytes()
+        data = head.bytes() + self._salt
         if self._suite == Suite.TAGGED:
             return data + packet + _tag(self._key, data + packet)
         nonce = _nonce(self._first, self._boot, self._counter)
@@ -156,6 +175,7 @@ class Opener:
         self._direction = direction
         self._keys = {(a, s): _derived(key, s, direction) for a, key in keys.items() for s in Suite}
         self._writers = {a: _Writer((boots or {}).get(a, 0) - 1) for a in keys}
+        self._salted: dict[tuple[int, bytes], bytes] = {}  # key of the last salt of each agent
 
     @property
     def boots(self) -> dict[int, int]:
@@ -167,6 +187,7 @@ class Opener:
         source = Reader(sealed)
         try:
             first, boot, counter = source.u8(), source.varint(_MAX_BOOT), source.varint(_MAX_COUNTER)
+            salt = source.raw(SALT_BYTES[first >> 7])
         except WireError:
             self.counters.truncated += 1
             return None
@@ -183,10 +204,15 @@ class Opener:
         if not writer.is_new(boot, counter):
             self._refuse("replayed", agent)
             return None
+        if salt:
+            key = self._salted.get((agent, salt)) or _salted(key, salt)
         packet = self._opened(key, suite, sealed[:body_at], sealed[body_at:], _nonce(first, boot, counter))
         if packet is None:
             self._refuse("forged", agent)
             return None
+        if salt and (agent, salt) not in self._salted:
+            self._salted = {held: k for held, k in self._salted.items() if held[0] != agent}
+            self._salted[agent, salt] = key
         writer.mark(boot, counter)
         self.counters.opened += 1
         return agent, packet

@@ -171,22 +171,9 @@ def next_number(path: Path, least: int = 1) -> int:
     return number
 
 
-def kept_folder(name: str, folder: Path) -> Path:
-    """The folder for files of `name` that outlive its logs: a service's state folder, else the logs' `folder`."""
-    return state_folder() / name if os.environ.get("STATE_DIRECTORY") else folder
-
-
-def number_of_start(name: str, folder: Path) -> int:
-    """The number of this start of `name`: higher than any before it, as ids and nonces are made of it.
-
-    folder: of its logs. Raises OSError, ValueError.
-    """
-    kept = kept_folder(name, folder)
-    if kept == folder:
-        return next_number(folder / "boot")
-    earlier = folder / "boot"  # of starts by hand, or of an older version
-    least = int(earlier.read_text()) + 1 if earlier.exists() else 1
-    return next_number(kept / "boot", least)
+def kept_folder(name: str) -> Path:
+    """The folder for files of `name` that outlive its logs."""
+    return state_folder() / name
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -198,3 +185,8 @@ def write_atomically(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     os.replace(new, path)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)  # else a power cut may bring the old file back
+    finally:
+        os.close(folder)

@@ -11,6 +11,7 @@ from kiteline_agent.runtime.agent_runtime import AgentRuntime
 from kiteline_basestation.runtime.base_runtime import BaseRuntime
 from kiteline_basestation.runtime.options import coded_channels
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase
 from kiteline_hw.logs.spill_file import SpillFile
@@ -28,7 +29,11 @@ def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
             ours[spec.agent], theirs[spec.agent] = plain_pair()
         elif mode == "local":
             ours[spec.agent] = coded_channel(
-                spec.boot + 1, spec.up_bytes_s, spec.profile, spill=SpillFile(Path(spec.folder)), bounded=True
+                agent_session(spec.order, spec.boot),
+                spec.up_bytes_s,
+                spec.profile,
+                spill=SpillFile(Path(spec.folder)),
+                bounded=True,
             )
         else:
             ours[spec.agent] = NoBaseChannel()

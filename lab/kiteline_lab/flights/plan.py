@@ -9,6 +9,7 @@ from pathlib import Path
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
+from kiteline_core.ids import MAX_BOOTS
 from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
@@ -75,12 +76,13 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
         made.close()
         raise
     counts = [source.frame_count for source in made.sources]
-    boot = process.next_number(Path(o.store) / "session") if o.store else 0  # ids in a store stay unique
+    number = process.next_number(Path(o.store) / "session") if o.store else 0  # ids in a store stay unique
     made.frames = None if o.seconds > 0 or None in counts else sum(count or 0 for count in counts)
     for k, text in enumerate(o.sources):
         made.agents.append(
             AgentOptions(
-                source=text, folder=str(o.out / f"agent{k}"), agent=k, boot=boot, mono=o.mono, imu=o.imu,
+                source=text, folder=str(o.out / f"agent{k}"), agent=k,
+                boot=number % MAX_BOOTS, order=number + 1, mono=o.mono, imu=o.imu,
                 config=o.config, rig=o.rig, calibration=o.calibration, grid=o.grid,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
@@ -93,7 +95,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
         made.base = BaseOptions(
             folder=str(o.out / "base"), agents=tuple(range(len(o.sources))), config=o.config, start_ns=starts[0],
             down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
-            seed=o.seed, session=max(1, boot), store=o.store, kill_at_s=o.kill_base_at_s,
+            seed=o.seed, session=max(1, number), store=o.store, kill_at_s=o.kill_base_at_s,
         )  # fmt: skip
     return made
 

@@ -48,7 +48,18 @@ from kiteline_codec.schema import (
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
+from kiteline_core.ids import (
+    MAX_KEYFRAMES,
+    MAX_SUBMAPS,
+    NO_KEYFRAME,
+    SEQUENCE_BITS,
+    SUBMAP_BITS,
+    AgentId,
+    KeyframeId,
+    SubmapId,
+    keyframe_id,
+    submap_id,
+)
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "records.json"
 
@@ -74,8 +85,10 @@ def a_scan(seed: int, n: int) -> ColumnScan:
 def some_records(seed: int, n: int) -> list[Record]:
     """One record of each kind, two scans, with n rows."""
     rng, steps = np.random.default_rng(seed), np.random.default_rng(seed + 1)
-    submap = submap_id(int(rng.integers(64)), int(rng.integers(1 << 14)), int(rng.integers(1 << 12)))
-    keyframe = keyframe_id(submap, int(rng.integers(50, 1 << 20)))
+    agent, high, middle, low = (int(rng.integers(*r)) for r in ((64,), (1 << 14,), (1 << 12,), (50, 1 << 20)))
+    number = high << 32 | middle << 20 | low  # of boot, submap and sequence
+    submap = submap_id(agent, number >> SUBMAP_BITS + SEQUENCE_BITS, number >> SEQUENCE_BITS & MAX_SUBMAPS - 1)
+    keyframe = keyframe_id(submap, max(50, number & MAX_KEYFRAMES - 1))
     pose = se3.exp(np.concatenate([rng.normal(0, 3, 3), rng.normal(0, 0.5, 3)]))
     index = np.sort(rng.permutation(2048)[:n]).astype(np.uint16)
     uv = rng.uniform(-10, 1300, (n, 2)).astype(np.float32)

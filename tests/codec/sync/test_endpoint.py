@@ -234,14 +234,35 @@ def test_packets_of_dead_sessions_change_nothing() -> None:
     assert pair.b.peer_values() == {}
 
 
-def test_a_session_number_that_went_back_is_reported() -> None:
+def test_a_session_number_that_went_back_is_overtaken() -> None:
+    for side in (0, 1):
+        pair = Pair()
+        fill(pair.a, 1, 10, NewLandmarks.KIND)
+        for _ in range(70):
+            pair.restart(side)
+        pair.settle()
+        known = pair.ends[side].session
+        pair.ends[side] = Endpoint(PLAIN, 5)  # its state was lost
+        fill(pair.ends[side], 2, 10, NewLandmarks.KIND)
+        pair.settle()
+        assert pair.ends[side].session > known and pair.ends[side].session % 64 == 5
+        assert pair.ends[1 - side].peer_values() == pair.ends[side].own_values() != {}
+
+
+def test_two_ends_with_one_number_do_not_overtake_each_other_for_ever() -> None:
     pair = Pair()
-    pair.restart(0)
-    pair.settle()
-    pair.ends[0] = Endpoint(PLAIN, 1)
-    pair.run(2000)
-    assert dict(pair.b.stats.reasons).keys() == {"from an earlier session of the peer"}
-    assert any("went back" in reason for reason, _ in pair.a.stats.reasons)
+    twin, raised = Endpoint(PLAIN, 7), set()
+    for _ in range(400):
+        pair.step()
+        while (packet := twin.poll(pair.now_ns)) is not None:
+            pair.b.receive(packet, pair.now_ns)
+        for _, packet in pair.sent[1]:
+            twin.receive(packet, pair.now_ns)
+        pair.sent[1].clear()
+        raised |= {pair.a.session, twin.session}
+    assert 2 < len(raised) <= 8
+    reasons = {reason for end in (pair.a, twin) for reason, _ in end.stats.reasons}
+    assert any("does another one run with its number?" in reason for reason in reasons)
 
 
 def test_another_protocol_version_is_refused_by_name() -> None:
@@ -250,7 +271,7 @@ def test_another_protocol_version_is_refused_by_name() -> None:
     assert packet is not None
     other = bytes([9]) + packet[1:-4]
     assert b.receive(other + zlib.crc32(other).to_bytes(4, "little"), 0) == []
-    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 5", 1),)
+    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 6", 1),)
     assert b.receive(packet[:-1] + b"?", 0) == []
     assert b.stats.rejected == 2
     assert b.peer_session is None

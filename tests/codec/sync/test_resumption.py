@@ -44,13 +44,16 @@ def talk(a: Endpoint, b: Endpoint, begin_ns: int, steps: int = 60, lose: float =
     return sent
 
 
+OF_BOOT_4, OF_BOOT_5 = (resumption.agent_session(1, boot) for boot in (4, 5))
+
+
 def end(session: int) -> Endpoint:
     return Endpoint(SyncConfig(budget_bytes=8000), session, coder=ResidualCoder())
 
 
 @pytest.mark.parametrize("lose", [0.0, 0.3])
 def test_a_base_that_kept_everything_is_sent_checksums(lose: float) -> None:
-    agent, base = end(5), end(1)
+    agent, base = end(OF_BOOT_4), end(1)
     mine = values(boot=4)
     for key, code in mine.items():
         agent.put(key, code)
@@ -66,7 +69,7 @@ def test_a_base_that_kept_everything_is_sent_checksums(lose: float) -> None:
 
 
 def test_only_what_is_missing_or_new_goes_whole() -> None:
-    agent, mine = end(5), values(boot=4)
+    agent, mine = end(OF_BOOT_4), values(boot=4)
     for key, code in mine.items():
         agent.put(key, code)
     base = end(2)
@@ -79,7 +82,7 @@ def test_only_what_is_missing_or_new_goes_whole() -> None:
 
 
 def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> None:
-    agent, base, again = end(5), end(1), end(2)
+    agent, base, again = end(OF_BOOT_4), end(1), end(2)
     own = {Key(RefinedLandmarks.KIND, keyframe_id(submap_id(1, 4, 0), i)): bytes([i]) * 300 for i in range(40)}
     for side in (base, again):
         for key, code in own.items():
@@ -93,7 +96,7 @@ def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> Non
 
 def test_another_boot_gets_no_summary() -> None:
     old = values(boot=4)
-    assert resumption.summaries(old, 5) and not resumption.summaries(old, 6)
+    assert resumption.summaries(old, OF_BOOT_4) and not resumption.summaries(old, OF_BOOT_5)
 
 
 @given(st.dictionaries(keys, st.binary(min_size=16, max_size=40), max_size=150))

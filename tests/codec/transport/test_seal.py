@@ -11,14 +11,14 @@ from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite, fing
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
 GOLDEN = (
-    "03050199184d8354e404494843e3e8dfdd10bc2818126c",
+    "03050100010203040506072ffcf28162b332eafff82dbe848abe93230b6d46",
     "8305016b6974651c305abc036f3490",
 )
 SUITES = pytest.mark.parametrize("suite", list(Suite))
 
 
 def sealer(suite: Suite, boot: int = 5, key: bytes = KEY, agent: int = 3) -> Sealer:
-    return Sealer(key, agent, boot, Direction.UP, suite)
+    return Sealer(key, agent, boot, Direction.UP, suite, lambda n: bytes(range(n)))
 
 
 def opener() -> Opener:
@@ -39,6 +39,9 @@ def test_a_packet_goes_through_once(suite: Suite) -> None:
         assert theirs.open(sealed[i]) is None
     assert theirs.counters.opened == theirs.counters.replayed == 20
     assert max(map(len, sealed)) - 19 <= seal_bytes(suite)
+    most = Sealer(KEY, 63, (1 << 42) - 1, Direction.UP, suite)
+    most._counter = (1 << 28) - 2
+    assert len(most.seal(b"")) == seal_bytes(suite)
 
 
 @SUITES
@@ -118,6 +121,26 @@ def test_no_nonce_comes_twice() -> None:
     assert len(nonces) == 2 * 2 * 3 * 3 * 4
 
 
+def test_a_boot_that_comes_again_meets_another_key() -> None:
+    first, again = (Sealer(KEY, 3, 5, Direction.UP, Suite.ENCRYPTED) for _ in range(2))  # as on two cloned cards
+    a, b = first.seal(bytes(40)), again.seal(bytes(40))
+    assert a[:3] == b[:3] and a[3:11] != b[3:11]
+    assert a[11:] != b[11:]  # equal bytes under equal nonces: one keystream would show
+    theirs = opener()
+    assert theirs.open(a) == (3, bytes(40)) and theirs.open(b) is None
+    assert theirs.open(again.seal(b"2")) == (3, b"2")
+
+
+@SUITES
+def test_a_raised_boot_goes_on_and_lower_ones_are_ignored(suite: Suite) -> None:
+    ours, theirs = sealer(suite), opener()
+    assert theirs.open(ours.seal(b"1")) is not None
+    ours.raise_to(900)
+    ours.raise_to(6)
+    assert theirs.open(ours.seal(b"2")) == (3, b"2")
+    assert theirs.boots == {3: 900}
+
+
 def test_encrypted_packets_tell_nothing() -> None:
     assert b"secret" not in sealer(Suite.ENCRYPTED).seal(b"secret" * 5)
 
@@ -128,7 +151,7 @@ def test_bad_keys_and_numbers_are_errors() -> None:
     with pytest.raises(ValueError, match="boot"):
         Sealer(KEY, 0, -1, Direction.UP, Suite.TAGGED)
     ours = sealer(Suite.TAGGED)
-    ours._counter = (1 << 48) - 1
+    ours._counter = (1 << 40) - 1
     with pytest.raises(OverflowError):
         ours.seal(b"")
     assert fingerprint(KEY) != fingerprint(OTHER)

@@ -12,6 +12,7 @@ from kiteline_agent.runtime.controller import pose_sample
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec.channel import coded_channel
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import AgentId
@@ -67,7 +68,11 @@ class Onboard(Closing):
             imu_rate_hz=config.controller_imu.noise.rate_hz, report=report,
         )  # fmt: skip
         self.link = self.sink.tunnel_link()
-        channel = NoBaseChannel() if self.link is None else coded_channel(boot + 1, _TUNNEL_BYTES_S, "radio")
+        channel = (
+            NoBaseChannel()
+            if self.link is None
+            else coded_channel(agent_session(boot + 1, boot), _TUNNEL_BYTES_S, "radio")
+        )
         self.agent = Agent(
             setting.rig, config.controller_imu.noise, config, Identity(AgentId(0), boot), channel, shipped_vocabulary()
         )

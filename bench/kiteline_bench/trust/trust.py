@@ -1,0 +1,12 @@
+"""`kiteline bench trust`: nothing is lost, and nothing comes twice."""
+
+from __future__ import annotations
+
+from kiteline_bench.harness.bars import Run
+from kiteline_bench.trust import disk, histories, store
+
+PARTS: dict[str, tuple[str, Run]] = {
+    "disk": ("Trust: full disks", disk.run),
+    "starts": ("Trust: ids and nonces", histories.run),
+    "store": ("Trust: flipped bits in a store", store.run),
+}
