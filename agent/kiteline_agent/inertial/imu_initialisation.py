@@ -110,9 +110,11 @@ class ImuInitialiser:
         config, last = self._config, self._poses[-1]
         recent = [p for p in self._poses if (last.t_ns - p.t_ns) * 1e-9 <= config.rest_window_s + 0.1]
         moved = max(float(np.linalg.norm(p.T_m_b[:3, 3] - last.T_m_b[:3, 3])) for p in recent)
-        mean, spread, n = self._buffer.mean(recent[0].t_ns, last.t_ns)
-        still = spread[:3].max() < config.rest_gyro_rad_s and spread[3:].max() < config.rest_accel_m_s2
-        if n < _REST_SAMPLES or not still or moved > config.rest_moved_m:
+        samples = self._buffer.within(recent[0].t_ns, last.t_ns)
+        if len(samples) < _REST_SAMPLES or moved > config.rest_moved_m:
+            return False
+        mean, spread = samples.mean(axis=0), samples.std(axis=0)
+        if spread[:3].max() >= config.rest_gyro_rad_s or spread[3:].max() >= config.rest_accel_m_s2:
             return False
         if abs(np.linalg.norm(mean[3:]) - config.gravity_m_s2) > 0.1 * config.gravity_m_s2:
             return False

@@ -26,6 +26,7 @@ from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 
@@ -374,7 +375,7 @@ class InertialTracker:
             samples = self.samples_between(self._scale_from[0], t_ns)
             seen = points.xyz[points.inlier]
             if samples is not None and len(seen):
-                depth_m = float(np.median(np.linalg.norm(seen - T_m_b[:3, 3], axis=1)))
+                depth_m = median(np.linalg.norm(seen - T_m_b[:3, 3], axis=1))
                 self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
             else:
                 self._scale.resume(state.velocity)

@@ -115,13 +115,10 @@ class SampleBuffer:
             self._densities(steps, lo, hi),
         )
 
-    def mean(self, from_ns: int, to_ns: int) -> tuple[F64, F64, int]:
-        """Mean (6,) and standard deviation (6,) of the samples between two instants, and their number."""
-        first, last = np.searchsorted(self._t, from_ns, "left"), np.searchsorted(self._t, to_ns, "right")
-        chosen = self._values[first:last]
-        if len(chosen) == 0:
-            return np.zeros(6), np.zeros(6), 0
-        return chosen.mean(axis=0), chosen.std(axis=0), len(chosen)
+    def within(self, from_ns: int, to_ns: int) -> F64:
+        """The samples (n,6) between two instants."""
+        first, last = self._t.searchsorted(from_ns, "left"), self._t.searchsorted(to_ns, "right")
+        return self._values[first:last]
 
     def _at(self, t_ns: int) -> F64:
         t = self._t

@@ -23,6 +23,7 @@ from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
+from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ class TwoViewStart:
         """A map is tracked, at these depths (n,): a later start takes on their scale, from a new first frame."""
         self._first = None
         if len(depth_m):
-            self._median_depth_m = float(np.median(depth_m))
+            self._median_depth_m = median(depth_m)
 
     def rescale(self, factor: float) -> None:
         """Change the unit of length: all lengths grow by `factor`."""

@@ -31,7 +31,7 @@ _NONE: I8 = np.zeros((0, 0), np.int8)
 _LEAST_HEADING = 0.3  # horizontal part of the vehicle's forward axis: less has no heading
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Drawn:
     """A scan in the grid's axes. x_m, y_m, z_m: of its camera. heading: of its azimuth 0. offset_px: see `Scanned`."""
 
@@ -41,11 +41,18 @@ class _Drawn:
     heading: float
     scan: ColumnScan
     offset_px: F64
+    _ranges: tuple[RangeError, F64, F64] | None = None  # what `ranges` returned last, and by which error
 
     @staticmethod
     def of(p: F64, ahead: F64, scan: ColumnScan, offset_px: F64) -> _Drawn:
         """That of a camera at p (3,) whose azimuth 0 lies towards ahead (3,)."""
         return _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan, offset_px)
+
+    def ranges(self, error: RangeError, sigma_m: float) -> tuple[F64, F64]:
+        """See `RangeError.ranges`. A scan is drawn again and again."""
+        if self._ranges is None or self._ranges[0] is not error:
+            self._ranges = error, *error.ranges(self.scan, self.offset_px, sigma_m)
+        return self._ranges[1:]
 
     def turned(self, R: F64) -> _Drawn:
         """The same in axes turned by R (3,3)."""
@@ -248,7 +255,7 @@ class LocalGrid:
         if away_m > config.body_m:
             return False
         canvas.number += 1
-        clear_m, certain_m = self._error.ranges(scan, drawn.offset_px, config.sigma_m)
+        clear_m, certain_m = drawn.ranges(self._error, config.sigma_m)
         seen_m = np.minimum(np.maximum(certain_m, config.near_m), config.reach_m)
         kernels.draw_rays(
             canvas.cells, canvas.marks, canvas.number, drawn.x_m - canvas.corner[0], drawn.y_m - canvas.corner[1],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import Key, KeyframeScan, messages
+from kiteline_codec.schema import Key, KeyframeScan, Record, messages
 
 _UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
 _WAITING = 1024  # scans kept while the link has no room, as codes: 0.3 MB
@@ -28,18 +28,27 @@ class ScanQueue:
         """Share a scan, in place of one that waits under the same key."""
         key = record.key()
         self._waiting.pop(key, None)
+        self._note_arrived()
+        if len(self._under_way) < _UNDER_WAY:
+            self._send(key, record)
+            return
         self._waiting[key] = messages.encode(record)
         if len(self._waiting) > _WAITING:
             oldest = next((k for k in self._waiting if k.part), next(iter(self._waiting)))
             del self._waiting[oldest]
-        self.share()
 
     def share(self) -> None:
         """Share what waits, as far as there is room."""
         if not self._waiting:
             return
-        self._under_way = [key for key in self._under_way if not self._channel.arrived(key)]
+        self._note_arrived()
         while self._waiting and len(self._under_way) < _UNDER_WAY:
             key, code = self._waiting.popitem()
-            self._channel.put(messages.decode(key, code))
-            self._under_way.append(key)
+            self._send(key, messages.decode(key, code))
+
+    def _note_arrived(self) -> None:
+        self._under_way = [key for key in self._under_way if not self._channel.arrived(key)]
+
+    def _send(self, key: Key, record: Record) -> None:
+        self._channel.put(record)
+        self._under_way.append(key)

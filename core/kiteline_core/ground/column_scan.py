@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,10 +55,13 @@ def level_rotation(up_c: F64) -> F64:
     up_c: (3,) unit vector against gravity in the camera. A camera that looks straight up or down has no horizontal
     viewing direction: then that side of the image is ahead that lay ahead before the camera was tilted so far.
     """
-    up = up_c / np.linalg.norm(up_c)
-    ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up
-    if float(np.linalg.norm(ahead)) < _LEAST_FORWARD:
-        image_up = np.array([0.0, -1.0 if up[2] < 0.0 else 1.0, 0.0])
-        ahead = image_up - float(image_up @ up) * up
-    ahead = ahead / np.linalg.norm(ahead)
-    return np.column_stack([ahead, np.cross(up, ahead), up])
+    x, y, z = up_c.tolist()
+    n = math.sqrt(x * x + y * y + z * z)
+    x, y, z = x / n, y / n, z / n
+    ahead = -z * x, -z * y, 1.0 - z * z
+    if math.hypot(*ahead) < _LEAST_FORWARD:
+        image_up = -1.0 if z < 0.0 else 1.0
+        ahead = -image_up * y * x, image_up - image_up * y * y, -image_up * y * z
+    n = math.hypot(*ahead)
+    a, b, c = ahead[0] / n, ahead[1] / n, ahead[2] / n
+    return np.array((a, y * c - z * b, x, b, z * a - x * c, y, c, x * b - y * a, z)).reshape(3, 3)

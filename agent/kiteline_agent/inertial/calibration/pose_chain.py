@@ -73,12 +73,13 @@ class PoseChain:
         frames = tuple((t + shift, T) for t, T in self._poses[: last + 1])
         self._poses = self._poses[last:]
         samples = buffer.between(begin_ns + shift, end_ns + shift)
-        rates = [buffer.mean(t + shift - _RATE_NS, t + shift + _RATE_NS) for t in (begin_ns, end_ns)]
-        if samples is None or samples.duration_s > _LONGEST * self._window_s or min(n for _, _, n in rates) == 0:
+        rates = [rate_at(buffer, t + shift) for t in (begin_ns, end_ns)]
+        if samples is None or samples.duration_s > _LONGEST * self._window_s or rates[0] is None or rates[1] is None:
             return True
-        return Link(samples, begin, end, np.array([mean[:3] for mean, _, _ in rates]), frames)
+        return Link(samples, begin, end, np.array(rates), frames)
 
 
-def rate_at(buffer: SampleBuffer, t_ns: int) -> F64:
-    """Raw rate (3,) rad/s at an instant."""
-    return np.asarray(buffer.mean(t_ns - _RATE_NS, t_ns + _RATE_NS)[0][:3])
+def rate_at(buffer: SampleBuffer, t_ns: int) -> F64 | None:
+    """Raw rate (3,) rad/s at an instant; None without samples."""
+    near = buffer.within(t_ns - _RATE_NS, t_ns + _RATE_NS)
+    return np.add.reduce(near[:, :3]) / len(near) if len(near) else None

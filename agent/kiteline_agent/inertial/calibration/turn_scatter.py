@@ -30,7 +30,8 @@ def added_variance(link: Link, buffer: SampleBuffer, matrix: F64, bias: F64, ima
     if 3 * steps <= _FITTED:
         return 0.0
     off, j, dt_s = np.empty(3 * steps), np.empty((3 * steps, _FITTED)), 0.0
-    rates = [rate_at(buffer, t_ns) @ matrix.T - bias for t_ns, _ in link.frames]
+    raw = [rate_at(buffer, t_ns) for t_ns, _ in link.frames]
+    rates = [(np.zeros(3) if rate is None else rate) @ matrix.T - bias for rate in raw]
     for k, ((t0_ns, T0), (t1_ns, T1)) in enumerate(zip(link.frames, link.frames[1:])):
         samples = buffer.between(t0_ns, t1_ns)
         if samples is None:
