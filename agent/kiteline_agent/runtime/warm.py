@@ -20,13 +20,12 @@ from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_codec.schema import KeyframeScan
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.geometry.se3 import from_rt
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.segmentation import GroundSegmenter
-from kiteline_core.ids import AgentId, KeyframeId
+from kiteline_core.ids import AgentId
 from kiteline_core.imaging.matching import MatchConfig, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pose.pnp import solve_pnp
@@ -76,9 +75,8 @@ def _warm_scans(rig: CameraRig) -> None:
     disparity = np.broadcast_to(np.maximum(rows * view.bf, 2.6)[:, None], (view.height, view.width))
     image = np.zeros((view.height, view.width), np.uint8)
     up_c = np.array([0.0, -1.0, 0.0])
-    scan = segmenter.segment(np.ascontiguousarray(disparity, np.float32), (image, image), up_c)
-    record = KeyframeScan(KeyframeId(0), scan, np.zeros(0, np.uint8))
-    grid.add(Scanned(record, np.eye(4), 1.0, np.zeros(5)), RangeError.of_noise(view.bf, segmenter.surface_sigma_px))
+    scan = segmenter.segment(np.ascontiguousarray(disparity, np.float32), (image, image), up_c).scan
+    grid.add(Scanned(scan, np.eye(4), 1.0, np.zeros(5)), RangeError.of_noise(view.bf, segmenter.surface_sigma_px))
     grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
 

@@ -131,7 +131,7 @@ class LocalGrid:
         """Draw a new scan. error: of the ranges of all scans, as it is known now."""
         self._sure_scans += not scanned.repeats  # those in doubt leave with other views
         self._take(error)
-        T, scan = scanned.T_o_c, scanned.record.scan
+        T, scan = scanned.T_o_c, scanned.scan
         R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
         if self._R_g_o is None or float(self._R_g_o[2] @ R_l_o[2]) < np.cos(self._config.level_rad):
             self._level(R_l_o)

@@ -23,6 +23,7 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan
 from kiteline_core.geometry import se3
+from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
 from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
@@ -44,7 +45,7 @@ class Scanned:
     before, which the base has.
     """
 
-    record: KeyframeScan
+    scan: ColumnScan
     T_o_c: F64
     height_m: float | None
     offset_px: F64
@@ -187,20 +188,20 @@ class ScanStage:
 
     def _finish(self, begun: _Begun, disparity: F32) -> Scanned:
         segmenter, stereo = self._segmenter, self._stripes is not None
-        scan = segmenter.segment(
+        seen = segmenter.segment(
             disparity, self._stripes.pair if self._stripes is not None else None, begun.up_c,
             self._map.disparity_offset * (segmenter.camera.bf / self._map.camera.bf) if stereo else None,
             self._ground.expected(begun.T_o_c, begun.up_c),
         )  # fmt: skip
         self._work.segmented_px += disparity.size
-        labels = segmenter.label_of(begun.uv)
-        labels = labels[:0] if self._channel.profile.thin else labels
-        record = KeyframeScan(begun.keyframe, scan, labels, begun.part, begun.T_k_s)
         if not begun.repeats:
-            self._take(self._ground.note(record, Seen(begun.T_o_c, scan, segmenter.saw_ground, segmenter.lowest_m)))
+            labels = segmenter.label_of(begun.uv)
+            labels = labels[:0] if self._channel.profile.thin else labels
+            record = KeyframeScan(begun.keyframe, seen.scan, labels, begun.part, begun.T_k_s)
+            self._take(self._ground.note(record, Seen(begun.T_o_c, *seen)))
         ground = self._ground.expected(begun.T_o_c, begun.up_c)
         height_m = None if ground is None else ground.height_m
-        return Scanned(record, begun.T_o_c, height_m, self._map.disparity_offset, begun.repeats)
+        return Scanned(seen.scan, begun.T_o_c, height_m, self._map.disparity_offset, begun.repeats)
 
     def _take(self, verdict: Verdict[KeyframeScan]) -> None:
         """Share scans that are believed, and take back those that are not any more."""

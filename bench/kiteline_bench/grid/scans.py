@@ -64,9 +64,9 @@ class Scanner:
             self._ground.start_at(np.array([*T_w_c[:2, 3], self._start_z]))
         up_c = np.ascontiguousarray(T_w_c[2, :3])
         segmenter, expected = self._segmenter, self._ground.expected(T_w_c, up_c)
-        scan = segmenter.segment(disparity, self._stripes.pair, up_c, None, expected)
-        self._made.append(PosedScan(scan, T_w_c))
-        verdict = self._ground.note(len(self._made) - 1, Seen(T_w_c, scan, segmenter.saw_ground, segmenter.lowest_m))
+        found = segmenter.segment(disparity, self._stripes.pair, up_c, None, expected)
+        self._made.append(PosedScan(found.scan, T_w_c))
+        verdict = self._ground.note(len(self._made) - 1, Seen(T_w_c, *found))
         self._believed = (self._believed | set(verdict.believed)) - set(verdict.withdrawn)
 
     def scans(self) -> list[PosedScan]:

@@ -9,7 +9,7 @@ Beyond it, what a column of azimuth sees is one disparity for each surface, refi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -50,13 +50,15 @@ _GAP_M = 0.25  # without seen ground that are free between free ones: beyond, a 
 class Ground:
     """The ground of an image: a B-spline of slope -z/x over levelled disparities low_px..high_px.
 
-    Beyond low_px..high_px nothing was seen, and the spline goes on as level ground.
+    Beyond low_px..high_px nothing was seen, and the spline goes on as level ground. seen: False where it lies as
+    expected, and the image shows too little of it.
     """
 
     coefficients: F64
     low_px: float
     high_px: float
     height_m: float  # of the camera above its nearest part
+    seen: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,17 @@ class ExpectedGround(NamedTuple):
 
     height_m: float
     within_m: float
+
+
+class Segmented(NamedTuple):
+    """What an image shows. ground: whether its scan saw ground.
+
+    lowest_m: depth below the camera that many pixels reach, less what ground may fall; NaN if that is not known.
+    """
+
+    scan: ColumnScan
+    ground: bool
+    lowest_m: float
 
 
 class GroundSegmenter:
@@ -103,7 +116,6 @@ class GroundSegmenter:
         self.x, self.z = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
         self._column = np.empty((h, w), np.int16)
         self.labels = np.zeros((h, w), np.uint8)
-        self.saw_ground = False  # in the last image
         self._textured = np.ones((h, w), np.bool_)
         self._counts, self._sums = np.empty((4, n, bins), np.int32), np.empty((n, bins))
         self._slab_sums = np.empty((n, bins))
@@ -112,13 +124,12 @@ class GroundSegmenter:
         self._in_band = np.empty((n, bins, len(self._bands) - 1), np.int32)
         self._heights = np.empty((bins, heights), np.int32)
         self._depths = np.empty(round(config.largest_height_m / _DEPTH_STEP_M), np.int32)
-        self.lowest_m = float("nan")  # depth below the camera that many pixels of the last image reach
         self._height_sums = np.empty((2, bins, heights))
 
     def segment(
         self, disparity: F32, pair: tuple[U8, U8] | None, up_c: F64, offset_px: F64 | None = None,
         expected: ExpectedGround | None = None,
-    ) -> ColumnScan:  # fmt: skip
+    ) -> Segmented:  # fmt: skip
         """Label a disparity image (h,w) in px, 0 unknown, into `labels`, and make its column scan.
 
         pair: the images (h,w) of a stereo pair: ground must have texture, and ranges are refined; None with depth.
@@ -140,8 +151,10 @@ class GroundSegmenter:
             self.sigma_px / self.bf, _DEPTH_STEP_M, self._depths,
         )  # fmt: skip
         below = np.flatnonzero(np.cumsum(self._depths[::-1]) >= config.lowest_pixels)
-        self.lowest_m = (len(self._depths) - 1 - int(below[0])) * _DEPTH_STEP_M if len(below) else float("nan")
-        return self._scan(self._find_ground(up_c, expected), view, expected)
+        lowest_m = (len(self._depths) - 1 - int(below[0])) * _DEPTH_STEP_M if len(below) else float("nan")
+        ground = self._find_ground(up_c, expected, lowest_m)
+        scan, refuted = self._scan(ground, view, expected)
+        return Segmented(scan, ground is not None and ground.seen and not refuted, lowest_m)
 
     @property
     def surface_sigma_px(self) -> float:
@@ -152,9 +165,8 @@ class GroundSegmenter:
         """Labels (n,) of pixels (n,2) of the full image."""
         return np.asarray(self.labels[self.camera.at(uv)])
 
-    def _find_ground(self, up_c: F64, expected: ExpectedGround | None) -> Ground | None:
+    def _find_ground(self, up_c: F64, expected: ExpectedGround | None, lowest_m: float) -> Ground | None:
         """The ground by u- and v-disparity, and by what is expected; None if too little of it is seen."""
-        self.saw_ground = False
         config, counts, bf = self.config, self._counts[0], self.bf
         in_image = float(np.hypot(up_c[0], up_c[1]))
         if in_image < _LEAST_IN_IMAGE:  # the camera looks straight up or down
@@ -174,9 +186,8 @@ class GroundSegmenter:
         )  # fmt: skip
         if expected is None:
             curved = self._curved_ground(expected)
-            if curved is None or curved.height_m < self.lowest_m - config.lower_m:
-                return self._lowest_ground()
-            self.saw_ground = True
+            if curved is None or curved.height_m < lowest_m - config.lower_m:
+                return self._lowest_ground(lowest_m)
             return curved
         level = self._expected_ground(expected)
         if _BETTER * self._pixels_near(np.full(self._bins, level.height_m)).sum() > self._heights.sum():
@@ -184,7 +195,7 @@ class GroundSegmenter:
         curved = self._curved_ground(expected)
         if curved is None or abs(curved.height_m - expected.height_m) > expected.within_m:
             return level
-        return curved if self._is_better(curved, level) else level
+        return replace(curved, seen=level.seen) if self._is_better(curved, level) else level
 
     def _is_better(self, curved: Ground, level: Ground) -> bool:
         """True if a curve without steep parts passes through many more pixels than level ground does."""
@@ -242,20 +253,20 @@ class GroundSegmenter:
             coefficients, low, high, float(profile_kernels.spline_at(coefficients, low, high, high)) * bf / high
         )
 
-    def _lowest_ground(self) -> Ground | None:
+    def _lowest_ground(self, lowest_m: float) -> Ground | None:
         """Level ground next to the lowest points; None if too little of it is seen."""
-        if np.isnan(self.lowest_m):
+        if np.isnan(lowest_m):
             return None
         config = self.config
         rows = self._heights.sum(0)
-        first = max(int((self.lowest_m - config.expected_m) / _HEIGHT_STEP_M), 0)
-        last = int((self.lowest_m + config.lower_m) / _HEIGHT_STEP_M) + 1
+        first = max(int((lowest_m - config.expected_m) / _HEIGHT_STEP_M), 0)
+        last = int((lowest_m + config.lower_m) / _HEIGHT_STEP_M) + 1
         some = np.convolve(rows, np.ones(3), "same")[first:last]
         if not len(some) or some.max() < config.expected_pixels:
             return None
         height_m = (first + int(np.argmax(some)) + 0.5) * _HEIGHT_STEP_M
         ground = self._expected_ground(ExpectedGround(height_m, config.expected_m))
-        return ground if self.saw_ground else None
+        return ground if ground.seen else None
 
     def _expected_ground(self, expected: ExpectedGround) -> Ground:
         """Level ground where it is expected, as high as pixels near it say."""
@@ -269,17 +280,20 @@ class GroundSegmenter:
         n = self._heights[sure, near].sum(1)
         disparities, slopes = (sums[sure, near].sum(1) for sums in self._height_sums)
         some, height_m = n > 0, expected_m
-        self.saw_ground = bool(n.sum() >= config.expected_pixels)
-        if self.saw_ground:
+        seen = bool(n.sum() >= config.expected_pixels)
+        if seen:
             found = np.repeat(self.bf * slopes[some] / disparities[some], n[some])
             gain = n.sum() / (n.sum() + _HALF_SURE)
             height_m += gain * (float(np.median(found)) - expected_m)
         low, high = self._lowest_px, bins * level_kernels.BIN_PX
         at = low + (np.arange(profile_kernels.COEFFICIENTS) - 1.0) * (high - low) / profile_kernels.SECTIONS
-        return Ground(at * (height_m / bf), low, high, height_m)
+        return Ground(at * (height_m / bf), low, high, height_m, seen)
 
-    def _scan(self, ground: Ground | None, view: _View, expected: ExpectedGround | None) -> ColumnScan:
-        """Label the pixels by the ground that was found, or obstacles by the one expected, and collect them."""
+    def _scan(self, ground: Ground | None, view: _View, expected: ExpectedGround | None) -> tuple[ColumnScan, bool]:
+        """Label the pixels by the ground that was found, or obstacles by the one expected, and collect them.
+
+        And whether too much was seen below that ground: then it is none.
+        """
         config, bins, n = self.config, self._bins, len(self._azimuths)
         borders = np.arange(bins + 1) * level_kernels.BIN_PX
         slope, seen, height_m = np.full(bins + 1, np.nan), np.zeros(bins, np.bool_), float("nan")
@@ -299,8 +313,7 @@ class GroundSegmenter:
             self._sums, self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
-            self.saw_ground = False
-            return self._scan(None, view, expected)
+            return self._scan(None, view, expected)[0], True
         lowest = round(self._lowest_px / level_kernels.BIN_PX)
         surface, bands = self._surface, np.empty(n, np.uint8)
         label_kernels.find_surfaces(
@@ -324,7 +337,8 @@ class GroundSegmenter:
         some = np.flatnonzero((free > 0.0) | (bands > 0) | (clear > 0.0))
         first, last = (int(some[0]), int(some[-1]) + 1) if len(some) else (0, n)
         free_from, free, obstacle, clear = (row[first:last].copy() for row in (free_from, free, obstacle, clear))
-        return ColumnScan(
+        scan = ColumnScan(
             view.up_c, float(self._azimuths[first]), self._step, free_from, free, obstacle, bands[first:last].copy(),
             clear, height_m,
         )  # fmt: skip
+        return scan, False

@@ -18,11 +18,10 @@ from kiteline_agent.scans import local_grid_kernels as kernels
 from kiteline_agent.scans.local_grid import SECTORS, LocalGrid, Surroundings
 from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
-from kiteline_codec.schema import GridTile, KeyframeScan
+from kiteline_codec.schema import GridTile
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import TERMS
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-from kiteline_core.ids import KeyframeId
 
 CELL_M = 0.1
 WEST, EAST, SOUTH, NORTH = -2.0, 3.0, -1.5, 2.0  # walls of a room
@@ -71,8 +70,7 @@ def scan_at(x: float, y: float, heading_rad: float, z: float = 1.0, noise_m: flo
     scan = ColumnScan(
         np.array([0.0, -1.0, 0.0]), azimuth[0], step, np.zeros(n), np.zeros(n), clear, np.full(n, 7, np.uint8), clear, z
     )
-    record = KeyframeScan(KeyframeId(1), scan, np.zeros(0, np.uint8))
-    return Scanned(record, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])), z, np.zeros(TERMS))
+    return Scanned(scan, TURN @ se3.from_rt(R_w_c, np.array([x, y, z])), z, np.zeros(TERMS))
 
 
 BF, EXACT = 50.0, RangeError.of_noise(50.0, 0.01)
@@ -153,7 +151,7 @@ def test_the_grid_and_its_tiles_take_less_than_four_mib() -> None:
     grid = LocalGrid(config)
     held = [vars(grid), vars(grid._canvas), vars(grid._next)]
     arrays = [value for values in held for value in values.values() if isinstance(value, np.ndarray)]
-    scans = config.scans * sum(v.nbytes for v in (scan_at(0, 0, 0).record.scan.clear_m,) * 5)
+    scans = config.scans * sum(v.nbytes for v in (scan_at(0, 0, 0).scan.clear_m,) * 5)
     assert sum(a.nbytes for a in arrays) + scans + config.tiles * (64 * 64 + 200) < 4 << 20
 
 
@@ -185,8 +183,8 @@ def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
     for k in range(40):
         scanned = scan_at(-1.5 + 0.1 * k, 0.0, 0.0)
         if k < 3:
-            wrong = replace(scanned.record.scan, up_c=tilt @ scanned.record.scan.up_c)
-            scanned = replace(scanned, record=replace(scanned.record, scan=wrong))
+            wrong = replace(scanned.scan, up_c=tilt @ scanned.scan.up_c)
+            scanned = replace(scanned, scan=wrong)
         grid.add(scanned, EXACT)
     heights = [drawn.z_m for drawn in grid._scans]
     assert np.ptp(heights) < 0.01
@@ -222,7 +220,7 @@ def test_ranges_are_corrected_by_the_offset_that_is_found_later(
 ) -> None:
     """Against pixels: where each column's point lies in the image, and what its disparity is there."""
     up_c = se3.so3_exp(np.array([pitch, 0.0, roll])) @ np.array([0.0, -1.0, 0.0])
-    scan = replace(scan_at(0.0, 0.0, 0.0).record.scan, up_c=up_c, clear_m=np.full(64, clear))
+    scan = replace(scan_at(0.0, 0.0, 0.0).scan, up_c=up_c, clear_m=np.full(64, clear))
     offset = np.array([c0, cx, 0.0, 0.0, 0.0])
     cov = np.diag([0.04, 0.01, 0.0, 0.0, 0.0])
     ranges, certain = RangeError(BF, 0.2, offset, cov).ranges(scan, np.zeros(TERMS), 0.07)
@@ -241,10 +239,10 @@ def test_scans_are_drawn_anew_once_the_rig_is_found_to_be_worn_and_only_near_one
     grid, T = LocalGrid(LocalGridConfig()), TURN @ vehicle(0.0, 0.0, 0.0)
     worn = np.array([0.4, 0.0, 0.0, 0.0, 0.0])
     scan = scan_at(0.0, 0.0, 0.0)
-    true_m = scan.record.scan.clear_m
-    ahead = np.cos(scan.record.scan.azimuths_rad)  # of depth in a range
+    true_m = scan.scan.clear_m
+    ahead = np.cos(scan.scan.azimuths_rad)  # of depth in a range
     measured_m = BF / (BF / true_m + worn[0] * ahead)
-    scan = replace(scan, record=replace(scan.record, scan=replace(scan.record.scan, clear_m=measured_m)))
+    scan = replace(scan, scan=replace(scan.scan, clear_m=measured_m))
     doubtful = RangeError(BF, 0.2, np.zeros(TERMS), np.diag([0.5, 0, 0, 0, 0]))
     grid.add(scan, doubtful)
     before = grid.around(T, None, {}, BANDS_M)
@@ -312,10 +310,10 @@ def test_who_walks_into_a_view_that_stays_is_told_and_other_views_are_kept() -> 
     for k in range(40):
         grid.add(scan_at(0.0, 0.0, 2.0 * np.pi * k / 40), EXACT)
     seen = scan_at(0.0, 0.0, 0.0)
-    person = replace(seen.record.scan, clear_m=np.full_like(seen.record.scan.clear_m, 1.2))
+    person = replace(seen.scan, clear_m=np.full_like(seen.scan.clear_m, 1.2))
     for shown in (0, 12, 60):
         for _ in range(shown):
-            grid.add(replace(seen, record=replace(seen.record, scan=person), repeats=True), EXACT)
+            grid.add(replace(seen, scan=person, repeats=True), EXACT)
         found = grid.around(TURN @ vehicle(0.0, 0.0, 0.0), None, {}, BANDS_M)
         assert found is not None
         distances.append(found.distance_m)

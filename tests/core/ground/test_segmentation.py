@@ -79,7 +79,7 @@ def assert_free_up_to(scan: ColumnScan, ahead_m: float, share: float = 0.95) -> 
 @pytest.mark.parametrize("roll_deg", [0.0, 25.0, -40.0, 180.0])
 def test_a_banked_camera_sees_the_same_ground(roll_deg: float) -> None:
     segmenter, disparity = view(up(roll_deg), level_ground, wall(4.0))
-    scan = segmenter.segment(disparity, None, up(roll_deg))
+    scan = segmenter.segment(disparity, None, up(roll_deg)).scan
     assert scan.camera_height_m == pytest.approx(HEIGHT_M, abs=0.04)
     assert (scan.free_m > 0).mean() > 0.6
     assert_free_up_to(scan, 4.0, 0.6 if roll_deg else 0.95)
@@ -92,7 +92,7 @@ def test_a_banked_camera_sees_the_same_ground(roll_deg: float) -> None:
 
 def test_a_ramp_is_ground() -> None:
     segmenter, disparity = view(up(), ramp)
-    scan = segmenter.segment(disparity, None, up())
+    scan = segmenter.segment(disparity, None, up()).scan
     labels = segmenter.labels[disparity > 3.0]
     assert (labels == GROUND).mean() > 0.9
     assert (labels == OBSTACLE).mean() < 0.05
@@ -119,7 +119,7 @@ def test_a_wave_is_ground() -> None:
 def test_a_box_on_the_ground_is_an_obstacle_of_its_height() -> None:
     box = wall(3.0, -HEIGHT_M, -HEIGHT_M + 0.4, 0.3, 0.3)
     segmenter, disparity = view(up(), level_ground, wall(6.0), box)
-    scan = segmenter.segment(disparity, None, up())
+    scan = segmenter.segment(disparity, None, up()).scan
     inside = np.abs(np.tan(scan.azimuths_rad) * 3.0) < 0.22
     assert np.abs(scan.obstacle_m[inside] * np.cos(scan.azimuths_rad[inside]) - 3.0).max() < 0.12
     assert (scan.bands[inside] == 1).all()
@@ -135,7 +135,7 @@ def test_ground_behind_a_low_obstacle_is_free() -> None:
     """A box so near that no ground is seen before it."""
     box = wall(1.2, -HEIGHT_M, -HEIGHT_M + 0.6)
     segmenter, disparity = view(up(0.0, 25.0), level_ground, wall(5.0), box)
-    scan = segmenter.segment(disparity, None, up(0.0, 25.0))
+    scan = segmenter.segment(disparity, None, up(0.0, 25.0)).scan
     ahead = np.cos(scan.azimuths_rad)
     middle = slice(12, -12)
     assert np.abs((scan.obstacle_m * ahead)[middle] - 1.2).max() < 0.1
@@ -146,7 +146,7 @@ def test_ground_behind_a_low_obstacle_is_free() -> None:
 def test_ground_that_is_seen_beside_a_leg_is_not_seen_over_it() -> None:
     leg = wall(2.0, -HEIGHT_M, -HEIGHT_M + 0.75, 0.025, 0.025)
     segmenter, disparity = view(up(), level_ground, wall(5.0), leg)
-    scan = segmenter.segment(disparity, None, up())
+    scan = segmenter.segment(disparity, None, up()).scan
     at_leg = np.isfinite(scan.obstacle_m) & (scan.obstacle_m < 2.5)
     assert at_leg.any()
     before, over = scan.free_m[at_leg] < 2.2, scan.free_from_m[at_leg] > 2.9  # 0.5 m high is the band of its upper end
@@ -157,7 +157,7 @@ def test_a_plain_floor_is_unknown() -> None:
     segmenter, disparity = view(up(), level_ground, wall(4.0))
     image = np.random.default_rng(1).normal(120.0, 0.45, segmenter.labels.shape).round().astype(np.uint8)
     image[: len(image) // 2] = np.random.default_rng(2).integers(0, 255, image[: len(image) // 2].shape)
-    scan = segmenter.segment(disparity, (image, image), up())
+    scan = segmenter.segment(disparity, (image, image), up()).scan
     floor = segmenter.labels[len(image) // 2 + 5 :]
     assert (floor == GROUND).mean() < 1e-2
     assert (scan.free_m == 0.0).mean() > 0.95
@@ -165,21 +165,21 @@ def test_a_plain_floor_is_unknown() -> None:
 
 def test_a_camera_that_faces_a_wall_says_unknown() -> None:
     segmenter, disparity = view(up(0.0, 0.0), level_ground, wall(0.9))
-    scan = segmenter.segment(disparity, None, up(0.0, 0.0))
+    scan = segmenter.segment(disparity, None, up(0.0, 0.0)).scan
     assert np.isnan(scan.camera_height_m)
     assert not scan.free_m.any()
     assert np.abs(scan.clear_m * np.cos(scan.azimuths_rad) - 0.9).max() < 0.1
-    expected = segmenter.segment(disparity, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
+    expected = segmenter.segment(disparity, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1)).scan
     assert np.abs(expected.obstacle_m * np.cos(scan.azimuths_rad) - 0.9).max() < 0.1
     assert not expected.free_m.any()
 
 
 def test_a_table_is_not_taken_for_the_ground_that_was_expected() -> None:
     segmenter, disparity = view(up(0.0, 20.0), lambda o, r: 0.5 * level_ground(o, r), wall(3.0))
-    alone = segmenter.segment(disparity, None, up(0.0, 20.0))
+    alone = segmenter.segment(disparity, None, up(0.0, 20.0)).scan
     assert alone.camera_height_m == pytest.approx(0.5 * HEIGHT_M, abs=0.05)
-    scan = segmenter.segment(disparity, None, up(0.0, 20.0), expected=ExpectedGround(HEIGHT_M, 0.1))
-    assert scan.camera_height_m == HEIGHT_M and not segmenter.saw_ground
+    scan, saw_ground, _ = segmenter.segment(disparity, None, up(0.0, 20.0), expected=ExpectedGround(HEIGHT_M, 0.1))
+    assert scan.camera_height_m == HEIGHT_M and not saw_ground
     assert not scan.free_m.any()
     assert np.isfinite(scan.obstacle_m).mean() > 0.9
 
@@ -191,7 +191,7 @@ def test_a_low_platform_far_away_is_not_ground_however_uncertain_its_height() ->
 
     edge = wall(4.5, -HEIGHT_M, -HEIGHT_M + 0.18, 0.7, 0.7)
     segmenter, disparity = view(up(), level_ground, platform, edge, noise_px=0.02)
-    scan = segmenter.segment(disparity, None, up(), expected=ExpectedGround(HEIGHT_M, 0.1))
+    scan = segmenter.segment(disparity, None, up(), expected=ExpectedGround(HEIGHT_M, 0.1)).scan
     there = np.abs(np.tan(scan.azimuths_rad)) < 0.1
     assert (scan.free_m[there] > 4.0).mean() > 0.9
     assert (scan.free_m[there] < 5.2).all()
@@ -203,20 +203,20 @@ def test_half_of_the_disparities_may_be_missing_or_wrong(seed: int) -> None:
     segmenter, disparity = view(up(), level_ground, wall(4.0), seed=seed)
     blocks = rng.random((15, 24)) < 0.5
     missing = np.kron(blocks, np.ones((8, 16), bool))[: disparity.shape[0], : disparity.shape[1]]
-    scan = segmenter.segment(np.where(missing, 0.0, disparity).astype(np.float32), None, up())
+    scan = segmenter.segment(np.where(missing, 0.0, disparity).astype(np.float32), None, up()).scan
     assert (scan.free_m <= 4.0 / np.cos(scan.azimuths_rad) + 0.2).all()
     noise = rng.uniform(0.0, 48.0, disparity.shape).astype(np.float32)
-    scan = segmenter.segment(noise, None, up())
+    scan = segmenter.segment(noise, None, up()).scan
     assert not (scan.free_m > 0).any()
 
 
 @pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 def test_any_attitude_gives_a_scan(direction: list[float]) -> None:
     segmenter, disparity = view(up(), level_ground, wall(4.0))
-    scan = segmenter.segment(disparity, None, np.array(direction))
+    scan = segmenter.segment(disparity, None, np.array(direction)).scan
     assert (scan.free_m <= 60.0).all()
     assert np.array_equal(np.isfinite(scan.obstacle_m), scan.bands > 0)
-    nothing = segmenter.segment(np.zeros_like(disparity), None, np.array(direction))
+    nothing = segmenter.segment(np.zeros_like(disparity), None, np.array(direction)).scan
     assert not nothing.free_m.any() and not nothing.clear_m.any() and np.isinf(nothing.obstacle_m).all()
     assert (segmenter.labels == UNKNOWN).all()
 
@@ -271,8 +271,8 @@ def test_surfaces_are_refined_by_their_images() -> None:
     right = np.array([np.interp(at + true_px, np.arange(w + 80), row) for row in texture]) * 1.03 + 4.0
     pair = left.round().clip(0, 255).astype(np.uint8), right.round().clip(0, 255).astype(np.uint8)
     wrong = np.where(disparity > 0.0, disparity + 0.2, 0.0).astype(np.float32)
-    plain = segmenter.segment(wrong, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
-    refined = segmenter.segment(wrong, pair, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
+    plain = segmenter.segment(wrong, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1)).scan
+    refined = segmenter.segment(wrong, pair, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1)).scan
     seen = slice(8, -8)
     errors = [np.median(np.abs((s.obstacle_m * np.cos(s.azimuths_rad))[seen] - 3.0)) for s in (plain, refined)]
     assert errors[0] > 0.05
