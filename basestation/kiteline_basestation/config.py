@@ -305,13 +305,21 @@ class GridConfig:
     )
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
     accurate_sigma_m: float = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
-    gap_sigmas: float = 2.7  # standard deviations before an obstacle within which ground is not freed
+    gap_sigmas: float = 3.0  # standard deviations before an obstacle within which ground is not freed
     log_hit: int = 6  # 1/16; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
     log_free: int = 3  # 1/16; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
-    log_free_far: int = 1  # 1/16; the same of a far view, and where no ground was seen, but rays pass low
+    log_free_sure: int = (
+        2  # 1/16; the same of a far view well before what it sees, and where rays to the ground pass low
+    )
+    log_free_far: int = 1  # 1/16; the same of a far view elsewhere: a far box and the wall behind it are one surface
+    sure_sigmas: float = (
+        2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
+    )
     occupied_from: int = 5  # 1/16; log-odds from which a band is occupied: one near view, two far ones
     free_from: int = 2  # 1/16; a cell is free if all bands lie at or below minus this: one near view, two far ones
-    free_beside: int = 4  # 1/16; the same beside an occupied cell: a near view and another, as one may lie a cell off
+    free_beside: int = (
+        5  # 1/16; the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
+    )
     hole_neighbours: int = (
         5  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)
     )

@@ -160,7 +160,7 @@ def test_each_cell_of_a_scan_is_freed_once() -> None:
         counted = 0
         for place in grid.places:
             odds = grid.log_odds(place)
-            assert set(np.unique(odds)) <= {0, -config.log_free, -config.log_free_far}
+            assert set(np.unique(odds)) <= {0, -config.log_free, -config.log_free_sure, -config.log_free_far}
             column, row = np.arange(64) + 64 * place.column, np.arange(64) + 64 * place.row
             dx, dy = (column[None, :] + 0.5) * 0.05 - x, (row[:, None] + 0.5) * 0.05 - y
             r, a = np.hypot(dx, dy), np.arctan2(dy, dx) - heading
@@ -175,11 +175,13 @@ def test_each_cell_of_a_scan_is_freed_once() -> None:
 def reference(
     x: float, y: float, first: float, step: float, ranges: NDArray[np.float64], bands: NDArray[np.uint8], size: int
 ) -> NDArray[np.int64]:
-    """Cells (size, size) with the bands of obstacles, sampled densely on each arc."""
+    """Cells (size, size) with the bands of obstacles, sampled densely on the surface in each column. ranges: (n,3)."""
     out = np.zeros((size, size), np.int64)
-    for i, r in enumerate(ranges):
-        n = max(1, int(np.ceil(2.0 * r * step)))
-        for a in first + (i + (np.arange(n) + 0.5) / n) * step:
+    for i, (lower, middle, upper) in enumerate(ranges):
+        n = max(1, int(np.ceil(2.0 * (max(lower, middle, upper) * step + abs(upper - lower)))))
+        part = (np.arange(n) + 0.5) / n
+        at = np.interp(part, [0.0, 0.5, 1.0], [lower, middle, upper])
+        for a, r in zip(first + (i + part) * step, at, strict=True):
             out[int(np.floor(y + r * np.sin(a))), int(np.floor(x + r * np.cos(a)))] |= int(bands[i])
     return out
 
@@ -187,7 +189,8 @@ def reference(
 @given(st.integers(0, 2**31))
 def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    ranges, bands = rng.uniform(2, 90, 30), rng.integers(1, 8, 30).astype(np.uint8)
+    ranges = rng.uniform(2, 80, (30, 1)) * (1.0 + rng.uniform(0.0, 0.1) * np.array([-1.0, 0.0, 1.0]))
+    bands = rng.integers(1, 8, 30).astype(np.uint8)
     weight = rng.integers(1, 9, 30)
     first, step = float(rng.uniform(-4, 4)), 0.03
     hits, cells = np.zeros((192, 192), np.uint16), np.zeros((4000, 2), np.int32)
@@ -273,7 +276,8 @@ def test_a_table_leaves_the_floor_below_it_and_nothing_is_known_behind_a_wall() 
     assert not grid.log_odds(Place(0, 0, 0))[:, 2, 42:].any()
 
 
-def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_if_two_views_say_so() -> None:
+def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free() -> None:
+    """Nothing that stands there is higher than the lowest band begins: the ray to the ground would end on it."""
     bare = ColumnScan(
         np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 2.0), np.full(70, 4.0), np.full(70, np.inf),
         np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
@@ -283,11 +287,49 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_if_tw
     near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
-    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
+    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_sure).all()
     assert not odds[:, columns < first - 0.05].any()
-    assert grid.cells(near)[0][1, 37] == -1
-    grid.put(1, kept(bare), camera(0.0, 0.0, 0.05))
-    assert grid.cells(near)[0][1, 37] == 0
+    assert grid.cells(near)[0][1, 38] == 0
+
+
+def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_lies_close() -> None:
+    """A far box and the wall behind it are one surface: between them nothing is free by one look from afar."""
+    bf = 48.0
+    found = keep(CONFIG, scan_of(np.array(box(-5.53, -5.53, 5.53, 5.53)), 0.0, 0.0, 0.0), bf)
+    assert found is not None
+    grid = ScanGrid(CONFIG)
+    grid.put(0, found, camera(0.0, 0.0, 0.0))
+    row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
+    columns = (np.arange(128) + 0.5) * CONFIG.cell_m
+    sigma_m = CONFIG.sigma_px / bf * 5.53**2
+    end = 5.53 - CONFIG.gap_sigmas * sigma_m
+    sure = end - CONFIG.sure_sigmas * sigma_m
+    near = found.accurate_m(CONFIG)
+    assert near + 0.2 < sure < end - 0.2
+    assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -CONFIG.log_free_sure).all()
+    assert (row[(columns > sure + 0.1) & (columns < end - 0.1)] == -CONFIG.log_free_far).all()
+    assert not (row[columns > end + 0.1] < 0).any()
+    assert at(grid, 0.5 * (near + sure), 0.0) == 0 and at(grid, end - 0.15, 0.0) == -1
+    grid.put(1, found, camera(0.02, 0.0, 0.0))
+    assert at(grid, end - 0.15, 0.0) == 0
+
+
+@given(st.floats(0.0, 1.2), st.floats(1.0, 2.2))
+def test_a_wall_that_is_seen_aslant_is_drawn_as_a_line(turn: float, far_m: float) -> None:
+    """Columns are wider than cells, and the range of such a wall changes within one."""
+    along, normal = np.array([-np.sin(turn), np.cos(turn)]), np.array([np.cos(turn), np.sin(turn)])
+    a, b = far_m * normal - 30.0 * along, far_m * normal + 30.0 * along
+    grid = ScanGrid(replace(CONFIG, opening=False, storey_overlap_m=0.0))
+    grid.put(0, kept(scan_of(np.array([(*a, *b)]), 0.0, 0.0, 0.0, columns=48)), camera(0.0, 0.0, 0.0))
+    for place in grid.places:
+        odds = grid.log_odds(place)[0]
+        x = (np.arange(64) + 64 * place.column + 0.5) * CONFIG.cell_m
+        y = (np.arange(64) + 64 * place.row + 0.5) * CONFIG.cell_m
+        before = far_m - (x[None, :] * normal[0] + y[:, None] * normal[1])
+        azimuth, reach = np.arctan2(y[:, None], x[None, :]), np.hypot(x[None, :], y[:, None])
+        inner = (np.abs(azimuth) < 0.70) & (reach < 6.0) & (np.abs(azimuth - turn) < 1.2)
+        assert (np.abs(before[inner & (odds > 0)]) < 1.0 * CONFIG.cell_m).all(), "hits lie on the wall"
+        assert (before[inner & (odds < 0)] > 0.5 * CONFIG.cell_m).all(), "nothing behind it is free"
 
 
 def test_ground_that_was_seen_over_a_low_obstacle_is_free_and_what_it_hides_is_unknown() -> None:

@@ -31,15 +31,13 @@ from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import scan_kernels as kernels
 from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of, storey_at
 from kiteline_basestation.grid.scan_kernels import ALL, BANDS, SIDE
+from kiteline_basestation.grid.sectors import Sectors, sectors_of
 from kiteline_basestation.grid.tile_store import Place, TileStore
 
 F64 = NDArray[np.float64]
 I8 = NDArray[np.int8]
+I32 = NDArray[np.int32]
 U16 = NDArray[np.uint16]
-
-_AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from the image's lower border on
-_HIDDEN = 1.25  # times that distance, from which on something hides the ground before
-
 
 Name = int | tuple[int, int]
 
@@ -214,48 +212,21 @@ class ScanGrid:
         self._storeys[lattice.storeys] += sign
         if not self._storeys[lattice.storeys]:
             del self._storeys[lattice.storeys]
-        cell, scale = config.cell_m, scale_of(lattice)
-        ranges = scan.ranges()
-        bands = ranges[1].astype(np.uint8)
-        obstacle, start, free, clear = (r * (scale / cell) for r in (ranges[0], ranges[2], ranges[3], ranges[4]))
-        # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.
-        near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
-        gap = np.maximum(1.0, config.gap_sigmas * scan.sigma_per_m2 * near_m**2 * scale / cell)
-        before = np.where(bands > 0, obstacle - gap, np.inf)
-        under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
-        behind = start > obstacle  # ground that was seen over a low obstacle, which hides what lies before it
-        # Just before the nearest seen ground the ray to it passes below the lowest band: nothing stands there. But
-        # where the ground begins farther than at the image's lower border, something too near to be measured hides it.
-        ahead = start * np.cos(scan.first_rad + scan.step * (np.arange(scan.columns) + 0.5))
-        border = np.quantile(ahead[free > 0.0], _AT_BORDER) if (free > 0.0).any() else 0.0
-        hidden = behind | (ahead > _HIDDEN * border)
-        low = np.where(hidden, start, start * max(0.0, 1.0 - config.bands_m[0] / max(scan.height_m, 1e-3)))
-        end = np.where(behind & (under == 0), free, np.minimum(free, before))
-        space = np.stack([low, start, end, free, np.minimum(clear, before)], 1)
-        accurate_m = scan.accurate_m(config)
-        weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
-
-        reach = max(float(np.max(space[:, 2:])), float(np.max(obstacle[bands > 0], initial=0.0))) + 2.0
-        x, y = position_cells(lattice)
-        first = scan.heading_rad(config, lattice) + scan.first_rad
-        box = _box(x, y, first, scan.step, scan.columns, reach)
+        sectors = sectors_of(config, scan, lattice)
+        box = sectors.box()
         rows, columns = box[2] - box[0], box[3] - box[1]
-        x, y = x - SIDE * box[1], y - SIDE * box[0]
-        if self._hits.shape[0] < rows * SIDE or self._hits.shape[1] < columns * SIDE:
-            self._hits = np.zeros((rows * SIDE, columns * SIDE), np.uint16)
-        hits = self._hits[: rows * SIDE, : columns * SIDE]
-        cells = np.empty((int(np.sum(np.where(bands > 0, 2.0 * obstacle * scan.step + 2.0, 0.0))), 2), np.int32)
-        found = kernels.mark_hits(x, y, first, scan.step, obstacle, bands, weight, hits, cells)
-        camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
-        camera_band = camera_band if 0 <= camera_band < BANDS else -1
+        sectors = sectors._replace(x=sectors.x - SIDE * box[1], y=sectors.y - SIDE * box[0])
+        hits, cells, found = self._mark_hits(sectors, rows * SIDE, columns * SIDE)
         for storey in lattice.storeys:
             slots = self._store.open_box(storey, box[0], box[1], rows, columns)
             spare = self._store.spare(int(np.count_nonzero(slots < 0)))
             touched, used = np.zeros((rows, columns), np.uint8), np.zeros(1, np.int64)
             kernels.draw_hits(hits, cells, found, sign, slots, spare, used, self._store.pool, touched)
             kernels.draw_free(
-                x, y, first, scan.step, space, under, camera_band, accurate_m / cell, config.log_free,
-                config.log_free_far, hits, sign, slots, spare, used, self._store.pool, touched,
+                sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.begin, sectors.start, sectors.end,
+                sectors.low, sectors.under, sectors.clear, sectors.camera_band, sectors.accurate, sectors.sure,
+                (config.log_free, config.log_free_sure, config.log_free_far), hits, sign, slots, spare, used,
+                self._store.pool, touched,
             )  # fmt: skip
             for r, c in np.argwhere(touched).tolist():
                 place = Place(storey, box[0] + r, box[1] + c)
@@ -265,14 +236,16 @@ class ScanGrid:
         kernels.clear_hits(hits, cells, found)
         self._store.close()
 
-
-def _box(x: float, y: float, first: float, step: float, n: int, reach: float) -> tuple[int, int, int, int]:
-    """First row and column, and those after the last, of the tiles around a scan's sectors. x, y, reach: in cells."""
-    angles = first + step * np.arange(n + 1)
-    ends_x, ends_y = x + reach * np.cos(angles), y + reach * np.sin(angles)
-    low_x, high_x = min(x - 2.0, ends_x.min()), max(x + 2.0, ends_x.max())
-    low_y, high_y = min(y - 2.0, ends_y.min()), max(y + 2.0, ends_y.max())
-    return (
-        int(np.floor(low_y / SIDE)), int(np.floor(low_x / SIDE)),
-        int(np.floor(high_y / SIDE)) + 1, int(np.floor(high_x / SIDE)) + 1,
-    )  # fmt: skip
+    def _mark_hits(self, sectors: Sectors, rows: int, columns: int) -> tuple[U16, I32, int]:
+        """Cells (rows, columns) of obstacles, see `mark_hits`; which they are, and how many."""
+        if self._hits.shape[0] < rows or self._hits.shape[1] < columns:
+            self._hits = np.zeros((rows, columns), np.uint16)
+        hits = self._hits[:rows, :columns]
+        solid = sectors.obstacle[sectors.bands > 0]
+        samples = 2.0 * (solid.max(1) * sectors.step_rad + np.abs(solid[:, 2] - solid[:, 0])) + 2.0
+        cells = np.empty((int(np.sum(samples)), 2), np.int32)
+        found = kernels.mark_hits(
+            sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.obstacle, sectors.bands, sectors.weight,
+            hits, cells,
+        )  # fmt: skip
+        return hits, cells, found

@@ -48,6 +48,14 @@ def _add(pool: I16, slot: int, row: int, column: int, bands: int, value: int) ->
             pool[slot, 1 + b, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
 
 
+@helper
+def _between(lower: float, middle: float, upper: float, part: float) -> float:
+    """A range at a part of a column, by those at its lower edge, in its middle and at its upper edge."""
+    if part < 0.5:
+        return lower + 2.0 * part * (middle - lower)
+    return middle + (2.0 * part - 1.0) * (upper - middle)
+
+
 @njit
 def mark_hits(
     x: float, y: float, first_rad: float, step_rad: float, range_cells: F64, bands: U8, weight: I64, hits: U16,
@@ -55,18 +63,21 @@ def mark_hits(
 ) -> int:  # fmt: skip
     """Enter the cells of the nearest obstacles of a scan's columns into `hits` (rows, columns), zero before.
 
-    x, y: camera in cells of the box. first_rad: lower edge of column 0. range_cells: (n,) inf without an obstacle.
+    x, y: camera in cells of the box. first_rad: lower edge of column 0. range_cells: (n,3) at a column's lower edge, in
+    its middle and at its upper edge, inf without an obstacle.
     weight: (n,) below 128. A cell gets 256 weight + bands; of several columns the largest weight and all bands.
     cells: (m,2) row, column of the cells, out. Returns how many.
     """
     found = 0
     for i in range(range_cells.shape[0]):
-        reach = range_cells[i]
-        if not reach < np.inf:
+        lower, middle, upper = range_cells[i, 0], range_cells[i, 1], range_cells[i, 2]
+        if not middle < np.inf:
             continue
-        samples = max(1, int(np.ceil(2.0 * reach * step_rad)))
+        samples = max(1, int(np.ceil(2.0 * (max(lower, middle, upper) * step_rad + abs(upper - lower)))))
         for k in range(samples):
-            angle = first_rad + (i + (k + 0.5) / samples) * step_rad
+            part = (k + 0.5) / samples
+            reach = _between(lower, middle, upper, part)
+            angle = first_rad + (i + part) * step_rad
             row, column = int(np.floor(y + reach * np.sin(angle))), int(np.floor(x + reach * np.cos(angle)))
             if row < 0 or column < 0 or row >= hits.shape[0] or column >= hits.shape[1]:
                 continue
@@ -93,34 +104,30 @@ def draw_hits(
 
 @njit
 def draw_free(
-    x: float, y: float, first_rad: float, step_rad: float, free: F64, under: U8, camera_band: int, near_cells: float,
-    weight: int, far_weight: int, hits: U16, sign: int, slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
+    x: float, y: float, first_rad: float, step_rad: float, begins: F64, starts: F64, ends: F64, lows: F64, under: U8,
+    clears: F64, camera_band: int, near_cells: float, sures: F64, weights: tuple[int, int, int], hits: U16, sign: int,
+    slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
 ) -> None:  # fmt: skip
     """Take evidence of free space from the cells of each column's sector; each cell belongs to one column.
 
-    free: (n,5) ranges in cells: from where the rays to the nearest seen ground are low, from and up to where the ground
-    was seen and all bands are free, up to where the bands `under` (n,) are free too, and up to where the line of sight
-    is clear, which frees camera_band (-1: none). weight: of seen ground up to near_cells; far_weight: beyond, and where
-    rays are low. Marked cells keep the bands of their obstacles.
+    Ranges in cells: begins, starts: (n,) from where the rays to the nearest seen ground are low, and from where the
+    ground was seen. ends: (n,3) up to where all bands are free, at a column's lower edge, in its middle and at its
+    upper edge; lows: (n,) up to where the bands `under` (n,) are free too. clears: (n,) up to where the line of sight
+    is clear, which frees camera_band (-1: none). weights: of seen ground up to near_cells; beyond, up to sures (n,),
+    and where rays are low; and beyond that. Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
+    weight, sure_weight, far_weight = weights
     near2 = near_cells * near_cells
-    for i in range(free.shape[0]):
-        start, end, low, clear = free[i, 1], free[i, 2], free[i, 3], free[i, 4] if camera_band >= 0 else 0.0
-        reach = max(end, low, clear)
+    for i in range(ends.shape[0]):
+        lower, middle, upper = ends[i, 0], ends[i, 1], ends[i, 2]
+        least, most = max(min(lower, middle, upper), 0.0), max(lower, middle, upper, 0.0)
+        low, clear = lows[i], clears[i] if camera_band >= 0 else 0.0
+        reach = max(most, low, clear)
         if reach <= 0.0:
             continue
-        begin2, start2, end2, low2, clear2 = (
-            free[i, 0] * free[i, 0],
-            start * start,
-            end * end,
-            max(end, low) ** 2,
-            clear * clear,
-        )
-        if end <= 0.0:
-            end2 = -1.0
-        if max(end, low) <= 0.0:
-            low2 = -1.0
+        begin2, start2, least2, most2 = begins[i] ** 2, starts[i] ** 2, least * least, most * most
+        low2, clear2, sure2 = low * low, clear * clear, sures[i] ** 2
         a0, a1 = first_rad + i * step_rad, first_rad + (i + 1) * step_rad
         c0, s0, c1, s1 = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
         bottom = max(0, int(np.floor(y + min(0.0, reach * s0, reach * s1) - 1.0)))
@@ -152,8 +159,16 @@ def draw_free(
                     dx = column + 0.5 - x
                     distance2 = dx * dx + dy * dy
                     bands = 0
-                    if begin2 <= distance2 <= low2:
-                        bands = ALL if distance2 <= end2 else int(np.int64(under[i]))
+                    if begin2 <= distance2:
+                        if distance2 <= least2:
+                            bands = ALL
+                        elif distance2 <= most2:
+                            left = c0 * dy - s0 * dx
+                            part = left / (left + s1 * dx - c1 * dy)
+                            if distance2 <= _between(lower, middle, upper, part) ** 2:
+                                bands = ALL
+                        if bands == 0 and distance2 <= low2:
+                            bands = int(np.int64(under[i]))
                     if distance2 <= clear2:
                         bands |= 1 << camera_band
                     bands &= ~int(np.int64(hits[row, column]))
@@ -162,7 +177,10 @@ def draw_free(
                     if slot < 0:
                         slot = _tile(row, column, slots, spare, used)
                         touched[row >> _SHIFT, column >> _SHIFT] = 1
-                    value = -sign * (weight if start2 <= distance2 <= near2 else far_weight)
+                    if start2 <= distance2 <= near2:
+                        value = -sign * weight
+                    else:
+                        value = -sign * (sure_weight if distance2 <= max(sure2, start2) else far_weight)
                     if bands == ALL:
                         total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
                         pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
