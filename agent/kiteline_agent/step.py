@@ -15,10 +15,11 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Number of an agent. boot: number of its start, never reused."""
+    """Number of an agent. boot: number of its start, never reused. submap: number of the first submap."""
 
     agent: AgentId
     boot: int
+    submap: int = 0
 
 
 @dataclass(frozen=True, slots=True)

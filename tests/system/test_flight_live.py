@@ -274,7 +274,8 @@ def test_a_base_imports_logs_and_manages_maps(
     assert agent.wait(30.0) == 0
     (log,) = (tmp_path / "log" / "agent0").glob("boot*.mcap")
     with LogReader(log) as read_log:
-        name = f"0.{json.loads(read_log.metadata['spec'])['boot']}.0"
+        spec = json.loads(read_log.metadata["spec"])
+        name = f"0.{spec['boot']}.{spec['submap']}"
     endpoint = free_endpoint()
     words = ("--link", f"zenoh:{endpoint}", "--store", tmp_path / "store", "--log", tmp_path / "log")
     base = start("base", *words, "--import", log)

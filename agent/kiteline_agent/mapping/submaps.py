@@ -12,7 +12,7 @@ class Submaps:
     def __init__(self, identity: Identity) -> None:
         self._identity = identity
         self._number: int | None = None  # of the active one
-        self.opened = 0
+        self.opened = 0  # so many, numbered from that of the identity
 
     @property
     def any(self) -> bool:
@@ -22,17 +22,18 @@ class Submaps:
     @property
     def room(self) -> bool:
         """True if ids are left for another one."""
-        return self.opened < MAX_SUBMAPS
+        return self._identity.submap + self.opened < MAX_SUBMAPS
 
     @property
     def active(self) -> SubmapId:
         """The submap in which the camera is tracked; the first one before it is opened."""
-        return submap_id(self._identity.agent, self._identity.boot, self._number or 0)
+        number = self._identity.submap if self._number is None else self._number
+        return submap_id(self._identity.agent, self._identity.boot, number)
 
     @property
     def first(self) -> SubmapId:
         """The submap in which the flight begins."""
-        return submap_id(self._identity.agent, self._identity.boot, 0)
+        return submap_id(self._identity.agent, self._identity.boot, self._identity.submap)
 
     @property
     def in_first(self) -> bool:
@@ -41,7 +42,7 @@ class Submaps:
 
     def open_next(self) -> SubmapId:
         """Open another submap, and make it the active one."""
-        self._number = self.opened
+        self._number = self._identity.submap + self.opened
         self.opened += 1
         return self.active
 

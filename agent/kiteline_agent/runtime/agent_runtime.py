@@ -99,7 +99,7 @@ class AgentRuntime:
             source.rig,
             source.imu,
             config,
-            Identity(AgentId(options.agent), options.boot),
+            Identity(AgentId(options.agent), options.boot, options.submap),
             channel,
             shipped_vocabulary(),
         )

@@ -183,7 +183,7 @@ def _link_text(options: AgentOptions) -> str:
 def _numbered(options: AgentOptions, start: Start) -> AgentOptions:
     """The options with the numbers of this start."""
     name = options.log_name and f"{LOG_STEM}{start.order:05d}.mcap"
-    return replace(options, boot=start.boot, order=start.order, log_name=name)
+    return replace(options, boot=start.boot, submap=start.submap, order=start.order, log_name=name)
 
 
 def _key_of(options: AgentOptions) -> bytes | None:

@@ -31,6 +31,7 @@ class AgentOptions:
     log_optional: bool = False  # fly also where no log can be written
     agent: int = 0
     boot: int = 0  # of the ids that it makes
+    submap: int = 0  # number of the first submap
     order: int = 1  # of its starts: higher than that of any before it
     link: str = "none"  # LINK, or lockstep:ENDPOINT
     mono: bool = False

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_codec.sync.resumption import agent_session, later_session, order_of
 from kiteline_codec.transport.seal import Direction, Sealer, Suite
+from kiteline_core.ids import submap_id
 from kiteline_hw.system.start_numbers import StartNumbers
 
 _HISTORIES = 10_000
@@ -149,7 +150,10 @@ class History:
         numbers = StartNumbers(folder, machine, draw.randrange)
         start = numbers.next()
         self.starts += 1
-        self._use("boot of ids", start.boot)
+        planted = self.forgets_sync or self.ignores_machine  # to be seen without what is drawn beside the boot
+        first = 0 if planted else start.submap
+        for k in range(draw.randrange(1, 4)):  # submaps of this start
+            self._use("id of a submap", submap_id(3, start.boot, first + k))
         session = agent_session(start.order, start.boot)
         sealer = Sealer(bytes(32), 3, session, Direction.UP, Suite.ENCRYPTED, draw.randbytes)
         self._use("nonce", sealer.seal(b"")[:-16])
@@ -187,9 +191,7 @@ def run(bench: Bench) -> list[Bar]:
     twice, starts = found_twice(histories)
     for line in twice[:20]:
         bench.say(line)
-    bench.more.append(
-        f"{histories} histories with {starts} starts. Boots are drawn from 2^19 where a card is lost or cloned."
-    )
+    bench.more.append(f"{histories} histories with {starts} starts, of up to three submaps each.")
     some = histories // 20
     bugs = [len(found_twice(some, forgets_sync=True)[0]), len(found_twice(some, ignores_machine=True)[0])]
     return [

@@ -52,7 +52,7 @@ def _start(out: Path, name: str, *words: object) -> subprocess.Popen[bytes]:
     with (out / f"{name}.txt").open("wb") as said:
         return subprocess.Popen(
             [sys.executable, "-m", "kiteline_cli", *map(str, words)], stderr=said, stdout=said,
-            env={**os.environ, "XDG_STATE_HOME": str(out / "state")},
+            env={**os.environ, "XDG_STATE_HOME": str(out / "disks" / "agent" / "state")},
         )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Protocol
 
-from kiteline_core.ids import MAX_BOOTS
+from kiteline_core.ids import MAX_BOOTS, MAX_SUBMAPS
 
 NAME = "start"  # of the file
 _SLOT_BYTES = 512  # a sector: written as a whole by most disks
@@ -30,10 +30,14 @@ _UNKEPT = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EACCES, err
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """One start. order: above those before it. boot: of ids, 0 to MAX_BOOTS - 1. kept: "" or why it is not on disk."""
+    """One start. order: above those before it. boot: of ids, 0 to MAX_BOOTS - 1. submap: number of its first submap.
+
+    kept: "" or why it is not on disk.
+    """
 
     order: int
     boot: int
+    submap: int = 0
     kept: str = ""
 
 
@@ -55,7 +59,13 @@ class StartNumbers:
         self._folder, self._machine, self._draw = folder, machine, draw
 
     def next(self, least_order: int = 1) -> Start:
-        """The numbers of this start. least_order: of the order, whatever is kept. Never raises OSError."""
+        """The numbers of this start. least_order: of the order, whatever is kept. Never raises OSError.
+
+        The first submap is always drawn: should a boot come again, its ids most likely differ all the same.
+        """
+        return replace(self._next_kept(least_order), submap=self._draw(MAX_SUBMAPS // 2))
+
+    def _next_kept(self, least_order: int) -> Start:
         try:
             with self._folder.lock():
                 return self._next(least_order)

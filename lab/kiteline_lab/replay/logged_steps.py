@@ -92,7 +92,9 @@ def agent_of_log(log: LogReader) -> Agent:
         spill = SpillFile(Path(tempfile.gettempdir())) if options.log_name else None
         channel = coded_channel_for(options, link_traits(options.link), spill)
     config = configuration.apply(AgentConfig(), tomllib.loads(log.metadata["config"]))
-    return Agent(rig, imu, config, Identity(AgentId(options.agent), options.boot), channel, shipped_vocabulary())
+    return Agent(
+        rig, imu, config, Identity(AgentId(options.agent), options.boot, options.submap), channel, shipped_vocabulary()
+    )
 
 
 def agent_input(step: Step) -> StepInput:

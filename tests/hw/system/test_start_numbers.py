@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_core.ids import MAX_BOOTS, submap_id
+from kiteline_core.ids import MAX_BOOTS, MAX_SUBMAPS, submap_id
 from kiteline_hw.system.start_numbers import NAME, DiskFolder, Start, StartNumbers, machine_identity, numbers_in
 
 
@@ -40,14 +40,14 @@ def test_a_torn_slot_leaves_the_other(tmp_path: Path) -> None:
         (tmp_path / NAME).write_bytes(torn)
         assert numbers(tmp_path).next().order in (before.order, before.order + 1, newest.order + 1)
     (tmp_path / NAME).write_bytes(b"rubbish")
-    assert numbers(tmp_path, drawn=777).next() == Start(778, 777)
+    assert numbers(tmp_path, drawn=777).next() == Start(778, 777, 777 % (MAX_SUBMAPS // 2))
 
 
 def test_a_cloned_card_draws_others(tmp_path: Path) -> None:
-    before = numbers(tmp_path).next()
+    before, submap = numbers(tmp_path).next(), 5000 % (MAX_SUBMAPS // 2)
     here, there = numbers(tmp_path, drawn=5000).next(), numbers(tmp_path, "b", drawn=5000).next()
-    assert here == Start(before.order + 1, before.boot + 1)
-    assert there == Start(here.order + 5001, 5000)
+    assert here == Start(before.order + 1, before.boot + 1, submap)
+    assert there == Start(here.order + 5001, 5000, submap)
     assert numbers(tmp_path, "b").next() == Start(there.order + 1, 5001)
 
 
