@@ -23,6 +23,7 @@ from kiteline_hw.sim.world.built_in_paths import built_in_path
 from kiteline_hw.sim.world.path import Path
 
 F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 FOCAL = 450.0
@@ -130,6 +131,56 @@ def test_noise_of_the_accelerometer_is_not_believed_below_its_least() -> None:
     assert few.updated(before, 6.0, 3.0).accel == 3.0
     many = NoiseEvidence(chi2=np.array([30.0, 40.0, 3.0]), expected=np.array([30.0, 30.0, 3.0]))
     assert many.updated(before, 6.0, 3.0) == many.updated(before, 6.0)
+
+
+def walking(corners: CornerObservations, truth: F64, share: float, seed: int) -> tuple[CornerObservations, Bools]:
+    """The corners, a share of them on things that walk across the view from one keyframe to the next; and which."""
+    rng = np.random.default_rng(seed)
+    walks = rng.random(len(corners.ids)) < share
+    step = rng.choice([-1.0, 1.0], len(walks)) * rng.uniform(0.02, 0.04, len(walks))  # 10 to 20 px
+    xy = corners.xy.copy()
+    xy[:, walks, 0] += (np.arange(len(truth))[:, None] * step)[:, walks]
+    return replace(corners, xy=xy), walks
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 4])  # from nothing, one window in five ends in another minimum
+def test_corners_that_walk_are_left_out(seed: int) -> None:
+    corners, samples, truth = window(seed)
+    crowd, walks = walking(corners, truth, 0.3, seed)
+    found = bundle(crowd, samples).solve()
+    still = bundle(corners.part(np.flatnonzero(~walks)), samples).solve()
+    assert found is not None and still is not None and found.converged
+    # as by the still corners alone
+    assert abs(np.log(scale_of(found, truth) / scale_of(still, truth))) < 0.5 * still.scale_sigma
+    assert found.scale_sigma < 1.2 * still.scale_sigma
+    assert found.reprojection_px < 1.2 * still.reprojection_px
+    # and they become no landmarks of the map
+    placed = bundle(crowd, samples).place_landmarks(found.state)
+    assert placed is not None
+    newest = corners.seen[-1]
+    assert (placed.depth_sigma[walks & newest] > 0.25).mean() > 0.9
+    assert (placed.depth_sigma[~walks & newest] < 0.25).mean() > 0.7
+
+
+def test_costs_with_and_without_walking_corners_can_be_compared() -> None:
+    """What is left out costs as much as just before, not nothing: else the worst solution had the lowest cost."""
+    corners, samples, truth = window(1)
+    crowd, walks = walking(corners, truth, 0.3, 1)
+    with_them, without = bundle(crowd, samples).solve(), bundle(crowd.part(np.flatnonzero(~walks)), samples).solve()
+    assert with_them is not None and without is not None
+    observations = np.count_nonzero(corners.seen[:, walks])
+    each = CONFIG.huber * (CONFIG.max_rms - 0.5 * CONFIG.huber)
+    assert with_them.cost - without.cost == pytest.approx(observations * each, rel=0.2)  # some corners that stay, too
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_walking_corners_the_solution_is_no_worse(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    corners, samples, _ = window(seed)
+    found = bundle(corners, samples).solve()
+    monkeypatch.setattr(InertialBundle, "_leave_out", lambda *_: False)
+    before = bundle(corners, samples).solve()
+    assert found is not None and before is not None and found.converged
+    assert found.cost < before.cost + 1.0
 
 
 def test_a_still_camera_tells_no_scale() -> None:

@@ -29,6 +29,7 @@ I64 = NDArray[np.int64]
 
 _MAX_DAMPING = 1e4
 _PLACE_ITERATIONS = 4  # of landmarks alone
+_ROUNDS = 2  # in which corners are left out, each followed by another solution
 
 
 @dataclass(slots=True)
@@ -70,6 +71,7 @@ class InertialBundle:
         self._keyframes, self._landmarks = observations.seen.shape
         self._origin, self._axes = np.zeros((self._landmarks, 3)), np.zeros((self._landmarks, 3, 3))
         self._error = np.zeros((0, 0))  # (K,P) of observations in deviations
+        self._used = np.ones(self._landmarks, np.bool_)  # the other landmarks move, or their corners slide along edges
         self._projected: tuple[WindowState, tuple[F64, F64, F64, F64]] | None = None  # the last state's projections
 
     def solve(self, warm: WarmStart | None = None) -> WindowSolution | None:
@@ -80,7 +82,7 @@ class InertialBundle:
                 return None
             self._terms.integrate(state)
             every = np.arange(6, STATE * self._keyframes + SHARED)
-            state, system = self._iterate(state, every, self._config.iterations, inertial=True)
+            state, system = self._consistent(state, every, self._config.iterations, inertial=True)
             return self._solution(state, system, every)
         except np.linalg.LinAlgError:
             return None
@@ -95,6 +97,8 @@ class InertialBundle:
         for _ in range(_PLACE_ITERATIONS):
             moved = self._moved(state, still, system)
             state = replace(state, m=moved.m, rho=moved.rho)
+            system = self._linearise(state, inertial=True)
+        if self._leave_out(state):
             system = self._linearise(state, inertial=True)
         return self._solution(state, system, np.arange(6, len(still)))
 
@@ -125,7 +129,7 @@ class InertialBundle:
         state = self._anchored(replace(state, R=R, p=self._t_bc - R @ self._t_bc, rho=rho))
         unknown = (STATE * np.arange(1, n)[:, None] + np.arange(6)).ravel()
         unknown = np.concatenate([unknown, STATE * n + np.arange(3)])
-        return self._iterate(state, unknown, self._config.structure_iterations, inertial=False)[0]
+        return self._consistent(state, unknown, self._config.structure_iterations, inertial=False)[0]
 
     def _warm_state(self, warm: WarmStart) -> WindowState:
         """The state of an earlier solution, carried to the newest keyframes by the IMU. NaN: unknown landmarks."""
@@ -163,6 +167,29 @@ class InertialBundle:
         camera = state.p + state.R @ self._t_bc
         self._axes, self._origin = (state.R @ self._r_bc)[first], camera[first]
         return replace(state, m=self._obs.xy[first, np.arange(self._landmarks)].copy())
+
+    def _consistent(
+        self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
+    ) -> tuple[WindowState, _System]:
+        """`_iterate`, and again without the corners that do not fit: a robust weight does not end their pull."""
+        state, system = self._iterate(state, unknown, iterations, inertial=inertial)
+        for _ in range(_ROUNDS):
+            if not self._leave_out(state):
+                break
+            state, system = self._iterate(state, unknown, iterations, inertial=inertial)
+        return state, system
+
+    def _leave_out(self, state: WindowState) -> bool:
+        """Leave out the corners that do not fit. Returns whether there are any.
+
+        Errors count beside their median as well: before the solver has converged, those of still corners are large.
+        """
+        square = np.where(self._obs.seen, np.sum(self._project(state)[3] ** 2, axis=2), 0.0)
+        rms = np.sqrt(square.sum(axis=0) / np.maximum(self._obs.seen.sum(axis=0), 1))
+        fits = rms < self._config.max_rms * max(1.0, float(np.median(rms[self._used])))
+        changed = bool((self._used & ~fits).any())
+        self._used &= fits
+        return changed
 
     def _iterate(
         self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
@@ -213,7 +240,7 @@ class InertialBundle:
         )
         camera = state.p[-1] + state.R[-1] @ self._t_bc
         scaled = (self._rays(state) + state.rho[:, None] * (self._origin - camera)) @ (state.R[-1] @ self._r_bc)
-        fits = self._error[self._obs.seen]
+        fits = self._error[self._obs.seen & self._used]
         fits = fits[fits < 3.0]
         reprojection_px = float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf
         return WindowSolution(
@@ -243,10 +270,13 @@ class InertialBundle:
     def _visual_cost(self, error: F64) -> tuple[float, F64]:
         """Robust cost, and weights (K,P) of the observations."""
         k = self._config.huber
-        norm = np.where(self._obs.seen, np.linalg.norm(error, axis=2), 0.0)
+        used = self._obs.seen & self._used
+        norm = np.where(used, np.linalg.norm(error, axis=2), 0.0)
         self._error = norm
-        weight = np.where(norm < k, 1.0, k / np.maximum(norm, 1e-9)) * self._obs.seen
-        return float(np.where(norm < k, 0.5 * norm**2, k * (norm - 0.5 * k)).sum()), weight
+        weight = np.where(norm < k, 1.0, k / np.maximum(norm, 1e-9)) * used
+        # so that costs with different corners can be compared, those left out cost what they would just before
+        left_out = k * (self._config.max_rms - 0.5 * k) * float(np.count_nonzero(self._obs.seen & ~self._used))
+        return float(np.where(norm < k, 0.5 * norm**2, k * (norm - 0.5 * k)).sum()) + left_out, weight
 
     def _cost(self, state: WindowState, *, inertial: bool) -> float:
         return self._visual_cost(self._project(state)[3])[0] + self._terms.cost(state, inertial=inertial)
