@@ -52,7 +52,9 @@ class OdometryFactorConfig:
 
     enough_observations: int = 80  # observations of a keyframe above which only the rotation is constrained
     rotation_sigma_px: float = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
-    worn_px: float = 1.4  # px per sqrt(s) between them, for both: rotations of a worn rig err by 0.8 px after 1 s
+    worn_px: float = (
+        0.5  # px per sqrt(s) between them, for both: of a worn rig, whose disparity offset is counted apart
+    )
     run: int = 20  # keyframes; consecutive rotations whose common error is estimated together
     sigma_px: float = 0.15  # px; of each of 12 synthetic points if the keyframe has no observations
     scale_sigma_px: float = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale

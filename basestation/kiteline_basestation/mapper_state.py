@@ -42,6 +42,7 @@ class MapState:
     disparity_offset_px: Mapping[AgentId, F64] = field(default_factory=dict)
     disparity_calibrated: frozenset[AgentId] = frozenset()
     disparity_sigma_px: Mapping[AgentId, float] = field(default_factory=dict)
+    measured_with_px: Mapping[KeyframeId, F64] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ def map_state(sparse_map: SparseMap) -> MapState:
     return MapState(
         dict(sorted(sparse_map.root_submaps.items())), dict(sorted(sparse_map.submap_poses.items())),
         dict(sorted(sparse_map.disparity_offset_px.items())), frozenset(sparse_map.disparity_calibrated),
-        dict(sorted(sparse_map.disparity_sigma_px.items())),
+        dict(sorted(sparse_map.disparity_sigma_px.items())), dict(sorted(sparse_map.measured_with_px.items())),
     )  # fmt: skip
 
 
@@ -74,5 +75,6 @@ def restore_map(sparse_map: SparseMap, state: MapState) -> None:
     sparse_map.disparity_offset_px.update(state.disparity_offset_px)
     sparse_map.disparity_calibrated.update(state.disparity_calibrated)
     sparse_map.disparity_sigma_px.update(state.disparity_sigma_px)
+    sparse_map.measured_with_px = dict(state.measured_with_px)
     told = sparse_map.onboard_sigma_px  # on board: what the agent found itself stays the prior
     sparse_map.known_offset_px.update({a: px for a, px in state.disparity_offset_px.items() if a not in told})

@@ -8,6 +8,7 @@ import numpy as np
 
 from kiteline_basestation.config import BaseConfig, OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.mapper_state import map_state, restore_map
 from kiteline_basestation.refinement.bundle_window import bundle_window
 from kiteline_basestation.refinement.disparity_calibration import with_border
 from kiteline_basestation.refinement.odometry_factors import with_odometry_factors, without_odometry_factors
@@ -162,7 +163,8 @@ def test_links_of_a_worn_rig_count_less() -> None:
     assert worn.min() > 5.0 * good.max()
 
 
-def test_links_stand_aside_of_the_border() -> None:
+def test_links_of_few_points_are_measured_with_the_offset_of_the_border() -> None:
+    """A synthetic point has a disparity where the child sees it, which the offset changes, and none in the parent."""
     sparse_map, _ = flight(noise_px=0.3)
     config = BaseConfig()
     part = bundle_window(
@@ -174,8 +176,61 @@ def test_links_stand_aside_of_the_border() -> None:
     linked = with_odometry_factors(sparse_map, replace(part, problem=problem), config.odometry_factors)
     assert linked.border is not None
     assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
+    disparity = linked.measured[len(part.slots) :, 2].reshape(-1, 2)
+    assert ((disparity >= 0.0).sum(1) == 1).all()
+    assert np.array_equal(linked.border.group[len(part.slots) :] == 0, disparity.ravel() >= 0.0)
+    many = OdometryFactorConfig(enough_observations=5)  # rotations alone, of points far away: no disparity counts there
+    linked = with_odometry_factors(sparse_map, replace(part, problem=problem), many)
+    assert linked.border is not None
     assert (linked.border.group[len(part.slots) :] == -1).all()
     assert bundle(linked, config.bundle).offset.shape == (1, 5)
+
+
+OFFSET = np.array([0.5, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_steps_follow_the_disparity_offset_as_it_becomes_known() -> None:
+    """Disparities are half a pixel too large; the agent did not know when it measured its steps by them."""
+    config = BaseConfig()
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+    sparse_map, truth = flight(noise_px=0.0, births=70)
+    sparse_map.keypoints.inv_depth[: sparse_map.slots] += OFFSET[0] / CAMERA.bf
+    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
+    assert part is not None
+    told = bundle(part.problem, replace(config.bundle, robust_trials=20)).T_c_m
+    for k in range(1, KEYFRAMES):
+        sparse_map.keyframes.T_p_k[sparse_map.rows[keyframes[k]]] = told[k - 1] @ se3.inverse(told[k])
+    blind = replace(
+        part, problem=replace(part.problem, T_c_m=told, sigma=1e3 * part.problem.sigma)
+    )  # links alone count
+    sparse_map.disparity_offset_px[AgentId(0)] = OFFSET
+    few = replace(config.odometry_factors, enough_observations=1000)
+    for known, least, most in (({}, 0.0, 0.5), ({keyframes[0]: OFFSET}, 0.98, 1.02)):  # it stands if the agent knew
+        sparse_map.measured_with_px = dict(known)
+        linked = with_odometry_factors(sparse_map, blind, few)
+        result = bundle(linked, replace(config.bundle, robust_trials=20))
+        assert least <= error_m(result.T_c_m, truth) / error_m(told, truth) <= most
+
+
+def test_a_map_notes_which_offset_each_keyframe_was_measured_with() -> None:
+    sparse_map, better = SparseMap(), OFFSET + 0.1
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(6)]
+    for k, keyframe in enumerate(keyframes):
+        if k in (2, 4):
+            sparse_map.disparity_offset_px[AgentId(0)] = OFFSET if k == 2 else better
+        sparse_map.add_keyframe(keyframe, k, KeyframeId(keyframe - 1) if k else NO_KEYFRAME, np.eye(4), 0)
+    other = keyframe_id(submap_id(1, 0, 0), 0)
+    sparse_map.add_keyframe(other, 0, NO_KEYFRAME, np.eye(4), 0)
+    sparse_map.add_keyframe(keyframes[1], 1, keyframes[0], np.eye(4), 0)  # its header again: measured as it was
+    expected = [0.0, 0.0, 0.5, 0.5, 0.6, 0.6]
+    again = SparseMap()  # a later process that receives all of them at once
+    again.disparity_offset_px[AgentId(0)] = better
+    for k, keyframe in enumerate(keyframes):
+        again.add_keyframe(keyframe, k, KeyframeId(keyframe - 1) if k else NO_KEYFRAME, np.eye(4), 0)
+    restore_map(again, map_state(sparse_map))
+    for one in (sparse_map, again):
+        assert [one.offset_measured_with(k)[0] for k in keyframes] == expected
+        assert not one.offset_measured_with(other).any()
 
 
 def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:

@@ -37,7 +37,8 @@ def full_state() -> MapperState:
     return MapperState(
         names={A: 'hall "7"'}, unbundled={A: (KeyframeId(1), KeyframeId(2))},
         map=MapState(
-            {B: A}, {B: S}, {AgentId(1): np.array([0.1, 0, 0, 0, 0])}, frozenset({AgentId(1)}), {AgentId(1): 0.07}
+            {B: A}, {B: S}, {AgentId(1): np.array([0.1, 0, 0, 0, 0])}, frozenset({AgentId(1)}), {AgentId(1): 0.07},
+            {KeyframeId(7): np.array([0.2, 0, 0, 0, 0])},
         ),
         intake=IntakeState({A: LivePose(AgentId(0), 5, KeyframeId(2), T, 80)}, {A: 5}, (KeyframeId(3),), (B,)),
         placements=PlacementState({B: S, A: T}, {A: T}, frozenset({B})), merger=merger,
@@ -59,8 +60,10 @@ def test_a_state_of_an_earlier_version_can_be_read() -> None:
     texts = texts_of(full_state())
     before = json.loads(texts["mapper.map"])
     assert before.pop("disparity_sigma_px") == [[1, 0.07]]
+    assert len(before.pop("measured_with_px")) == 1
     again = state_of({**texts, "mapper.map": json.dumps(before)})
     assert again.map.disparity_sigma_px == {}
+    assert again.map.measured_with_px == {}
     assert again.map.disparity_calibrated == {AgentId(1)}
     del before["root_submaps"]  # always there
     with pytest.raises(KeyError):

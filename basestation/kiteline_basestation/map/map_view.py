@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import fields
 
 import numpy as np
@@ -19,8 +20,17 @@ from kiteline_basestation.map.map_tables import (
     empty_keypoints,
 )
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, AgentId, KeyframeId, SubmapId, agent_of_submap
+from kiteline_core.ids import (
+    KEYPOINT_BITS,
+    MAX_KEYPOINTS,
+    AgentId,
+    KeyframeId,
+    SubmapId,
+    agent_of_keyframe,
+    agent_of_submap,
+)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -53,6 +63,7 @@ class MapView:
         self.disparity_sigma_px: dict[AgentId, float] = {}  # its deviation, rms over the image, if the rig is worn
         self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: that of earlier flights, or found on board
         self.onboard_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
+        self.measured_with_px: dict[KeyframeId, F64] = {}  # (5,) offset that motion was measured with, where it changed
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self.moved_rows: set[int] = set()  # keyframes whose pose changed, by row, since a reader cleared it
@@ -223,6 +234,14 @@ class MapView:
     def is_onboard_offset(self, agent: AgentId) -> bool:
         """True if the disparity offset of an agent is the one that it found on board, unchanged."""
         return agent in self.onboard_sigma_px and self.disparity_offset_px[agent] is self.known_offset_px[agent]
+
+    def offset_measured_with(self, keyframe: KeyframeId) -> F64:
+        """Disparity offset (5,) px that an agent corrected for when it measured the motion to a keyframe."""
+        changes = sorted(self.measured_with_px)
+        before = changes[: bisect_right(changes, keyframe)]
+        if not before or agent_of_keyframe(before[-1]) != agent_of_keyframe(keyframe):
+            return disparity_offset.none()
+        return self.measured_with_px[before[-1]]
 
     def map_id(self, submap: SubmapId) -> SubmapId:
         """The root submap of the map that a submap belongs to."""

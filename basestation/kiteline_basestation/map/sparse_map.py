@@ -120,6 +120,7 @@ class SparseMap(MapView):
                 grow(table, row + max(32, row // 4))
             self.rows[keyframe] = row
             insort(self.submaps.setdefault(submap_of_keyframe(keyframe), []), keyframe)
+            self._note_offset(keyframe)
             table.id[row] = keyframe
             table.start[row] = self._allocate(row, keypoints)
             table.count[row] = keypoints
@@ -140,6 +141,12 @@ class SparseMap(MapView):
         if waiting is not None:
             self._link_observations(np.array(waiting, np.int32))
         return row
+
+    def _note_offset(self, keyframe: KeyframeId) -> None:
+        """Note the disparity offset that both sides know as a keyframe arrives: its motion was measured with it."""
+        offset = self.disparity_offset_px.get(agent_of_keyframe(keyframe))
+        if offset is not None and not np.array_equal(offset, self.offset_measured_with(keyframe)):
+            self.measured_with_px[keyframe] = offset
 
     def put_new_landmarks(
         self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,

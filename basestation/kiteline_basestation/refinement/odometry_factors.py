@@ -3,8 +3,10 @@
 The agent tracked all frames in between, with an IMU if it has one, and with ten times the landmarks that a thin link
 carries. A relative pose is added as synthetic points that both keyframes observe exactly where that pose puts them. For
 a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the
-agent measures best (0.1 to 0.2 mrad an axis between keyframes). A disparity offset biases the agent's translations and,
-all in one direction, its rotations: the weight decreases where rotations differ, and for rigs that are known to be
+agent measures best (0.1 to 0.2 mrad an axis between keyframes). Other keyframes observe points nearby, with a disparity
+in one of the two images. It stands for those that the agent measured: with another disparity offset than the agent had,
+the same images mean another motion, so that a worn rig's steps follow the offset as it becomes known. While it is not,
+it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
 worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
 its IMU.
 """
@@ -19,8 +21,8 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
-from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.geometry import disparity_offset, se3, sim3
+from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 
 F64 = NDArray[np.float64]
@@ -30,6 +32,7 @@ _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviatio
 _MIN_RUN = 5  # rotations for an estimate of their common error
 _DEPTHS = (0.7, 1.8)  # times the median depth: near points constrain translation, far ones rotation
 _ROTATION_DEPTHS = (8.0,)  # the same for rotation alone
+_NO_DISPARITY, _NO_GROUP = -1.0, -1
 
 
 def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig) -> BundleProblem:
@@ -39,11 +42,12 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
-    points, camera, measured, sigma = [], [], [], []
+    points, camera, measured, sigma, group, terms = [], [], [], [], [], []
+    border, of_camera = problem.border, _groups(problem)
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
-        agent = agent_of_keyframe(KeyframeId(int(table.id[row])))
-        submap = submap_of_keyframe(KeyframeId(int(table.id[row])))
+        keyframe = KeyframeId(int(table.id[row]))
+        agent, submap = agent_of_keyframe(keyframe), submap_of_keyframe(keyframe)
         if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
@@ -51,8 +55,9 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         rotation_sigma = max(config.rotation_sigma_px, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
         point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
+        ranged = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
-        if not (sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth):
+        if not ranged:
             sets.append((_DEPTHS, config.scale_sigma_px))
         for depths, set_sigma in sets:
             T_p_k = sim3.with_scaled_translation(table.T_p_k[row], sparse_map.scale(submap))
@@ -60,20 +65,31 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
             if synthetic is None:
                 continue
             in_k, in_p, world = synthetic
+            at = np.zeros((len(in_k), disparity_offset.TERMS))
+            if ranged and depths is _DEPTHS:
+                at = disparity_offset.terms((in_k[:, :2] - problem.lens[k, 2:4]) / problem.lens[k, :2])
+                in_k[:, 2] += at @ (
+                    sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
+                )
+                in_p[:, 2] = _NO_DISPARITY
+                seen = in_k[:, 2] > 0.0
+                in_k, in_p, world, at = in_k[seen], in_p[seen], world[seen], at[seen]
             points.append(world)
             first, second = (p, k) if p < k else (k, p)
             for i in range(len(world)):
                 camera += [first, second]
                 measured += [in_p[i], in_k[i]] if p < k else [in_k[i], in_p[i]]
                 sigma += [[set_sigma, set_sigma]] * 2
+                group += [_NO_GROUP, of_camera[k]] if p < k else [of_camera[k], _NO_GROUP]
+                terms += [at[i]] * 2
     if not points:
         return problem
     added = np.concatenate(points)
-    border = problem.border
     if border is not None:
-        none = np.full(len(camera), -1, np.int32)
-        terms = np.concatenate([border.terms, np.zeros((len(camera), border.terms.shape[1]))])
-        border = replace(border, group=np.concatenate([border.group, none]), terms=terms)
+        groups = np.where(np.any(terms, axis=1), group, _NO_GROUP).astype(np.int32)
+        border = replace(
+            border, group=np.concatenate([border.group, groups]), terms=np.concatenate([border.terms, np.array(terms)])
+        )
     return replace(
         problem,
         points=np.concatenate([problem.points, added]),
@@ -85,6 +101,20 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         sigma=np.concatenate([problem.sigma, np.array(sigma)]),
         border=border,
     )
+
+
+def _groups(problem: BundleProblem) -> NDArray[np.int32]:
+    """Group (k,) of each camera in the problem's border; none where its disparities are taken as corrected."""
+    out = np.full(len(problem.T_c_m), _NO_GROUP, np.int32)
+    if problem.border is not None:
+        np.maximum.at(out, problem.camera, problem.border.group)
+    return out
+
+
+def _assumed(sparse_map: SparseMap, agent: AgentId, group: int) -> F64:
+    """Disparity offset (5,) px that a problem's disparities are corrected for: none where it is estimated."""
+    known = sparse_map.disparity_offset_px.get(agent)
+    return disparity_offset.none() if known is None or group != _NO_GROUP else known
 
 
 def _rotation_difference_px(sparse_map: SparseMap, window: BundleWindow, number: dict[int, int], run: int) -> float:

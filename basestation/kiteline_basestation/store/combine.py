@@ -59,6 +59,7 @@ def _combined(ours: MapperState, theirs: MapperState, new: list[KeyframeId]) -> 
         disparity_offset_px={**b.disparity_offset_px, **a.disparity_offset_px},
         disparity_calibrated=a.disparity_calibrated | b.disparity_calibrated,
         disparity_sigma_px={**b.disparity_sigma_px, **a.disparity_sigma_px},
+        measured_with_px={**b.measured_with_px, **a.measured_with_px},
     )
     intake = replace(
         ours.intake,

@@ -24,7 +24,7 @@ T = TypeVar("T")
 _HINTS: dict[Any, dict[str, Any]] = {}  # by dataclass
 
 ROOT = "mapper"  # name of the text of the state itself
-_ADDED = {"disparity_sigma_px"}  # fields that states of earlier versions lack: as in a new mapper
+_ADDED = {"disparity_sigma_px", "measured_with_px"}  # fields that states of earlier versions lack: as in a new mapper
 
 
 class StateWriter:
