@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kiteline_bench.grid import costs, maps, obstacles, robust, scans, street
-from kiteline_bench.grid.accuracy import objects_present
+from kiteline_bench.grid.accuracy import judged, objects_present
 from kiteline_bench.grid.flown import FlownGrid
 from kiteline_bench.grid.places import Place
 from kiteline_bench.grid.ray_kernels import cast_rays
@@ -114,12 +114,12 @@ def test_objects_are_present_or_missed() -> None:
     states = np.full(true.image.shape, FREE, np.int8)
     states[true.image == 0] = OCCUPIED
     grid = GridFile(true.cell_m, (*true.corner, 0.0), states)
-    place = Place("room", "", grid, grid, world)
+    place = Place("room", "", grid, grid, grid, world)
     bars = objects_present(place, grid, np.eye(3))
     assert len(bars) == 5 and all(bar.met for bar in bars)
     empty = replace(grid, state=np.full(states.shape, FREE, np.int8))
     assert not any(bar.met for bar in objects_present(place, empty, np.eye(3)))
-    unseen = Place("room", "", grid, replace(grid, state=np.full(states.shape, UNKNOWN, np.int8)), world)
+    unseen = Place("room", "", grid, replace(grid, state=np.full(states.shape, UNKNOWN, np.int8)), grid, world)
     assert objects_present(unseen, grid, np.eye(3)) == []
 
 
@@ -262,3 +262,22 @@ def test_a_pose_that_is_not_finite_does_not_move_the_storey() -> None:
     assert np.array_equal(
         scans.as_file(scans.drawn([good, bad], 175.0)).state, scans.as_file(scans.drawn([good], 175.0)).state
     )
+
+
+def test_what_is_free_beyond_the_range_is_no_error_if_it_was_in_sight_and_recall_does_not_ask_for_it() -> None:
+    """A strip of 10 m of which the first 6 m count, 8 m were in sight, and the last metre is a wall."""
+
+    def strip(free_m: float, wall: bool = False) -> GridFile:
+        state = np.full((20, 200), UNKNOWN, np.int8)
+        state[:, : round(free_m / 0.05)] = FREE
+        if wall:
+            state[:, 180:] = OCCUPIED
+        return GridFile(0.05, (0.0, 0.0, 0.0), state)
+
+    place = Place("strip", "", strip(9.0, wall=True), strip(6.0), strip(8.0), None)
+    precision, recall = {}, {}
+    for free_m in (5.0, 6.0, 6.5, 8.0, 10.0):
+        found = judged(place, strip(free_m), np.eye(3))[0]
+        precision[free_m], recall[free_m] = found.precision, found.recall
+    assert precision[5.0] == precision[6.0] == precision[6.5] == precision[8.0] == 100.0 > precision[10.0]
+    assert recall[5.0] < 90.0 < recall[6.0] == recall[6.5] == recall[10.0] == 100.0

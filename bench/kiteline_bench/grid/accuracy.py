@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ def run(bench: Bench) -> list[Bar]:
     bars, rows = [], []
     for place in all_places(bench):
         flight = fly_grid(bench, place.name, load(place.recording))
-        found, everything = (score(flight.grid, true, flight.T_plane) for true in (place.seen, place.true))
+        found, everything = judged(place, flight.grid, flight.T_plane)
         draw_comparison(picture_path(bench, place.name), flight.grid, place.seen, flight.T_plane)
         bars += [
             _at_least(f"{place.name}: precision", found.precision, _PRECISION),
@@ -50,6 +51,15 @@ def run(bench: Bench) -> list[Bar]:
     return bars
 
 
+def judged(place: Place, grid: GridFile, T_true_est: F64) -> tuple[GridScore, GridScore]:
+    """The score by what was seen, and by all that is true.
+
+    Recall is that of cells within range. What is free beyond, and was in sight there, is no error.
+    """
+    found, in_sight, everything = (score(grid, true, T_true_est) for true in (place.seen, place.sight, place.true))
+    return replace(found, precision=in_sight.precision), everything
+
+
 def references(place: Place, flight: FlownGrid) -> list[Sequence[object]]:
     """Rows of the methods that draw sparse points."""
     sparse, rows = flight.sparse, []
@@ -59,7 +69,7 @@ def references(place: Place, flight: FlownGrid) -> list[Sequence[object]]:
             ("sparse points, log-odds", log_odds_grid(sparse, cell_m)),
             ("sparse points, binary layers (Segfloor)", binary_grid(sparse, labels, cell_m)),
         ):
-            found, everything = (score(grid, true, flight.T_plane) for true in (place.seen, place.true))
+            found, everything = judged(place, grid, flight.T_plane)
             rows.append(_row(place, name, grid, found, everything))
     return rows
 
